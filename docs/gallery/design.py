@@ -1,9 +1,9 @@
 """
-Local precision of a fingertip
-==============================
+Expected error of the place
+===========================
 
-How precisely a skin tells neighbouring touches of 5 N apart, against the thickness of the skin, for regular
-grids of sensors (:doc:`/design`).
+How well the posterior locates fingertips of about 5 N, against the thickness of the skin, for regular grids
+of sensors (:doc:`/design`).
 """
 
 from collections import defaultdict
@@ -14,7 +14,7 @@ from tempfile import mkdtemp
 
 from skin.core.files import ROOT
 from skin.design.drawing import draw_sweep
-from skin.design.precision import Findings, Step
+from skin.design.expected import Findings, Step
 
 # %%
 # ``skin design design=sweep simulator=solid simulator.divisions=6`` computed the numbers.

@@ -2,24 +2,22 @@
 Which skin should I build?
 ==========================
 
-``skin design`` computes how precisely a skin tells neighbouring touches apart, before anything is built or
-trained. This tutorial calls it from Python for four skins. :doc:`/design` explains this local precision.
+``skin design`` computes how well the posterior tells where and how hard a skin is touched, before anything is
+built or trained. This tutorial calls it from Python for four skins (:doc:`/design`).
 """
 
 from pathlib import Path
 from tempfile import mkdtemp
 
 import skin
-from skin.design.drawing import draw_precision
-from skin.design.precision import LocalPrecision
+from skin.design.drawing import draw_expected
+from skin.design.expected import ExpectedPosterior
 
 # %%
 # Thickness and number of sensors
 # -------------------------------
-# The touches have a force of 5 N. A touch is blind if it raises no sensor above three standard deviations of
-# the noise. The local precision is the standard deviation of the place near the true touch, to first order.
-# It is no limit for an estimator: a touch above a single sensor can be located within a few mm, because the
-# other sensors stay silent. The local precision does not count that.
+# The touches have a force of about 5 N. A touch is blind if it raises no sensor above three standard
+# deviations of the noise. The error of a place is that of the posterior mean along one axis.
 
 
 def build(thickness: float, count: int) -> tuple[skin.Sheet, skin.Solid]:
@@ -32,13 +30,13 @@ def build(thickness: float, count: int) -> tuple[skin.Sheet, skin.Solid]:
     return body, skin.Solid(body, sensors, divisions=3)
 
 
-precision = LocalPrecision(forces=(5.0,), touches=128, margin=0.02)
-print("thickness, mm  sensors  blind, %  local precision, mm")
+design = ExpectedPosterior(forces=(5.0,), touches=128, margin=0.02)
+print("thickness, mm  sensors  blind, %  place, rms, mm")
 for count in (3, 5):
     for thickness in (0.010, 0.025):
         body, simulator = build(thickness, count)
-        (found,) = precision.find(simulator, body)
-        numbers = f"{100 * found.blind_share:8.0f}  {1e3 * found.place_m:19.1f}"
+        (found,) = design.find(simulator, body)
+        numbers = f"{100 * found.blind_share:8.0f}  {1e3 * found.place_m:14.1f}"
         print(f"{1e3 * thickness:13g}  {count**2:7}  {numbers}")
 
 # %%
@@ -47,9 +45,10 @@ for count in (3, 5):
 #
 # Where on the skin
 # -----------------
-# The map shows the local precision for a touch on each cell of the last skin. ``skin design design=place``
+# The map shows the expected error for a touch on each cell of the last skin. ``skin design design=place``
 # chooses positions (:doc:`/design`).
 
 sensors = skin.Grid(rows=5, columns=5, depth=0.0245).sensors(body)
-maps = {5.0: precision.maps(simulator, body)[0]}
-figure = draw_precision(body, sensors, maps, Path(mkdtemp()) / "design.png")
+(trials,) = design.trials(simulator, body).values()
+maps = {5.0: design.expected_map(trials, body)}
+figure = draw_expected(body, sensors, maps, Path(mkdtemp()) / "design.png")

@@ -22,6 +22,7 @@ class Stream(IntEnum):
     PLACEMENT = 11
     SKIN = 12
     SKIN_ORDER = 13
+    DESIGN = 14
 
 
 def generator(stream: Stream, *key: int) -> np.random.Generator:

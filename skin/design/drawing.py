@@ -1,4 +1,4 @@
-"""Tables and pictures of the local precision of a skin."""
+"""Tables and pictures of the expected posterior of a skin, and of placements."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -9,33 +9,33 @@ from matplotlib.colors import ListedColormap, LogNorm
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from matplotlib.ticker import LogLocator
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
-from torch import Tensor
 
 from skin.body.base import AbstractBody, Sensors
-from skin.design.precision import Findings, Step
+from skin.design.expected import Findings, Step
 from skin.plot.figures import COLOURS, MARKS, save_figure
 
 _NOTE = (
-    "The local precision is no limit for an estimator: above a single sensor a touch can be located within a "
-    "few mm,\nbecause the sensors that stay silent inform, too (docs/design.md)."
+    "Errors of the posterior mean; of the place: rms per axis, median, 90 %, rms where a sensor is raised.\n"
+    "Local precision tells a touch from its neighbours alone and is no limit (docs/design.md)."
 )
-_WIDE = ("radius, mm", "reach, mm")  # columns without room in the table of a sweep
+_WIDE = ("raised\nmm", "radius\nmm", "reach\nmm", "local precision\nmm")  # no room in the table of a sweep
 
 
-def print_precision(findings: Sequence[Findings]) -> None:
-    """Print one line per force; the reach is the receptive radius."""
+def print_expected(findings: Sequence[Findings]) -> None:
+    """Print a line per force; the reach is the receptive radius."""
     _print([_cells(finding) for finding in findings])
 
 
-def draw_precision(body: AbstractBody, sensors: Sensors, maps: Mapping[float, Tensor], path: Path) -> Path:
-    """Draw the local precision of the place for each force, with the sensors, and return the path.
+def draw_expected(body: AbstractBody, sensors: Sensors, maps: Mapping[float, np.ndarray], path: Path) -> Path:
+    """Draw the expected error of the place for each force, with the sensors, and return the path.
 
     Args:
         body: the skin.
         sensors: in it.
-        maps: force, N -> standard deviation on each cell, (H, W), m.
+        maps: force, N -> error on each cell, (H, W), m; NaN where there is none.
         path: x.png.
     """
     wide = body.size[0] > 2 * body.size[1]
@@ -44,13 +44,13 @@ def draw_precision(body: AbstractBody, sensors: Sensors, maps: Mapping[float, Te
     size = counts * (panel + np.array([0.2, 0.4])) + np.array([1.4, 0.5])
     figure = Figure(figsize=tuple(size), layout="constrained")
     axes = figure.subplots(counts[1], counts[0], squeeze=False, sharex=True, sharey=True)
-    scaled = {force: 1e3 * np.asarray(deviation) for force, deviation in maps.items()}
+    scaled = {force: 1e3 * error for force, error in maps.items()}
     values = np.array(list(scaled.values()))
-    lowest, highest = values.min(), values.max()
+    lowest, highest = np.nanmin(values), np.nanmax(values)
     scale = LogNorm(lowest, highest)
     extent = (0, 1e3 * body.size[0], 1e3 * body.size[1], 0)
-    for axis, (force, deviation) in zip(axes.flat, scaled.items(), strict=True):
-        picture = axis.imshow(deviation, cmap="viridis_r", norm=scale, extent=extent)
+    for axis, (force, error) in zip(axes.flat, scaled.items(), strict=True):
+        picture = axis.imshow(error, cmap="viridis_r", norm=scale, extent=extent)
         x, y = 1e3 * sensors.positions[:, :2].T
         axis.plot(x, y, "o", color="white", markeredgecolor="black", markersize=4)
         axis.set_title(f"{force:g} N")
@@ -60,7 +60,7 @@ def draw_precision(body: AbstractBody, sensors: Sensors, maps: Mapping[float, Te
         axis.set_ylabel("y, mm")
     steps = (1, 2, 5) if highest > 5 * lowest else range(1, 10)
     figure.colorbar(
-        picture, ax=axes, label="local precision of the place, mm", format="%g", ticks=LogLocator(subs=steps)
+        picture, ax=axes, label="expected error of the place, mm", format="%g", ticks=LogLocator(subs=steps)
     ).minorticks_off()
     return save_figure(figure, path)
 
@@ -70,9 +70,9 @@ def print_sweep(steps: Sequence[Step]) -> None:
     rows = []
     for step in steps:
         about = {
-            "thickness, mm": f"{1e3 * step.thickness:g}",
+            "thickness\nmm": f"{1e3 * step.thickness:g}",
             "sensors": f"{step.grid[0]} x {step.grid[1]}",
-            "pitch, mm": f"{1e3 * step.pitch:.0f}",
+            "pitch\nmm": f"{1e3 * step.pitch:.0f}",
         }
         cells = (_cells(finding) for finding in step.findings)
         rows += [about | {name: text for name, text in texts.items() if name not in _WIDE} for texts in cells]
@@ -80,7 +80,7 @@ def print_sweep(steps: Sequence[Step]) -> None:
 
 
 def draw_sweep(steps: Sequence[Step], path: Path) -> Path:
-    """Draw the local precision of the place against thickness, and return the path.
+    """Draw the error of the place against thickness, and return the path.
 
     There is a line per number of sensors.
 
@@ -104,7 +104,7 @@ def draw_sweep(steps: Sequence[Step], path: Path) -> Path:
         axis.set(title=f"{force:g} N", xlabel="thickness, mm", yscale="log")
         axis.yaxis.set_major_formatter("{x:g}")
         axis.grid(which="both", alpha=0.3)
-    axes[0].set_ylabel("local precision of the place, mm")
+    axes[0].set_ylabel("error of the place, rms, mm")
     axes[-1].legend(loc="center left", bbox_to_anchor=(1, 0.5))
     return save_figure(figure, path)
 
@@ -112,18 +112,23 @@ def draw_sweep(steps: Sequence[Step], path: Path) -> Path:
 def _cells(finding: Findings) -> dict[str, str]:
     """Return name and text of each column of a table."""
     return {
-        "force, N": f"{finding.force_N:g}",
-        "blind, %": f"{100 * finding.blind_share:.1f}",
-        "place, mm": f"{1e3 * finding.place_m:.2f}",
-        "90 %, mm": f"{1e3 * finding.place_90_m:.2f}",
-        "radius, mm": f"{1e3 * finding.radius_m:.2f}",
-        "force, %": f"{100 * finding.force_relative:.1f}",
-        "reach, mm": f"{1e3 * finding.receptive_radius_m:.1f}",
+        "force\nN": f"{finding.force_N:g}",
+        "blind\n%": f"{100 * finding.blind_share:.1f}",
+        "place\nmm": f"{1e3 * finding.place_m:.2f}",
+        "median\nmm": f"{1e3 * finding.place_median_m:.2f}",
+        "90 %\nmm": f"{1e3 * finding.place_90_m:.2f}",
+        "raised\nmm": f"{1e3 * finding.place_raised_m:.2f}",
+        "radius\nmm": f"{1e3 * finding.radius_m:.2f}",
+        "force\n%": f"{100 * finding.force_relative:.1f}",
+        "reach\nmm": f"{1e3 * finding.receptive_radius_m:.1f}",
+        "local precision\nmm": f"{1e3 * finding.local_precision_m:.1f}",
     }
 
 
 def _print(rows: Sequence[dict[str, str]]) -> None:
-    table = Table(*rows[0], title="Local precision of a fingertip (median over touches)")
+    title = "Expected posterior of a fingertip"
+    # All columns fit into 80 characters.
+    table = Table(*rows[0], title=title, box=SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
     for row in rows:
         table.add_row(*row.values())
     Console().print(table)

@@ -129,6 +129,7 @@ def _response(body: AbstractBody, sensors: Sensors, model: AbstractSimulator, re
     touches = torch.from_numpy(np.concatenate([places[owner, number].clip(0, body.size), constants], axis=1))
     rows = torch.arange(len(owner))
     index = torch.from_numpy(owner)
-    felt = fingertip_readings(model, body, touches, _RIM)
+    # A simulator of a user's own computes in single precision.
+    felt = fingertip_readings(model, body, touches.float(), _RIM)
     total = torch.zeros(len(sensors)).index_add(0, index, felt[rows, index].float())
     return total / torch.bincount(index, minlength=len(sensors))

@@ -147,7 +147,7 @@ SERIAL = ["device=serial", "device.port=/dev/null"]
         (["device.dead=[4,2]"], r"device.dead=\[4, 2\] must be a range \[least, most\]"),
         (
             ["+device.noize=1"],
-            "device has no setting noize: did you mean noise[?] it has .*gain_spread, offset",
+            "device has no setting noize: did you mean noise[?] it has .*gain_spread, scale_spread, offset",
         ),
         (["layout=grid", "layout.rows=1.5"], "layout.rows=1.5 must be a valid integer"),
         (["body.cells=9"], "body.cells=9 must be a list"),

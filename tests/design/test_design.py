@@ -12,29 +12,32 @@ SMALL = (
 
 
 @pytest.mark.slow
-def test_the_local_precision_of_nine_sensors(run, tmp_path):
+def test_the_expected_posterior_of_nine_sensors(run, tmp_path):
     done = run(tmp_path, *SMALL, "simulator=solid", "simulator.divisions=2", "out=x", store=False)
     assert done.returncode == 0, done.stderr
-    assert "Local precision of a fingertip" in done.stdout
-    assert "no limit for an estimator" in done.stdout
+    assert "Expected posterior of a fingertip" in done.stdout
+    assert "\u2026" not in done.stdout  # no column is cut off
     assert "bound" not in done.stdout.lower()
     found = json.loads((tmp_path / "x" / "design.json").read_text())
     assert found["sensors"] == 9
     assert found["settings"]["noise_N"] == 0.05
-    weak, middle, strong = found["precision"]
+    weak, middle, strong = found["expected"]
     assert [one["force_N"] for one in (weak, middle, strong)] == [1, 5, 20]
     prior = (0.24**2 / 24 + 0.08**2 / 24) ** 0.5  # the root of the mean of both variances
-    for name, most in {"place_m": prior, "radius_m": 0.008 / 12**0.5, "force_relative": 0.5}.items():
-        assert 0 < strong[name] < middle[name] < weak[name] < most * (1 + 1e-9)
+    for name in ("place_m", "place_median_m", "local_precision_m"):
+        assert 0 < strong[name] < weak[name] < prior * (1 + 1e-9)
+    for findings in (weak, middle, strong):
+        assert findings["place_median_m"] < findings["place_90_m"]
+        assert findings["place_raised_m"] <= findings["place_m"]
     assert 0 <= strong["blind_share"] < middle["blind_share"] < weak["blind_share"] <= 1
     assert strong["receptive_radius_m"] > weak["receptive_radius_m"]
     assert (tmp_path / "x" / "design.png").stat().st_size > 10_000
 
 
-def test_a_skin_without_mechanics_has_a_precision_too(run, tmp_path):
+def test_a_skin_without_mechanics_has_a_posterior_too(run, tmp_path):
     done = run(tmp_path, *SMALL, "simulator=naive", "out=x", store=False)
     assert done.returncode == 0, done.stderr
-    weak, _, strong = json.loads((tmp_path / "x" / "design.json").read_text())["precision"]
+    weak, _, strong = json.loads((tmp_path / "x" / "design.json").read_text())["expected"]
     # A touch beside every sensor's cell raises none, however hard it is.
     assert 0.5 < strong["blind_share"] <= weak["blind_share"] < 1
 
@@ -69,6 +72,7 @@ def test_a_sweep_has_a_line_for_each_thickness_and_grid(run, tmp_path):
             ["design.margin=0.04"],
             "design.margin=0.04 m leaves no place on 0.24 x 0.08 m: give less than 0.04",
         ),
+        (["design.touches=3"], "design.touches=3 must be"),
         (["design.noise=0"], "design.noise=0 must be greater than 0"),
         (["design.radii=[0.01,0.002]"], "must be a range [least, most]"),
         (["device.noise=[0.05,0.2]"], "design.noise="),

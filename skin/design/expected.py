@@ -1,0 +1,397 @@
+"""The expected posterior of fingertips on a skin: errors, blind touches and reach; a sweep over designs."""
+
+import csv
+import math
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import torch
+from annotated_types import Ge, Gt, MinLen
+from pydantic import NonNegativeFloat, PositiveFloat, PositiveInt
+from rich.console import Console
+from rich.progress import track
+from scipy.stats.qmc import Halton
+
+from skin.body.base import AbstractBody, Layer
+from skin.body.layout import Footprint, Grid
+from skin.body.material import Material
+from skin.core.files import json_text, whole, write
+from skin.core.rng import Stream, generator
+from skin.core.settings import RISING, checked
+from skin.design.precision import Sensitivity, local_covariance, sensitivity
+from skin.errors import InputError
+from skin.inference.candidates import CandidateReadings, FingertipPrior, disc_readings
+from skin.inference.contact import Cloud, blur_first, one_contact
+from skin.inference.likelihood import Observation
+from skin.inference.noise import Noise
+from skin.mechanics.geometry import Fingertip
+from skin.mechanics.simulator.base import AbstractSimulator
+from skin.runs.build import SkinModel, build_skin
+from skin.runs.configuration import Config
+
+_UNITS = {
+    **dict.fromkeys(("radii", "rim", "margin"), "_m"),
+    **dict.fromkeys(("forces", "noise", "clip"), "_N"),
+    "gain": "_relative",
+}
+
+Lengths = Annotated[tuple[PositiveFloat, PositiveFloat], RISING]
+
+
+@dataclass(frozen=True)
+class Findings:
+    """Errors of the posterior mean for drawn touches around one force.
+
+    The error of a place is that along one axis, the root of the mean square along x and y.
+
+    Attributes:
+        force_N: median of the forces.
+        blind_share: touches that raise no sensor above three standard deviations of the noise of a frame.
+        place_m: error of the place, root of the mean square over touches.
+        place_median_m: its median.
+        place_90_m: its 90 % quantile.
+        place_raised_m: as ``place_m``, over touches that raise a sensor; NaN without any.
+        radius_m: error of the radius, median over touches.
+        force_relative: error of the force, as a share of it, median over touches.
+        receptive_radius_m: radius of the disc with the area over which a touch raises a sensor above three
+            standard deviations, median over sensors.
+        local_precision_m: standard deviation of the place near the true touch, to first order, median over
+            touches (:mod:`skin.design.precision`). It is no limit.
+    """
+
+    force_N: float  # noqa: N815 - the unit
+    blind_share: float
+    place_m: float
+    place_median_m: float
+    place_90_m: float
+    place_raised_m: float
+    radius_m: float
+    force_relative: float
+    receptive_radius_m: float
+    local_precision_m: float
+
+
+@dataclass(frozen=True)
+class Trials:
+    """What the posterior tells of drawn touches.
+
+    Attributes:
+        touches: (B, 4), x, y and radius, m, and force, N.
+        raised: (B, S), bool, sensors above three standard deviations of the noise of a frame.
+        means: (B, 4), posterior means of the touches.
+        deviation: (B,), posterior standard deviation of the place along one axis, m.
+    """
+
+    touches: np.ndarray
+    raised: np.ndarray
+    means: np.ndarray
+    deviation: np.ndarray
+
+
+def try_touches(
+    candidates: CandidateReadings,
+    prior: FingertipPrior,
+    noise: Noise,
+    touches: np.ndarray,
+    readings: np.ndarray,
+    rng: np.random.Generator,
+) -> Trials:
+    """Measure touches on a device with noise and unknown gains, and return what the posterior tells.
+
+    Args:
+        candidates: of the skin.
+        prior: of one contact.
+        noise: of the device.
+        touches: (B, 4), m and N.
+        readings: (B, S), their true readings, N.
+        rng: of noise and gains.
+    """
+    first = blur_first(candidates, noise)
+    gains = 1 + noise.gain * rng.standard_normal(readings.shape)
+    measured = gains * readings + math.sqrt(noise.floor) * rng.standard_normal(readings.shape)
+    valid = np.ones(readings.shape[1], bool)
+    frames = (Observation.of(frame, valid, frame >= noise.clip, noise) for frame in measured)
+    moments = [_moments(one_contact(candidates, prior, frame, first)) for frame in frames]
+    raised = noise.felt(torch.from_numpy(readings)).numpy()
+    return Trials(touches, raised, *(np.array(part) for part in zip(*moments, strict=True)))
+
+
+def _moments(cloud: Cloud) -> tuple[np.ndarray, float]:
+    """Return the mean (4,) of a contact, and the standard deviation of its place along one axis."""
+    weight, (centre, width) = cloud.weight.sum(1), cloud.boxes
+    mean = weight @ centre
+    variance = weight @ ((centre - mean) ** 2 + width**2 / 12)
+    return np.append(mean, (cloud.weight * cloud.force).sum()), math.sqrt(variance[:2].mean())
+
+
+@checked("design")
+@dataclass(frozen=True, kw_only=True)
+class ExpectedPosterior:
+    """Computes how well the posterior of one contact tells place, radius and force of fingertips.
+
+    Touches are spread evenly over places and radii (Halton points). Their forces are log-normal around each
+    of ``forces``, which is also the prior (:class:`skin.inference.candidates.FingertipPrior`).
+
+    Args:
+        forces: medians, N.
+        radii: least and largest radius of a fingertip, m.
+        rim: softness of its edge, m (:class:`skin.mechanics.geometry.Fingertip`).
+        frames: number of frames of a touch that are averaged.
+        noise: standard deviation of a sensor's noise in a frame, N.
+        gain: standard deviation of the unknown gain of a sensor, relative.
+        clip: largest force that a sensor measures, N.
+        margin: least distance of touches from the edges, m.
+        touches: number of touches of each force.
+        seed: of the touches and of the noise.
+    """
+
+    forces: Annotated[Sequence[PositiveFloat], MinLen(1)] = (1.0, 5.0, 20.0)
+    radii: Lengths = (0.004, 0.012)
+    rim: PositiveFloat = 0.0015
+    frames: PositiveInt = 10
+    noise: Annotated[float, Gt(0)] = 0.05
+    gain: NonNegativeFloat = 0.0
+    clip: PositiveFloat = 10.0
+    margin: NonNegativeFloat = 0.0
+    touches: Annotated[int, Ge(16)] = 512
+    seed: Annotated[int, Ge(0)] = 0
+
+    def run(self, config: Config, folder: Path) -> None:
+        """Write design.json and design.png for the configured skin, and print a table.
+
+        Raises:
+            InputError: a skin that cannot be built, or a margin that leaves no place.
+        """
+        from skin.design.drawing import draw_expected, print_expected
+
+        skin = build_skin(config)
+        simulator = skin.simulator(skin.body, skin.sensors)
+        trials = self.trials(simulator, skin.body)
+        findings = self.find(simulator, skin.body, trials)
+        print_expected(findings)
+        settings = {name + _UNITS.get(name, ""): value for name, value in asdict(self).items()}
+        lines = [asdict(finding) for finding in findings]
+        about = {"sensors": len(skin.sensors), "settings": settings, "expected": lines}
+        maps = {force: self.expected_map(trial, skin.body) for force, trial in trials.items()}
+        print(
+            write(json_text(about), folder / "design.json"),
+            draw_expected(skin.body, skin.sensors, maps, folder / "design.png"),
+            sep="\n",
+        )
+
+    def trials(self, simulator: AbstractSimulator, body: AbstractBody) -> dict[float, Trials]:
+        """Return what the posterior tells of touches around each force, N.
+
+        Raises:
+            InputError: the margin leaves no place.
+        """
+        places = self.sample(body)
+        priors = {force: FingertipPrior(force, radii=self.radii, rim=self.rim) for force in self.forces}
+        candidates = CandidateReadings(simulator, body, next(iter(priors.values())))
+        felt = disc_readings(simulator, body, places, self.rim)
+        trials = dict[float, Trials]()
+        for number, (force, prior) in enumerate(priors.items()):
+            rng = generator(Stream.DESIGN, self.seed, number)
+            drawn = force * np.exp(prior.spread * rng.standard_normal(len(places)))
+            touches = np.column_stack([places, drawn])
+            trials[force] = try_touches(candidates, prior, self._noise, touches, felt * drawn[:, None], rng)
+        return trials
+
+    def find(
+        self, simulator: AbstractSimulator, body: AbstractBody, trials: Mapping[float, Trials] | None = None
+    ) -> list[Findings]:
+        """Return the findings for each force.
+
+        Args:
+            simulator, body: of the skin.
+            trials: of :meth:`trials`; None: they are computed.
+
+        Raises:
+            InputError: the margin leaves no place.
+        """
+        if trials is None:
+            trials = self.trials(simulator, body)
+        unit = torch.from_numpy(np.column_stack([self.sample(body), np.ones(self.touches)]))
+        felt = sensitivity(simulator, Fingertip(body, self.rim, simulator.smooth), unit)
+        simulator.float()
+        area = math.prod(self._extent(body))
+        return [
+            _findings(force, trial, area, self._local_precision(felt.of_force(force), force, body))
+            for force, trial in trials.items()
+        ]
+
+    def _local_precision(self, felt: Sensitivity, force: float, body: AbstractBody) -> float:
+        """Return the median local precision of the place, m."""
+        variances = local_covariance(felt, self._noise, self.priors(force, body)).diagonal(dim1=1, dim2=2)
+        return float(variances[:, :2].mean(1).sqrt().median())
+
+    @property
+    def _noise(self) -> Noise:
+        return Noise(self.noise, self.frames, self.gain, self.clip)
+
+    def priors(self, force: float, body: AbstractBody) -> torch.Tensor:
+        """Return the standard deviations of x, y, radius and force before a touch, (4,), m and N.
+
+        They are those of uniform places and radii, and half of the force.
+        """
+        spreads = [*body.size, self.radii[1] - self.radii[0]]
+        return torch.tensor([spread / math.sqrt(12) for spread in spreads] + [force / 2]).double()
+
+    def sample(self, body: AbstractBody) -> np.ndarray:
+        """Return places and radii of touches, (B, 3), m.
+
+        Raises:
+            InputError: the margin leaves no place.
+        """
+        shares = Halton(3, seed=self.seed).random(self.touches)
+        extent = np.array([*self._extent(body), self.radii[1] - self.radii[0]])
+        return np.array([self.margin, self.margin, self.radii[0]]) + shares * extent
+
+    def _extent(self, body: AbstractBody) -> tuple[float, float]:
+        width, height = (side - 2 * self.margin for side in body.size)
+        if min(width, height) <= 0:
+            raise InputError(
+                f"design.margin={self.margin:g} m leaves no place on {body.size[0]:g} x {body.size[1]:g} m: "
+                f"give less than {min(body.size) / 2:g}"
+            )
+        return width, height
+
+    def expected_map(self, trials: Trials, body: AbstractBody) -> np.ndarray:
+        """Return the expected error of the place along one axis on each cell, (H, W), m.
+
+        It is the root of the mean posterior variance of the touches around a cell, weighted by a normal
+        distribution as wide as their mean distance. Cells nearer to the edge than the margin are NaN.
+        """
+        width = math.sqrt(math.prod(self._extent(body)) / len(trials.touches))
+        near, inside = [], []
+        for axis in (0, 1):
+            middles = (np.arange(body.cells[axis]) + 0.5) * body.cell[axis]
+            near.append(np.exp(-0.5 * ((middles[:, None] - trials.touches[:, axis]) / width) ** 2))
+            inside.append((middles >= self.margin) & (middles <= body.size[axis] - self.margin))
+        across, down = near
+        variance = (down * trials.deviation**2) @ across.T / (down @ across.T)
+        return np.where(np.outer(inside[1], inside[0]), np.sqrt(variance), np.nan)
+
+
+def _findings(force: float, trials: Trials, area: float, local: float) -> Findings:
+    """Return the findings of touches on an area, m^2."""
+    errors = trials.means - trials.touches
+    place = np.sqrt((errors[:, :2] ** 2).mean(1))
+    raised = trials.raised.any(1)
+    numbers = (
+        1 - raised.mean(),
+        _rms(place),
+        np.median(place),
+        np.quantile(place, 0.9),
+        _rms(place[raised]) if raised.any() else math.nan,
+        np.median(np.abs(errors[:, 2])),
+        np.median(np.abs(errors[:, 3]) / trials.touches[:, 3]),
+        np.median(np.sqrt(trials.raised.mean(0) * area / math.pi)),
+        local,
+    )
+    return Findings(force, *map(float, numbers))
+
+
+def _rms(values: np.ndarray) -> float:
+    return math.sqrt((values**2).mean())
+
+
+Pair = tuple[PositiveInt, PositiveInt]
+
+
+@dataclass(frozen=True)
+class Step:
+    """One combination of thickness and sensors.
+
+    Attributes:
+        thickness: of the layer, m.
+        grid: rows and columns of sensors.
+        pitch: distance of neighbouring sensors, the mean of both directions, m.
+        findings: for each force.
+    """
+
+    thickness: float
+    grid: tuple[int, int]
+    pitch: float
+    findings: list[Findings]
+
+    def lines(self) -> Iterator[dict[str, float]]:
+        """Yield one line of a table per force."""
+        rows, columns = self.grid
+        for finding in self.findings:
+            about = {"thickness_m": self.thickness, "rows": rows, "columns": columns, "pitch_m": self.pitch}
+            yield about | asdict(finding)
+
+
+@checked("design")
+@dataclass(frozen=True, kw_only=True)
+class Sweep(ExpectedPosterior):
+    """Computes the expected posterior of one layer for several thicknesses and regular grids of sensors.
+
+    Args:
+        material: of the layer, as in ``body.layers``.
+        thicknesses: of the layer, m.
+        grids: rows and columns of sensors.
+        footprint: extent (x, y) of the sensitive area of a sensor, m.
+        height: of the sensors above the base, m.
+    """
+
+    material: str | Mapping[str, Any] = "EcoFlex 00-30"
+    thicknesses: Annotated[Sequence[PositiveFloat], MinLen(1)] = (0.01, 0.015, 0.02, 0.025, 0.03, 0.04)
+    grids: Annotated[Sequence[Pair], MinLen(1)] = tuple((count, count) for count in range(3, 9))
+    footprint: Footprint = (0.01, 0.01)
+    height: PositiveFloat = 0.0005
+
+    def run(self, config: Config, folder: Path) -> None:
+        """Write design_sweep.csv and design_sweep.png.
+
+        Raises:
+            InputError: a skin that cannot be built, a simulator without mechanics, or sensors outside the
+                layer.
+        """
+        from skin.design.drawing import draw_sweep, print_sweep
+
+        skin = build_skin(config)
+        cases = [
+            (thickness, (rows, columns)) for thickness in self.thicknesses for rows, columns in self.grids
+        ]
+        console, interactive = Console(stderr=True), sys.stderr.isatty()
+        steps = [
+            self.step(skin, *case)
+            for case in track(cases, "solving", console=console, disable=not interactive)
+        ]
+        print_sweep(steps)
+        path = folder / "design_sweep.csv"
+        with whole(path) as partial, partial.open("w", newline="") as file:
+            lines = [line for step in steps for line in step.lines()]
+            writer = csv.DictWriter(file, list(lines[0]), lineterminator="\n")
+            writer.writeheader()
+            writer.writerows(lines)
+        print(path, draw_sweep(steps, folder / "design_sweep.png"), sep="\n")
+
+    def step(self, skin: SkinModel, thickness: float, grid: tuple[int, int]) -> Step:
+        """Return the findings of one layer with a grid of sensors.
+
+        Args:
+            skin: its body gives extent and cells, and its simulator the mechanics.
+            thickness: m.
+            grid: rows and columns.
+
+        Raises:
+            InputError: as of :meth:`run`.
+        """
+        if thickness <= self.height:
+            raise InputError(
+                f"design.height={self.height:g} m is not inside a layer of {thickness:g} m: give less"
+            )
+        body = replace(skin.body, layers=(Layer(Material.of(self.material), thickness),))
+        sensors = Grid(*grid, footprint=self.footprint, depth=thickness - self.height).sensors(body)
+        simulator = skin.simulator(body, sensors)
+        if not simulator.mechanical:
+            raise InputError("a sweep over thickness needs a simulator with mechanics: set simulator=solid")
+        pitch = sum(side / count for side, count in zip(body.size, grid[::-1], strict=True)) / 2
+        return Step(thickness, grid, pitch, self.find(simulator, body))

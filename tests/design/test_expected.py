@@ -1,0 +1,124 @@
+"""The expected posterior agrees with estimates of `skin.Posterior` of other touches, and so does its map."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from skin.body.base import Sheet
+from skin.body.layout import Grid
+from skin.design.expected import ExpectedPosterior
+from skin.errors import InputError
+from skin.inference.candidates import FingertipPrior, disc_readings
+from skin.inference.noise import Noise
+from skin.inference.posterior import Posterior
+from skin.mechanics.simulator.solid import Solid
+
+BODY = Sheet(
+    (0.12, 0.08),
+    (24, 16),
+    [{"material": {"name": "EcoFlex 00-30", "young": 170e3, "poisson": 0.49}, "thickness": 0.02}],
+)
+
+
+@cache
+def solid():
+    return Solid(BODY, Grid(2, 3, depth=0.0195).sensors(BODY), divisions=3)
+
+
+def design(**settings):
+    return ExpectedPosterior(**{"forces": (5.0,), "touches": 256, **settings})
+
+
+def rms(values):
+    return np.sqrt((values**2).mean())
+
+
+def per_axis(errors):
+    return np.sqrt((errors**2).mean(-1))
+
+
+def standard_error(values, statistic):
+    """Return the standard error of a statistic of values, by the bootstrap."""
+    rng = np.random.default_rng(1)
+    return np.std([statistic(rng.choice(values, len(values))) for _ in range(300)])
+
+
+@cache
+def monte_carlo(count=300):
+    """Return errors of place, m, radius, m, and force, relative, and which touches raise a sensor."""
+    rng = np.random.default_rng(11)
+    prior = FingertipPrior(5.0, numbers=(0, 1, 0, 0), large=0)
+    noise = Noise(0.05, 10, clip=10.0)
+    discs = np.column_stack([rng.uniform(0, 1, (count, 2)) * BODY.size, rng.uniform(0.004, 0.012, count)])
+    force = 5 * np.exp(0.5 * rng.standard_normal(count))
+    true = disc_readings(solid(), BODY, discs, prior.rim) * force[:, None]
+    readings = true + np.sqrt(noise.floor) * rng.standard_normal(true.shape)
+    estimates = Posterior(solid(), noise, BODY, prior, contacts=1).estimate(readings)
+    contacts = [estimate.contacts[0] for estimate in estimates]
+    place = per_axis(np.array([contact.place for contact in contacts]) - discs[:, :2])
+    radius = np.abs([contact.radius for contact in contacts] - discs[:, 2])
+    relative = np.abs([contact.force for contact in contacts] - force) / force
+    return place, radius, relative, (true > 3 * noise.frame).any(1)
+
+
+def test_findings_are_those_of_estimates_of_other_touches():
+    (finding,) = design().find(solid(), BODY)
+    place, radius, relative, raised = monte_carlo()
+    pairs = [
+        (finding.place_m, place, rms),
+        (finding.place_median_m, place, np.median),
+        (finding.place_90_m, place, lambda values: np.quantile(values, 0.9)),
+        (finding.place_raised_m, place[raised], rms),
+        (finding.radius_m, radius, np.median),
+        (finding.force_relative, relative, np.median),
+        (finding.blind_share, ~raised, np.mean),
+    ]
+    for value, sample, statistic in pairs:
+        # Both are samples, of about the same number.
+        assert value == pytest.approx(statistic(sample), abs=3 * 2**0.5 * standard_error(sample, statistic))
+
+
+def test_the_posterior_says_how_far_it_errs_and_the_map_shows_where():
+    expected = design(touches=400)
+    (trials,) = expected.trials(solid(), BODY).values()
+    errors = per_axis(trials.means[:, :2] - trials.touches[:, :2])
+    assert 0.7 < (errors**2).mean() / (trials.deviation**2).mean() < 1.4
+    shown = expected.expected_map(trials, BODY)
+    assert shown.shape == BODY.shape
+    assert rms(shown) == pytest.approx(rms(trials.deviation), rel=0.1)
+    # Actual errors are larger where the map is high.
+    column, row = (trials.touches[:, :2] / np.array(BODY.cell)).astype(int).T
+    near = shown[row, column]
+    high = near > np.median(near)
+    assert rms(errors[high]) > 1.2 * rms(errors[~high])
+
+
+def test_the_map_has_no_value_where_no_touch_is():
+    expected = design(touches=32, margin=0.02)
+    (trials,) = expected.trials(solid(), BODY).values()
+    shown = expected.expected_map(trials, BODY)
+    assert np.isnan(shown[:4]).all()
+    assert np.isnan(shown[:, -4:]).all()
+    assert np.isfinite(shown[4:-4, 4:-4]).all()
+    assert (trials.touches[:, :2] >= 0.02).all()
+
+
+def test_findings_repeat_and_change_with_the_seed():
+    first, again, other = (design(touches=32, seed=seed).find(solid(), BODY)[0] for seed in (1, 1, 2))
+    assert first == again
+    assert first.place_m != other.place_m
+
+
+def test_noise_and_unknown_gains_cost_precision():
+    clear, noisy = (design(touches=128, noise=noise).find(solid(), BODY)[0] for noise in (0.02, 0.5))
+    assert clear.place_m < noisy.place_m
+    assert clear.blind_share < noisy.blind_share
+    certain, unknown = (design(touches=128, gain=gain).find(solid(), BODY)[0] for gain in (0.0, 0.3))
+    assert certain.force_relative < unknown.force_relative
+    assert certain.place_median_m < unknown.place_median_m
+
+
+def test_a_margin_that_leaves_no_place_is_refused():
+    with pytest.raises(InputError, match=r"leaves no place on 0\.12 x 0\.08 m: give less than 0\.04"):
+        design(margin=0.05).find(solid(), BODY)

@@ -5,7 +5,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 import torch
-from annotated_types import Ge, Gt
+from annotated_types import Ge, Gt, Le
 from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat
 from torch import Tensor
 
@@ -98,6 +98,7 @@ class ImperfectionSettings:
         independent: each range above has a share of its own.
         aligned: touches begin and end at the edges of the model's intervals; False: anywhere in them, as on
             a real skin.
+        framed: share of devices that read the frames of the model whatever ``rate`` and ``aligned`` say.
     """
 
     gain_spread: Spread = 0.05
@@ -120,6 +121,7 @@ class ImperfectionSettings:
     rate: PositiveFloat | Annotated[tuple[PositiveFloat, PositiveFloat], RISING] = 10.0
     independent: bool = False
     aligned: bool = True
+    framed: Annotated[float, Ge(0), Le(1)] = 0.0
 
     @property
     def slowest(self) -> float:

@@ -85,7 +85,7 @@ def measure(
         readings (B, T, S), N, float32, valid and saturated (B, T, S), bool.
     """
     rate = imperfection.rate
-    if not imperfection.aligned or not isinstance(rate, int | float):
+    if not imperfection.aligned or imperfection.framed or not isinstance(rate, int | float):
         return _measure_each(imperfection, constants, force, model_rate, noise)
     if rate <= model_rate:
         return imperfection.apply(force, constants, noise)
@@ -114,6 +114,9 @@ def _measure_each(
     else:
         # Later by part of an interval; earlier where the window ends with the touch.
         shifts -= (force[:, -1] != 0).any(dim=1).cpu().numpy()
+    if imperfection.framed:
+        framed = noise.random(batch) < imperfection.framed
+        ratios, shifts = np.where(framed, 1, ratios), np.where(framed, 0, shifts)
     padded, fine = torch.nn.functional.pad(force, (0, 0, 0, 1)), 1
     if not imperfection.is_static(constants, sensors):
         fine = _SENSED

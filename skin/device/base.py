@@ -2,9 +2,10 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
+from threading import Thread
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import torch
@@ -327,6 +328,20 @@ def in_threads(work: Callable[[int], _T], count: int) -> list[_T]:
     finally:
         pool.shutdown(wait=not ended, cancel_futures=True)
         torch.set_num_threads(threads)
+
+
+def in_background(work: Callable[[], _T]) -> Future[_T]:
+    """Return the result of ``work()`` to come, from a thread that does not outlive the command."""
+    future: Future[_T] = Future()
+
+    def run() -> None:
+        try:
+            future.set_result(work())
+        except BaseException as error:
+            future.set_exception(error)
+
+    Thread(target=run, daemon=True).start()
+    return future
 
 
 def joined(batches: Sequence[Part]) -> Recording:

@@ -47,7 +47,7 @@ CUTS = [(0, 7), (7, 19), (19, 23)]
 
 
 class Trainer:
-    current_epoch, world_size, global_rank = 0, 1, 0
+    current_epoch, world_size, global_rank, max_epochs = 0, 1, 0, 3
 
 
 @pytest.fixture
@@ -89,6 +89,16 @@ def test_an_epoch_shows_every_gesture_once(make):
     assert sorted(flat(batches)) == list(range(23))
     assert [len(batch) for batch in numbers(batches)] == [5, 5, 5, 5, 3]
     assert len(batches) == 5
+
+
+def test_one_thread_trains_while_another_draws_the_next_epoch(make, monkeypatch):
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 1)
+    data = make(fresh=True)
+    for epoch in range(3):
+        data.trainer.current_epoch = epoch
+        shown = flat(data.train_dataloader())
+        assert sorted(shown) == list(range(1000 * epoch, 1000 * epoch + 23))
+    assert sorted(data.device.asked) == [("train", epoch) for epoch in range(3)]
 
 
 def test_the_order_follows_from_seed_and_epoch(make):

@@ -1,7 +1,7 @@
 """The interface of a device: a source of touches."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
@@ -307,6 +307,7 @@ def split_shards(split: Split, counts: Sequence[int], seed: int) -> Iterator[tup
 # Draw batches on as many threads as torch has.
 
 
+_S = TypeVar("_S")
 _T = TypeVar("_T")
 _PART = 8  # batches: enough for few files, and little enough for memory
 
@@ -342,6 +343,18 @@ def in_background(work: Callable[[], _T]) -> Future[_T]:
 
     Thread(target=run, daemon=True).start()
     return future
+
+
+def one_ahead(work: Callable[[_S], _T], values: Iterable[_S]) -> Iterator[_T]:
+    """Yield ``work(value)`` in order; the next one is computed on another thread meanwhile."""
+    current: Future[_T] | None = None
+    for value in values:
+        following = in_background(partial(work, value))
+        if current is not None:
+            yield current.result()
+        current = following
+    if current is not None:
+        yield current.result()
 
 
 def joined(batches: Sequence[Part]) -> Recording:

@@ -13,7 +13,7 @@ from pydantic import NonNegativeFloat, PositiveInt
 from torch import Tensor
 
 from skin.core.settings import checked
-from skin.device.base import AbstractDevice, Split, in_background
+from skin.device.base import AbstractDevice, Split, in_background, one_ahead
 from skin.device.touches import Touches, touches_hash
 from skin.errors import InputError
 from skin.learning.representation import AbstractRepresentation, Frames, idle_level
@@ -195,10 +195,17 @@ class TouchData(pl.LightningDataModule):
 
     def draw_ahead(self, epoch: int) -> None:
         """Begin to draw the new gestures of an epoch on a thread beside the one that trains."""
-        wanted = self.trainer is not None and epoch < (self.trainer.max_epochs or 0)
-        # With more threads each draw uses all of them, and changes their number meanwhile.
-        if wanted and self._fresh and torch.get_num_threads() == 1:
+        if self.alongside and self.trainer is not None and epoch < (self.trainer.max_epochs or 0):
             self._ahead[epoch] = in_background(partial(self.device.touches, "train", epoch))
+
+    @property
+    def alongside(self) -> bool:
+        """Whether new gestures and frames are computed on threads beside the one that trains.
+
+        With more threads each draw uses all of them, and changes their number meanwhile.
+        """
+        here = self.trainer is not None and self.trainer.strategy.root_device.type == "cpu"
+        return here and self._fresh and torch.get_num_threads() == 1
 
     @property
     def _fresh(self) -> bool:
@@ -252,9 +259,9 @@ class TouchData(pl.LightningDataModule):
         """Return the batches of the validation split."""
         return _Batches(self, "validation")
 
-    def on_after_batch_transfer(self, batch: Touches, dataloader_idx: int) -> Batch:
+    def on_after_batch_transfer(self, batch: Touches | Batch, dataloader_idx: int) -> Batch:
         """Return the frames and labels of a batch that has arrived where the network is."""
-        return self.frames(batch)
+        return self.frames(batch) if isinstance(batch, Touches) else batch
 
 
 class _Batches:
@@ -266,7 +273,14 @@ class _Batches:
     def __len__(self) -> int:
         return sum(-(-count // self.data.batch_size) for count in self.data.count(self.split))
 
-    def __iter__(self) -> Iterator[Touches]:
+    def __iter__(self) -> Iterator[Touches | Batch]:
+        data = self.data
+        if self.split == "train" and data.alongside:
+            yield from one_ahead(data.frames, self._touches())
+        else:
+            yield from self._touches()
+
+    def _touches(self) -> Iterator[Touches]:
         data = self.data
         if self.split != "train":
             for touches in data.parts(self.split):

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import partial
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -48,6 +49,7 @@ CUTS = [(0, 7), (7, 19), (19, 23)]
 
 class Trainer:
     current_epoch, world_size, global_rank, max_epochs = 0, 1, 0, 3
+    strategy = SimpleNamespace(root_device=torch.device("meta"))
 
 
 @pytest.fixture
@@ -93,11 +95,16 @@ def test_an_epoch_shows_every_gesture_once(make):
 
 def test_one_thread_trains_while_another_draws_the_next_epoch(make, monkeypatch):
     monkeypatch.setattr(torch, "get_num_threads", lambda: 1)
-    data = make(fresh=True)
+    data, other = make(fresh=True), make(fresh=True)
+    data.trainer.strategy = SimpleNamespace(root_device=torch.device("cpu"))
     for epoch in range(3):
-        data.trainer.current_epoch = epoch
-        shown = flat(data.train_dataloader())
-        assert sorted(shown) == list(range(1000 * epoch, 1000 * epoch + 23))
+        data.trainer.current_epoch = other.trainer.current_epoch = epoch
+        batches = [data.on_after_batch_transfer(batch, 0) for batch in data.train_dataloader()]
+        expected = [other.frames(batch) for batch in other.train_dataloader()]
+        assert len(batches) == len(expected) == 5
+        for batch, (frames, labels) in zip(batches, expected, strict=True):
+            assert torch.equal(batch[0].x, frames.x)
+            assert torch.equal(batch[1], labels)
     assert sorted(data.device.asked) == [("train", epoch) for epoch in range(3)]
 
 

@@ -57,11 +57,16 @@ class FrozenSettings:
     out: str = "results"
 
 
-def frozen_hash(recording: Recording) -> str:
-    """Return a hash of labels, gestures and invalid readings, which rounding does not change."""
+def frozen_hash(recording: Recording, about: Mapping[str, Any]) -> str:
+    """Return a hash of what rounding does not change: overrides, labels, gestures and invalid readings.
+
+    Args:
+        recording: the touches of a set.
+        about: the set.
+    """
     touches = recording.touches
     parts = [touches.known_labels.bool(), touches.valid, *(recording.parameters[name] for name in _HASHED)]
-    content = hashlib.sha256()
+    content = hashlib.sha256("\n".join(about["overrides"]).encode())
     for part in parts:
         content.update(part.contiguous().numpy().tobytes())
     return content.hexdigest()[:16]
@@ -121,7 +126,7 @@ def score(settings: FrozenSettings) -> Iterator[dict[str, Any]]:
         if (predict := predictor_on(settings.predictor, device)) is None:
             continue
         recording = device.recording("test", complete=False)
-        if (present := frozen_hash(recording)) != about["sets"][name]["hash"]:
+        if (present := frozen_hash(recording, about["sets"][name])) != about["sets"][name]["hash"]:
             raise InputError(
                 f"the touches of the set {name} have the hash {present}, and the frozen ones "
                 f"{about['sets'][name]['hash']}: use the version of the package that they were frozen with"

@@ -17,6 +17,7 @@ _QUANTILES = 20000
 _NUMBERS = tuple(np.geomspace(1, 1000, 61).tolist())  # of frames in an interval; between them, 0.001 s.d.
 _SENSED = 5  # times the model's rate, of hysteresis, lag and curve; odd, so that a frame of the model is one
 _FAINT = 0.01  # standard deviations of the noise below which a sensor feels nothing
+_EXTREME = np.float32(1e-7)  # chance of the least and largest noise
 _ELEMENTS = 2**19  # frames times sensors at a time, which the cache holds
 
 
@@ -191,6 +192,8 @@ def _draw_highest(counts: np.ndarray, sensors: int, noise: np.random.Generator) 
     Its chance to be below x is the normal one to the power of the count, and is itself uniform.
     """
     drawn = noise.standard_exponential((len(counts), sensors), dtype=np.float32)
+    # One draw in some millions is 0 or rounds to a chance of 1, whose quantiles are infinite.
+    drawn = np.clip(drawn, _EXTREME, -np.log(_EXTREME))
     return -ndtri(-np.expm1(-drawn / counts[:, None].astype(np.float32)))
 
 

@@ -31,7 +31,7 @@ def described(tmp_path, monkeypatch):
     about = {"common": ["simulator=naive", "data.gestures=10"], "gestures": 64}
     words = {"small": {"overrides": ["device.dead=2"]}}
     device = frozen.build_set("small", words["small"], about["common"], 64)
-    words["small"]["hash"] = frozen.frozen_hash(device.recording("test", complete=False))
+    words["small"]["hash"] = frozen.frozen_hash(device.recording("test", complete=False), words["small"])
     path = tmp_path / "sets.yaml"
     OmegaConf.save(OmegaConf.create(about | {"sets": words}), path)
     return path

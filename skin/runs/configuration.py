@@ -48,8 +48,9 @@ ADDED: dict[str, Any] = {
     "interface": 0.0,
     "second": 0.0,
     "training_touch": {},
+    "start": None,
 }
-"""Settings of devices and touches that came later, and the values that earlier runs mean: not counted."""
+"""Settings that came later, and the values that earlier runs mean: not counted."""
 _FOLDERS = ("skin", "experiments", "conf", "data")  # results depend on nothing else in the repository
 
 
@@ -66,7 +67,7 @@ def _counted(value: Any, group: str = "") -> Any:
     if not isinstance(value, dict):
         return value
     left_out = MACHINE if group == "trainer" else ()
-    added = ADDED if group in ("device", "skins", "touch") else {}
+    added = ADDED if group in ("device", "skins", "touch", "learner") else {}
     return {
         key: _counted(entry, key)
         for key, entry in value.items()

@@ -22,7 +22,7 @@ _SAMPLES = 10  # binary logarithm of the number of samples
 _WIDER = 1.1  # spread of the samples' proposal, relative to the posterior's
 _FREEDOM = 8.0  # degrees of freedom of the proposal, Student's distribution
 _MODES, _UNLIKELY, _ALIKE = 6, 6.0, 0.002  # modes that are sampled; log score below the best; m between two
-_WALKERS, _WALK = 256, 30  # and steps of each
+_WALKERS, _WALK = 256, 60  # and steps of each
 
 # A guess is (M, n, 4): x, y, m, and scores whose prior is the standard normal distribution: of the radius,
 # which is uniform, and of the force, which is log-normal. Posteriors are then nearly Gaussian.

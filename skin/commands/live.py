@@ -35,6 +35,9 @@ _DEMO = (
     "web=true",
     "touch=fingertips",
     "touch.force=2",
+    "layout=grid",
+    "layout.rows=6",
+    "layout.columns=6",
     "body.layers=[{material: Dragon Skin 10 Medium, thickness: 0.01}, "
     "{material: EcoFlex 00-30, thickness: 0.02}]",
 )
@@ -98,11 +101,11 @@ def emulated_skin(words: Sequence[str]) -> Iterator[tuple[Config, list[str]]]:
 
 def _demo_overrides(words: Sequence[str]) -> tuple[list[str], list[str]]:
     """Return the overrides of the live view of a demonstration, and those of the skin that is emulated."""
-    groups = {_group(word) for word in words}
-    if groups & {"run", "layout", "simulator"}:
-        groups.add("body")  # the skin is another one
+    skin, groups = {"body", "layout", "simulator"}, {_group(word) for word in words}
+    if groups & {"run", *skin}:
+        groups |= skin  # it is another one
     words = [*(word for word in _DEMO if _group(word) not in groups), *words]
-    touched = [word for word in words if _group(word) in ("body", "layout", "simulator", "touch")]
+    touched = [word for word in words if _group(word) in {"touch", *skin}]
     return ["device=serial", *(word for word in words if _group(word) != "touch")], [
         "device=simulated",
         *touched,

@@ -104,7 +104,7 @@ def _contact(contact: "ContactEstimate") -> dict[str, Any]:
     }
 
 
-def contact_lines_of_text(message: dict[str, Any]) -> list[str]:
+def contact_text_lines(message: dict[str, Any]) -> list[str]:
     """Return what is known of contacts in words, a line for each."""
     state, chance = message["state"], message["probability"]
     if state == "unknown":

@@ -26,7 +26,7 @@ from skin.hardware.live.engine import Verdict
 from skin.hardware.wire.channels import UnitConversion
 
 if TYPE_CHECKING:
-    from skin.body.base import AbstractBody
+    from skin.body.base import AbstractBody, Sensors
     from skin.device.base import AbstractSimulated
     from skin.inference.noise import Noise
     from skin.inference.posterior import ContactEstimate, FrameEstimate, Posterior
@@ -45,6 +45,7 @@ _CALIBRATED = 0.02  # standard deviation of the gains of a calibrated device
 _PLACED = 0.001  # m, standard deviation of the positions of sensors, as made by hand
 _QUIET = 1e-3  # N, least noise
 _NICE = 10
+_MOST = 1000  # frames
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
@@ -134,13 +135,15 @@ class Mechanics:
     """What contacts are estimated with.
 
     Attributes:
-        simulator: of the skin; its readings add up.
-        body: the skin.
+        simulator: ``simulator(body, sensors)`` gives readings that add up. The process builds it, from the
+            cache on the disk: its factors cannot be sent.
+        body, sensors: the skin.
         noise: of a device of this kind, as far as it is known before its tare.
     """
 
-    simulator: "AbstractSimulator"
+    simulator: "Callable[[AbstractBody, Sensors], AbstractSimulator]"
     body: "AbstractBody"
+    sensors: "Sensors"
     noise: "Noise"
 
     @classmethod
@@ -160,14 +163,14 @@ class Mechanics:
         advice = "use run=any_skin, or a run of simulator=solid"
         if device is None:
             raise InputError(f"no contacts: this run has no simulated skin: {advice}")
-        simulator = device.simulator(device.body, device.sensors)
-        if getattr(simulator, "reading", None) == "equation10":
+        if getattr(device.model, "reading", None) == "equation10":
             raise InputError(f"no contacts: readings of equation 10 do not add up: {advice}")
         settings = device.imperfection
         noise = max(float(np.mean(settings.noise)), _QUIET)
         gain = _CALIBRATED if calibrated else float(np.mean(settings.gain_spread))
         offset = 0.0 if settings.tare else settings.offset
-        return cls(simulator, device.body, Noise(noise, gain=gain, offset=offset, position=_PLACED))
+        known = Noise(noise, gain=gain, offset=offset, position=_PLACED)
+        return cls(device.simulator, device.body, device.sensors, known)
 
 
 class Readings(NamedTuple):
@@ -286,7 +289,8 @@ def _answers(receive: Callable[[], Any]) -> Any:
     torch.set_num_threads(1)
     mechanics = receive()
     try:
-        posterior = Posterior(mechanics.simulator, mechanics.noise, mechanics.body)
+        simulator = mechanics.simulator(mechanics.body, mechanics.sensors)
+        posterior = Posterior(simulator, mechanics.noise, mechanics.body)
     except InputError as error:
         yield str(error)
         return
@@ -308,7 +312,7 @@ class LiveContacts:
     def __init__(self, reason: str = "this view estimates none") -> None:
         self._reason, self._lock, self._wake = reason, Lock(), Event()
         self._latest, self._host = unknown_contacts(PREPARING), -np.inf
-        self._frames: deque[Frame] = deque()
+        self._frames: deque[Frame] = deque(maxlen=_MOST)
         self._newest: Readings | None = None
         self._process: subprocess.Popen[bytes] | None = None
         self._thread: Thread | None = None
@@ -409,7 +413,7 @@ class LiveContacts:
                 message = pickle.load(answers)
                 with self._lock:
                     self._latest, self._host = message, readings.host
-        except (OSError, EOFError, ValueError, pickle.UnpicklingError):
+        except (OSError, EOFError, ValueError, TypeError, AttributeError, pickle.PickleError):
             self.explain("the process that estimates them has ended")
 
 

@@ -88,7 +88,7 @@ def message(state: DisplayState, picture: SkinPicture) -> dict[str, Any]:
         "trouble": state.trouble,
         "alarm": state.alarm,
         "line": state.line,
-        "contacts": state.contacts["contacts"],
+        "contacts": state.contacts,
         "contact_text": contact_text_lines(state.contacts),
     }
 

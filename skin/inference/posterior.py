@@ -19,6 +19,7 @@ from skin.mechanics.simulator.base import AbstractSimulator
 MOST_CONTACTS = 3
 """Contacts that are told apart."""
 
+_WIDTH = 1.0  # of the boxes around samples of several contacts, in standard deviations
 _PER_CONTACT = 3  # sensors that a contact takes at least: it has a place and a force
 _FITS = 0.01  # a smaller predictive probability says that no contacts give such readings
 _POOR, _LIKELY = 1e-3, 0.5  # a further contact is tried below this probability, or above these odds
@@ -314,7 +315,7 @@ class Posterior:
         for contact in self._search.contacts(mixture.samples).transpose(1, 0, 2):
             spread = np.sqrt(np.maximum(_variance(contact[:, :2], weight[:, 0]), 1e-12))
             widths = np.zeros((len(contact), 3))
-            widths[:, :2] = 0.6 * spread
+            widths[:, :2] = _WIDTH * spread
             parts.append(self._summary(contact[:, :3], widths, contact[:, 3:], weight))
         return tuple(sorted(parts, key=lambda part: -part.force))
 

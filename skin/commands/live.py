@@ -43,7 +43,7 @@ _DEMO = (
 )
 """Settings of a demonstration, unless others are given: fingertips, on a skin that tells them apart."""
 
-_EXPORTED = "no contacts: an exported model has no mechanics; give the run itself, as in run=latest"
+_EXPORTED = "an exported model has no mechanics: give the run itself, as in run=latest"
 
 
 @command("live")
@@ -143,13 +143,13 @@ def show(config: Config, changes: Sequence[str], own_mechanics: bool = False) ->
     try:
         with ExitStack() as opened:
             opened.enter_context(ends_on_signal())
-            contacts = LiveContacts("no contacts: live.contacts=false")
+            contacts = LiveContacts("live.contacts=false")
             opened.callback(contacts.close)
             if exported:
                 watched = watch_exported(str(config.run), config.device, live, say, opened)
                 if live.contacts:
                     contacts.explain(_EXPORTED)
-                    say(_EXPORTED)
+                    say(f"no contacts: {_EXPORTED}")
             else:
                 watched = watch_run(config, live, say, changes, opened, contacts, own_mechanics)
             source, model = watched.source, watched.model

@@ -66,14 +66,14 @@ def contact_message(estimate: "FrameEstimate", time: float) -> dict[str, Any]:
         time: s, the device's clock at their latest frame.
     """
     none = estimate.number == 0 and estimate.fit >= _IDLE_FITS and estimate.large < 0.5
-    known = {"reason": estimate.unknown or "", "device_time": time}
-    known |= {"fit": round(estimate.fit, 6), "large": round(estimate.large, 6)}
+    base = {"reason": estimate.unknown or "", "device_time": time}
+    base |= {"fit": round(estimate.fit, 6), "large": round(estimate.large, 6)}
     if not (estimate.fingertip or none):
         # The best fingertips are none of those that press: a reader must not find them.
-        return unknown_contacts("") | known | {"state": "not a fingertip"}
+        return unknown_contacts("") | base | {"state": "not a fingertip"}
     return {
         "state": "no contact" if none else "contacts",
-        **known,
+        **base,
         "number": estimate.number,
         "probability": round(float(estimate.probabilities[estimate.number]), 6),
         "probabilities": estimate.probabilities.round(6).tolist(),
@@ -162,19 +162,19 @@ class Mechanics:
 
         advice = "use run=any_skin, or a run of simulator=solid"
         if device is None:
-            raise InputError(f"no contacts: this run has no simulated skin: {advice}")
+            raise InputError(f"this run has no simulated skin: {advice}")
         if getattr(device.model, "reading", None) == "equation10":
-            raise InputError(f"no contacts: readings of equation 10 do not add up: {advice}")
+            raise InputError(f"readings of equation 10 do not add up: {advice}")
         settings = device.imperfection
         noise = max(float(np.mean(settings.noise)), _QUIET)
         gain = _CALIBRATED if calibrated else float(np.mean(settings.gain_spread))
         offset = 0.0 if settings.tare else settings.offset
-        known = Noise(noise, gain=gain, offset=offset, position=_PLACED)
-        return cls(device.simulator, device.body, device.sensors, known)
+        nominal = Noise(noise, gain=gain, offset=offset, position=_PLACED)
+        return cls(device.simulator, device.body, device.sensors, nominal)
 
 
-class Readings(NamedTuple):
-    """Readings of a moment.
+class MeanReadings(NamedTuple):
+    """MeanReadings of a moment.
 
     Attributes:
         values: (S,), N above the untouched skin: the mean of some frames.
@@ -201,7 +201,7 @@ def average_frames(
     masked: Sequence[int],
     baseline: np.ndarray,
     whole: bool,
-) -> Readings:
+) -> MeanReadings:
     """Return the readings of frames, the latest one last.
 
     Args:
@@ -221,7 +221,7 @@ def average_frames(
     # The zero is that of largest values of intervals, which noise raises above the mean.
     rest = baseline if conversion.rest is None else baseline + conversion.rest
     noise = None if conversion.noise is None or not works.any() else conversion.noise[works]
-    return Readings(
+    return MeanReadings(
         newtons.mean(axis=0, dtype=float) - rest,
         works,
         saturated & works,
@@ -233,7 +233,7 @@ def average_frames(
     )
 
 
-def estimate_contacts(posterior: "Posterior", nominal: "Noise", readings: Readings) -> dict[str, Any]:
+def estimate_contacts(posterior: "Posterior", nominal: "Noise", readings: MeanReadings) -> dict[str, Any]:
     """Return what readings tell of contacts, as JSON data.
 
     Args:
@@ -313,7 +313,7 @@ class LiveContacts:
         self._reason, self._lock, self._wake = reason, Lock(), Event()
         self._latest, self._host = unknown_contacts(PREPARING), -np.inf
         self._frames: deque[Frame] = deque(maxlen=_MOST)
-        self._newest: Readings | None = None
+        self._newest: MeanReadings | None = None
         self._process: subprocess.Popen[bytes] | None = None
         self._thread: Thread | None = None
         self._whole: Callable[[], bool] = bool

@@ -354,7 +354,7 @@ def watch_run(
             contacts.start(mechanics, lambda: port is not None and port.raw_range.whole)
         except InputError as error:
             contacts.explain(str(error))
-            say(str(error))
+            say(f"no contacts: {error}")
     settings = used_and_nominal(model, port, live, say)
     if port is None:
         port = open_source(device)

@@ -22,8 +22,8 @@ from skin.hardware.live.contacts import (
     SPAN,
     STALE,
     LiveContacts,
+    MeanReadings,
     Mechanics,
-    Readings,
     average_frames,
     contact_message,
     contact_text_lines,
@@ -90,7 +90,7 @@ def frames(values, count=10, end=1.0, **changes):
 def moment(values, **changes):
     """Return readings of now."""
     valid, none = np.ones(SENSORS, dtype=bool), np.zeros(SENSORS, dtype=bool)
-    readings = Readings(np.asarray(values, dtype=float), valid, none, 0.05, 10, 0.0, 1.0, monotonic())
+    readings = MeanReadings(np.asarray(values, dtype=float), valid, none, 0.05, 10, 0.0, 1.0, monotonic())
     return readings._replace(**changes)
 
 

@@ -44,7 +44,7 @@ _IDLE_FITS = 1e-4  # predictive probability below which the readings of an untou
 _CALIBRATED = 0.02  # standard deviation of the gains of a calibrated device
 _PLACED = 0.001  # m, standard deviation of the positions of sensors, as made by hand
 _QUIET = 1e-3  # N, least noise
-_NICE = 10
+_NICE = 5
 _MOST = 1000  # frames
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 

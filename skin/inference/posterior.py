@@ -81,11 +81,17 @@ class ContactEstimate:
         """Return the probability that the highest pressure is above a limit, Pa."""
         return float(self.weights[self.peaks > pressure].sum())
 
-    def region(self, share: float = 0.9) -> Region:
-        """Return the smallest set of cells that holds the place with a probability; it may have parts."""
+    def region(self, share: float = 0.9, least: float = 0.0) -> Region:
+        """Return the smallest set of cells that holds the place with a probability; it may have parts.
+
+        Args:
+            share: the probability.
+            least: smallest width of a cell, m.
+        """
         weight = self.weights.sum(1)
         low, high = (self.places - self.widths / 2).min(0), (self.places + self.widths / 2).max(0)
-        steps = np.clip(np.ceil((high - low) / self.widths.min(0) - 1e-6), 1, _CELLS).astype(int)
+        width = np.maximum(self.widths.min(0), least)
+        steps = np.clip(np.ceil((high - low) / width - 1e-6), 1, _CELLS).astype(int)
         edges = [np.linspace(low[axis], high[axis], steps[axis] + 1) for axis in (0, 1)]
         parts = [_overlap(edges[axis], self.places[:, axis], self.widths[:, axis]) for axis in (0, 1)]
         mass = (parts[0] * weight[:, None]).T @ parts[1]

@@ -37,9 +37,9 @@ from sklearn.svm import SVR
 
 from skin.core.files import write
 from skin.core.settings import checked, configured
-from skin.device.conversion import GROUP, convert_files
+from skin.device.conversion import convert_files
 from skin.device.formats import read_format
-from skin.device.touches import Recording
+from skin.device.touches import GROUP, Recording
 from skin.errors import InputError
 from skin.learning.features import engineered_features
 

@@ -2,10 +2,12 @@
 
 from collections.abc import Iterable
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from skin.device.touches import Touches
+from skin.touch.labels import Task
 from skin.touch.movie import longest_run
 
 LEVELS = (0.15, 0.3, 0.6, 1.0, 2.0, 3.0)  # N above idle, where the noise is NOISE
@@ -230,6 +232,40 @@ def _spread(x: Tensor, places: Tensor, rise: Tensor) -> Iterable[Block]:
         evenness = weight.square().sum(dim=1, keepdim=True).clamp(min=1e-6).reciprocal()
         names = [f"{measure} of the {name}" for measure in ("length", "breadth", "evenness")]
         yield names, torch.cat([axes, evenness], dim=1)
+
+
+# Features of each sensor, and those that a task needs.
+
+
+def sensor_features(touches: Touches) -> dict[str, Tensor]:
+    """Return four named features, (B,) each, of each sensor, N: where and how hard a touch is.
+
+    Unlike the other features they depend on the sensors and their order, and have a sign.
+    """
+    raw = _valid(touches)
+    strongest = raw.abs().sum(dim=2).argmax(dim=1)
+    columns = {
+        "reading in the strongest frame": _frame_at(raw, strongest),
+        "mean": raw.mean(dim=1),
+        "maximum": raw.amax(dim=1),
+        "minimum": raw.amin(dim=1),
+    }
+    return {
+        f"{name} of sensor {number}": column
+        for name, values in columns.items()
+        for number, column in enumerate(values.unbind(dim=1))
+    }
+
+
+def feature_matrix(touches: Touches, task: Task) -> np.ndarray:
+    """Return the features that a task needs, (B, D), float32."""
+    moved = touches.to("cpu")
+    columns = engineered_features(moved)
+    if task.direction:
+        columns |= direction_features(moved)
+    if task.kind == "regression":
+        columns |= sensor_features(moved)
+    return torch.stack([column.to(torch.float32) for column in columns.values()], dim=1).numpy()
 
 
 # Signed features of the direction of sliding, along x and along y.

@@ -66,6 +66,8 @@ def _check_options(config: Config, *names: str) -> None:
 def build_device(config: Config) -> AbstractDevice:
     """Return the device, with its body, layout and, if it has one, its simulator."""
     body, layout = _body_and_layout(config, "device")
+    if config.task is not None and "task" not in config.device:
+        raise InputError(f"task={config.task} needs device=recording device.path=FILE.parquet")
     # Not arguments of instantiate, which would treat the dataclass of the body as a configuration.
     device: AbstractDevice = instantiate(config.device, _partial_=True)(body=body, layout=layout)
     if device.simulation is not None and device.simulation.model.mechanical:

@@ -388,8 +388,10 @@ def summarise_conversion(recording: Recording) -> str:
         parts += [
             f"{name} in {int(column.nansum())} of {int((~column.isnan()).sum())}" for name, column in shares
         ]
+    if "classes" in recording.metadata:
+        parts.append(f"classes {', '.join(recording.metadata['classes'])}")
     for name, values in recording.parameters.items():
-        if not name.startswith(GROUP):
+        if name != CLASS and not name.startswith(GROUP):
             parts.append(f"{name} of {int((~values.isnan()).sum())}")
     parts += [f"{len(values)} of {name}" for name, values in recording.metadata["groups"].items()]
     return ", ".join([*parts, f"positions {recording.metadata['positions']}"])

@@ -36,6 +36,7 @@ from skin.evaluation.operating_point import OperatingPoint, choose_operating_poi
 from skin.evaluation.report import evaluate, metrics_table
 from skin.evaluation.settings import check_evaluation
 from skin.learning.data import TouchData
+from skin.learning.few import split_folds
 from skin.learning.network import TouchClassifier, probabilities
 from skin.runs.build import build_data, build_device, build_learner
 from skin.runs.configuration import Config
@@ -137,20 +138,6 @@ def fine_tune(
             steps = folds.train(touches, chosen.layers, chosen.lr, settings.folds)
             network.load_state_dict(next(islice(steps, epochs - 1, None)).state_dict())
     return Adaptation(trials, choice, *(probabilities(logits, network.task) for logits in (first, judged)))
-
-
-def split_folds(labels: Tensor, count: int, seed: int) -> Tensor:
-    """Return the fold of each gesture, (B,), from 0 up, for labels (B, L).
-
-    Folds differ by at most one in size, and in the number of gestures with each combination of labels. The
-    gestures are dealt out in an order that the seed gives.
-    """
-    order = torch.randperm(len(labels), generator=torch.Generator().manual_seed(seed))
-    combination = torch.unique(labels > 0.5, dim=0, return_inverse=True)[1]
-    order = order[combination[order].argsort(stable=True)]
-    folds = torch.empty_like(order)
-    folds[order] = torch.arange(len(order)) % count
-    return folds
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from skin.device.files import DataSet, Manifest
 from skin.runs.build import build_device
 from skin.runs.configuration import validate_config
 from skin.runs.generation import generate_data_set
-from skin.touch.fingertips import CONTACT
+from skin.touch.labels import CONTACT
 
 PAGE = (ROOT / "docs" / "data.md").read_text()
 LINES = {

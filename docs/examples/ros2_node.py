@@ -1,8 +1,9 @@
 """ROS 2 node that publishes the verdicts of ``skin live ... live.verdicts=7777``.
 
-Topics: ~/verdict (std_msgs/String, the JSON line), ~/danger, ~/unknown and ~/stale (std_msgs/Bool).
-Without danger, the skin is safe only where ~/unknown is false. Parameters: host, port. A lost connection
-makes the data stale and unknown. It does not clear an alarm.
+Topics: ~/verdict (std_msgs/String, the JSON line), ~/contacts (std_msgs/String, its field contacts: place,
+force and 90 % region of each), ~/danger, ~/unknown and ~/stale (std_msgs/Bool). Without danger, the skin is
+safe only where ~/unknown is false. Parameters: host, port. A lost connection makes all data unknown or stale.
+It does not clear an alarm.
 """
 
 import json
@@ -25,10 +26,12 @@ class SkinNode(Node):
         host = self.declare_parameter("host", "127.0.0.1").value
         port = self.declare_parameter("port", 7777).value
         self._address = host, port
-        self._verdict = self.create_publisher(String, "~/verdict", 10)
-        self._danger = self.create_publisher(Bool, "~/danger", 10)
-        self._unknown = self.create_publisher(Bool, "~/unknown", 10)
-        self._stale = self.create_publisher(Bool, "~/stale", 10)
+        self._verdict, self._contacts = (
+            self.create_publisher(String, f"~/{name}", 10) for name in ("verdict", "contacts")
+        )
+        self._danger, self._unknown, self._stale = (
+            self.create_publisher(Bool, f"~/{name}", 10) for name in ("danger", "unknown", "stale")
+        )
         self._over = Event()
         self._thread = Thread(target=self._read, daemon=True)
         self._thread.start()
@@ -52,6 +55,8 @@ class SkinNode(Node):
                 reason = str(error)
             self._unknown.publish(Bool(data=True))
             self._stale.publish(Bool(data=True))
+            lost = {"state": "unknown", "reason": reason, "contacts": []}
+            self._contacts.publish(String(data=json.dumps(lost)))
             self.get_logger().warning(f"no verdicts from {self._address}: {reason}")
             self._over.wait(SILENCE)
 
@@ -59,6 +64,7 @@ class SkinNode(Node):
         if message["schema"] != SCHEMA:
             raise ValueError(f"schema {message['schema']}, this node reads {SCHEMA}")
         self._verdict.publish(String(data=line))
+        self._contacts.publish(String(data=json.dumps(message["contacts"])))
         self._danger.publish(Bool(data=message["alarm"]))
         self._unknown.publish(Bool(data=message["state"] == "unknown"))
         self._stale.publish(Bool(data=message["stale"]))

@@ -346,7 +346,7 @@ def _rows_of_places(
 ) -> Iterator[RealRow]:
     """Yield the row for all places, and for those near sensors."""
     run = partial(run_sessions, train=set(range(len(train))), test=len(train))
-    for words, reach in (("", np.inf), (", over sensors", REACH)):
+    for words, reach in ((" near sensors", REACH), (" everywhere", np.inf)):
         read = partial(read_places, train=train, test=test, reach=reach)
         place = split if np.isinf(reach) else f"{split}, places up to {reach:g} mm"
         yield _x(name=name + words, split=place, goal=goal, read=read, run=run)
@@ -354,9 +354,9 @@ def _rows_of_places(
 
 ROWS = (
     *_rows_of_places(
-        "barometers x, other day", "9 runs of 26 and 28 June 2023 -> 29 June 2023", 0.8, BEFORE, AFTER
+        "barometers x other day", "9 runs of 26 and 28 June 2023 -> 29 June 2023", 0.8, BEFORE, AFTER
     ),
-    *_rows_of_places("barometers x, other speed", "26 June 2023: 6 runs -> 2 slower runs", 1.8, SLOW, SLOWER),
+    *_rows_of_places("barometers x other speed", "26 June 2023: 6 runs -> 2 slower runs", 1.8, SLOW, SLOWER),
     _row(
         name="barometers simulated, readings",
         split=_same,

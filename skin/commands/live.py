@@ -10,6 +10,7 @@ device= the simulator of the run is used: no hardware is needed. demo=true emula
 model at a port of this machine and serves the page. Ctrl-C stops.
 """
 
+import re
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
@@ -29,8 +30,20 @@ if TYPE_CHECKING:
     from skin.hardware.live.loop import Display
 
 
-_DEMO = ("run=default_skin", "web=true")
-"""Settings of a demonstration, unless others are given."""
+_DEMO = (
+    "run=any_skin",
+    "web=true",
+    "touch=fingertips",
+    "touch.force=2",
+    "layout=grid",
+    "layout.rows=6",
+    "layout.columns=6",
+    "body.layers=[{material: Dragon Skin 10 Medium, thickness: 0.01}, "
+    "{material: EcoFlex 00-30, thickness: 0.02}]",
+)
+"""Settings of a demonstration, unless others are given: fingertips, on a skin that tells them apart."""
+
+_EXPORTED = "an exported model has no mechanics: give the run itself, as in run=latest"
 
 
 @command("live")
@@ -66,10 +79,10 @@ def emulated_skin(words: Sequence[str]) -> Iterator[tuple[Config, list[str]]]:
     quiet()
     if devices := [word for word in words if word.startswith("device=")]:
         raise InputError(f"demo=true emulates a skin at a port: leave out {devices[0]}, or demo=true")
-    words = ["device=serial", *words]
-    config = validate_config(compose("live", [*_DEMO, *words]))
+    words, touched = _demo_overrides(words)
+    config = validate_config(compose("live", words))
     run = FinishedRun.named(config)
-    device = build_device(run.configured(compose("train"), ["device=simulated"]))
+    device = build_device(run.configured(compose("train", touched), touched))
     port = open_port("tcp:0", None)
     emulator = Emulator(device.simulated("a skin is emulated"), port, EmulatorSettings(), Faults())
     thread = Thread(target=emulator.run, name="skin-emulator", daemon=True)
@@ -86,6 +99,23 @@ def emulated_skin(words: Sequence[str]) -> Iterator[tuple[Config, list[str]]]:
         port.unplug()
 
 
+def _demo_overrides(words: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Return the overrides of the live view of a demonstration, and those of the skin that is emulated."""
+    skin, groups = {"body", "layout", "simulator"}, {_group(word) for word in words}
+    if groups & {"run", *skin}:
+        groups |= skin  # it is another one
+    words = [*(word for word in _DEMO if _group(word) not in groups), *words]
+    touched = [word for word in words if _group(word) in {"touch", *skin}]
+    return ["device=serial", *(word for word in words if _group(word) != "touch")], [
+        "device=simulated",
+        *touched,
+    ]
+
+
+def _group(word: str) -> str:
+    return re.split(r"[.=]", word, maxsplit=1)[0]
+
+
 def show(config: Config, changes: Sequence[str], own_mechanics: bool = False) -> None:
     """Show the predictions of a run for a skin until the command is ended.
 
@@ -98,6 +128,7 @@ def show(config: Config, changes: Sequence[str], own_mechanics: bool = False) ->
 
     from skin.core.interrupt import ends_on_signal
     from skin.core.messages import quiet
+    from skin.hardware.live.contacts import LiveContacts
     from skin.hardware.live.engine_builder import LiveSettings, watch_exported, watch_run
     from skin.hardware.live.loop import Display, DisplayInfo, LiveLoop
     from skin.runs.exported_model import check_overrides
@@ -112,13 +143,19 @@ def show(config: Config, changes: Sequence[str], own_mechanics: bool = False) ->
     try:
         with ExitStack() as opened:
             opened.enter_context(ends_on_signal())
+            contacts = LiveContacts("live.contacts=false")
+            opened.callback(contacts.close)
             if exported:
                 watched = watch_exported(str(config.run), config.device, live, say, opened)
+                if live.contacts:
+                    contacts.explain(_EXPORTED)
+                    say(f"no contacts: {_EXPORTED}")
             else:
-                watched = watch_run(config, live, say, changes, opened, own_mechanics)
+                watched = watch_run(config, live, say, changes, opened, contacts, own_mechanics)
             source, model = watched.source, watched.model
             display = Display(
-                DisplayInfo(model.title, source.name, model.positions, model.size, live.top, watched.span)
+                DisplayInfo(model.title, source.name, model.positions, model.size, live.top, watched.span),
+                contacts,
             )
             for text in _views(display, config, live, opened):
                 say(text)

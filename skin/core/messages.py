@@ -134,11 +134,13 @@ class Steps:
 
     Attributes:
         silent: whether to print nothing for now, such as while a person is prompted.
+        share: of the step that is done, where it is counted; None: it is estimated from the time.
     """
 
     def __init__(self, seconds: Mapping[str, float], pause: float = 10.0) -> None:
         self._seconds, self._pause = dict(seconds), pause
         self._name, self.silent = next(iter(self._seconds)), False
+        self.share: float | None = None
         self._done = 0.0  # s of the steps that have ended, as expected
         self._began = self._step_began = time.monotonic()
         self._ended = threading.Event()
@@ -156,7 +158,7 @@ class Steps:
         """Say which step begins; those before it have ended."""
         names = list(self._seconds)
         self._done = sum(self._seconds[before] for before in names[: names.index(name)])
-        self._name, self._step_began = name, time.monotonic()
+        self._name, self._step_began, self.share = name, time.monotonic(), None
 
     def line(self) -> str:
         """Return the step, the share that is done, and the estimated remaining time."""
@@ -165,7 +167,8 @@ class Steps:
         pace = spent / self._done if self._done and spent else 1.0  # s for each expected one
         # A step that takes longer than expected is almost done, never done.
         share = (now - self._step_began) / (pace * self._seconds[self._name])
-        done = self._done + self._seconds[self._name] * min(share, 0.95)
+        share = min(share, 0.95) if self.share is None else self.share
+        done = self._done + self._seconds[self._name] * share
         left = (now - self._began) * (whole / done - 1) if done else pace * whole
         return f"{self._name}: {100 * done / whole:.0f} % done, about {format_duration(left)} left"
 

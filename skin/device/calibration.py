@@ -55,7 +55,8 @@ class Calibration:
         polarity: 1 or -1 per sensor: -1 where the raw value falls with force. Readings in N rise with force
             either way. Empty: 1 for all.
         channels: the device's channel, from 0, of every sensor of the layout. Empty: the same order.
-        exponent_at: N, at which the curves of all exponents meet (:class:`skin.device.curves.Curves`).
+        exponent_at: N, at which the curves of all exponents meet (:class:`skin.device.curves.Curves`). There
+            the noise of a curved sensor has its value: at other readings the curve has other slopes.
         tables: curves of sensors, from 0, that follow no power law.
 
     Raises:

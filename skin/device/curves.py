@@ -10,6 +10,7 @@ from skin.errors import InputError
 
 _LEAST = 1e-9  # of the reference: below, a power law is a line, whose slope is finite
 _MOST_ROWS = 1000
+_STEP = 0.01  # of a reading, over which a slope is taken
 
 Table = Sequence[Sequence[float]]
 """Linear readings and values of a curve, each rising from 0, N."""
@@ -47,6 +48,12 @@ class Curves:
         for sensor, (readings, shown) in self.tables.items():
             linear[..., sensor] = _interpolate(values[..., sensor], shown, readings)
         return linear
+
+    @property
+    def slopes(self) -> np.ndarray:
+        """Change of the value per change of the linear reading at :attr:`at`, (S,); 1 where it is a line."""
+        at = np.broadcast_to(self.at, np.shape(self.exponent)).astype(float)
+        return np.asarray((self.bend((1 + _STEP) * at) - self.bend((1 - _STEP) * at)) / (2 * _STEP * at))
 
     def scaled(self, factor: np.ndarray) -> "Curves":
         """Return these curves for readings and values in another unit; ``factor`` (S,) of that per N."""

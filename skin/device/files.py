@@ -37,8 +37,7 @@ from skin.core.safe_loading import ChecksumError, check_seal, file_sha256, read_
 from skin.core.settings import ONCE, check_settings
 from skin.device.touches import Recording, Touches
 from skin.errors import InputError
-from skin.touch.fingertips import CONTACT
-from skin.touch.labels import Task
+from skin.touch.labels import CONTACT, Task
 
 # The schema of recordings, and checks of their JSON metadata before memory is allocated for the rows.
 

@@ -269,7 +269,7 @@ class Imperfection(ImperfectionSettings):
         constants = constants.to(readings.device)
         dead = constants.dead.expand(readings.shape)
         output, saturated = self._measure(readings, constants, generator, time)
-        return output.masked_fill(dead, 0.0), ~dead, saturated & ~dead
+        return self.undo_curve(output, constants).masked_fill(dead, 0.0), ~dead, saturated & ~dead
 
     def raw(
         self,
@@ -289,6 +289,11 @@ class Imperfection(ImperfectionSettings):
         constants = constants._replace(baseline=torch.zeros(())).to(readings.device)
         output, _ = self._measure(readings, constants, generator, time)
         return torch.where(constants.dead, constants.level, output)
+
+    def undo_curve(self, readings: Tensor, constants: Constants) -> Tensor:
+        """Return readings (B, T, S), N, without the curves of a calibration, as a live view gives them."""
+        curves = None if self.calibration is None else self._curves(constants, readings.shape[-1])
+        return readings if curves is None else curves.straighten(readings)
 
     def is_static(self, constants: Constants, sensors: int) -> bool:
         """Return whether the sensors follow the force at once and in proportion to it."""

@@ -127,6 +127,7 @@ def _measure_each(
     if constants.quantum.any():
         output = quantize(output + constants.baseline, constants.quantum) - constants.baseline
     dead = constants.dead.expand(output.shape)
+    output = imperfection.undo_curve(output, constants)
     return output.masked_fill(dead, 0.0), ~dead, saturated.to(force.device) & ~dead
 
 

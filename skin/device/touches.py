@@ -14,8 +14,7 @@ from torch.nn.functional import pad
 
 from skin.body.base import GEOMETRY
 from skin.errors import InputError
-from skin.touch.fingertips import CONTACT
-from skin.touch.labels import TOUCH_OR_NOT, Task
+from skin.touch.labels import CONTACT, TOUCH_OR_NOT, Task
 from skin.touch.movie import Movie, join_movies
 from skin.touch.sampler import AbstractSampler
 
@@ -36,7 +35,7 @@ class Touches:
         saturated: (B, T, S), bool: the sensor is at its limit, so the force is at least its reading; None
             if unknown.
         geometry: (S, G) or (B, S, G), the columns :data:`GEOMETRY` of each sensor; None if unknown.
-        contacts: (B, T, K, 5), the columns :data:`skin.touch.fingertips.CONTACT` of up to K contacts, NaN
+        contacts: (B, T, K, 5), the columns :data:`skin.touch.labels.CONTACT` of up to K contacts, NaN
             where there is none; None if unknown.
 
     Raises:

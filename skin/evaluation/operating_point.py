@@ -33,6 +33,9 @@ _APART = 1e-6  # scores closer than this may have another order on another proce
 _MOST_DRAWS = 6
 SAFE_TOUCHES = 2000
 """Safe touches on which a threshold is chosen: where 2 % are wanted, the rate is then 1.4 to 2.7 % (95 %)."""
+DANGEROUS_TOUCHES = 400
+"""Dangerous touches on which a threshold of the live view is checked: 75 % are then 71 to 79 % (95 %)."""
+_HIDDEN = 0.25  # share of dangerous touches that a threshold may hide
 _TOUCHES = 50  # touches
 _WINDOWS = 500  # windows that are classified at once
 _AFTER = 1.0  # s that are simulated behind the window of a touch
@@ -127,6 +130,11 @@ class OperatingPoint:
         """Whether the threshold is so high that no probability raises the alarm."""
         return self.threshold >= 1
 
+    @property
+    def hides(self) -> bool:
+        """Whether more than a quarter of the dangerous touches raise no alarm of the live view."""
+        return self.rate is not None and self.dangerous - self.found > _HIDDEN * self.dangerous
+
     def alarm(self, chance: Tensor) -> Tensor:
         """Return which probabilities raise the alarm, bool, in the shape of ``chance``."""
         return chance > self.threshold
@@ -157,6 +165,8 @@ class OperatingPoint:
                 f"no threshold has {100 * self.target:g} % false alarms or fewer: "
                 "safe gestures have the highest probabilities too, no alarm will be raised"
             )
+        if self.hides:
+            return f"{self.sentence()}: it hides dangerous touches"
         if self.safe < ENOUGH:
             return f"{self.sentence()}; {ENOUGH} are needed to rely on that rate"
         return None
@@ -301,6 +311,8 @@ def choose_for_touches(
     watching: Watching,
     target: float,
     count: int = SAFE_TOUCHES,
+    dangerous: int = 0,
+    report: Callable[[int], None] | None = None,
 ) -> OperatingPoint:
     """Return the threshold at which a share of safe touches raises the alarm of the live view.
 
@@ -310,12 +322,17 @@ def choose_for_touches(
         watching: how they are watched.
         target: largest share of safe touches that raise the alarm.
         count: number of safe touches.
+        dangerous: number of dangerous touches; how many of them raise the alarm is counted.
+        report: called with the number of touches that are done.
     """
-    labels = device.sampler.balanced(2 * count, generator(Stream.ALARM, device.data_seed, 1))
-    safe = labels[~labels[:, TOUCH.names.index(LABEL)]][:count]
-    scores = touch_scores(learner, device, watching, safe, device.data_seed)
-    point = OperatingPoint(lowest_threshold(scores, target), target, len(scores), 0, device.data_seed)
-    return replace(point, raised=int(point.alarm(scores).sum()))
+    labels = device.sampler.balanced(2 * max(count, dangerous), generator(Stream.ALARM, device.data_seed, 1))
+    danger = labels[:, TOUCH.names.index(LABEL)]
+    safe, others = labels[~danger][:count], labels[danger][:dangerous]
+    scores = touch_scores(learner, device, watching, np.concatenate([safe, others]), device.data_seed, report)
+    threshold = lowest_threshold(scores[: len(safe)], target)
+    point = OperatingPoint(threshold, target, len(safe), 0, device.data_seed, len(others))
+    alarms = point.alarm(scores)
+    return replace(point, raised=int(alarms[: len(safe)].sum()), found=int(alarms[len(safe) :].sum()))
 
 
 @torch.inference_mode()
@@ -325,6 +342,7 @@ def touch_scores(
     watching: Watching,
     labels: np.ndarray,
     seed: int,
+    report: Callable[[int], None] | None = None,
 ) -> Tensor:
     """Return the score of each touch: it raises the alarm at thresholds below.
 
@@ -332,6 +350,7 @@ def touch_scores(
         learner, device, watching: as in :func:`choose_for_touches`.
         labels: (B, 4), bool, of the touches.
         seed: of the touches and their devices.
+        report: called with the number of touches that are done.
 
     Returns:
         (B,), the largest over the decisions of the smallest probability of ``dangerous`` among as many
@@ -350,6 +369,8 @@ def touch_scores(
         row = watching.decisions(_round_rate(device, watching))
         least = -max_pool1d(-pad(chances, (row - 1, 0)), row, 1) if row > 1 else chances
         scores.append(least.amax(dim=1))
+        if report is not None:
+            report(first + len(batch))
     return torch.cat(scores)
 
 

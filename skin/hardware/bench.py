@@ -148,7 +148,7 @@ class Gauge:
             peaks: (P,), highest pressure of each press under 1 N, Pa (:func:`pressed_peaks`).
 
         Returns:
-            The columns :data:`skin.touch.fingertips.CONTACT`.
+            The columns :data:`skin.touch.labels.CONTACT`.
         """
         force, press = self.at(time)
         rows = self.first[np.maximum(press, 0)]

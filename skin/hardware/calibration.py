@@ -43,7 +43,10 @@ _UNITS = {"gain": "", "hysteresis": "of peak", "time_constant": "s", "drift": "N
 
 @dataclass
 class _Channel:
-    """Constants of one channel, in the session's unit; gain per N; None if unknown."""
+    """Constants of one channel, in the session's unit; gain per N; None if unknown.
+
+    ``noise`` is that of linear changes, where the response is a curve.
+    """
 
     idle: Idle
     quantum: float
@@ -55,6 +58,7 @@ class _Channel:
     broken: str | None = None
     polarity: float = 1.0
     shape: Shape = field(default_factory=Shape)
+    noise: float | None = None
 
 
 def fit_calibration(bench: BenchData, presses: Collection[int] | None = None) -> Calibration:
@@ -284,8 +288,11 @@ def _fit_branches(
     if up.sum() < 10:
         return
     noise = channel.idle.noise
-    if channel.shape.kind != "linear":  # under load, where the curve has another slope than at rest
+    if channel.shape.kind != "linear":  # the curve has another slope at rest than under load
         noise = _MAD / math.sqrt(2) * float(np.median(np.abs(np.diff(measured[up]))))
+        loaded = np.diff(measured[up], 2)  # twice: the rising force is no noise
+        rest = np.diff(measured[bench.idle & np.isfinite(measured)], 2)
+        channel.noise = _MAD / math.sqrt(6) * max(float(np.median(np.abs(part))) for part in (loaded, rest))
     gain, channel.error, plateau = fit_clip_and_gain(lagged[up], measured[up], noise)
     channel.clip = plateau
     if plateau is not None and curves is not None:
@@ -314,9 +321,13 @@ def _convert_to_newton(
     # Counts have an unknown zero, common to all channels; readings in N do not.
     counts = [channel.idle.offset for channel, live in zip(channels, alive, strict=True) if live]
     zero = 0.0 if bench.session.unit == "N" else float(np.median(counts))
+    slopes = np.ones(len(channels)) if curves is None else curves.slopes
+    noises = zip(channels, slopes.tolist(), strict=True)
     in_newton: dict[str, list[float | None]] = {
         "offset": [channel.polarity * (channel.idle.offset - zero) for channel in channels],
-        "noise": [channel.idle.noise for channel in channels],
+        "noise": [
+            entry.idle.noise if entry.noise is None else entry.noise * slope for entry, slope in noises
+        ],
         "drift": [channel.polarity * channel.idle.drift for channel in channels],
         "quantum": [channel.quantum for channel in channels],
         "clip": [channel.clip for channel in channels],

@@ -31,7 +31,7 @@ from skin.errors import InputError
 from skin.hardware.wire.channels import UnitConversion
 from skin.hardware.wire.contact_lines import MOST_CONTACTS
 from skin.hardware.wire.segmentation import RecordedGesture
-from skin.touch.fingertips import CONTACT
+from skin.touch.labels import CONTACT
 
 _SUM = ', "sum": "'
 

@@ -3,6 +3,7 @@
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import permutations
 from typing import NamedTuple
 
 import numpy as np
@@ -21,7 +22,7 @@ _SAMPLES = 10  # binary logarithm of the number of samples
 _WIDER = 1.1  # spread of the samples' proposal, relative to the posterior's
 _FREEDOM = 8.0  # degrees of freedom of the proposal, Student's distribution
 _MODES, _UNLIKELY, _ALIKE = 6, 6.0, 0.002  # modes that are sampled; log score below the best; m between two
-_WALKERS, _WALK = 256, 30  # and steps of each
+_WALKERS, _WALK = 256, 60  # and steps of each
 
 # A guess is (M, n, 4): x, y, m, and scores whose prior is the standard normal distribution: of the radius,
 # which is uniform, and of the force, which is log-normal. Posteriors are then nearly Gaussian.
@@ -248,7 +249,7 @@ class Search:
             score: (M,), their log posterior.
         """
         chosen = self._distinct(modes, score)
-        modes, number = modes[chosen], modes.shape[1]
+        modes, number = _order(modes[chosen], modes[chosen[0]]), modes.shape[1]
         information = self._expand(frame, modes)[2]
         spread = np.linalg.cholesky(np.linalg.inv(information)) * _WIDER
         owner = np.arange(2**_SAMPLES) % len(modes)
@@ -330,7 +331,7 @@ class Search:
             if step >= _WALK // 3:
                 samples.append(guess.copy())
                 misfits.append(float(misfit.mean()))
-        every = np.concatenate(samples)
+        every = _order(np.concatenate(samples), mixture.mode)
         weight = np.full(len(every), 1 / len(every))
         return replace(mixture, samples=every, weight=weight, misfit=float(np.mean(misfits)))
 
@@ -338,6 +339,16 @@ class Search:
         """Return x, y and radius, m, and force, N, of samples (N, n, 4)."""
         places, force, _ = self._places_of(samples.reshape(-1, 4))
         return np.column_stack([places, force]).reshape(samples.shape)
+
+
+def _order(guess: np.ndarray, mode: np.ndarray) -> np.ndarray:
+    """Return guesses (N, n, 4) with each contact in the row of the contact of a mode (n, 4) that it is near.
+
+    Contacts have no order of their own: without one, two places would be averaged.
+    """
+    orders = np.array(list(permutations(range(len(mode)))))
+    away = ((guess[:, orders, :2] - mode[:, :2]) ** 2).sum((2, 3))
+    return np.take_along_axis(guess, orders[away.argmin(1)][..., None], axis=1)
 
 
 def _differ(first: np.ndarray, second: np.ndarray) -> bool:

@@ -19,6 +19,7 @@ from skin.mechanics.simulator.base import AbstractSimulator
 MOST_CONTACTS = 3
 """Contacts that are told apart."""
 
+_WIDTH = 1.0  # of the boxes around samples of several contacts, in standard deviations
 _PER_CONTACT = 3  # sensors that a contact takes at least: it has a place and a force
 _FITS = 0.01  # a smaller predictive probability says that no contacts give such readings
 _POOR, _LIKELY = 1e-3, 0.5  # a further contact is tried below this probability, or above these odds
@@ -80,11 +81,17 @@ class ContactEstimate:
         """Return the probability that the highest pressure is above a limit, Pa."""
         return float(self.weights[self.peaks > pressure].sum())
 
-    def region(self, share: float = 0.9) -> Region:
-        """Return the smallest set of cells that holds the place with a probability; it may have parts."""
+    def region(self, share: float = 0.9, least: float = 0.0) -> Region:
+        """Return the smallest set of cells that holds the place with a probability; it may have parts.
+
+        Args:
+            share: the probability.
+            least: smallest width of a cell, m.
+        """
         weight = self.weights.sum(1)
         low, high = (self.places - self.widths / 2).min(0), (self.places + self.widths / 2).max(0)
-        steps = np.clip(np.ceil((high - low) / self.widths.min(0) - 1e-6), 1, _CELLS).astype(int)
+        width = np.maximum(self.widths.min(0), least)
+        steps = np.clip(np.ceil((high - low) / width - 1e-6), 1, _CELLS).astype(int)
         edges = [np.linspace(low[axis], high[axis], steps[axis] + 1) for axis in (0, 1)]
         parts = [_overlap(edges[axis], self.places[:, axis], self.widths[:, axis]) for axis in (0, 1)]
         mass = (parts[0] * weight[:, None]).T @ parts[1]
@@ -308,7 +315,7 @@ class Posterior:
         for contact in self._search.contacts(mixture.samples).transpose(1, 0, 2):
             spread = np.sqrt(np.maximum(_variance(contact[:, :2], weight[:, 0]), 1e-12))
             widths = np.zeros((len(contact), 3))
-            widths[:, :2] = 0.6 * spread
+            widths[:, :2] = _WIDTH * spread
             parts.append(self._summary(contact[:, :3], widths, contact[:, 3:], weight))
         return tuple(sorted(parts, key=lambda part: -part.force))
 

@@ -1,7 +1,6 @@
 """The model of a finished run: it predicts, evaluates and raises the alarm on the skin that it is used on."""
 
 import logging
-import os
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, fields, replace
@@ -32,6 +31,7 @@ from skin.device.touches import Touches
 from skin.errors import InputError
 from skin.evaluation import decisions, operating_point
 from skin.evaluation.operating_point import (
+    DANGEROUS_TOUCHES,
     LABEL,
     ContactThreshold,
     OperatingPoint,
@@ -201,15 +201,17 @@ def alarm_point_for_touches(
     def choose() -> dict[str, np.ndarray]:
         devices = "" if settings.profile is None else f" and devices of the profile {settings.profile}"
         say(f"choosing the alarm's threshold on {count} safe touches at {watching.rate:.3g} Hz{devices}")
-        threads = torch.get_num_threads()
-        torch.set_num_threads(os.cpu_count() or 1)  # nothing is watched yet
-        point = choose_for_touches(learner, device, watching, target, count)
-        torch.set_num_threads(threads)
-        return {"point": np.array([point.threshold, point.raised])}
+        with Steps({"choosing the threshold of the alarm": _EXPECTED}) as steps:
+            counts = count, DANGEROUS_TOUCHES
+            # More threads than free cores take many times as long.
+            report = lambda done: setattr(steps, "share", done / sum(counts))  # noqa: E731
+            point = choose_for_touches(learner, device, watching, target, *counts, report)
+        return {"point": np.array([point.threshold, point.raised, point.dangerous, point.found])}
 
     file = array_cache.folder(None) / f"threshold_{key[:16]}.npz"
-    threshold, raised = array_cache.kept(file, key, {"point": (2,)}, choose)["point"].tolist()
-    return OperatingPoint(threshold, target, count, int(raised), device.data_seed, rate=watching.rate)
+    threshold, *counts = array_cache.kept(file, key, {"point": (4,)}, choose)["point"].tolist()
+    raised, dangerous, found = (int(number) for number in counts)
+    return OperatingPoint(threshold, target, count, raised, device.data_seed, dangerous, found, watching.rate)
 
 
 def _remaining(calibration: Calibration) -> dict[str, Any]:
@@ -220,7 +222,7 @@ def _remaining(calibration: Calibration) -> dict[str, Any]:
     """
     values, curves = calibration.values(), calibration.curves
     if curves is not None:
-        values |= {"clip": curves.straighten(values["clip"]), "noise": values["noise"] / values["exponent"]}
+        values |= {"clip": curves.straighten(values["clip"]), "noise": values["noise"] / curves.slopes}
     names = ("noise", "hysteresis", "time_constant")
     left = {name: float(np.median(values[name])) for name in names}
     clip = float(np.median(values["clip"]))
@@ -391,11 +393,10 @@ class RunModel(TrainedModel):
         self, rate: float, patience: float, aligned: bool, say: Callable[[str], None]
     ) -> float | None:
         """Return the threshold of :meth:`point_at`, which is announced."""
-        with Steps({"choosing the threshold of the alarm": _EXPECTED}):
-            point = self.point_at(rate, patience, aligned, say)
+        point = self.point_at(rate, patience, aligned, say)
         if point is None:
             return None
-        if point.silent:
+        if point.silent or point.hides:
             raise InputError(f"{point.warning()}: give live.patience.above=0.5, or train another run")
         say(point.sentence())
         return point.threshold

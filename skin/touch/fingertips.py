@@ -24,13 +24,10 @@ from skin.touch.gesture import (
     sample_paths,
 )
 from skin.touch.images import load_image
-from skin.touch.labels import TOUCH
+from skin.touch.labels import CONTACT, TOUCH
 from skin.touch.movie import Movie, join_movies, measure_gestures
 from skin.touch.sampler import AbstractSampler, ContactModel, describe_touches, steer
 from skin.touch.shapes import Shapes
-
-CONTACT = ("x", "y", "radius", "force", "peak")
-"""Columns of contacts: centre and radius (m), force (N) and highest pressure (Pa)."""
 
 _DYNAMIC, _PRESS = TOUCH.names.index("dynamic"), TOUCH.names.index("press")
 _TRIES = 1000

@@ -101,6 +101,9 @@ TOUCH_SLIDING = Task((*TOUCH.names, "slide_x", "slide_y"), direction=True)
 """The four binary labels and the direction of sliding, as :func:`skin.touch.movie.sliding` gives it."""
 
 
+CONTACT = ("x", "y", "radius", "force", "peak")
+"""Columns of contacts: centre and radius (m), force (N) and highest pressure (Pa)."""
+
 OPPOSITE = {"big": "small", "dynamic": "static", "press": "tap", "dangerous": "safe"}
 """Label -> name of its opposite."""
 

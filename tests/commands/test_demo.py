@@ -46,22 +46,29 @@ def refuses(address):
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 0), (signal.SIGTERM, 143)])
 def test_the_page_shows_an_emulated_skin_until_a_signal_ends_both(begin, tmp_path, number, code):
     store = f"tracking.uri=sqlite:///{tmp_path}/m.db"
-    with begin(tmp_path, "live", "demo=true", "live.web_port=0", store) as demo:
+    # The choice of the threshold, which is tested elsewhere, takes a minute.
+    fast = "live.patience.above=0.97", "live.touch=0.3"
+    with begin(tmp_path, "live", "demo=true", "live.web_port=0", *fast, store) as demo:
         page = page_of(demo)
         with urlopen(page, timeout=PATIENCE) as answer:
             assert b"<!doctype html>" in answer.read()
         with urlopen(f"{page}/skin.json", timeout=PATIENCE) as answer:
             known = json.load(answer)
-        assert known["title"] == "default_skin"
-        assert len(known["positions"]) == 25
+        assert known["title"] == "any_skin"
+        assert len(known["positions"]) == 36
         assert known["port"].startswith("socket://127.0.0.1:")
+        touched = next(picture for picture in pictures(page) if picture["contacts"]["state"] == "contacts")
+        assert len(touched["contacts"]["contacts"]) == touched["contacts"]["number"]
+        assert " kPa" in touched["contact_text"][1]
         touched = next(
             one["verdict"] for one in pictures(page) if one["verdict"] and one["verdict"]["touched"]
         )
         assert len(touched["words"]) == 4
-        assert not psutil.Process(demo.pid).children()
+        # The emulator is a thread; only contacts have a process.
+        (estimating,) = psutil.Process(demo.pid).children()
         demo.send_signal(number)
         assert demo.wait(PATIENCE) == code, demo.err
+    estimating.wait(PATIENCE)
     assert refuses(page)
     assert refuses(known["port"])
     assert "Traceback" not in demo.err
@@ -78,3 +85,32 @@ def test_a_device_is_refused(run, tmp_path):
     done = run(tmp_path, "live", "demo=true", "device=serial")
     assert done.returncode == 2
     assert done.stderr == "demo=true emulates a skin at a port: leave out device=serial, or demo=true\n"
+
+
+@pytest.mark.slow
+def test_what_is_killed_leaves_no_process_and_no_port(begin, tmp_path):
+    with begin(
+        tmp_path, "live", "demo=true", "live.web_port=0", "live.patience.above=0.97", "web=true"
+    ) as demo:
+        page = page_of(demo)
+        (estimating,) = psutil.Process(demo.pid).children()
+        demo.send_signal(signal.SIGKILL)
+        estimating.wait(PATIENCE)
+    assert refuses(page)
+
+
+@pytest.mark.slow
+def test_a_run_of_equation_10_says_why_it_estimates_no_contacts(begin, tmp_path):
+    words = ["run=default_skin", "live.web_port=0", "live.patience.above=0.95", "seconds=6"]
+    with begin(tmp_path, "live", "demo=true", *words) as demo:
+        page = page_of(demo)
+        with suppress(OSError):
+            told = {
+                (one["contacts"]["state"], one["contacts"]["reason"])
+                for one in pictures(page)
+                if one["verdict"]
+            }
+        assert demo.wait(PATIENCE) == 0, demo.err
+    reason = "readings of equation 10 do not add up: use run=any_skin, or a run of simulator=solid"
+    assert told == {("unknown", reason)}
+    assert " ".join(demo.err.split()).count(f"no contacts: {reason}") == 1

@@ -1,11 +1,14 @@
 """Imperfections, one by one."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
 from skin.device.calibration import Calibration
 from skin.device.imperfection import Imperfection
+from skin.device.sampling import measure
 from skin.errors import InputError
 
 NONE = {"gain_spread": 0.0, "offset": 0.0, "noise": 0.0}
@@ -173,6 +176,23 @@ def test_a_calibrated_device_is_the_real_one_whatever_the_seed():
         )
         torch.testing.assert_close(said[0, 0], torch.tensor([8.1, 4.8, 0]))
         assert valid[0, 0].tolist() == [True, True, False]
+
+
+def test_the_curve_of_a_calibration_is_undone_as_in_the_live_view():
+    """What the hardware sends is bent; a network that learned from bent readings would see others live."""
+    curved = Calibration({"gain": [0.8, 1.2, 1.0], "exponent": [0.5, 0.7, 1.0]}, exponent_at=2.0)
+    imperfection = Imperfection(calibration=curved, aligned=False, rate=50.0)
+    force = torch.linspace(0, 8, 18).view(2, 3, 3)
+    constants = imperfection.constants(3, generator())
+    expected = force * torch.tensor([0.8, 1.2, 1.0])
+    torch.testing.assert_close(imperfection.apply(force, constants, generator())[0], expected)
+    sent = imperfection.raw(force, constants, generator())
+    assert float(sent[1, 2, 0]) == pytest.approx(2 * (float(expected[1, 2, 0]) / 2) ** 0.5)
+    rising = torch.linspace(0, 8, 90).view(1, 30, 3)
+    highest, *_ = measure(imperfection, constants, rising, 10.0, generator())
+    straight = replace(imperfection, calibration=Calibration({"gain": [0.8, 1.2, 1.0]}))
+    plain, *_ = measure(straight, straight.constants(3, generator()), rising, 10.0, generator())
+    torch.testing.assert_close(highest, plain, rtol=0.02, atol=0.1)
 
 
 def test_ranges_give_every_gesture_another_device():

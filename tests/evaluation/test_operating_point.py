@@ -210,6 +210,15 @@ def test_a_threshold_that_nothing_passes_is_told():
     assert "no alarm will be raised" in replace(POINT, threshold=1.000001).warning()
 
 
+def test_a_threshold_that_hides_dangerous_touches_is_told():
+    """Only where the live view chose it: a window may show less than a touch."""
+    point = replace(POINT, rate=100.0, dangerous=400, found=300)
+    assert point.warning() is None
+    hiding = replace(point, found=299)
+    assert "finds 74.8 % of 400 dangerous ones: it hides dangerous touches" in hiding.warning()
+    assert replace(hiding, rate=None).warning() is None
+
+
 def test_what_is_stored_reads_back_to_the_last_digit():
     point = replace(POINT, threshold=lowest_threshold(torch.linspace(0.1, 0.7, 500), 0.02))
     assert parse_operating_point(point.text()) == point
@@ -319,6 +328,7 @@ def test_the_share_of_new_safe_touches_is_the_one_that_was_asked_for(drawn, rate
     point = choose_for_touches(Largest(), drawn, watching(rate), 0.1, 400)
     assert (point.safe, point.rate) == (400, None)
     assert point.raised <= 40
+    assert point.dangerous == 0
     labels = balanced(1600, generator(Stream.TEST, 8))
     safe = labels[~labels[:, 3]]
     share = float(point.alarm(touch_scores(Largest(), drawn, watching(rate), safe, 99)).float().mean())

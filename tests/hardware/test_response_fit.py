@@ -1,5 +1,7 @@
 """Responses that are no lines: is the hidden curve found, named, and undone on held-out presses?"""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -29,6 +31,21 @@ def test_a_power_law_is_found_and_named(exponent, capsys):
     np.testing.assert_allclose(outcome.force, 1, atol=0.03)
     print_calibration(calibration, outcome)
     assert f"follow force^{exponent:.1f}"[:-1] in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("curve", [{"exponent": 0.5}, {"table": DIVIDER}])
+def test_the_noise_of_a_curved_sensor_is_that_of_its_force(curve):
+    """A root amplifies the noise at rest, which says nothing of that under load."""
+    hidden = {"noise": 0.0, "offset": 0.0, "clip": 100.0, **curve}
+    bench, gain = bent(**hidden), device(**hidden).constants.gain.numpy()
+    tables = dict.fromkeys(range(6), curve["table"]) if "table" in curve else {}
+    curves = Curves(np.full(6, curve.get("exponent", 1.0)), np.full(6, 2.0), tables)
+    noise = np.random.default_rng(0).normal(0, 0.05, bench.session.raw.shape)
+    raw = curves.bend(curves.straighten(bench.session.raw) + gain * noise)
+    calibration = fit_calibration(replace(bench, session=replace(bench.session, raw=raw)))
+    assert calibration.curves is not None
+    fitted = calibration.known("noise") / calibration.curves.slopes / calibration.known("gain")
+    np.testing.assert_allclose(fitted, 0.05, rtol=0.15)
 
 
 def test_a_table_is_found_where_no_power_law_fits(capsys):

@@ -187,18 +187,22 @@ def test_a_contact_is_told_as_one_and_where_it_is():
     error = [e.contacts[0].place - t[0, :2] for e, t in zip(estimates, touches[rows], strict=True)]
     assert np.sqrt(np.square(error).mean()) < 2.5e-3
     force = [e.contacts[0].force / t[0, 3] - 1 for e, t in zip(estimates, touches[rows], strict=True)]
-    assert np.median(np.abs(force)) < 0.1
+    assert np.median(np.abs(force)) < 0.08
 
 
 def test_two_contacts_are_told_apart():
-    touches = draw(12, seed=4, number=2, margin=0.03, apart=0.064)
+    touches = draw(60, seed=4, number=2, margin=0.03, apart=0.064)
     estimates = posterior().estimate(measure(felt(touches), NOISE, 5))
     right = [row for row, estimate in enumerate(estimates) if estimate.number == 2]
-    assert len(right) >= 11
+    assert len(right) >= 57
+    errors = []
     for row in right:
-        places = np.array([contact.place for contact in estimates[row].contacts])
-        away = np.linalg.norm(touches[row][:, None, :2] - places, axis=2).min(1)
-        assert away.max() < 0.015
+        contacts = estimates[row].contacts
+        places = np.array([contact.place for contact in contacts])
+        errors.append(np.linalg.norm(touches[row][:, None, :2] - places, axis=2).min(1))
+        # Two places that exchange their order would be averaged, half of their distance from either.
+        assert max(contact.place_deviation.max() for contact in contacts) < 0.015
+    assert np.sqrt(np.square(errors).mean() / 2) < 3e-3
 
 
 @pytest.mark.parametrize("thin", [False, True])

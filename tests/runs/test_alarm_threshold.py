@@ -8,11 +8,18 @@ import torch
 from hydra import compose, initialize_config_dir
 
 from skin.core.files import CONF
+from skin.device.calibration import Calibration, write_calibration
 from skin.errors import InputError
-from skin.evaluation.operating_point import OperatingPoint
+from skin.evaluation.operating_point import OperatingPoint, Watching
 from skin.runs.configuration import validate_config
 from skin.runs.finished_run import TAG, FinishedRun
-from skin.runs.model_of_run import alarm_point, profile_settings, threshold_device
+from skin.runs.model_of_run import (
+    RunModel,
+    alarm_point,
+    alarm_point_for_touches,
+    profile_settings,
+    threshold_device,
+)
 
 SMALL = ["simulator=naive", "data.gestures=40", "evaluation.safe_gestures=16"]
 
@@ -96,6 +103,36 @@ def test_another_profile_and_one_of_many_skins_have_a_threshold_of_their_own(hyd
     ):
         point = alarm_point(run_of(run, STORED), Quiet(), config, one_skin)
         assert 0.25 < point.threshold < 0.2501
+
+
+@pytest.fixture
+def force_resistors(hydra, tmp_path):
+    """The configuration of sensors that follow the root of the force, with a noise of 0.06 N at 4 N."""
+    sensors = {"gain": [1.0] * 25, "noise": [0.03] * 25, "exponent": [0.5] * 25}
+    path = write_calibration(Calibration(sensors, exponent_at=4.0), tmp_path / "fsr.yaml")
+    return hydra("device=serial", "device.port=x", f"device.calibration={path}")
+
+
+def test_the_noise_of_curved_sensors_is_that_of_the_force(hydra, force_resistors, tmp_path, monkeypatch):
+    devices = []
+
+    def choose(learner, device, watching, target, *counts):
+        devices.append(device)
+        return STORED
+
+    monkeypatch.setenv("SKIN_CACHE", str(tmp_path))
+    monkeypatch.setattr("skin.runs.model_of_run.choose_for_touches", choose)
+    watching = Watching(100.0, 0.1, 2.0, 0.1, 3)
+    alarm_point_for_touches(run_of(hydra(), STORED), Quiet(), force_resistors, watching, print)
+    assert devices[0].imperfection.noise == pytest.approx(0.06, rel=0.01)
+
+
+def test_a_threshold_that_hides_dangerous_touches_is_refused(hydra):
+    model = RunModel.__new__(RunModel)
+    hiding = OperatingPoint(0.9996, 0.02, 2000, 39, 0, 400, 250, 100.0)
+    model.point_at = lambda *_: hiding
+    with pytest.raises(InputError, match=r"finds 62\.5 % of 400 dangerous ones: it hides dangerous touches"):
+        model.threshold_at(100.0, 0.1, False, print)
 
 
 def test_more_noise_means_higher_readings_at_rest(hydra):

@@ -280,6 +280,11 @@ class Engine:
         return self._contact.since is not None
 
     @property
+    def baseline(self) -> np.ndarray:
+        """Readings (S,), N, of the untouched skin by now."""
+        return self._contact.baseline
+
+    @property
     def frozen(self) -> bool:
         """Whether no reading has changed for so long that the device cannot be working."""
         return self._freshness.frozen

@@ -17,6 +17,7 @@ from skin.core.settings import configured
 from skin.device.resampling import Frame
 from skin.errors import InputError
 from skin.evaluation.decisions import DRIFT
+from skin.hardware.live.contacts import LiveContacts, Mechanics
 from skin.hardware.live.engine import DebounceSettings, Detection, EngineSettings, sensor_list
 from skin.hardware.wire.channels import RawRange, UnitConversion, unit_conversion
 from skin.hardware.wire.reader import PortSettings, SkinTimeout
@@ -191,6 +192,7 @@ class LiveSettings:
         drift: N in ten minutes that the baseline may follow without touch.
         verdicts: where JSON lines go: ``stdout``, or a TCP port, 0: any free one; None: nowhere.
         log: file to which alarms are appended; None: no log.
+        contacts: whether a process of its own estimates contacts.
         selftest: whether simulated dangerous touches must raise the alarm at the start.
         patience: settings of debouncing.
     """
@@ -201,6 +203,7 @@ class LiveSettings:
     drift: Annotated[float, Ge(0)]
     verdicts: Literal["stdout"] | Annotated[int, Ge(0), Le(65535)] | None
     log: str | None
+    contacts: bool
     selftest: bool
     patience: DebounceSettings
 
@@ -302,6 +305,7 @@ def watch_run(
     say: Callable[[str], None],
     overrides: Sequence[str],
     opened: ExitStack,
+    contacts: LiveContacts,
     own_mechanics: bool = False,
 ) -> Watched:
     """Return a finished run and the device of a configuration.
@@ -312,6 +316,7 @@ def watch_run(
         say: called with each message for the user.
         overrides: settings that replace those of the run; ``config`` has their values.
         opened: closes the device in the end.
+        contacts: is started as soon as the mechanics are known.
         own_mechanics: the device has the mechanics of the run, though it is at a port.
 
     Raises:
@@ -343,7 +348,13 @@ def watch_run(
     # Without a simulator nothing could tune a contact threshold.
     touch = None if "simulator" in run.stored.device else live.touch
     model = load_model(run, trained, watched, touch=touch, alarm=False)
-
+    if live.contacts:
+        try:
+            mechanics = Mechanics.of(model.device.reference, bool(config.device.get("calibration")))
+            contacts.start(mechanics, lambda: port is not None and port.raw_range.whole)
+        except InputError as error:
+            contacts.explain(str(error))
+            say(f"no contacts: {error}")
     settings = used_and_nominal(model, port, live, say)
     if port is None:
         port = open_source(device)

@@ -20,6 +20,7 @@ import numpy as np
 from skin.core.files import json_line, unwritable
 from skin.device.resampling import Frame
 from skin.errors import InputError
+from skin.hardware.live.contacts import LiveContacts, unknown_contacts
 from skin.hardware.live.engine import Engine, Verdict
 from skin.hardware.wire.channels import Tare, UnitConversion
 from skin.hardware.wire.reader import SkinDisconnected, SkinTimeout
@@ -75,6 +76,7 @@ class DisplayState:
         alarm: the latest verdict was dangerous, and the contact has not ended as far as known.
         line: text with rate, lost frames and latency.
         peak: (S,), N, the largest of each sensor in the touch that the verdict is about; 0 without touch.
+        contacts: what is known of them, as in :func:`skin.hardware.live.contacts.contact_message`.
     """
 
     number: int
@@ -86,6 +88,7 @@ class DisplayState:
     line: str
     alarm: bool
     peak: np.ndarray
+    contacts: dict[str, Any]
 
     @property
     def held(self) -> bool:
@@ -104,13 +107,14 @@ class Display:
 
     Attributes:
         info: as given.
+        contacts: the latest estimate of them.
         closed: event, set at the end.
         observers: called with each verdict, in the thread that classifies.
         listeners: called with the name of each event of the operator, such as ``tare``.
     """
 
-    def __init__(self, info: DisplayInfo) -> None:
-        self.info, self.closed = info, Event()
+    def __init__(self, info: DisplayInfo, contacts: LiveContacts | None = None) -> None:
+        self.info, self.closed, self.contacts = info, Event(), contacts or LiveContacts()
         self.observers: list[Observer] = []
         self.listeners: list[Callable[[str], None]] = []
         self._lock = Lock()
@@ -193,8 +197,9 @@ class Display:
             line = ", ".join(text for text in (self._note, self._line) if text)
             state = self._verdict, self._trouble, line, self._alarm, self._peak
             number, valid = self._number, self._valid
+        contacts = unknown_contacts(state[1]) if state[0] is None else self.contacts.state()
         values, saturated = (np.max(part, axis=0) for part in zip(*latest, strict=True))
-        return DisplayState(number, np.where(valid, values, 0.0), valid, saturated & valid, *state)
+        return DisplayState(number, np.where(valid, values, 0.0), valid, saturated & valid, *state, contacts)
 
 
 STALE = 1.5
@@ -302,6 +307,8 @@ class LiveLoop:
             self._display.set_verdict(verdict)
         if verdicts:
             self._delays.append(monotonic() - verdicts[-1].t_host)
+        # After the verdict is shown: it waits for nothing.
+        self._display.contacts.look(frames, conversion, verdicts, self._engine.baseline)
 
     @property
     def line(self) -> str:
@@ -331,20 +338,23 @@ SCHEMA = 1
 """Version of the messages. A field may be added without a new version; a reader ignores unknown ones."""
 
 
-def verdict_message(verdict: Verdict | None, reason: str, alarm: bool) -> dict[str, Any]:
+def verdict_message(
+    verdict: Verdict | None, reason: str, alarm: bool, contacts: dict[str, Any]
+) -> dict[str, Any]:
     """Return a verdict, or the reason why there is none, as JSON data.
 
     Args:
         verdict: the present one; None if there is none.
         reason: why there is none.
         alarm: an alarm that continues without a verdict.
+        contacts: what is known of them beside a verdict.
 
     Returns:
         The fields of ``docs/export.md`` but ``number`` and ``event``.
     """
     if verdict is None:
         shared = {"schema": SCHEMA, "stale": True, "reason": reason, "state": "unknown"}
-        return shared | {"time": _utc(0.0), "alarm": alarm}
+        return shared | {"time": _utc(0.0), "alarm": alarm, "contacts": unknown_contacts(reason)}
     shared = {"schema": SCHEMA, "stale": False, "reason": verdict.reason, "state": verdict.state}
     return shared | {
         "time": _utc(monotonic() - verdict.t_host),
@@ -360,6 +370,7 @@ def verdict_message(verdict: Verdict | None, reason: str, alarm: bool) -> dict[s
         "gap": verdict.gap,
         "masked": list(verdict.masked),
         "unknown": list(verdict.unknown),
+        "contacts": contacts,
     }
 
 
@@ -383,9 +394,13 @@ class VerdictStream:
 
     Each verdict is a line. Without verdicts, a line is sent when the reason changes and every ``HEARTBEAT``
     seconds, with ``stale`` true.
+
+    Args:
+        contacts: tells what is known of them.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, contacts: LiveContacts) -> None:
+        self._contacts = contacts
         self._lock, self._number, self._readers = Lock(), 0, list[Lines]()
         self._state: tuple[Verdict | None, str, bool] = None, "waiting for the first frame", False
         self._sent = self._seen = monotonic()
@@ -410,7 +425,11 @@ class VerdictStream:
 
     def _send(self, event: str) -> None:
         self._number, self._sent = self._number + 1, monotonic()
-        message = {"number": self._number, "event": event, **verdict_message(*self._state)}
+        message = {
+            "number": self._number,
+            "event": event,
+            **verdict_message(*self._state, self._contacts.state()),
+        }
         line = (json_line(message) + "\n").encode()
         for lines in self._readers:
             _put(lines, line)
@@ -459,7 +478,7 @@ def stream_verdicts(display: Display, where: Literal["stdout"] | int) -> Iterato
     Raises:
         InputError: the port is in use or not allowed.
     """
-    stream, over = VerdictStream(), Event()
+    stream, over = VerdictStream(display.contacts), Event()
     display.observers.append(stream.observe)
     beats = Thread(target=_beat, args=(stream, over), name="skin-heartbeat", daemon=True)
     beats.start()
@@ -515,10 +534,12 @@ class AlarmLog:
 
     Args:
         file: open for writing. If it becomes unwritable, a message says so once, and the live view continues.
+        contacts: tells what is known of them.
     """
 
-    def __init__(self, file: TextIO) -> None:
+    def __init__(self, file: TextIO, contacts: LiveContacts) -> None:
         self._file: TextIO | None = file
+        self._contacts = contacts
         self._alarm, self._stale, self._unknown = False, True, False
 
     def observe(self, verdict: Verdict | None, reason: str, alarm: bool) -> None:
@@ -541,7 +562,8 @@ class AlarmLog:
         if self._file is None:
             return
         try:
-            self._file.write(json_line({"event": event, **verdict_message(verdict, reason, alarm)}) + "\n")
+            message = verdict_message(verdict, reason, alarm, self._contacts.state())
+            self._file.write(json_line({"event": event, **message}) + "\n")
             self._file.flush()
         except OSError as error:
             self._file = None
@@ -561,7 +583,7 @@ def log_alarms(display: Display, path: Path) -> Iterator[None]:
     except OSError as error:
         raise unwritable(path, error, "live.log=FILE.jsonl") from error
     with file:
-        log = AlarmLog(file)
+        log = AlarmLog(file, display.contacts)
         log.write("started")
         display.observers.append(log.observe)
         display.listeners.append(log.write)

@@ -17,6 +17,7 @@ from rich.table import Table
 from rich.text import Text
 from scipy.spatial import ConvexHull, Delaunay
 
+from skin.hardware.live.contacts import contact_text_lines
 from skin.hardware.live.loop import Display, DisplayState
 from skin.hardware.wire.segmentation import typed_lines
 from skin.learning.representation import centres, weights
@@ -166,7 +167,8 @@ def _sentence(state: DisplayState) -> str:
 def screen(display: Display, state: DisplayState, picture: SkinPicture) -> RenderableType:
     """Return the skin beside the verdict, with the status of the stream below."""
     info, beside = display.info, Table.grid(padding=(0, 3))
-    beside.add_row(_map(picture(state.map, state.valid)), _verdict(state))
+    contacts = Text("\n".join(contact_text_lines(state.contacts)))
+    beside.add_row(_map(picture(state.map, state.valid)), Group(_verdict(state), Text(), contacts))
     border = "bold red" if state.alarm else "dim"
     panel = Panel(beside, title=f"{info.title} on {info.port}", border_style=border, expand=False)
     return Group(panel, Text(state.line or " ", style="dim"), Text(_KEYS, style="dim"))

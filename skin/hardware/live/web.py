@@ -20,6 +20,7 @@ from starlette.routing import Route
 
 from skin.core.files import json_line
 from skin.errors import InputError
+from skin.hardware.live.contacts import contact_text_lines
 from skin.hardware.live.loop import Display, DisplayState
 from skin.hardware.live.terminal import SkinPicture, contact_text
 
@@ -87,6 +88,8 @@ def message(state: DisplayState, picture: SkinPicture) -> dict[str, Any]:
         "trouble": state.trouble,
         "alarm": state.alarm,
         "line": state.line,
+        "contacts": state.contacts,
+        "contact_text": contact_text_lines(state.contacts),
     }
 
 

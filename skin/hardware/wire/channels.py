@@ -132,6 +132,8 @@ class UnitConversion:
         changing: (S,), share of the frames of the untouched skin that differed from the one before; None:
             unknown.
         curves: of the sensors, for gain 1; None: all are linear.
+        rest: (S,), N, mean of the frames of the untouched skin: below 0, because the zero is that of the
+            largest values of intervals; None: unknown.
     """
 
     scale: np.ndarray
@@ -140,6 +142,7 @@ class UnitConversion:
     noise: np.ndarray | None = None
     changing: np.ndarray | None = None
     curves: Curves | None = None
+    rest: np.ndarray | None = None
 
     def __call__(self, values: np.ndarray, valid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return readings (..., S), N, 0 where invalid, and a mask of the valid ones, (..., S), bool.
@@ -439,9 +442,10 @@ class Tare:
             return
         frames = np.stack([frame.values for frame in self._quiet])
         steps = np.diff(frames, axis=0)
-        noise = np.diff(fresh.newtons(frames), axis=0).std(axis=0) / np.sqrt(2)
+        newtons = fresh.newtons(frames)
+        noise, rest = np.diff(newtons, axis=0).std(axis=0) / np.sqrt(2), newtons.mean(axis=0)
         changing = (steps != 0).mean(axis=0)
-        self.conversion = replace(fresh, noise=noise, changing=changing)
+        self.conversion = replace(fresh, noise=noise, changing=changing, rest=rest)
         lacks = (
             [f"{_channels(untared)} at the limit or without a value: no baseline"] if untared.any() else []
         )

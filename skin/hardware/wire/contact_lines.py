@@ -11,7 +11,7 @@ from math import isfinite, nan
 import numpy as np
 
 from skin.hardware.wire.protocol import crc16
-from skin.touch.fingertips import CONTACT
+from skin.touch.labels import CONTACT
 
 _VERSION = 1
 _NUMBERS = ("number", "lines", "frames", "most", "frame")

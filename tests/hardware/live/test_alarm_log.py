@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from skin.errors import InputError
+from skin.hardware.live.contacts import LiveContacts
 from skin.hardware.live.engine import Verdict
 from skin.hardware.live.loop import AlarmLog, Display, DisplayInfo, log_alarms
 
@@ -58,7 +59,7 @@ def test_a_full_disk_ends_the_log_and_not_the_view(capsys):
         def write(self, text):
             raise OSError("No space left on device")
 
-    log = AlarmLog(Full())
+    log = AlarmLog(Full(), LiveContacts())
     log.observe(verdict(True), "", False)
     log.observe(verdict(False), "", False)
     assert capsys.readouterr().err == "the alarm log ends here: No space left on device\n"

@@ -23,7 +23,7 @@ from skin.runs.onnx_writer import write_model
 pytest.importorskip("onnxruntime")
 RATE = 100.0  # Hz, of the device
 PATIENCE = 300  # s
-LIVE = LiveSettings(0, 4.0, None, 0.2, None, None, True, DebounceSettings())
+LIVE = LiveSettings(0, 4.0, None, 0.2, None, None, False, True, DebounceSettings())
 WATCH = """
 import sys
 from skin.__main__ import main

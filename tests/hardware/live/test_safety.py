@@ -101,6 +101,11 @@ class Watching:
         inside = [(verdict, on) for at, verdict, _, on in self.said if begin < at < end]
         return {"unknown" if verdict is None else verdict.state for verdict, _ in inside}
 
+    def states_of_frames(self, begin, end):
+        """Return the states that frames of some seconds of the device's clock led to, however late."""
+        inside = [verdict for _, verdict, _, _ in self.said if verdict and begin < verdict.t < end]
+        return {verdict.state for verdict in inside}
+
     def first(self, after):
         """Return when the first alarm came, s of the stream."""
         return next((at for at, _, _, on in self.said if on and at >= after), np.inf)
@@ -168,7 +173,7 @@ def test_a_broken_wire_does_not_clear_the_alarm(broken):
 def test_values_that_fall_with_force_are_unknown_and_told():
     values = force(12, (6, 8, 4, -6.0), (6, 8, 5, -3.0))
     seen = Watching(lines(values))
-    assert seen.states(6 + LATE, 8) == {"unknown"}
+    assert seen.states_of_frames(6.2, 7.95) == {"unknown"}
     verdict = next(verdict for at, verdict, _, _ in seen.said if verdict and at > 7)
     assert "device.scale" in verdict.reason
 

@@ -147,7 +147,7 @@ def test_the_ros_node_publishes_verdicts_and_marks_their_loss(monkeypatch):
     for name, module in modules.items():
         monkeypatch.setitem(sys.modules, name, module)
     path = ROOT / "docs" / "examples" / "ros2_node.py"
-    assert len(path.read_text().splitlines()) <= 85
+    assert len(path.read_text().splitlines()) <= 90
     spec = importlib.util.spec_from_file_location("ros2_node", path)
     example = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(example)
@@ -174,8 +174,12 @@ def test_the_ros_node_publishes_verdicts_and_marks_their_loss(monkeypatch):
         pushing.join()
         lines = [json.loads(data) for topic, data in published if topic == "~/verdict"]
         assert any(line["event"] == "verdict" for line in lines)
+        contacts = [json.loads(data) for topic, data in published if topic == "~/contacts"]
+        assert contacts == [line["contacts"] for line in lines]
     published.clear()
     until(("~/stale", True))
+    lost = [json.loads(data) for topic, data in published if topic == "~/contacts"]
+    assert {contacts["state"] for contacts in lost} <= {"unknown"}
     assert ("~/danger", False) not in published  # the loss of the connection clears no alarm
     node.destroy_node()
     assert published[-1] == ("destroyed", "skin")

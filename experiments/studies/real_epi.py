@@ -150,13 +150,13 @@ def _label_lines(
 ) -> Iterator[dict[str, Any]]:
     for number, name in enumerate(recording.task.names):
         goals = {"press": 99.9, "big": 96.5, "dynamic": 95.5} if row.goal is not None else {}
-        known = int((~recording.touches.known_labels[:, number].isnan()).sum())
+        tested = len(recording) - (training if isinstance(training, int) else 0)
         column = values[:, number]
         low, high = spread(column)
         yield result_line(
             replace(row, goal=goals.get(name)),
             training,
-            known,
+            tested,
             estimator,
             metric=f"balanced accuracy, {name}",
             value=float(column.mean()),

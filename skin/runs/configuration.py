@@ -45,6 +45,8 @@ ADDED = {
     "footprint_error": 0.0,
     "described": None,
     "interface": 0.0,
+    "task": None,
+    "targets": None,
 }
 """Settings of a device that came later, with the values that earlier runs mean; those count as left out."""
 _FOLDERS = ("skin", "experiments", "conf", "data")  # results depend on nothing else in the repository
@@ -177,6 +179,7 @@ class Config:
 
     row: str | None = None
     seed: int = 0
+    task: str | None = None
     epochs: dict[str, int] = field(default_factory=dict)
     touch: dict[str, Any] = field(default_factory=dict)
     body: dict[str, Any] = field(default_factory=dict)

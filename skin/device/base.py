@@ -1,10 +1,11 @@
 """The interface of a device: a source of touches."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
+from threading import Thread
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import torch
@@ -306,6 +307,7 @@ def split_shards(split: Split, counts: Sequence[int], seed: int) -> Iterator[tup
 # Draw batches on as many threads as torch has.
 
 
+_S = TypeVar("_S")
 _T = TypeVar("_T")
 _PART = 8  # batches: enough for few files, and little enough for memory
 
@@ -327,6 +329,32 @@ def in_threads(work: Callable[[int], _T], count: int) -> list[_T]:
     finally:
         pool.shutdown(wait=not ended, cancel_futures=True)
         torch.set_num_threads(threads)
+
+
+def in_background(work: Callable[[], _T]) -> Future[_T]:
+    """Return the result of ``work()`` to come, from a thread that does not outlive the command."""
+    future: Future[_T] = Future()
+
+    def run() -> None:
+        try:
+            future.set_result(work())
+        except BaseException as error:
+            future.set_exception(error)
+
+    Thread(target=run, daemon=True).start()
+    return future
+
+
+def one_ahead(work: Callable[[_S], _T], values: Iterable[_S]) -> Iterator[_T]:
+    """Yield ``work(value)`` in order; the next one is computed on another thread meanwhile."""
+    current: Future[_T] | None = None
+    for value in values:
+        following = in_background(partial(work, value))
+        if current is not None:
+            yield current.result()
+        current = following
+    if current is not None:
+        yield current.result()
 
 
 def joined(batches: Sequence[Part]) -> Recording:

@@ -1,11 +1,12 @@
 """Imperfections of a real device: lag, gain, curve, clip, noise, offset, rounding, dead sensors, tare."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 import torch
-from annotated_types import Ge, Gt
+from annotated_types import Ge, Gt, Le
 from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat
 from torch import Tensor
 
@@ -59,6 +60,16 @@ class Constants(NamedTuple):
 
 _IDLE_FRAMES = 30
 
+_EQUAL = 1e-6
+_COMPARED = {
+    "rate": ("rate", " Hz"),
+    "time_constant": ("lag", " s"),
+    "noise": ("noise", " N"),
+    "gain_spread": ("spread of the gains", ""),
+    "scale_spread": ("spread of the scale", ""),
+    "drift": ("drift", " N/s"),
+    "hysteresis": ("hysteresis", ""),
+}
 _SPREADS = ("gain_spread", "noise", "drift", "hysteresis", "time_constant", "exponent", "scale_spread")
 
 Spread = NonNegativeFloat | Annotated[tuple[NonNegativeFloat, NonNegativeFloat], RISING]
@@ -98,6 +109,7 @@ class ImperfectionSettings:
         independent: each range above has a share of its own.
         aligned: touches begin and end at the edges of the model's intervals; False: anywhere in them, as on
             a real skin.
+        framed: share of devices that read the frames of the model whatever ``rate`` and ``aligned`` say.
     """
 
     gain_spread: Spread = 0.05
@@ -120,6 +132,7 @@ class ImperfectionSettings:
     rate: PositiveFloat | Annotated[tuple[PositiveFloat, PositiveFloat], RISING] = 10.0
     independent: bool = False
     aligned: bool = True
+    framed: Annotated[float, Ge(0), Le(1)] = 0.0
 
     @property
     def slowest(self) -> float:
@@ -334,6 +347,25 @@ class Imperfection(ImperfectionSettings):
         if constants.quantum.any():
             output = quantize(output + constants.baseline, constants.quantum) - constants.baseline
         return output, saturated
+
+
+def outside(settings: Mapping[str, Any], ranges: Mapping[str, Any]) -> list[str]:
+    """Return what of a device lies outside the ranges of others, as "lag 0.2 s (0 to 0.12 s)".
+
+    Args:
+        settings: of the device (:class:`ImperfectionSettings`); what it does not name is not compared.
+        ranges: the same of devices that were drawn.
+    """
+    texts = list[str]()
+    for name, (text, unit) in _COMPARED.items():
+        if settings.get(name) is None or ranges.get(name) is None:
+            continue
+        (least, most), (low, high) = (np.broadcast_to(values[name], 2) for values in (settings, ranges))
+        # A device with less noise, drift or lag is easier; a slower one is not.
+        if most > high * (1 + _EQUAL) or (name == "rate" and least < low * (1 - _EQUAL)):
+            value = f"{least:g}" if least == most else f"{least:g} to {most:g}"
+            texts.append(f"{text} {value}{unit} ({low:g} to {high:g}{unit})")
+    return texts
 
 
 def _part(spread: Spread, share: np.ndarray) -> np.ndarray:

@@ -17,6 +17,7 @@ _QUANTILES = 20000
 _NUMBERS = tuple(np.geomspace(1, 1000, 61).tolist())  # of frames in an interval; between them, 0.001 s.d.
 _SENSED = 5  # times the model's rate, of hysteresis, lag and curve; odd, so that a frame of the model is one
 _FAINT = 0.01  # standard deviations of the noise below which a sensor feels nothing
+_EXTREME = np.float32(1e-7)  # chance of the least and largest noise
 _ELEMENTS = 2**19  # frames times sensors at a time, which the cache holds
 
 
@@ -85,7 +86,7 @@ def measure(
         readings (B, T, S), N, float32, valid and saturated (B, T, S), bool.
     """
     rate = imperfection.rate
-    if not imperfection.aligned or not isinstance(rate, int | float):
+    if not imperfection.aligned or imperfection.framed or not isinstance(rate, int | float):
         return _measure_each(imperfection, constants, force, model_rate, noise)
     if rate <= model_rate:
         return imperfection.apply(force, constants, noise)
@@ -114,6 +115,9 @@ def _measure_each(
     else:
         # Later by part of an interval; earlier where the window ends with the touch.
         shifts -= (force[:, -1] != 0).any(dim=1).cpu().numpy()
+    if imperfection.framed:
+        framed = noise.random(batch) < imperfection.framed
+        ratios, shifts = np.where(framed, 1, ratios), np.where(framed, 0, shifts)
     padded, fine = torch.nn.functional.pad(force, (0, 0, 0, 1)), 1
     if not imperfection.is_static(constants, sensors):
         fine = _SENSED
@@ -189,6 +193,8 @@ def _draw_highest(counts: np.ndarray, sensors: int, noise: np.random.Generator) 
     Its chance to be below x is the normal one to the power of the count, and is itself uniform.
     """
     drawn = noise.standard_exponential((len(counts), sensors), dtype=np.float32)
+    # One draw in some millions is 0 or rounds to a chance of 1, whose quantiles are infinite.
+    drawn = np.clip(drawn, _EXTREME, -np.log(_EXTREME))
     return -ndtri(-np.expm1(-drawn / counts[:, None].astype(np.float32)))
 
 

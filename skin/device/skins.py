@@ -3,7 +3,7 @@
 import math
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from functools import cached_property, partial
 from typing import Annotated, Any, Literal
 
@@ -303,6 +303,7 @@ class Skins(ImperfectionSettings, AbstractDevice):
         skin_seed: of the skins.
         touch, gestures, test_gestures, padded, fresh, data_seed: as in
             :class:`skin.device.simulated.Simulated`.
+        training_touch: settings of ``touch`` that differ on the skins to train on.
         gain_spread, offset, noise, ...: as there; every gesture has a device of its own.
 
     Raises:
@@ -317,6 +318,7 @@ class Skins(ImperfectionSettings, AbstractDevice):
     test_skins: Annotated[int, Ge(1)] = 20
     skin_seed: Annotated[int, Ge(0)] = 0
     touch: Mapping[str, Any] | TouchSettings | None = None
+    training_touch: Mapping[str, Any] = field(default_factory=dict)
     gestures: Annotated[int, Ge(10)] = 40_000
     test_gestures: Annotated[int, Ge(1)] = 4000
     padded: bool = True
@@ -327,6 +329,7 @@ class Skins(ImperfectionSettings, AbstractDevice):
         self.distribution = configured(SkinDistribution, self.skins, "device.skins")
         self.task, self.size, self.sensors = TOUCH, self.body.size, self.layout.sensors(self.body)
         self.window = read_touch(self.touch).frames.window
+        self._wider = wider_touch(self.touch, self.training_touch)
         self._kept: dict[str, Touches] = {}
 
     @cached_property
@@ -342,7 +345,7 @@ class Skins(ImperfectionSettings, AbstractDevice):
     @property
     def reference(self) -> Simulated:
         """The skin of body, layout and simulator, with other imperfections in every touch."""
-        return self._simulated(DrawnSkin(self.body, self.layout, self.simulator, 0.0), 0)
+        return self._simulated(DrawnSkin(self.body, self.layout, self.simulator, 0.0), 0, self.touch)
 
     def strips(self) -> Iterator[Touches]:
         """Yield test streams on :attr:`reference`, without end."""
@@ -358,9 +361,12 @@ class Skins(ImperfectionSettings, AbstractDevice):
 
     def _skin(self, part: int, number: int) -> Simulated:
         random = generator(Stream.SKIN, self.skin_seed, part, number)
-        return self._simulated(self.distribution.draw(random, mixed=part == _TRAINING), number)
+        touch = self._wider if part == _TRAINING else self.touch
+        return self._simulated(self.distribution.draw(random, mixed=part == _TRAINING), number, touch)
 
-    def _simulated(self, skin: DrawnSkin, number: int) -> Simulated:
+    def _simulated(
+        self, skin: DrawnSkin, number: int, touch: Mapping[str, Any] | TouchSettings | None
+    ) -> Simulated:
         imperfections = {entry.name: getattr(self, entry.name) for entry in fields(ImperfectionSettings)}
         sensors = len(skin.layout.sensors(skin.body))
         imperfections["dead"] = [
@@ -373,7 +379,7 @@ class Skins(ImperfectionSettings, AbstractDevice):
             position_error=skin.position_error,
             footprint_error=skin.footprint_error,
             described=skin.described,
-            touch=self.touch,
+            touch=touch,
             padded=self.padded,
             randomise=True,
             seed=number,
@@ -418,6 +424,24 @@ class Skins(ImperfectionSettings, AbstractDevice):
         rate = float(read_touch(self.touch).rate)
         touches = Touches(empty, empty == 0, positions, None, rate, geometry=geometry)
         return Blank.of(self.task, self.size, touches)
+
+
+def wider_touch(touch: Mapping[str, Any] | TouchSettings | None, changes: Mapping[str, Any]) -> TouchSettings:
+    """Return the settings of touches with other ones of the same window.
+
+    Args:
+        touch: as :func:`skin.touch.fingertips.read_touch` takes it.
+        changes: settings by name.
+
+    Raises:
+        InputError: settings that are not valid, or another window.
+    """
+    settings = read_touch(touch)
+    given = {entry.name: getattr(settings, entry.name) for entry in fields(settings)}
+    wider = type(settings).of(given | dict(changes))
+    if (wider.frames.window, wider.rate) != (settings.frames.window, settings.rate):
+        raise InputError("device.training_touch must keep touch.window and touch.rate: leave these two out")
+    return wider
 
 
 def join_skins(parts: Sequence[Touches]) -> Touches:

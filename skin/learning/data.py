@@ -1,8 +1,9 @@
 """The LightningDataModule: touches as batches of frames."""
 
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from hashlib import sha256
 from typing import Any
 
@@ -12,7 +13,7 @@ from pydantic import NonNegativeFloat, PositiveInt
 from torch import Tensor
 
 from skin.core.settings import checked
-from skin.device.base import AbstractDevice, Split
+from skin.device.base import AbstractDevice, Split, in_background, one_ahead
 from skin.device.touches import Touches, touches_hash
 from skin.errors import InputError
 from skin.learning.representation import AbstractRepresentation, Frames, idle_level
@@ -135,6 +136,7 @@ class TouchData(pl.LightningDataModule):
         self.augmentation = None if augmentation == Augmentation() else augmentation
         self._known: tuple[Tensor, AbstractRepresentation] | None = None
         self._drawn: dict[str, Touches] = {}
+        self._ahead: dict[int, Future[Touches]] = {}
 
     @property
     def task(self) -> Task:
@@ -184,11 +186,30 @@ class TouchData(pl.LightningDataModule):
 
     def touches(self, split: Split, epoch: int = 0) -> Touches:
         """Return the touches of a split; those of epoch 0 are kept."""
-        if epoch == 0 or not getattr(self.device, "fresh", False):
+        if epoch == 0 or not self._fresh:
             if split not in self._drawn:
                 self._drawn[split] = self.device.touches(split)
             return self._drawn[split]
-        return self.device.touches(split, epoch)
+        ahead = self._ahead.pop(epoch, None) if split == "train" else None
+        return self.device.touches(split, epoch) if ahead is None else ahead.result()
+
+    def draw_ahead(self, epoch: int) -> None:
+        """Begin to draw the new gestures of an epoch on a thread beside the one that trains."""
+        if self.alongside and self.trainer is not None and epoch < (self.trainer.max_epochs or 0):
+            self._ahead[epoch] = in_background(partial(self.device.touches, "train", epoch))
+
+    @property
+    def alongside(self) -> bool:
+        """Whether new gestures and frames are computed on threads beside the one that trains.
+
+        With more threads each draw uses all of them, and changes their number meanwhile.
+        """
+        here = self.trainer is not None and self.trainer.strategy.root_device.type == "cpu"
+        return here and self._fresh and torch.get_num_threads() == 1
+
+    @property
+    def _fresh(self) -> bool:
+        return bool(getattr(self.device, "fresh", False))
 
     def representation_for(self, positions: Tensor) -> AbstractRepresentation:
         """Return the representation of a layout with positions (S, 3), m; that of the last layout is kept.
@@ -238,9 +259,9 @@ class TouchData(pl.LightningDataModule):
         """Return the batches of the validation split."""
         return _Batches(self, "validation")
 
-    def on_after_batch_transfer(self, batch: Touches, dataloader_idx: int) -> Batch:
+    def on_after_batch_transfer(self, batch: Touches | Batch, dataloader_idx: int) -> Batch:
         """Return the frames and labels of a batch that has arrived where the network is."""
-        return self.frames(batch)
+        return self.frames(batch) if isinstance(batch, Touches) else batch
 
 
 class _Batches:
@@ -252,7 +273,14 @@ class _Batches:
     def __len__(self) -> int:
         return sum(-(-count // self.data.batch_size) for count in self.data.count(self.split))
 
-    def __iter__(self) -> Iterator[Touches]:
+    def __iter__(self) -> Iterator[Touches | Batch]:
+        data = self.data
+        if self.split == "train" and data.alongside:
+            yield from one_ahead(data.frames, self._touches())
+        else:
+            yield from self._touches()
+
+    def _touches(self) -> Iterator[Touches]:
         data = self.data
         if self.split != "train":
             for touches in data.parts(self.split):
@@ -260,6 +288,7 @@ class _Batches:
                     yield touches[start : start + data.batch_size]
             return
         epoch = data.trainer.current_epoch if data.trainer else 0
+        data.draw_ahead(epoch + 1)
         # one stream per (seed, epoch); a mere sum would give seed 1 the orders of seed 0, an epoch late
         generator = torch.Generator().manual_seed(data.seed * 1_000_003 + epoch)
         for touches in data.parts(self.split, epoch, generator):

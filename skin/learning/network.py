@@ -385,6 +385,8 @@ class Network(AbstractLearner):
         warmup: share of the training in which the learning rate rises to that of the optimizer; it then
             decays to 0 along a cosine. None: constant.
         dropout: probability of dropout for the embedding and the dense layers.
+        start: file ``weights.pt`` of the same network, from which the training goes on; None: drawn weights.
+            Statistics of batch norm begin anew.
         seed: of weights and dropout only; the global random state does not change.
     """
 
@@ -398,8 +400,10 @@ class Network(AbstractLearner):
         activation: str = "relu",
         warmup: Annotated[float, Ge(0), Le(1)] | None = None,
         dropout: Annotated[float, Ge(0), Lt(1)] = 0.0,
+        start: str | None = None,
         seed: int = 0,
     ) -> None:
+        self._start = None if start is None else Path(start).expanduser()
         self._fusion = partial(fusion, model)
         self._optimizer, self._trainer = optimizer, dict(trainer)
         self._hidden, self._activation, self._seed = hidden, activation, seed
@@ -411,6 +415,7 @@ class Network(AbstractLearner):
         """Build network, optimizer and trainer once, so that errors in the settings are reported early."""
         with torch.random.fork_rng():
             network = self.build(data)
+        self._begin(network)
         self._trainer_of(None, [])
         settings = self._optimizer.keywords if isinstance(self._optimizer, partial) else {}
         if text := [name for name, value in settings.items() if isinstance(value, str)]:
@@ -433,6 +438,7 @@ class Network(AbstractLearner):
             classifier = self.build(data)
             if data.task.kind == "regression":
                 classifier.targets.scale(torch.cat([part.known_labels for part in data.parts("train")]))
+            self._begin(classifier)
             best = ModelCheckpoint(folder, monitor="val_loss", save_weights_only=True)
             clock, last = Clock(folder / "seconds.json"), folder / LAST
             trainer = self._trainer_of(logger, [best, clock], folder)
@@ -451,6 +457,28 @@ class Network(AbstractLearner):
             weights = torch.load(best.best_model_path, weights_only=True, map_location="cpu")
             classifier.load_state_dict(weights["state_dict"])
             self.seconds_per_epoch = clock.median()
+
+    def _begin(self, classifier: TouchClassifier) -> None:
+        """Give a network the weights of ``start``.
+
+        Raises:
+            InputError: there is no such file, or it is of another network.
+        """
+        if self._start is None:
+            return
+        if not self._start.is_file():
+            raise InputError(f"learner.start={self._start}: no such file")
+        check_archive(self._start)
+        weights = torch.load(self._start, weights_only=True, map_location="cpu")
+        try:
+            classifier.load_state_dict(weights)
+        except RuntimeError as error:
+            raise InputError(
+                f"learner.start={self._start} is of another network: {one_line(error)}"
+            ) from error
+        for module in classifier.modules():
+            if isinstance(module, nn.BatchNorm1d):
+                module.reset_running_stats()
 
     @contextmanager
     def _folder(self) -> Iterator[Path]:

@@ -38,17 +38,21 @@ from skin.evaluation.settings import Evaluation
 
 MACHINE = ("accelerator", "devices", "enable_progress_bar", "num_nodes", "precision", "strategy")
 """Settings of Lightning's Trainer that choose the machine, not the result."""
-ADDED = {
+ADDED: dict[str, Any] = {
     "scale_spread": 0.0,
     "independent": False,
     "aligned": True,
+    "framed": 0.0,
     "footprint_error": 0.0,
     "described": None,
     "interface": 0.0,
     "task": None,
     "targets": None,
+    "second": 0.0,
+    "training_touch": {},
+    "start": None,
 }
-"""Settings of a device that came later, with the values that earlier runs mean; those count as left out."""
+"""Settings that came later, and the values that earlier runs mean: not counted."""
 _FOLDERS = ("skin", "experiments", "conf", "data")  # results depend on nothing else in the repository
 
 
@@ -65,7 +69,7 @@ def _counted(value: Any, group: str = "") -> Any:
     if not isinstance(value, dict):
         return value
     left_out = MACHINE if group == "trainer" else ()
-    added = ADDED if group in ("device", "skins") else {}
+    added = ADDED if group in ("device", "skins", "touch", "learner") else {}
     return {
         key: _counted(entry, key)
         for key, entry in value.items()

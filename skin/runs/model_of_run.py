@@ -525,15 +525,23 @@ def load_model(
 
 
 def _warn_of_unknown_skin(stored: Config, config: Config) -> None:
-    """Warn where a run that was trained on drawn skins is used on one that they do not include."""
-    if (ranges := stored.device.get("skins")) is None:
+    """Warn where a run that was trained on drawn skins is used on others than those."""
+    if (distributed := stored.device.get("skins")) is None:
         return
+    from skin.device.calibration import read_calibration
+    from skin.device.imperfection import outside
     from skin.device.skins import SkinDistribution
 
-    distribution, skin = configured(SkinDistribution, ranges, "device.skins"), build_skin(config)
-    if outside := distribution.outside(skin.body, skin.sensors):
+    distribution, skin = configured(SkinDistribution, distributed, "device.skins"), build_skin(config)
+    unlike = distribution.outside(skin.body, skin.sensors)
+    if "skins" not in config.device:
+        path = config.device.get("calibration")
+        measured = {} if path is None else read_calibration(path).values()
+        ranges = {name: (values.min(), values.max()) for name, values in measured.items()}
+        unlike += outside(config.device | ranges, stored.device)
+    if unlike:
         warnings.warn(
-            f"this skin is unlike those that the run was trained on: {', '.join(outside)}; its verdicts may "
+            f"this skin is unlike those that the run was trained on: {', '.join(unlike)}; its verdicts may "
             "be worse than the run's results",
             UserWarning,
             stacklevel=3,

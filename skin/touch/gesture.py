@@ -181,8 +181,11 @@ class TouchSettings(ABC):
 class GestureSettings(TouchSettings):
     """Ranges of the report's gestures; ``conf/touch/gestures.yaml`` holds the same defaults and their units.
 
+    Attributes:
+        second: share of touches with a second gesture at the same time (:mod:`skin.touch.pairs`).
+
     Raises:
-        InputError: as :class:`TouchSettings`.
+        InputError: as :class:`TouchSettings`, or two gestures at a time that slide with friction.
     """
 
     shapes: Annotated[tuple[str, ...], MinLen(1)] = (
@@ -201,8 +204,14 @@ class GestureSettings(TouchSettings):
     stretch: Annotated[float, Ge(1)] = 4.0
     leak: Annotated[float, Ge(0.5), Le(1)] = 0.6
     strict: bool = False
+    second: Annotated[float, Ge(0), Le(1)] = 0.0
 
     def __post_init__(self) -> None:
+        if self.second and self.shear:
+            raise InputError(
+                "two gestures at a time have no common direction of friction: set touch.second=0 or "
+                "touch.shear=0"
+            )
         lines = self.thresholds
         # (name, lowest allowed, highest allowed): a range beyond its threshold would be redrawn forever.
         for name, low, high in (

@@ -27,6 +27,7 @@ from skin.touch.gesture import (
 )
 from skin.touch.labels import TOUCH
 from skin.touch.movie import Measures, Movie, join_movies, measure_gestures
+from skin.touch.pairs import add_second
 from skin.touch.shapes import Fit, Shapes
 
 _ATTEMPTS = 50
@@ -239,6 +240,11 @@ class TouchSampler(AbstractSampler):
     ) -> None:
         super().__init__(body, footprints, contact, GestureSettings.of(settings), padded, moments)
         self.leak, self.strict = self.settings.leak, self.settings.strict
+        if self.settings.second and not contact.proportional:
+            raise InputError(
+                "the pressures of two gestures at a time add up only with contact=prescribed: set that, or "
+                "touch.second=0"
+            )
 
     @cached_property
     def fit(self) -> Fit | None:
@@ -286,7 +292,9 @@ class TouchSampler(AbstractSampler):
                 pending = pending[~chosen & ~given_up]
             pending = np.concatenate([pending, *hopeless])
         tally.warn()
-        return join_movies(movies)[torch.from_numpy(np.concatenate(finished).argsort())]
+        movie = join_movies(movies)[torch.from_numpy(np.concatenate(finished).argsort())]
+        share, contact = self.settings.second, self.settings.thresholds.contact
+        return add_second(movie, share, contact, generator) if share else movie
 
     def _round(
         self, pending: np.ndarray, wanted: np.ndarray, gestures: Draws, chance: np.ndarray, tally: _Tally

@@ -178,6 +178,29 @@ def test_touches_begin_anywhere_in_an_interval():
     assert not readings[:, 0].any()
 
 
+@pytest.mark.parametrize("drawn", [0.0, 1e-12, 30.0])
+def test_rare_draws_of_noise_are_finite(drawn):
+    class Rare(np.random.Generator):
+        def standard_exponential(self, size=None, dtype=np.float64, **options):
+            return np.full(size, drawn, dtype)
+
+    device = Imperfection(rate=(10.0, 1000.0), aligned=False, gain_spread=0.0, offset=0.0, noise=1.0)
+    constants = device.constants(3, np.random.default_rng(0), 50)
+    readings = measure(device, constants, torch.zeros(50, 12, 3), 10.0, Rare(np.random.PCG64(1)))[0]
+    assert readings.isfinite().all()
+    assert readings.abs().max() < 8
+
+
+def test_a_share_of_devices_reads_the_frames_of_the_model():
+    force = touches()[:1].expand(2000, -1, -1)
+    quiet = {"noise": 0.0, "offset": 0.0, "gain_spread": 0.0}
+    device = Imperfection(rate=(10.0, 1000.0), aligned=False, framed=0.3, **quiet)
+    constants = device.constants(3, np.random.default_rng(0), 2000)
+    readings = measure(device, constants, force, 10.0, np.random.default_rng(1))[0]
+    framed = (readings - force).abs().amax(dim=(1, 2)) < 1e-6
+    assert framed.float().mean().item() == pytest.approx(0.3, abs=0.05)
+
+
 def test_independent_ranges_are_not_correlated():
     ranges = {
         "noise": (0.0, 0.1),

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from skin.device.calibration import Calibration
-from skin.device.imperfection import Imperfection
+from skin.device.imperfection import Imperfection, outside
 from skin.device.sampling import measure
 from skin.errors import InputError
 
@@ -243,3 +243,12 @@ def test_spreads_grow_with_the_share_of_a_device():
 def test_what_is_no_range_is_refused(given):
     with pytest.raises(InputError, match=r"device\.noise"):
         Imperfection(noise=given)
+
+
+def test_what_lies_outside_of_other_devices_is_named():
+    ranges = {"rate": [20.0, 500.0], "time_constant": [0.0, 0.1], "noise": 0.05, "drift": [0.0, 0.05]}
+    assert outside({"rate": 100.0, "time_constant": 0.1, "noise": 0.02, "gain_spread": 0.3}, ranges) == []
+    device = {"rate": 10.0, "time_constant": [0.0, 0.2], "noise": 0.06}
+    assert outside(device, ranges) == [
+        "rate 10 Hz (20 to 500 Hz)", "lag 0 to 0.2 s (0 to 0.1 s)", "noise 0.06 N (0.05 to 0.05 N)"
+    ]  # fmt: skip

@@ -40,6 +40,17 @@ def test_an_epoch_is_new_and_repeatable_and_validation_stays(device):
     assert device.touches("validation", 1) is device.touches("validation", 2)
 
 
+def test_training_skins_may_have_other_touches(configured):
+    changes = "+device.training_touch.second=0.5", "+device.training_touch.press=[0.4,2.8]"
+    wider = build_device(configured(*SMALL, *changes))
+    assert {skin.sampler.settings.second for skin in wider.training_skins} == {0.5}
+    assert {skin.sampler.settings.frames.press for skin in wider.training_skins} == {(4, 28)}
+    for skin in (*wider.unseen_skins, wider.reference):
+        assert (skin.sampler.settings.second, skin.sampler.settings.frames.press) == (0.0, (4, 20))
+    with pytest.raises(InputError, match=r"touch\.window"):
+        build_device(configured(*SMALL, "+device.training_touch.window=4.0"))
+
+
 def test_test_skins_are_not_training_skins(device):
     sizes = {skin.body.size for skin in device.training_skins}
     assert not sizes & {skin.body.size for skin in device.unseen_skins}

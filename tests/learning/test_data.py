@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import partial
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -47,7 +48,8 @@ CUTS = [(0, 7), (7, 19), (19, 23)]
 
 
 class Trainer:
-    current_epoch, world_size, global_rank = 0, 1, 0
+    current_epoch, world_size, global_rank, max_epochs = 0, 1, 0, 3
+    strategy = SimpleNamespace(root_device=torch.device("meta"))
 
 
 @pytest.fixture
@@ -89,6 +91,21 @@ def test_an_epoch_shows_every_gesture_once(make):
     assert sorted(flat(batches)) == list(range(23))
     assert [len(batch) for batch in numbers(batches)] == [5, 5, 5, 5, 3]
     assert len(batches) == 5
+
+
+def test_one_thread_trains_while_another_draws_the_next_epoch(make, monkeypatch):
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 1)
+    data, other = make(fresh=True), make(fresh=True)
+    data.trainer.strategy = SimpleNamespace(root_device=torch.device("cpu"))
+    for epoch in range(3):
+        data.trainer.current_epoch = other.trainer.current_epoch = epoch
+        batches = [data.on_after_batch_transfer(batch, 0) for batch in data.train_dataloader()]
+        expected = [other.frames(batch) for batch in other.train_dataloader()]
+        assert len(batches) == len(expected) == 5
+        for batch, (frames, labels) in zip(batches, expected, strict=True):
+            assert torch.equal(batch[0].x, frames.x)
+            assert torch.equal(batch[1], labels)
+    assert sorted(data.device.asked) == [("train", epoch) for epoch in range(3)]
 
 
 def test_the_order_follows_from_seed_and_epoch(make):

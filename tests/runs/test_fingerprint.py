@@ -31,12 +31,12 @@ def test_settings_that_came_later_make_no_other_run(configured, device, profile)
     """A run that finished before them has their values without naming them, and is found again."""
     config = configured(f"device={device}", f"profile={profile}")
     former = deepcopy(config)
-    groups = [former.device, former.device.get("skins", {})]
+    groups = [former.device, former.device.get("skins", {}), former.device["touch"], former.touch]
     missing = [{name: group.pop(name) for name in ADDED if name in group} for group in groups]
-    assert set().union(*missing) >= {"scale_spread", "independent", "aligned", "footprint_error"}
+    assert set().union(*missing) >= {"scale_spread", "independent", "aligned", "framed", "second"}
     assert all(value == ADDED[name] for group in missing for name, value in group.items())
     assert fingerprint(config) == fingerprint(former)
-    others = {"scale_spread": 0.1, "independent": True, "aligned": False, "footprint_error": 0.1}
+    others = {"scale_spread": 0.1, "independent": True, "aligned": False, "framed": 0.1}
     for name, value in others.items():
         assert fingerprint(replace(former, device=former.device | {name: value})) != fingerprint(former)
 

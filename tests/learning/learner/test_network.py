@@ -145,3 +145,20 @@ def test_it_trains_with_half_of_the_bits(configured, made_up_device, overrides):
 def test_a_learning_rate_may_fall_from_the_start(configured, made_up_device):
     config = configured("representation=readings", "model=mlp", "trainer.max_epochs=1", "learner.warmup=0")
     build_learner(config).fit(TouchData(made_up_device, instantiate(config.representation)))
+
+
+def test_a_training_goes_on_from_weights(configured, made_up_device, tmp_path):
+    words = "representation=readings", "model=mlp", "fusion=early", "trainer.max_epochs=1"
+    config = configured(*words)
+    data = TouchData(made_up_device, instantiate(config.representation), 32)
+    first = build_learner(config)
+    first.fit(data)
+    path = first.save(tmp_path)
+    second = build_learner(configured(*words, f"learner.start={path}", "optimizer.lr=1e-12"))
+    second.fit(data)
+    for name, weights in second.network.state_dict().items():
+        torch.testing.assert_close(weights, first.network.state_dict()[name], rtol=0, atol=1e-6)
+    for start, words in ((tmp_path / "none.pt", "no such file"), (path, "of another network")):
+        other = configured("representation=readings", "model=mlp", f"learner.start={start}")
+        with pytest.raises(InputError, match=words):
+            build_learner(other).check(data)

@@ -24,12 +24,10 @@ from skin.device.formats import (
     read_table,
     require_columns,
 )
-from skin.device.touches import Recording, Touches
+from skin.device.touches import CLASS, GROUP, Recording, Touches, one_hot
 from skin.errors import InputError
 from skin.touch.labels import TOUCH, Task
 
-GROUP = "group_"
-"""What the parameter of a group is called, before its name; the metadata ``groups`` list its values."""
 _NOMINAL_RATE = 10.0  # Hz, of presses without a time
 _NOMINAL_PITCH = 0.01  # m, between sensors whose places nobody knows
 
@@ -54,8 +52,8 @@ def convert_files(
     """Return the recording of foreign files.
 
     Targets and groups are its parameters, (B,): ``x`` and ``y`` (m), ``force``, ``force_x`` and ``force_y``
-    (N), NaN where unknown, and ``group_<name>``, a number of the list in the metadata ``groups``. Unknown
-    labels are NaN.
+    (N), NaN where unknown, and ``group_<name>``, a number of the list in the metadata ``groups``; beside
+    labels also ``class``, a number of the list in the metadata ``classes``. Unknown labels are NaN.
 
     Args:
         mapping: says what the files hold.
@@ -72,17 +70,23 @@ def convert_files(
     if not content.readings:
         raise InputError(f"{folder} has no touch: lower segments.threshold, or segments.frames")
     readings = np.stack(content.readings)
-    task, labels = _labels(mapping, content.labels)
     parameters, groups = _parameters(mapping, content)
+    about = {"about": mapping.about, "positions": _positions_word(mapping), "groups": groups}
+    task, labels = _labels(mapping, content.labels)
+    if mapping.classes is not None:
+        names, numbers = _classes(mapping, [row[-1] for row in content.labels])
+        if mapping.labels:
+            parameters[CLASS], about["classes"] = numbers, names
+        else:
+            task, labels = Task(tuple(names), "exclusive"), one_hot(numbers, len(names))
     placed, extent = _place(mapping, readings.shape[2], sensors, size)
     touches = Touches(
         torch.from_numpy(np.nan_to_num(readings)),
         torch.from_numpy(~np.isnan(readings)),
         torch.from_numpy(placed.positions).float(),
-        None if labels is None else torch.from_numpy(labels),
+        labels,
         float(np.median(content.rates)),
     )
-    about = {"about": mapping.about, "positions": _positions_word(mapping), "groups": groups}
     return Recording(touches, task, extent, placed.footprint, parameters=parameters, metadata=about)
 
 
@@ -266,10 +270,9 @@ def _reduce(name: str, values: np.ndarray) -> float:
 
 
 def _rules(mapping: ForeignFormat) -> Mapping[str, LabelRule]:
-    """Return the rules of labels; that of classes has the name of none."""
-    if mapping.classes is not None:
-        return {"classes": LabelRule(column=mapping.classes.column)}
-    return mapping.labels or {}
+    """Return the rules of labels; that of classes is the last."""
+    classes = {} if mapping.classes is None else {"classes": LabelRule(column=mapping.classes.column)}
+    return {**(mapping.labels or {}), **classes}
 
 
 def _source(rule: LabelRule, table: pd.DataFrame, path: Path, name: str) -> np.ndarray | None:
@@ -331,22 +334,20 @@ def _single(texts: np.ndarray, where: str) -> str:
     raise InputError(f"{where}: each touch needs one group, got {' and '.join(map(str, values[:3]))} in one")
 
 
-def _labels(mapping: ForeignFormat, rows: Sequence[Sequence[Any]]) -> tuple[Task, np.ndarray | None]:
-    """Return the task and the labels (B, L), float32, NaN where unknown; None without any."""
-    if mapping.classes is not None:
-        return _classes(mapping, [row[0] for row in rows])
+def _labels(mapping: ForeignFormat, rows: Sequence[Sequence[Any]]) -> tuple[Task, torch.Tensor | None]:
+    """Return the task and the binary labels (B, L), NaN where unknown; None without any."""
     if not mapping.labels:
         return TOUCH, None
-    labels = np.array(
-        [[np.nan if value is None else value for value in row] for row in rows], dtype=np.float32
-    )
-    for name, column in zip(mapping.labels, labels.T, strict=True):
-        if np.isnan(column).all():
+    columns = list(zip(*rows, strict=True))[: len(mapping.labels)]
+    labels = torch.tensor([[np.nan if value is None else value for value in column] for column in columns])
+    for name, column in zip(mapping.labels, labels, strict=True):
+        if column.isnan().all():
             raise InputError(f"labels.{name} is unknown in all touches: correct its values, or leave it out")
-    return Task(tuple(mapping.labels)), labels
+    return Task(tuple(mapping.labels)), labels.T.float().contiguous()
 
 
-def _classes(mapping: ForeignFormat, texts: Sequence[str | None]) -> tuple[Task, np.ndarray]:
+def _classes(mapping: ForeignFormat, texts: Sequence[str | None]) -> tuple[list[str], torch.Tensor]:
+    """Return the names of the classes, and the number of that of each touch, (B,), NaN where unknown."""
     its = mapping.classes
     assert its is not None
     names = {str(key): str(name) for key, name in its.names.items()} if its.names else {}
@@ -357,11 +358,8 @@ def _classes(mapping: ForeignFormat, texts: Sequence[str | None]) -> tuple[Task,
         raise InputError(
             f"classes: column {its.column} has fewer than two of the classes {', '.join(order) or '-'}"
         )
-    labels = np.full((len(assigned), len(present)), np.nan, dtype=np.float32)
-    for row, name in zip(labels, assigned, strict=True):
-        if name is not None:
-            row[:] = [name == entry for entry in present]
-    return Task(tuple(present), "exclusive"), labels
+    numbers = [np.nan if name is None else float(present.index(name)) for name in assigned]
+    return present, torch.tensor(numbers, dtype=torch.float32)
 
 
 def _parameters(
@@ -390,8 +388,10 @@ def summarise_conversion(recording: Recording) -> str:
         parts += [
             f"{name} in {int(column.nansum())} of {int((~column.isnan()).sum())}" for name, column in shares
         ]
+    if "classes" in recording.metadata:
+        parts.append(f"classes {', '.join(recording.metadata['classes'])}")
     for name, values in recording.parameters.items():
-        if not name.startswith(GROUP):
+        if name != CLASS and not name.startswith(GROUP):
             parts.append(f"{name} of {int((~values.isnan()).sum())}")
     parts += [f"{len(values)} of {name}" for name, values in recording.metadata["groups"].items()]
     return ", ".join([*parts, f"positions {recording.metadata['positions']}"])

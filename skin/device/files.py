@@ -143,8 +143,8 @@ def column_types(about: dict[str, Any]) -> dict[str, pa.DataType]:
     task, sensors = about["task"], len(about["positions"])
     columns = {"simulation": pa.int32(), "frame": pa.int32()}
     if about["labelled"]:
-        cosines = 2 if task.get("direction") else 0
-        kinds = [pa.int8()] * (len(task["names"]) - cosines) + [pa.float32()] * cosines
+        binary = set(Task(**task).binary)
+        kinds = [pa.int8() if name in binary else pa.float32() for name in task["names"]]
         columns |= dict(zip(task["names"], kinds, strict=True))
     names = numbered("reading", sensors) + ["force"] * about["force"]
     limits = numbered("saturated", sensors) if about["saturated"] else []

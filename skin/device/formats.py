@@ -221,7 +221,7 @@ class ForeignFormat:
             rate of the rows.
         baseline: what is subtracted.
         labels: name -> rule of a binary label.
-        classes: exclusive classes, instead of labels.
+        classes: exclusive classes; beside labels, ``task=classes`` chooses them.
         targets: x, y, force, force_x or force_y -> measured quantity.
         groups: columns such as a session or a person, or name -> columns that make it together; the touches
             of a group stay together in splits.
@@ -343,8 +343,6 @@ def _check(mapping: ForeignFormat, name: str) -> None:
 
 
 def _check_labels(mapping: ForeignFormat, name: str) -> None:
-    if mapping.labels and mapping.classes is not None:
-        raise InputError(f"{name}: give labels or classes, not both")
     targets = mapping.targets or {}
     for target, column in targets.items():
         if target not in TARGETS or column.unit not in TARGETS[target]:

@@ -4,20 +4,23 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import torch
+from annotated_types import MinLen
 from torch import Tensor
 
 from skin.body.base import AbstractBody, Sensors, require_memory
 from skin.body.layout import AbstractLayout
-from skin.core.settings import checked
+from skin.core.settings import ONCE, checked
 from skin.device.base import AbstractDevice, Blank, Split, split_groups, split_rows, split_shards
 from skin.device.files import DataSet, read_recording
-from skin.device.touches import Part, Recording, Touches, concatenate
+from skin.device.touches import CLASS, GROUP, Part, Recording, Touches, concatenate, one_hot
 from skin.errors import InputError
+from skin.touch.labels import Task, target_unit
 
+What = Literal["labels", "classes", "regression"]
 _SAME_PLACE = 1e-6  # m: the file's positions are float32
 _BYTES = 8.0  # of a reading, whether it is valid and whether it is saturated; of a number of a contact
 
@@ -40,6 +43,9 @@ class Recorded(AbstractDevice):
         group: whose touches stay together, such as ``session``, or ``gesture``; None: the first group of the
             file, if it has one.
         test_groups: groups of ``holdout``; None draws a tenth of them.
+        task: what is learned: ``labels``, exclusive ``classes``, or ``regression`` of targets; None: what the
+            file has as labels, which may be classes.
+        targets: of a regression, such as ``[x, y]``; None: all measured ones of the file.
 
     Attributes:
         sensors: as ``layout`` gives them.
@@ -48,8 +54,9 @@ class Recorded(AbstractDevice):
 
     Raises:
         InputError: no file given, unreadable, too few touches, or another sheet or other sensors than the
-            configuration's; groups that the file lacks, or that leave none to train on. Methods raise it if
-            touches do not fit into memory, or if those to train on have a label of one class.
+            configuration's; groups, classes or targets that the file lacks; groups that leave none to train
+            on. Methods raise it if touches do not fit into memory, or if those to train on have a label of
+            one class, or a target with one value.
     """
 
     def __init__(
@@ -61,6 +68,8 @@ class Recorded(AbstractDevice):
         test: Literal["holdout", "all"] = "holdout",
         group: str | None = None,
         test_groups: str | Sequence[str | int] | None = None,
+        task: What | None = None,
+        targets: Annotated[Sequence[str], MinLen(1), ONCE] | None = None,
     ) -> None:
         if path is None:
             raise InputError(
@@ -70,13 +79,14 @@ class Recorded(AbstractDevice):
         folder = Path(path).expanduser()
         self._whole = folder.suffix != "" and not folder.is_dir()
         self._stored = _File(path) if self._whole else DataSet(path)
+        self._what, self._targets = task, targets
         count = sum(self._stored.counts)
         if count < 10 and test == "holdout":
             raise InputError(
                 f"{path} has {count} touches: 80/10/10 needs at least 10, or a "
                 "run that was trained on others and device.test=all"
             )
-        self._example = self._stored.read(0)[torch.tensor([0])]  # a copy: a slice would keep the whole
+        self._example = self._read(0)[torch.tensor([0])]  # a copy: a slice would keep the whole
         self._groups: dict[Split, Tensor] = {}
         if self._example.metadata.get("positions") in ("unknown", "stated"):
             places = self._example.touches.positions.double().numpy()
@@ -120,7 +130,7 @@ class Recorded(AbstractDevice):
             )
         if len(set(tested)) == len(values):
             raise InputError(f"device.test_groups has every {name}: leave out some to train on")
-        numbers = self._stored.read(0).parameters[f"group_{name}"].long()
+        numbers = self._stored.read(0).parameters[GROUP + name].long()
         chosen = [values.index(value) for value in tested] or None
         self._groups = split_groups(numbers, self.split_seed, chosen)
         trained, held, judged = (
@@ -136,10 +146,11 @@ class Recorded(AbstractDevice):
 
     def _check_classes(self, labels: Tensor | None) -> None:
         """Raise InputError where the touches to train on have a label of one class."""
-        for label, column in zip(self.task.binary, () if labels is None else labels.T, strict=False):
+        lack = "has less than two values" if self.task.kind == "regression" else "lacks a class"
+        for label, column in zip(self.task.names, () if labels is None else labels.T, strict=False):
             if len(column[~column.isnan()].unique()) < 2:
                 raise InputError(
-                    f"split {self.split}: {label} lacks a class in the touches to train on: give other "
+                    f"split {self.split}: {label} {lack} in the touches to train on: give other "
                     "device.test_groups, or device.group=gesture"
                 )
 
@@ -170,7 +181,7 @@ class Recorded(AbstractDevice):
 
     def all_touches(self) -> Touches:
         """Return the touches of the whole file, or of the first shard."""
-        return self._stored.read(0).touches
+        return self._read(0).touches
 
     def blank(self) -> AbstractDevice:
         """Return a device that has labels, which the file may lack."""
@@ -180,7 +191,7 @@ class Recorded(AbstractDevice):
 
     def strips(self) -> Iterator[Touches]:
         """Yield the touches of the file, or of the first shard."""
-        yield self._stored.read(0, complete=False).touches
+        yield self._read(0, complete=False).touches
 
     def recording(self, split: Split | None = None, epoch: int = 0, complete: bool = True) -> Recording:
         """Return the recording of a split; None takes the whole file or data set."""
@@ -208,7 +219,7 @@ class Recorded(AbstractDevice):
     def _parts(self, split: Split | None, complete: bool) -> list[Part]:
         counts = self._stored.counts
         if split is None or (split == "test" and self._test == "all"):
-            return [Part(count, partial(self._stored.read, n, complete)) for n, count in enumerate(counts)]
+            return [Part(count, partial(self._read, n, complete)) for n, count in enumerate(counts)]
         part: Split = "holdout" if split == "test" else split
         seed = self.split_seed
         if self._groups:
@@ -220,7 +231,56 @@ class Recorded(AbstractDevice):
         return [Part(len(selected), partial(self._rows, n, complete, selected)) for n, selected in shares]
 
     def _rows(self, number: int, complete: bool, rows: Tensor) -> Recording:
-        return self._stored.read(number, complete)[rows]
+        return self._read(number, complete)[rows]
+
+    def _read(self, number: int, complete: bool = True) -> Recording:
+        return choose_task(self._stored.read(number, complete), self._what, self._targets, self.path)
+
+
+def choose_task(
+    recording: Recording, task: What | None, targets: Sequence[str] | None, path: str
+) -> Recording:
+    """Return a recording with other labels: what is learned of its touches.
+
+    Args:
+        recording: whose parameters are targets, m or N, and whose metadata ``classes`` name the values of the
+            parameter ``class``.
+        task: as of :class:`Recorded`.
+        targets: as of :class:`Recorded`.
+        path: of the recording, for messages.
+
+    Raises:
+        InputError: it has no such labels, classes or targets; one sentence.
+    """
+    kind, parameters = recording.task.kind, recording.parameters
+    if targets is not None and task != "regression":
+        raise InputError("device.targets needs task=regression")
+    if task is None or (task == "classes" and kind == "exclusive"):
+        return recording
+    if task == "labels":
+        if kind != "binary" or recording.touches.labels is None:
+            raise InputError(f"{path} has no labels that hold or not: give task=classes or task=regression")
+        return recording
+    if task == "classes":
+        names = recording.metadata.get("classes", [])
+        if CLASS not in parameters or len(names) < 2:
+            raise InputError(
+                f"{path} has no classes: give task=labels or task=regression, or classes in the mapping"
+            )
+        labels = one_hot(parameters[CLASS], len(names))
+        return _relabelled(recording, Task(tuple(names), "exclusive"), labels)
+    measured = [name for name in parameters if name != CLASS and not name.startswith(GROUP)]
+    chosen = [name for name in measured if target_unit(name)] if targets is None else list(targets)
+    if unknown := [name for name in chosen if name not in measured]:
+        raise InputError(f"{path} has no target {unknown[0]}, it has {', '.join(measured) or 'none'}")
+    if not chosen:
+        raise InputError(f"{path} has no target: give targets in the mapping, or device.targets=[NAME]")
+    values = torch.stack([parameters[name] for name in chosen], dim=1)
+    return _relabelled(recording, Task(tuple(chosen), "regression"), values)
+
+
+def _relabelled(recording: Recording, task: Task, labels: Tensor) -> Recording:
+    return replace(recording, task=task, touches=replace(recording.touches, labels=labels))
 
 
 def _few(values: Sequence[str]) -> str:

@@ -28,7 +28,7 @@ class Touches:
         valid: (B, T, S), bool: False for invalid readings (dead sensor, lost frame).
         positions: (S, 3), (B, S, 3) or (B, T, S, 3), m: x right and y down from the upper left corner, z
             depth.
-        labels: (B, L), 0 or 1, float; or None.
+        labels: (B, L), 0 or 1, or the targets of a regression, float, NaN where unknown; or None.
         rate: frames per second, Hz.
         motion: (B, T, S, 3), m, how far each sensor is from its place in ``positions``, along the same axes;
             None if unknown.
@@ -209,6 +209,18 @@ def join_contacts(parts: Sequence[Tensor | None]) -> Tensor | None:
         return None
     most = max(tensor.shape[2] for tensor in tensors)
     return torch.cat([pad(tensor, (0, 0, 0, most - tensor.shape[2]), value=nan) for tensor in tensors])
+
+
+CLASS = "class"
+"""Parameter with the number of a class, of a recording with labels too; the metadata ``classes`` name it."""
+GROUP = "group_"
+"""What the parameter of a group is called, before its name; the metadata ``groups`` list its values."""
+
+
+def one_hot(numbers: Tensor, count: int) -> Tensor:
+    """Return labels (B, L), 0 or 1, of L = ``count`` classes with numbers (B,); NaN where that is NaN."""
+    labels = numbers.nan_to_num().long()[:, None] == torch.arange(count)
+    return labels.float().where(~numbers.isnan()[:, None], nan)
 
 
 def touches_hash(touches: Touches) -> str:

@@ -14,7 +14,7 @@ from torchmetrics.functional.classification import (
 )
 
 from skin.evaluation.operating_point import LABEL, OperatingPoint
-from skin.touch.labels import Task
+from skin.touch.labels import PLACE, Task, target_unit
 
 OUTCOMES = "outcomes.npy"
 """Name of the file of a run that holds the outcomes of its test gestures."""
@@ -41,14 +41,18 @@ def compute_metrics(
         evaluated on the touches for which it is true, and the gate does not count in the overall values. A
         direction adds ``direction/degrees``, the mean absolute error, and ``direction/accuracy``, the share
         of errors up to 45 degrees, on the touches that have one (random guesses: 90 and .25); both do not
-        count in the overall values. Values are NaN where the touches do not define them: a recall needs
-        touches with and without the label.
+        count in the overall values. A regression has ``<target>/rms_mm``, ``/rms_N`` or ``/rms``, the root
+        of the mean square error, the same of ``place`` for x and y together, and ``overall/r2``, the mean
+        over the targets of the share of the variance that is predicted. Values are NaN where the touches do
+        not define them: a recall needs touches with and without the label.
     """
     alarm: dict[str, float] = {}
     if point is not None:
         reached = point.reached(probabilities, labels, task)
         alarm[f"{LABEL}/alarm_recall"] = reached.recall
         alarm[f"{LABEL}/false_alarm_rate"] = reached.false_alarm_rate
+    if task.kind == "regression":
+        return _errors(probabilities, labels, task)
     if task.kind == "exclusive":
         rows = task.counts(labels)[:, 0]
         if not rows.any():
@@ -74,6 +78,21 @@ def compute_metrics(
         values["direction/degrees"] = float(degrees.mean())
         values["direction/accuracy"] = float((degrees <= 45).float().mean())
     return values | alarm
+
+
+def _errors(predicted: Tensor, labels: Tensor, task: Task) -> dict[str, float]:
+    """Return the metrics of a regression for predicted and true targets (B, L), NaN where unknown."""
+    square, values = (predicted - labels).double().square(), dict[str, float]()
+    pairs = [(name, square[:, number]) for number, name in enumerate(task.names)]
+    if set(PLACE) <= set(task.names):
+        pairs.append(("place", square[:, [task.names.index(name) for name in PLACE]].sum(dim=1)))
+    for name, column in pairs:
+        unit = target_unit(PLACE[0] if name == "place" else name)
+        suffix, factor = {"m": ("rms_mm", 1e3), "N": ("rms_N", 1.0)}.get(unit, ("rms", 1.0))
+        values[f"{name}/{suffix}"] = factor * float(column.nanmean().sqrt())
+    spread = (labels - labels.nanmean(dim=0)).double().square().nanmean(dim=0)
+    values["overall/r2"] = float((1 - square.nanmean(dim=0) / spread).nanmean())
+    return values
 
 
 def calibration_error(chance: Tensor, label: Tensor, bins: int = 15) -> float:

@@ -30,7 +30,7 @@ from skin.touch.labels import Task
 _FIRST_DEVICE, _FIRST_LAYOUT = 1, 101
 PERCENTAGES = ("/accuracy", "/alarm_recall", "/false_alarm_rate")
 """Suffixes of the metrics that are shown in per cent."""
-_SHOWN = (*PERCENTAGES, "/degrees")
+_SHOWN = (*PERCENTAGES, "/degrees", "/r2", "/rms", "/rms_mm", "/rms_N")
 _UNDEFINED = "not defined, because the test has only gestures with this label or only gestures without it"
 
 
@@ -210,15 +210,18 @@ def metric_rows(metrics: Mapping[str, float], degree: str = "") -> list[list[str
     sets = list(dict.fromkeys(name.split("/")[0] for name in names))
     rows = [["", *sets]]
     for line in dict.fromkeys(name.split("/", 1)[1] for name in names):
-        unit, sign = (1, degree) if line.endswith("/degrees") else (100, "")
+        unit, sign = (100, "") if line.endswith(PERCENTAGES) else (1, degree * line.endswith("/degrees"))
+        digits = 1 if unit == 100 or line.endswith("/degrees") else 3
         values = (metrics.get(f"{column}/{line}") for column in sets)
-        rows.append([line, *(format_number(value, unit) + sign * (value is not None) for value in values)])
+        rows.append(
+            [line, *(format_number(value, unit, digits) + sign * (value is not None) for value in values)]
+        )
     return rows
 
 
-def format_number(value: float | None, unit: float = 100) -> str:
-    """Return a value with one decimal; "-" for NaN, and an empty string for None."""
-    return "" if value is None else "-" if isnan(value) else f"{unit * value:.1f}"
+def format_number(value: float | None, unit: float = 100, digits: int = 1) -> str:
+    """Return a value with some decimals; "-" for NaN, and an empty string for None."""
+    return "" if value is None else "-" if isnan(value) else f"{unit * value:.{digits}f}"
 
 
 def evaluation_markdown(report: Report, task: Task, title: str, about: str) -> str:
@@ -232,7 +235,7 @@ def evaluation_markdown(report: Report, task: Task, title: str, about: str) -> s
     """
     (_, *columns), *rows = metric_rows(report.metrics, "°")
     lines = [f"# {title}", "", about, "", *([f"Split {report.split}.", ""] if report.split else [])]
-    lines += ["Per cent:", "", f"| | {' | '.join(columns)} |"]
+    lines += ["" if task.kind == "regression" else "Per cent:", "", f"| | {' | '.join(columns)} |"]
     lines.append("|---" * (len(columns) + 1) + "|")
     lines += [f"| {' | '.join(row)} |" for row in rows]
     if report.point is not None and report.reached is not None:

@@ -20,7 +20,7 @@ from torch import Tensor
 from skin.core.safe_loading import check_archive
 from skin.device.touches import Touches
 from skin.errors import InputError
-from skin.learning.features import direction_features, engineered_features
+from skin.learning.features import feature_matrix
 from skin.learning.learner import AbstractLearner
 from skin.touch.labels import Task
 
@@ -45,7 +45,8 @@ class BoostedTrees(AbstractLearner):
     This is the baseline that a network should beat. The features (:mod:`skin.learning.features`) do not
     depend on the number or order of sensors, so any layout is accepted. Where the task has a direction,
     signed features (:mod:`skin.learning.features`) are added, and regression trees with a squared-error loss
-    predict its cosines.
+    predict its cosines. They predict the targets of a regression, too, for which features of each sensor are
+    added: such trees accept the sensors of the training only.
 
     Args:
         rounds: maximum number of trees per label; early stopping may use fewer.
@@ -77,17 +78,28 @@ class BoostedTrees(AbstractLearner):
         for split in ("train", "validation"):
             touches = data.touches(split)
             labels = touches.known_labels.cpu().numpy()
-            table |= {split: _matrix(touches, data.task), f"{split}_labels": labels}
+            table |= {split: feature_matrix(touches, data.task), f"{split}_labels": labels}
         self._grow(table, data.task)
 
     def probabilities(self, touches: Touches) -> Tensor:
-        """Return the probability of each label, (B, L), for touches of any layout; cosines of a direction."""
+        """Return the probability of each label, (B, L), for touches of any layout; cosines of a direction.
+
+        Raises:
+            InputError: targets of a regression for other sensors than those of the training.
+        """
         if self._task is None:
             raise RuntimeError("fit or load the learner first")
-        matrix = _matrix(touches, self._task)
+        matrix = feature_matrix(touches, self._task)
+        if matrix.shape[1] != (count := self._models[0].n_features_in_):
+            raise InputError(
+                f"these touches have {matrix.shape[1]} features, the trees were trained on {count}: give "
+                "touches of the sensors of the training"
+            )
         columns = [_predict(model, matrix) for model in self._models]
         result = torch.from_numpy(np.stack(columns, axis=1)).to(torch.float32)
-        return result / result.sum(dim=1, keepdim=True) if self._task.kind == "exclusive" else result
+        if self._task.kind == "exclusive":
+            return result / result.sum(dim=1, keepdim=True)
+        return result.clamp(-1, 1) if self._task.direction else result  # of the cosines
 
     def save(self, folder: Path) -> Path:
         """Write the trees to ``trees.skops`` and return its path: skops stores no code and no pickles."""
@@ -114,7 +126,7 @@ class BoostedTrees(AbstractLearner):
             models = load(path, trusted=_TRUSTED)
         except Exception as error:  # whatever zipfile, zlib, JSON, numpy and skops raise
             raise ValueError(" ".join(str(error).split()) or "it is cut off") from error
-        task, example = data.task, _matrix(data.example, data.task)
+        task, example = data.task, feature_matrix(data.example, data.task)
         if not isinstance(models, list) or len(models) != len(task):
             raise ValueError(f"it has no trees for each of {', '.join(task.names)}")
         for model, name in zip(models, task.names, strict=True):
@@ -191,14 +203,7 @@ def _check(model: Any, kind: "type[Trees]", columns: int) -> None:
 
 
 def _predict(model: Trees, matrix: np.ndarray) -> np.ndarray:
-    """Return the predicted probability (B,), or the predicted cosine."""
+    """Return the predicted probability (B,), or the predicted cosine or target."""
     if isinstance(model, HistGradientBoostingRegressor):
-        return model.predict(matrix).clip(-1, 1)
+        return model.predict(matrix)
     return model.predict_proba(matrix)[:, 1]
-
-
-def _matrix(touches: Touches, task: Task) -> np.ndarray:
-    """Return the features as (B, D), float32."""
-    moved = touches.to("cpu")
-    columns = engineered_features(moved) | (direction_features(moved) if task.direction else {})
-    return torch.stack([column.to(torch.float32) for column in columns.values()], dim=1).numpy()

@@ -2,10 +2,12 @@
 
 from collections.abc import Iterable
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from skin.device.touches import Touches
+from skin.touch.labels import Task
 from skin.touch.movie import longest_run
 
 LEVELS = (0.15, 0.3, 0.6, 1.0, 2.0, 3.0)  # N above idle, where the noise is NOISE
@@ -19,6 +21,8 @@ Block = tuple[list[str], Tensor]
 
 # Standard deviation of normal noise, per median distance between two frames.
 _PER_MEDIAN = 1.0484
+_REST = 20  # of so many frames one is at rest at least, in a touch that lasts longer than IDLE allows
+_FALL = 0.2  # of the range of the sum of readings; what silicone pulls is less
 _BELOW = 0.8416  # standard deviations from the quantile IDLE of normal noise up to its mean
 
 
@@ -71,7 +75,9 @@ def above_idle(touches: Touches, noise: Tensor | None = None) -> Tensor:
     """Return by how much each reading exceeds its sensor's idle level, (B, T, S), N; 0 where it is not valid.
 
     That level is a low quantile over the window, so that constant offsets of a device do not matter. Normal
-    noise lowers the quantile, which is corrected.
+    noise lowers the quantile, which is corrected. If a touch lasts for longer than the quantile allows, as in
+    a recording that begins in contact, the readings together fall far below it in the few frames at rest;
+    the level is then the mean of these.
 
     Args:
         touches: B touches of S sensors.
@@ -80,7 +86,12 @@ def above_idle(touches: Touches, noise: Tensor | None = None) -> Tensor:
     raw = _valid(touches)
     noise = estimate_noise(touches) if noise is None else noise
     idle = torch.quantile(raw, IDLE, dim=1, keepdim=True) + _BELOW * noise[:, None, None]
-    return (raw - idle) * touches.valid
+    total = (raw - idle).sum(dim=2)
+    rest = total.topk(max(1, raw.shape[1] // _REST), dim=1, largest=False)
+    fall, noisy = -rest.values.mean(dim=1), 5 * raw.shape[2] ** 0.5 * noise
+    contact = (fall > noisy) & (fall > _FALL * (total.amax(dim=1) + fall))
+    at_rest = raw.gather(1, rest.indices[..., None].expand(-1, -1, raw.shape[2])).mean(dim=1, keepdim=True)
+    return (raw - torch.where(contact[:, None, None], at_rest, idle)) * touches.valid
 
 
 def _valid(touches: Touches) -> Tensor:
@@ -230,6 +241,101 @@ def _spread(x: Tensor, places: Tensor, rise: Tensor) -> Iterable[Block]:
         evenness = weight.square().sum(dim=1, keepdim=True).clamp(min=1e-6).reciprocal()
         names = [f"{measure} of the {name}" for measure in ("length", "breadth", "evenness")]
         yield names, torch.cat([axes, evenness], dim=1)
+
+
+# Features of the course over time, of each sensor, and those that a task needs.
+
+
+BANDS = (0.02, 0.05, 0.1, 0.2)  # cycles per frame
+
+
+def course_features(touches: Touches) -> dict[str, Tensor]:
+    """Return about 90 named features, (B,) each, of how often and when a touch of any layout comes and goes.
+
+    They tell repeated contacts, such as pats, from a long one. Times are in frames.
+    """
+    x = above_idle(touches)
+    columns = dict[str, Tensor]()
+    for name, course in {"sum": x.clamp(min=0).sum(dim=2), "maximum": x.amax(dim=2)}.items():
+        columns |= {f"{key} of the {name}": value for key, value in _course(course).items()}
+    highest = x.amax(dim=(1, 2), keepdim=True).clamp(min=1e-6)
+    for share in (0.1, 0.3):
+        active = (x > share * highest).int()
+        rises = _count_rises(active).float()
+        columns |= {
+            f"rises of sensors above {share}": rises.sum(dim=1),
+            f"most rises of a sensor above {share}": rises.amax(dim=1),
+            f"sensors that rise above {share}": (rises > 0).float().sum(dim=1),
+            f"sensors at once above {share}": active.sum(dim=(1, 2))
+            / active.amax(dim=2).sum(dim=1).clamp(min=1),
+        }
+    return columns
+
+
+def _count_rises(active: Tensor) -> Tensor:
+    """Return how often numbers 0 or 1, (B, T, ...), become 1, (B, ...)."""
+    return (active.diff(dim=1) > 0).sum(dim=1) + active[:, 0]
+
+
+def _course(course: Tensor) -> dict[str, Tensor]:
+    """Return features of a course over time (B, T)."""
+    count, columns = course.shape[1], dict[str, Tensor]()
+    top = course.amax(dim=1, keepdim=True).clamp(min=1e-6)
+    for share in SHARES:
+        active = (course > share * top).int()
+        rises, first = _count_rises(active), active.argmax(dim=1)
+        last = count - 1 - active.flip(1).argmax(dim=1)
+        columns |= {
+            f"contacts above {share}": rises.float(),
+            f"mean contact above {share}": active.sum(dim=1) / rises.clamp(min=1),
+            f"span above {share}": (last - first + 1).float(),
+            f"begin above {share}": first.float(),
+        }
+    power = torch.fft.rfft(course - course.mean(dim=1, keepdim=True), dim=1).abs().square()
+    power = power / power.sum(dim=1, keepdim=True).clamp(min=1e-12)
+    frequency = torch.linspace(0, 0.5, power.shape[1], dtype=power.dtype)
+    columns["mean frequency"] = power @ frequency
+    band = torch.bucketize(frequency, torch.tensor(BANDS, dtype=power.dtype))
+    shares = power.new_zeros(len(power), len(BANDS) + 1).index_add(1, band, power)
+    columns |= {f"share of band {number}": shares[:, number] for number in range(len(BANDS) + 1)}
+    step = course.diff(dim=1)
+    turned = (step[:, 1:] * step[:, :-1] < 0) & (step[:, 1:].abs() > 0.05 * top)
+    done = course.clamp(min=0).cumsum(dim=1) / course.clamp(min=0).sum(dim=1, keepdim=True).clamp(min=1e-6)
+    columns |= {"variation": step.abs().sum(dim=1) / top[:, 0], "reversals": turned.float().sum(dim=1)}
+    return columns | {
+        f"time of {part} of it": (done < part).float().sum(dim=1) for part in (0.1, 0.25, 0.5, 0.75, 0.9)
+    }
+
+
+def sensor_features(touches: Touches) -> dict[str, Tensor]:
+    """Return four named features, (B,) each, of each sensor, N: where and how hard a touch is.
+
+    Unlike the other features they depend on the sensors and their order, and have a sign.
+    """
+    raw = _valid(touches)
+    strongest = raw.abs().sum(dim=2).argmax(dim=1)
+    columns = {
+        "reading in the strongest frame": _frame_at(raw, strongest),
+        "mean": raw.mean(dim=1),
+        "maximum": raw.amax(dim=1),
+        "minimum": raw.amin(dim=1),
+    }
+    return {
+        f"{name} of sensor {number}": column
+        for name, values in columns.items()
+        for number, column in enumerate(values.unbind(dim=1))
+    }
+
+
+def feature_matrix(touches: Touches, task: Task) -> np.ndarray:
+    """Return the features that a task needs, (B, D), float32."""
+    moved = touches.to("cpu")
+    columns = engineered_features(moved)
+    if task.direction:
+        columns |= direction_features(moved)
+    if task.kind == "regression":
+        columns |= sensor_features(moved)
+    return torch.stack([column.to(torch.float32) for column in columns.values()], dim=1).numpy()
 
 
 # Signed features of the direction of sliding, along x and along y.

@@ -48,8 +48,14 @@ def neighbours(positions: np.ndarray, edges: Edges, count: int = 6) -> np.ndarra
 
 
 def typical_distance(positions: np.ndarray) -> float:
-    """Return d0, the median distance of sensors (S, 3), m, to their nearest neighbours, m."""
-    distance = cdist(positions, positions)
+    """Return d0, the median distance of sensors (S, 3), m, to their nearest neighbours elsewhere, m.
+
+    Channels of a sensor with three axes are at one place. Of a single place it is 1.
+    """
+    places = np.unique(positions, axis=0)
+    if len(places) < 2:
+        return 1.0
+    distance = cdist(places, places)
     return float(np.median((distance + np.diag(np.full(len(distance), np.inf))).min(axis=1)))
 
 
@@ -167,8 +173,7 @@ class Graph(AbstractRepresentation):
         places = layout.cpu().numpy().astype(float)
         weights = adjacency(places, neighbours(places, edges, count), weight, body)
         first, second = np.nonzero(np.triu(weights))
-        # A single sensor has no distance and no edges.
-        self.unit = typical_distance(places) if len(places) > 1 else 1.0
+        self.unit = typical_distance(places)
         self.register_buffer("adjacency", torch.from_numpy(normalised(weights)).to(torch.float32))
         self.register_buffer("layout", torch.from_numpy(places).to(torch.float32))
         self.register_buffer("size", torch.tensor(size, dtype=torch.float32))

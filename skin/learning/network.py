@@ -41,7 +41,12 @@ MakeOptimizer = Callable[[Iterable[nn.Parameter]], torch.optim.Optimizer]
 
 
 def probabilities(logits: Tensor, task: Task) -> Tensor:
-    """Return the probability of each label, (B, L), from logits (B, L); of a direction the mean cosines."""
+    """Return the probability of each label, (B, L), from logits (B, L); of a direction the mean cosines.
+
+    Of a regression the outputs are the targets.
+    """
+    if task.kind == "regression":
+        return logits
     if task.kind == "exclusive":
         return logits.softmax(dim=-1)
     chances = logits.sigmoid()
@@ -53,7 +58,8 @@ class TouchClassifier(LightningModule):
 
     Logs ``{train,val}_loss``, ``{train,val}_accuracy`` and, of binary tasks, ``{train,val}_accuracy_<label>``
     per epoch. Labels that are undefined, because the task's gate is 0 or a touch has no direction, are left
-    out of both.
+    out of both. A regression has no accuracy, and its loss is the mean square error of targets that are
+    scaled to a deviation of 1 over the training.
 
     Numbers about the whole window, if the representation has them (``Frames.summary``), are encoded by two
     dense layers and concatenated to the embedding.
@@ -90,13 +96,23 @@ class TouchClassifier(LightningModule):
             # Without dropout there is no layer, so that older weights keep their names.
             dropped = [nn.Dropout(dropout)] if dropout else []
             layers += [*dropped, nn.Linear(before, after), make_activation(activation)]
-        self.head = nn.Sequential(*layers, nn.Linear(widths[-1], len(task)))
+        layers.append(nn.Linear(widths[-1], len(task)))
+        if task.kind == "regression":
+            layers.append(_Targets(len(task)))
+        self.head = nn.Sequential(*layers)
         self.task = task
         self._make_optimizer, self._warmup = optimizer, warmup
         self._batches: dict[str, list[tuple[int, dict[str, Tensor]]]] = {"train": [], "val": []}
 
+    @property
+    def targets(self) -> "_Targets":
+        """The last layer of a regression."""
+        layer = self.head[-1]
+        assert isinstance(layer, _Targets)
+        return layer
+
     def forward(self, frames: Frames) -> Tensor:
-        """Return the logits (B, L) of frames."""
+        """Return the logits (B, L) of frames; the targets of a regression."""
         return self.head(self.embed(frames))
 
     def embed(self, frames: Frames) -> Tensor:
@@ -115,6 +131,8 @@ class TouchClassifier(LightningModule):
         counts = self.task.counts(labels)
         if not counts.any():
             return 0.0 * logits.sum()
+        if self.task.kind == "regression":
+            return ((logits - labels) / self.targets.deviation)[counts].square().mean()
         if self.task.kind == "exclusive":
             return F.cross_entropy(logits[counts[:, 0]], labels[counts[:, 0]])
         if counts.all():
@@ -139,6 +157,8 @@ class TouchClassifier(LightningModule):
 
     def _accuracy(self, logits: Tensor, labels: Tensor) -> dict[str, Tensor]:
         counts = self.task.counts(labels)
+        if self.task.kind == "regression":
+            return {}
         if self.task.kind == "exclusive":
             right = (logits.argmax(dim=-1) == labels.argmax(dim=-1)) & counts[:, 0]
             return {"accuracy": right.sum() / counts[:, 0].sum().clamp(min=1)}
@@ -173,6 +193,28 @@ class TouchClassifier(LightningModule):
         rate = optimizer.defaults["lr"]
         schedule = OneCycleLR(optimizer, rate, steps, pct_start=self._warmup, cycle_momentum=False)
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
+
+
+class _Targets(nn.Module):
+    """Maps outputs of the size of 1 to targets in their units."""
+
+    mean: Tensor
+    deviation: Tensor
+
+    def __init__(self, targets: int) -> None:
+        super().__init__()
+        self.register_buffer("mean", torch.zeros(targets))
+        self.register_buffer("deviation", torch.ones(targets))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Return targets (B, L) of outputs (B, L)."""
+        return self.mean + self.deviation * x
+
+    def scale(self, labels: Tensor) -> None:
+        """Take mean and deviation of the known targets (B, L)."""
+        for number, column in enumerate(labels.T):
+            present = column[~column.isnan()]
+            self.mean[number], self.deviation[number] = present.mean(), present.std(correction=0)
 
 
 class _Standardised(nn.BatchNorm1d):
@@ -394,6 +436,8 @@ class Network(AbstractLearner):
         with torch.random.fork_rng(), self._folder() as folder:
             torch.manual_seed(self._seed)
             classifier = self.build(data)
+            if data.task.kind == "regression":
+                classifier.targets.scale(torch.cat([part.known_labels for part in data.parts("train")]))
             self._begin(classifier)
             best = ModelCheckpoint(folder, monitor="val_loss", save_weights_only=True)
             clock, last = Clock(folder / "seconds.json"), folder / LAST

@@ -1,4 +1,4 @@
-"""Adapt a finished run to another skin: fine-tune its network on few gestures, if that is better.
+"""Adapt a finished run to another skin: fine-tune its network on few gestures, or learn anew, if better.
 
 The gestures are split into folds with equal shares of each combination of labels. For each choice of layers
 and learning rate, and each fold, a copy of the network is trained on the other folds, and its loss on the
@@ -8,26 +8,31 @@ gestures.
 The lowest of many losses is too low by chance. So the result is judged on each fold with the choice that has
 the lowest loss on the other folds. The network is changed only if this loss is lower than that of the
 original network by more than two standard errors of the difference, and the accuracy is not lower.
+
+Learners from scratch (:mod:`skin.learning.few`) are compared on the same folds. The one with the lowest loss
+on held-out gestures takes the place of the network under the same two conditions, and if its loss is lower
+than that of the fine-tuned network, too.
 """
 
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import asdict, dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import islice, product
 from typing import Annotated, Any, Literal
 
 import torch
 from annotated_types import Ge, Le, MinLen
 from hydra import compose
+from hydra.utils import instantiate
 from pydantic import NonNegativeInt, PositiveFloat, PositiveInt
 from rich.console import Console
 from torch import Tensor, nn
 
 from skin.core.messages import Steps
 from skin.core.rng import Stream, generator
-from skin.core.settings import checked, configured
+from skin.core.settings import checked, configured, import_target
 from skin.device.base import AbstractDevice, Blank
 from skin.device.touches import Touches, touches_hash
 from skin.errors import InputError
@@ -36,8 +41,9 @@ from skin.evaluation.operating_point import OperatingPoint, choose_operating_poi
 from skin.evaluation.report import evaluate, metrics_table
 from skin.evaluation.settings import check_evaluation
 from skin.learning.data import TouchData
+from skin.learning.few import AbstractFew, few_features, predict_held_out, split_folds, touch_losses
 from skin.learning.network import TouchClassifier, probabilities
-from skin.runs.build import build_data, build_device, build_learner
+from skin.runs.build import build_data, build_device, build_learner, default_option
 from skin.runs.configuration import Config
 from skin.runs.finished_run import TAG, FinishedRun
 from skin.runs.model_of_run import alarm_point, threshold_device
@@ -74,6 +80,7 @@ class FineTuning:
     patience: PositiveInt = 10
     batch_size: PositiveInt = 32
     seed: NonNegativeInt = 0
+    scratch: Sequence[str] = ("kernel_ridge", "extra_trees")
 
 
 @dataclass(frozen=True)
@@ -137,20 +144,6 @@ def fine_tune(
             steps = folds.train(touches, chosen.layers, chosen.lr, settings.folds)
             network.load_state_dict(next(islice(steps, epochs - 1, None)).state_dict())
     return Adaptation(trials, choice, *(probabilities(logits, network.task) for logits in (first, judged)))
-
-
-def split_folds(labels: Tensor, count: int, seed: int) -> Tensor:
-    """Return the fold of each gesture, (B,), from 0 up, for labels (B, L).
-
-    Folds differ by at most one in size, and in the number of gestures with each combination of labels. The
-    gestures are dealt out in an order that the seed gives.
-    """
-    order = torch.randperm(len(labels), generator=torch.Generator().manual_seed(seed))
-    combination = torch.unique(labels > 0.5, dim=0, return_inverse=True)[1]
-    order = order[combination[order].argsort(stable=True)]
-    folds = torch.empty_like(order)
-    folds[order] = torch.arange(len(order)) % count
-    return folds
 
 
 @dataclass(frozen=True)
@@ -237,11 +230,100 @@ def _is_better(network: TouchClassifier, first: Tensor, last: Tensor, labels: Te
     """Return whether the loss is lower by more than two standard errors, and the accuracy is not lower."""
     pairs = zip(first.split(1), last.split(1), labels.split(1), strict=True)
     gain = torch.stack([network.loss(old, truth) - network.loss(new, truth) for old, new, truth in pairs])
-    before, after = (
-        compute_metrics(probabilities(logits, network.task), labels, network.task)["overall/accuracy"]
-        for logits in (first, last)
-    )
-    return bool(gain.mean() > _CLEAR * gain.std() / len(gain) ** 0.5) and after >= before
+    before, after = (probabilities(logits, network.task) for logits in (first, last))
+    return _is_clear(gain, before, after, labels, network.task)
+
+
+def _is_clear(gain: Tensor, before: Tensor, after: Tensor, labels: Tensor, task: Task) -> bool:
+    """Return whether losses fall by more than two standard errors, and the accuracy does not.
+
+    Args:
+        gain: (B,), by how much the loss of each gesture falls.
+        before, after: probabilities (B, L), or targets.
+        labels: (B, L).
+        task: of a regression r2 takes the place of the accuracy.
+    """
+    name = "overall/r2" if task.kind == "regression" else "overall/accuracy"
+    old, new = (compute_metrics(chances, labels, task)[name] for chances in (before, after))
+    return bool(gain.mean() > _CLEAR * gain.std() / len(gain) ** 0.5) and new >= old
+
+
+@dataclass(frozen=True)
+class Scratch:
+    """The best learner from scratch.
+
+    Attributes:
+        name: of the option of ``learner``.
+        learner: fitted to all gestures.
+        settings: of the learner.
+        chances: probabilities (B, L) of the gestures, each from a learner that did not see it.
+    """
+
+    name: str
+    learner: AbstractFew
+    settings: dict[str, Any]
+    chances: Tensor
+
+
+def learn_from_scratch(
+    touches: Touches,
+    task: Task,
+    adaptation: Adaptation,
+    settings: FineTuning,
+    options: Mapping[str, dict[str, Any]],
+) -> Scratch | None:
+    """Return the learner from scratch that is better than the network, fine-tuned or not; None: none is.
+
+    Args:
+        touches: B labelled gestures.
+        task: the labels.
+        adaptation: of the network to them.
+        settings: whose folds are held out.
+        options: name -> settings of a learner.
+    """
+    labels = touches.known_labels
+    fold = split_folds(labels, settings.folds, settings.seed)
+    if lacking := _lacking(labels, fold, task):
+        if options:
+            print(f"from scratch: not compared, too few gestures tell {lacking}", file=sys.stderr)
+        return None
+    matrix, truth = few_features(touches, task), labels.numpy()
+    kept = adaptation.after if adaptation.better else adaptation.before
+    losses, held = {"": touch_losses(kept.numpy(), truth, task)}, dict[str, Tensor]()
+    for name, option in options.items():
+        make = partial(instantiate, option, seed=settings.seed)
+        predicted = predict_held_out(make, matrix, truth, task, fold.numpy())
+        held[name], losses[name] = torch.from_numpy(predicted).float(), touch_losses(predicted, truth, task)
+        print(f"{name}: held-out loss {losses[name].mean():.4f}", file=sys.stderr, flush=True)
+    best = min(losses, key=lambda name: float(losses[name].mean()))
+    gain = torch.from_numpy(touch_losses(adaptation.before.numpy(), truth, task) - losses[best])
+    if not best or not _is_clear(gain, adaptation.before, held[best], labels, task):
+        return None
+    learner: AbstractFew = instantiate(options[best], seed=settings.seed)
+    return Scratch(best, learner.learn(matrix, truth, task), options[best], held[best])
+
+
+def _scratch_options(names: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """Return the settings of learners for few touches by name.
+
+    Raises:
+        InputError: a name is of no such learner.
+    """
+    options = {name: default_option("learner", name) for name in names}
+    for name, option in options.items():
+        kind = import_target(option["_target_"], "adapt.scratch")
+        if not (isinstance(kind, type) and issubclass(kind, AbstractFew)):
+            raise InputError(f"adapt.scratch={name} is no learner for few touches: kernel_ridge, extra_trees")
+    return options
+
+
+def _lacking(labels: Tensor, fold: Tensor, task: Task) -> str:
+    """Return the names of the labels (B, L) that have fewer than two values outside of some fold."""
+    names = []
+    for name, column, known in zip(task.names, labels.T, task.counts(labels).T, strict=True):
+        values = (column[known & (fold != number)].unique() for number in fold.unique())
+        names += [name] if min(len(part) for part in values) < 2 else []
+    return ", ".join(names)
 
 
 @dataclass(frozen=True)
@@ -314,11 +396,25 @@ def _check(parent: FinishedRun, device: AbstractDevice, twin: AbstractDevice) ->
             f"run {parent.identity} was trained on many skins: name the one to adapt to, as in "
             "device=recording device.path=session.parquet or device=simulated layout.path=sensors.csv"
         )
-    if device.task != twin.task:
+    plain = twin.task.kind == "binary" and twin.task.gate is None and not twin.task.direction
+    some = plain and device.task == replace(twin.task, names=device.task.names)
+    if device.task != twin.task and not (some and set(device.task.names) <= set(twin.task.names)):
         raise InputError(
             f"run {parent.identity} predicts {', '.join(twin.task.names)}, the gestures have the labels "
             f"{', '.join(device.task.names)}: give gestures with the labels of the run"
         )
+
+
+def label_as(touches: Touches, present: Task, wanted: Task) -> Touches:
+    """Return touches with the labels of another task; those that are not present are unknown, NaN."""
+    if present == wanted:
+        return touches
+    labels = touches.known_labels
+    unknown = labels.new_full((len(labels),), torch.nan)
+    columns = [
+        labels[:, present.names.index(name)] if name in present.names else unknown for name in wanted.names
+    ]
+    return replace(touches, labels=torch.stack(columns, dim=1))
 
 
 def choose_gestures(device: AbstractDevice, settings: FineTuning) -> tuple[Touches, AbstractDevice | None]:
@@ -375,6 +471,7 @@ def adapt(config: Config, overrides: Sequence[str]) -> None:
 
 def _adapt(config: Config, overrides: Sequence[str], steps: Steps) -> None:
     settings = configured(FineTuning, config.adapt, "adapt")
+    options = _scratch_options(settings.scratch)
     if config.tracking.threads:
         torch.set_num_threads(config.tracking.threads)
     parent = FinishedRun.named(config)
@@ -386,15 +483,22 @@ def _adapt(config: Config, overrides: Sequence[str], steps: Steps) -> None:
         note_reuse(earlier[0])
         print(f"run {earlier[0].info.run_id} did this before: tracking.resume=false repeats it")
         return
-    learner, data = build_learner(target.config), build_data(target.config, target.device.blank())
+    task, evaluation = target.twin.task, check_evaluation(target.config.evaluation)
+    blank, present = target.device.blank(), target.device.task
+    if present != task:
+        blank = Blank.of(task, blank.size, blank.touches("train"))
+        blank.configured = target.device.configured
+    learner, data = build_learner(target.config), build_data(target.config, blank)
     parent.load_weights(learner, data)
     network = learner.network  # refuses another learner before gestures are read from a port
     steps.begin("reading or simulating the gestures")
     steps.silent = target.device.real
     touches, others = choose_gestures(target.device, settings)
+    touches = label_as(touches, present, task)
+    if others is not None and present != task:
+        others = Blank(task, target.device.size, label_as(others.touches("test"), present, task))
     steps.silent = False
     steps.begin("choosing the threshold of the alarm")
-    task, evaluation = target.device.task, check_evaluation(target.config.evaluation)
     point = alarm_point(parent, learner, target.config, one_skin=True, device=target.twin)
     figures: dict[str, float] = {}
     if others is not None:
@@ -403,15 +507,23 @@ def _adapt(config: Config, overrides: Sequence[str], steps: Steps) -> None:
     name = f"{target.config.row} {identity['simulator']} {len(touches)} gestures seed {settings.seed}"
     store = Store.open(config.tracking)
     with store.run(name, identity, parent.identity) as run:
-        log_configuration(store, run.info.run_id, target.config, touches_hash(touches))
         steps.begin("fine-tuning")
         adaptation = fine_tune(network, data, touches, settings)
+        scratch = learn_from_scratch(touches, task, adaptation, settings, options)
+        chosen, choice = target.config, ""
+        if scratch is not None:
+            learner, chosen = scratch.learner, replace(target.config, learner=scratch.settings)
+            choice = f"{scratch.name}, from scratch"
+        elif adaptation.better:
+            choice = adaptation.choice
+        log_configuration(store, run.info.run_id, chosen, touches_hash(touches))
         log_learner(store, run, learner)
         steps.begin("evaluating the result")
-        if adaptation.better and point is not None:
+        if choice and point is not None:
             point = choose_operating_point(learner, target.twin, evaluation)
         figures |= _figures("validation_before", adaptation.before, touches, task)
         after = adaptation.after if adaptation.better else adaptation.before
+        after = after if scratch is None else scratch.chances
         figures |= _figures("validation", after, touches, task)
         if others is None:
             store.client.set_tag(run.info.run_id, TAG, "null" if point is None else point.text())
@@ -422,12 +534,12 @@ def _adapt(config: Config, overrides: Sequence[str], steps: Steps) -> None:
             same = {key: value for key, value in report.metrics.items() if key.startswith("same/")}
             figures |= same
         store.client.log_text(run.info.run_id, _table(adaptation.trials), "adapt.csv")
-        store.client.set_tag(run.info.run_id, "chosen", adaptation.choice)
+        store.client.set_tag(run.info.run_id, "chosen", choice)
     Console().print(metrics_table(figures, f"{name}, run {run.info.run_id}"))
-    about = "validation: the gestures to adapt on, each predicted by a network that was not trained on it"
+    about = "validation: the gestures to adapt on, each predicted by a model that was not trained on it"
     print(about, "" if others is None else "; before, same: other gestures of the skin", sep="")
-    unchanged = "fine-tuning is not better on held-out gestures: the new run keeps the weights of run "
-    print(f"fine-tuned: {adaptation.choice}" if adaptation.better else f"{unchanged}{parent.identity}")
+    unchanged = "nothing is better on held-out gestures: the new run keeps the weights of run "
+    print(f"chosen: {choice}" if choice else f"{unchanged}{parent.identity}")
 
 
 def _figures(

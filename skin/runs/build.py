@@ -66,6 +66,8 @@ def _check_options(config: Config, *names: str) -> None:
 def build_device(config: Config) -> AbstractDevice:
     """Return the device, with its body, layout and, if it has one, its simulator."""
     body, layout = _body_and_layout(config, "device")
+    if config.task is not None and "task" not in config.device:
+        raise InputError(f"task={config.task} needs device=recording device.path=FILE.parquet")
     # Not arguments of instantiate, which would treat the dataclass of the body as a configuration.
     device: AbstractDevice = instantiate(config.device, _partial_=True)(body=body, layout=layout)
     if device.simulation is not None and device.simulation.model.mechanical:
@@ -115,11 +117,11 @@ def with_skin(config: Config, body: AbstractBody | str | None, layout: AbstractL
         InputError: there is no such option or file, or a sensor lies outside the body.
     """
     if body is not None:
-        settings = _default_option("body", body) if isinstance(body, str) else _body_settings(body)
+        settings = default_option("body", body) if isinstance(body, str) else _body_settings(body)
         config = replace(config, body=settings)
     if isinstance(layout, str):
         file = layout.lower().endswith(".csv")
-        settings = _default_option("layout", "file" if file else layout)
+        settings = default_option("layout", "file" if file else layout)
         config = replace(config, layout=settings | ({"path": layout} if file else {}))
     elif layout is not None:
         check_groups({"body": config.body})
@@ -153,7 +155,7 @@ def _listed_settings(layout: AbstractLayout, body: AbstractBody) -> dict[str, An
     }
 
 
-def _default_option(group: str, name: str) -> dict[str, Any]:
+def default_option(group: str, name: str) -> dict[str, Any]:
     """Return the default settings of an option.
 
     Raises:

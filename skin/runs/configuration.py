@@ -46,6 +46,8 @@ ADDED: dict[str, Any] = {
     "footprint_error": 0.0,
     "described": None,
     "interface": 0.0,
+    "task": None,
+    "targets": None,
     "second": 0.0,
     "training_touch": {},
     "start": None,
@@ -181,6 +183,7 @@ class Config:
 
     row: str | None = None
     seed: int = 0
+    task: str | None = None
     epochs: dict[str, int] = field(default_factory=dict)
     touch: dict[str, Any] = field(default_factory=dict)
     body: dict[str, Any] = field(default_factory=dict)

@@ -418,8 +418,13 @@ class RunModel(TrainedModel):
             thresholds: rate of a device, Hz -> threshold of the alarm; None: :attr:`threshold` only.
 
         Raises:
-            InputError: as of :attr:`contact`.
+            InputError: as of :attr:`contact`; or the model estimates targets.
         """
+        if self.task.kind == "regression":
+            raise InputError(
+                f"{self.title} estimates {', '.join(self.task.names)}, and no labels: skin export "
+                "writes models of labels or classes"
+            )
         return ModelMetadata(
             run=self.identity,
             title=self.title,

@@ -1,4 +1,4 @@
-"""Labels of a touch and their thresholds.
+"""What is learned of a touch: labels and their thresholds, classes, or measured targets.
 
 torch is not imported here: an exported model needs no torch.
 """
@@ -20,7 +20,8 @@ class Task:
 
     Attributes:
         names: one name per label, in the order of the label tensor's last axis.
-        kind: ``binary`` (each label holds or not by itself) or ``exclusive`` (exactly one holds).
+        kind: ``binary`` (each label holds or not by itself), ``exclusive`` (exactly one holds) or
+            ``regression`` (each is a measured target, such as x, m, or force, N).
         gate: the label without which the others are undefined (report, 4.2), such as ``touch``; None: all
             labels are always defined.
         direction: the last two labels are not binary but the cosines of a direction with x and y, -1 to 1.
@@ -31,7 +32,7 @@ class Task:
     """
 
     names: Annotated[tuple[str, ...], MinLen(1), ONCE]
-    kind: Literal["binary", "exclusive"] = "binary"
+    kind: Literal["binary", "exclusive", "regression"] = "binary"
     gate: str | None = None
     direction: bool = False
 
@@ -46,7 +47,9 @@ class Task:
 
     @property
     def binary(self) -> tuple[str, ...]:
-        """The names of all labels but a direction's."""
+        """The names of all labels but a direction's; targets of a regression are no labels."""
+        if self.kind == "regression":
+            return ()
         return self.names[:-2] if self.direction else self.names
 
     @property
@@ -79,6 +82,14 @@ class Task:
         shares[:, -2:] = (1 + labels[:, -2:]) / 2
         return shares
 
+
+def target_unit(name: str) -> str:
+    """Return the unit of a target in recordings: m of a place, N of a force, and none of others."""
+    return "m" if name in PLACE else "N" if name.startswith("force") else ""
+
+
+PLACE = ("x", "y")
+"""The targets that are a place together."""
 
 TOUCH = Task(("big", "dynamic", "press", "dangerous"))
 """The four binary labels of the report, section 2.1.1."""

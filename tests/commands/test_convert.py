@@ -94,6 +94,50 @@ def test_bad_input_ends_with_a_sentence(run, tmp_path, words, message):
     assert not list(tmp_path.glob("x.*"))
 
 
+def test_classes_and_targets_are_learned_instead_of_labels(run, tmp_path):
+    write(tmp_path)
+    mapping = MAPPING | {"classes": {"column": "gesture"}}
+    (tmp_path / "map.yaml").write_text(yaml.safe_dump(mapping, sort_keys=False))
+    done = run(tmp_path, "convert", "from=map.yaml", "out=x.parquet", store=False)
+    assert done.returncode == 0, done.stderr
+    assert "classes pat, press, tap" in done.stdout
+    trees = ["experiment=features", "learner.rounds=20"]
+    network = ["representation=readings", "model=mlp", "trainer.max_epochs=2"]
+    for task, figure in (("classes", "overall/accuracy"), ("regression", "force/rms_N")):
+        for settings in (trees, network):
+            words = ["device=recording", "device.path=x.parquet", f"task={task}", *settings]
+            done = run(tmp_path, "train.py", *words)
+            assert done.returncode == 0, done.stderr
+            assert figure in done.stdout
+            assert "press/accuracy" not in done.stdout
+    done = run(tmp_path, "evaluate.py", "run=latest")
+    assert done.returncode == 0, done.stderr
+    assert "force/rms_N" in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["task=classes"], "x.csv has no classes: give task=labels or task=regression"),
+        (["task=regression", "device.targets=[x]"], "x.csv has no target x, it has force"),
+        (["device.targets=[force]"], "device.targets needs task=regression"),
+        (["task=gestures"], "device.task=gestures must be"),
+        (["task=regression", "learner=rules"], "learner=rules knows the labels"),
+        (["task=regression", "device=simulated"], "task=regression needs device=recording"),
+    ],
+)
+def test_what_is_not_in_a_recording_is_not_learned(run, tmp_path, words, message):
+    write(tmp_path, persons=2, touches=12)
+    done = run(tmp_path, "convert", "from=map.yaml", "out=x.csv", store=False)
+    assert done.returncode == 0, done.stderr
+    words = ["device=recording", "device.path=x.csv", "experiment=features", *words]
+    words = [word for word in words if "device=simulated" not in words or not word.startswith("device.path")]
+    done = run(tmp_path, "train.py", *(words[1:] if "device=simulated" in words else words))
+    assert done.returncode == 2, done.stderr
+    assert message in done.stderr
+    assert done.stderr.count("\n") == 1
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [

@@ -132,9 +132,11 @@ def test_epi_has_a_touch_in_each_row(tmp_path):
     (tmp_path / "training_data_y.csv").write_text("\n".join(map(str, range(10, -1, -1))))
     recording = convert_files(read_format("epi"), tmp_path)
     assert torch.allclose(recording.touches.readings[3], torch.tensor(0.1 * values[3].T).float())
-    assert recording.task.kind == "exclusive"
-    assert recording.task.names[:2] == ("hold", "rub")
-    assert recording.touches.labels.argmax(1).tolist() == list(range(10, -1, -1))
+    assert recording.task.names == ("big", "dynamic", "press")
+    assert recording.touches.labels[[10, 3]].tolist() == [[1, 0, 1], [1, 0, 0]]  # hold and slap
+    assert recording.touches.labels[7].isnan().tolist() == [False, True, True]  # pick
+    assert recording.metadata["classes"][:2] == ["hold", "rub"]
+    assert recording.parameters["class"].tolist() == list(range(10, -1, -1))
 
 
 def test_a_folder_has_contacts_and_persons(tmp_path):
@@ -270,7 +272,6 @@ PRESS = {"press": {"column": "label", "values": {"press": 1, "none": 0}}}
         ({"labels": {"press": {"column": "label", "values": {"tap": 1}}}}, "press is unknown in all touches"),
         ({"labels": {"press": {"column": "label"}}}, "labels.press needs column and values"),
         ({"labels": {"press": {"column": "label", "values": {"press": 2}}}}, "values must be 0 or 1"),
-        ({"labels": PRESS, "classes": {"column": "label"}}, "give labels or classes, not both"),
         ({"classes": {"column": "person"}}, "fewer than two of the classes anna"),
         ({"groups": ["session"]}, "has no column session, which groups names"),
         ({"groups": ["label"]}, "each touch needs one group, got none and press"),

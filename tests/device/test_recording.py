@@ -7,11 +7,12 @@ import torch
 
 from skin.body.base import Sheet
 from skin.body.layout import Grid, Scattered
-from skin.device.files import Manifest, describe_recording, write_recording
+from skin.device.files import Manifest, describe_recording, read_recording, write_recording
 from skin.device.recording import Recorded
 from skin.device.simulated import Simulated
 from skin.errors import InputError
 from skin.mechanics.simulator.naive import Naive
+from skin.touch.labels import Task
 
 LAYER = [{"material": "EcoFlex 00-30", "thickness": 0.005}]
 BODY = Sheet([0.16, 0.16], [16, 16], LAYER)
@@ -153,3 +154,45 @@ def test_a_converted_recording_brings_its_sensors(simulated, tmp_path):
     assert not device.configured
     assert not device.blank().configured
     assert device.split == "by gesture"
+
+
+def test_classes_and_targets_replace_the_labels(simulated, tmp_path):
+    count = len(simulated)
+    parameters = {
+        "class": torch.arange(count).float() % 3,
+        "x": torch.linspace(0, 0.1, count),
+        "force": torch.arange(count).float().where(torch.arange(count) % 2 == 0, torch.nan),
+        "group_person": torch.arange(count).float() % 5,
+    }
+    about = {"groups": {"person": list("abcde")}, "classes": ["pat", "rub", "tap"]}
+    stored = str(
+        write_recording(replace(simulated, parameters=parameters, metadata=about), tmp_path / "x.csv")
+    )
+    classes = Recorded(BODY, LAYOUT, stored, task="classes", test_groups="a")
+    assert classes.task == Task(("pat", "rub", "tap"), "exclusive")
+    assert (classes.all_touches().labels.argmax(1) == parameters["class"]).all()
+    both = Recorded(BODY, LAYOUT, stored, task="regression", test_groups="a")
+    assert both.task == Task(("x", "force"), "regression")
+    assert both.touches("test").labels[:, 1].isnan().any()
+    place = Recorded(BODY, LAYOUT, stored, task="regression", targets=["x"])
+    torch.testing.assert_close(place.all_touches().labels[:, 0], parameters["x"])
+    assert place.recording().task == place.task
+    again = write_recording(place.recording(), tmp_path / "targets.parquet")
+    torch.testing.assert_close(read_recording(again).touches.labels[:, 0], parameters["x"])
+    assert Recorded(BODY, LAYOUT, stored, task="labels").task == simulated.task
+    with pytest.raises(InputError, match="has no target y, it has x, force"):
+        Recorded(BODY, LAYOUT, stored, task="regression", targets=["y"])
+
+
+@pytest.mark.parametrize("name", ["class", "x"])
+def test_one_class_or_value_to_train_on_is_refused(simulated, tmp_path, name):
+    person = torch.arange(len(simulated)) % 2
+    parameters = {name: person.float(), "group_person": person.float()}
+    about = {"groups": {"person": ["a", "b"]}, "classes": ["pat", "rub"]}
+    stored = str(
+        write_recording(replace(simulated, parameters=parameters, metadata=about), tmp_path / "x.csv")
+    )
+    task = {"class": "classes", "x": "regression"}[name]
+    message = {"class": "pat lacks a class", "x": "x has less than two values"}[name]
+    with pytest.raises(InputError, match=f"{message} in the touches to train on"):
+        Recorded(BODY, LAYOUT, stored, task=task, test_groups="b").touches("train")

@@ -212,3 +212,16 @@ def test_unknown_labels_do_not_count(scored):
     truth[50:] = torch.nan
     known = compute_metrics(chances[:50], truth[:50], task)
     assert compute_metrics(chances, truth, task) == pytest.approx(known)
+
+
+def test_errors_of_targets_are_in_their_units():
+    """Unknown targets do not count."""
+    task = Task(("x", "y", "force", "speed"), "regression")
+    truth = torch.tensor([[0.0, 0.0, 1.0, 1.0], [0.01, 0.02, 3.0, 2.0], [0.02, 0.01, torch.nan, 3.0]])
+    wrong = torch.tensor([[0.003, 0.004, 0.5, 0.0], [-0.003, 0.004, -0.5, 0.0], [0.003, -0.004, 9.0, 0.0]])
+    values = compute_metrics(truth.nan_to_num() + wrong, truth, task)
+    expected = {"x/rms_mm": 3, "y/rms_mm": 4, "place/rms_mm": 5, "force/rms_N": 0.5, "speed/rms": 0}
+    assert {name: values[name] for name in expected} == pytest.approx(expected, abs=1e-5)
+    spread = (1e-4 * 2 / 3, 1e-4 * 2 / 3, 1.0)
+    shares = [1 - 9e-6 / spread[0], 1 - 16e-6 / spread[1], 1 - 0.25, 1.0]
+    assert values["overall/r2"] == pytest.approx(sum(shares) / 4, rel=1e-4)

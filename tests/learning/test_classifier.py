@@ -16,6 +16,7 @@ from skin.learning.representation import Frames
 from skin.touch.labels import TOUCH, TOUCH_OR_NOT, TOUCH_SLIDING, Task
 
 GESTURES = Task(("grab", "hit", "stroke"), "exclusive")
+PLACE = Task(("x", "force"), "regression")
 
 
 class Flat(AbstractFusion):
@@ -207,7 +208,19 @@ def test_a_batch_of_one_touch_can_be_learnt_from():
     assert torch.isfinite(logits).all()
 
 
-@pytest.mark.parametrize("task", [TOUCH, TOUCH_OR_NOT, GESTURES])
+def test_the_loss_of_targets_is_relative_to_their_deviation():
+    network = classifier(PLACE)
+    network.targets.scale(torch.tensor([[0.0, 10.0], [0.02, torch.nan], [0.01, 30.0]]))
+    assert network.targets.mean.tolist() == pytest.approx([0.01, 20.0])
+    predicted = torch.tensor([[0.01, 20.0], [0.03, 0.0]])
+    labels = torch.tensor([[0.01, 25.0], [0.01, torch.nan]])
+    wanted = (0.5**2 + (0.02 / network.targets.deviation[0].item()) ** 2) / 3
+    assert network.loss(predicted, labels).item() == pytest.approx(wanted)
+    assert network(Frames(torch.zeros(1, 3, 2), None))[0, 1].item() == pytest.approx(20, abs=10)
+    assert torch.equal(probabilities(predicted, PLACE), predicted)
+
+
+@pytest.mark.parametrize("task", [TOUCH, TOUCH_OR_NOT, GESTURES, PLACE])
 def test_unknown_labels_have_no_loss_and_no_gradient(task):
     """The loss is that of the touches whose labels are known; without any, it is 0."""
     network = classifier(task)

@@ -9,7 +9,8 @@ from hydra.utils import instantiate
 
 from skin.errors import InputError
 from skin.learning.data import TouchData
-from skin.runs.adaptation import FineTuning, Folds, Trial, fine_tune, split_folds
+from skin.learning.few import split_folds
+from skin.runs.adaptation import FineTuning, Folds, Trial, fine_tune
 from skin.runs.build import build_learner
 
 SMALL = FineTuning(layers=["all"], lr=[3e-3], epochs=15, patience=5)

@@ -335,14 +335,15 @@ class LiveContacts:
         environment = os.environ | dict.fromkeys(_THREADS, "1") | {"PYTHONPATH": places}
         self._whole = whole
         self.explain(PREPARING)
-        # In a session of its own, Ctrl-C does not reach it.
+        # In a group of its own, Ctrl-C does not reach it. In a session of its own, its priority would not
+        # count: Linux shares the processor among sessions first.
         self._process = subprocess.Popen(
             [sys.executable, "-c", f"from {__name__} import serve; serve()"],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
             env=environment,
-            start_new_session=True,
+            process_group=0,
         )
         self._thread = Thread(target=self._run, args=(mechanics,), name="skin-contacts", daemon=True)
         self._thread.start()

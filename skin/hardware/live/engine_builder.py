@@ -378,8 +378,14 @@ def engine_settings(
         drift: N in ten minutes that the baseline may follow without touch.
 
     Raises:
-        InputError: ``touch`` is neither given nor known, or the threshold raises no alarm.
+        InputError: ``touch`` is neither given nor known, the threshold raises no alarm, or the model
+            estimates targets.
     """
+    if model.task.kind == "regression":
+        raise InputError(
+            f"{model.title} estimates {', '.join(model.task.names)}: skin live shows labels or classes, so "
+            "give a run of those"
+        )
     contact = model.contact if touch is None else touch
     if patience.above is None and model.threshold is not None:
         if model.threshold >= 1:

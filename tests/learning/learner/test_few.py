@@ -1,0 +1,198 @@
+"""Learners for few touches: labels, classes and targets, the choice among them, and damaged files."""
+
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+import pytest
+import torch
+from hydra.utils import instantiate
+from scipy.spatial.distance import cdist
+from sklearn.ensemble import ExtraTreesClassifier
+from sklearn.kernel_ridge import KernelRidge as SklearnKernelRidge
+
+from skin.device.base import AbstractDevice
+from skin.device.touches import Touches, one_hot
+from skin.errors import InputError
+from skin.learning.data import TouchData
+from skin.learning.features import above_idle, course_features
+from skin.learning.few import Chosen, ExtraTrees, KernelRidge, few_features, touch_losses
+from skin.touch.labels import TOUCH, Task
+
+PLACE = Task(("x", "force"), "regression")
+GESTURES = Task(("pat", "hold", "tap"), "exclusive")
+
+
+@dataclass
+class Presses(AbstractDevice):
+    """Yields presses on a row of four sensors: where, how hard, and how often."""
+
+    task: Task
+    size = (0.04, 0.01)
+    configured = False
+
+    def touches(self, split: str, epoch: int = 0) -> Touches:
+        """Return 100 presses to train on, 40 else."""
+        source = torch.Generator().manual_seed(sum(map(ord, split)))
+        count = 100 if split == "train" else 40
+        x, force = 0.04 * torch.rand(count, generator=source), 1 + 4 * torch.rand(count, generator=source)
+        places = 0.01 * (torch.arange(4) + 0.5)
+        gesture = torch.arange(count) % 3
+        time = torch.arange(30)
+        course = torch.stack([(time % 6 < 2).float(), torch.ones(30), (time == 9).float()])[gesture]
+        course = course * ((time > 3) & (time < 24))
+        readings = (
+            force[:, None, None]
+            * course[..., None]
+            * torch.exp(-(((x[:, None] - places) / 0.01) ** 2))[:, None]
+        )
+        readings = readings + 0.01 * torch.randn(readings.shape, generator=source)
+        labels = torch.stack([x, force], dim=1) if self.task == PLACE else one_hot(gesture.float(), 3)
+        labels[::10] = torch.nan
+        positions = torch.stack([places, torch.full((4,), 0.005), torch.zeros(4)], dim=1)
+        return Touches(readings, torch.ones_like(readings).bool(), positions, labels, 10.0)
+
+
+def data_of(task, configured) -> TouchData:
+    return TouchData(Presses(task), instantiate(configured("representation=readings").representation), 32)
+
+
+@pytest.mark.parametrize("make", [KernelRidge, ExtraTrees])
+def test_classes_and_targets_are_learned_and_stored(make, configured, tmp_path):
+    for task in (GESTURES, PLACE):
+        data = data_of(task, configured)
+        learner = make()
+        learner.fit(data)
+        touches = data.touches("test")
+        result = learner.probabilities(touches)
+        known = ~touches.labels[:, 0].isnan()
+        if task == GESTURES:
+            torch.testing.assert_close(result.sum(dim=1), torch.ones(40))
+            assert (result.argmax(1) == touches.labels.argmax(1))[known].float().mean() > 0.95
+        else:
+            errors = (result - touches.labels)[known].square().mean(dim=0).sqrt()
+            assert (errors < torch.tensor([0.003, 0.6])).all()
+        folder = tmp_path / task.kind
+        folder.mkdir()
+        path = learner.save(folder)
+        other = make()
+        other.load(data, path)
+        assert torch.equal(other.probabilities(touches), result)
+
+
+def test_the_leave_one_out_errors_are_those_of_trainings_without_the_touch(configured, monkeypatch):
+    monkeypatch.setattr("skin.learning.few._SCALES", (1.0,))
+    monkeypatch.setattr("skin.learning.few._RIDGES", np.array([0.1]))
+    outputs = []
+    monkeypatch.setattr(
+        "skin.learning.few._fit_link", lambda held, labels: outputs.append(held) or np.ones(2)
+    )
+    values = np.random.default_rng(0)
+    matrix, labels = values.normal(size=(30, 5)), (values.random((30, 1)) > 0.5).astype(float)
+    learner = KernelRidge().learn(matrix, labels, Task(("press",)))
+    kernel = learner._fitted[0]
+    if kernel.scale == 0:
+        gram = kernel.vectors @ kernel.vectors.T / 5
+    else:
+        gram = np.exp(-cdist(kernel.vectors, kernel.vectors, "cityblock") / 5)
+    centred = labels[:, 0] - labels.mean()
+    for left in (0, 17):
+        rest = np.delete(np.arange(30), left)
+        plain = SklearnKernelRidge(alpha=0.1, kernel="precomputed").fit(
+            gram[np.ix_(rest, rest)], centred[rest]
+        )
+        expected = plain.predict(gram[left, rest][None])[0] + labels.mean()
+        assert outputs[0][left, 0] == pytest.approx(expected)
+
+
+def test_the_trees_are_those_of_scikit_learn():
+    values = np.random.default_rng(0)
+    matrix = values.normal(size=(60, 4)).astype(np.float32)
+    labels = (matrix[:, :1] + 0.3 * values.normal(size=(60, 1)) > 0).astype(float)
+    learner = ExtraTrees(seed=3).learn(matrix[:40], labels[:40], Task(("press",)))
+    plain = ExtraTreesClassifier(300, random_state=3).fit(matrix[:40], labels[:40, 0])
+    np.testing.assert_allclose(learner.predict(matrix[40:])[:, 0], plain.predict_proba(matrix[40:])[:, 1])
+
+
+def test_the_member_with_the_lower_held_out_loss_is_kept(configured, tmp_path, capsys):
+    data = data_of(GESTURES, configured)
+    members = {"kernel_ridge": partial(KernelRidge), "extra_trees": partial(ExtraTrees)}
+    learner = Chosen(members, folds=4)
+    learner.fit(data)
+    best = min(learner.losses, key=learner.losses.get)
+    assert capsys.readouterr().err.strip().endswith(f": {best}")
+    path = learner.save(tmp_path)
+    assert [folder.name for folder in path.iterdir()] == [best]
+    other = Chosen(members)
+    other.load(data, path)
+    touches = data.touches("test")
+    assert torch.equal(other.probabilities(touches), learner.probabilities(touches))
+    with pytest.raises(ValueError, match="it holds none of extra"):
+        Chosen({"extra": partial(ExtraTrees)}).load(data, path)
+    with pytest.raises(InputError, match="learner=chosen has no member"):
+        Chosen({})
+
+
+@pytest.mark.parametrize("make", [KernelRidge, ExtraTrees])
+def test_a_single_class_is_refused(make):
+    matrix = np.random.default_rng(0).normal(size=(20, 3))
+    with pytest.raises(InputError, match="all training touches have the same label press: give more"):
+        make().learn(matrix, np.ones((20, 1)), Task(("press",)))
+
+
+@pytest.mark.parametrize(
+    ("make", "name", "change"),
+    [
+        (KernelRidge, "0_weights", lambda array: array[:-1]),
+        (KernelRidge, "0_vectors", lambda array: array[:, 1:]),
+        (KernelRidge, "0_mean", lambda array: array * np.nan),
+        (KernelRidge, "0_typical", lambda array: array.astype(str)),
+        (ExtraTrees, "0_left", lambda array: array * 0),
+        (ExtraTrees, "0_right", lambda array: array + 10**6),
+        (ExtraTrees, "0_feature", lambda array: array + 1000),
+        (ExtraTrees, "0_roots", lambda array: array - 1),
+        (ExtraTrees, "0_values", lambda array: array.astype(object)),
+        (ExtraTrees, "0_values", None),
+    ],
+)
+def test_damaged_files_are_refused(make, name, change, configured, tmp_path):
+    data = data_of(PLACE, configured)
+    learner = make()
+    learner.fit(data)
+    path = learner.save(tmp_path)
+    with np.load(path) as stored:
+        content = {key: stored[key] for key in stored.files}
+    array = content.pop(name)
+    np.savez_compressed(path, **content | ({} if change is None else {name: change(array)}))
+    with pytest.raises((ValueError, TypeError)):
+        make().load(data, path)
+
+
+def test_losses_leave_out_what_is_unknown():
+    labels = np.array([[1.0, 0, 0, np.nan], [np.nan] * 4])
+    losses = touch_losses(np.full((2, 4), 0.5), labels, TOUCH)
+    assert losses.tolist() == pytest.approx([np.log(2), 0])
+    place = np.array([[0.0, 1.0], [2.0, np.nan], [4.0, 3.0]])
+    assert touch_losses(np.nan_to_num(place) + 1, place, PLACE)[1] == pytest.approx(1 / np.var([0, 2, 4]))
+
+
+def test_a_touch_from_the_first_frame_on_has_its_idle_level_at_its_end():
+    """For 28 of 30 frames it lasts: a fifth of the window would be in contact."""
+    source = torch.Generator().manual_seed(0)
+    press = 2.0 * (torch.arange(30) < 28)[None, :, None] * torch.tensor([1.0, 0.4, 0.0])
+    offsets = torch.tensor([0.3, -0.2, 0.1])
+    readings = press + offsets + 0.01 * torch.randn(1, 30, 3, generator=source)
+    touches = Touches(readings, torch.ones_like(readings).bool(), torch.zeros(3, 3), None, 10.0)
+    torch.testing.assert_close(above_idle(touches), press, atol=0.05, rtol=0)
+
+
+def test_repeated_contacts_are_counted():
+    course = torch.zeros(1, 30, 1)
+    course[0, [3, 4, 10, 11, 12, 20], 0] = 1.0
+    touches = Touches(course, torch.ones_like(course).bool(), torch.zeros(1, 3), None, 10.0)
+    features = course_features(touches)
+    assert features["contacts above 0.3 of the sum"].item() == 3
+    assert features["mean contact above 0.3 of the sum"].item() == 2
+    assert features["span above 0.3 of the sum"].item() == 18
+    matrix = few_features(touches, TOUCH)
+    assert np.isfinite(matrix).all()

@@ -11,7 +11,7 @@ from typing import Any, overload
 
 import numpy as np
 import torch
-from hydra import compose
+from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from hydra.errors import InstantiationException
 from numpy.typing import ArrayLike
@@ -22,6 +22,7 @@ from skin import __version__
 from skin.body.base import AbstractBody
 from skin.body.layout import AbstractLayout
 from skin.core import array_cache
+from skin.core.files import CONF
 from skin.core.messages import Steps, to_input_error
 from skin.core.settings import configured
 from skin.device import imperfection, sampling
@@ -51,6 +52,7 @@ from skin.runs.store import Store
 from skin.runs.trained_model import TrainedModel
 
 _RATIOS = (1, 2, 3, 5, 7, 10, 15, 20, 30, 50, 70, 100)  # of the rate of a device to that of the model
+_USUAL = "mild"
 _DEVICE = "device"  # in place of a profile: the imperfections of the device that is evaluated
 _FAINT = 0.3  # N, default contact threshold
 _MANY = 4000  # windows of streams, a tenth of which tunes the contact threshold
@@ -168,7 +170,8 @@ def alarm_point_for_touches(
     Args:
         run: the run; its task has the label ``dangerous``.
         learner: of the run, trained.
-        config: its configuration with the skin, the device and the profile to use.
+        config: its configuration with the skin, the device and the profile to use; without a profile, a run
+            trained on devices of independent properties takes ``mild``.
         watching: how the device is watched.
         say: called with each message for the user.
 
@@ -180,8 +183,12 @@ def alarm_point_for_touches(
         point = stored_point(run, learner, settings)
         assert point is not None  # it has the label
         return point
-    device = threshold_device(run.stored, config)
     path = config.device.get("calibration") if config.device.get("port") else None
+    if settings.profile is None and path is None and run.stored.device.get("independent"):
+        # Such trainings have devices so different that a threshold for all of them hides dangerous touches.
+        settings = replace(settings, profile=_USUAL)
+        config = replace(config, evaluation=settings)
+    device = threshold_device(run.stored, config)
     calibration = read_calibration(path) if path and settings.profile is None else None
     if calibration is not None:
         device = device.replace(**_remaining(calibration), randomise=True, calibration=None)
@@ -251,6 +258,9 @@ def profile_settings(name: str) -> dict[str, Any]:
     Raises:
         InputError: there is no such profile.
     """
+    if not GlobalHydra.instance().is_initialized():  # from Python
+        with initialize_config_dir(str(CONF), version_base="1.3"):
+            return profile_settings(name)
     loader = GlobalHydra.instance().config_loader()
     names = loader.get_group_options("profile")
     if name not in names:

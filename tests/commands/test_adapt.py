@@ -92,7 +92,7 @@ def test_the_new_run_is_evaluated_on_its_skin_with_its_weights(run, folder, adap
 
 @pytest.mark.slow
 def test_the_new_run_is_shown_live(run, folder, adapted):
-    done = run(folder, "live", f"run={adapted[1]}", "live.touch=0.3", "seconds=2")
+    done = run(folder, "live", f"run={adapted[1]}", "live.touch=0.3", "live.patience.above=0.5", "seconds=2")
     assert done.returncode == 0, done.stderr
     assert "verdicts" in done.stderr
 

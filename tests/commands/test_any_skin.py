@@ -57,10 +57,13 @@ def test_it_watches_nine_sensors_at_a_port(begin, folder):
             sleep(0.2)
         reader = ["device=serial", f"device.port={link}", f"device.scale={scale[1]}"]
         store = [f"tracking.uri=sqlite:///{folder}/m.db", f"tracking.artifacts={folder}/a"]
+        refused = both.enter_context(begin(folder, "live", *reader, *OWN, *store, "seconds=8"))
+        assert refused.wait() == 2, refused.err  # a training of one epoch finds few dangerous touches
+        assert "it hides dangerous touches" in " ".join(refused.err.split())
+        store.append("live.patience.above=0.5")
         live = both.enter_context(begin(folder, "live", *reader, *OWN, *store, "seconds=8"))
         assert live.wait() == 0, live.err
     assert re.search(r"[1-9]\d* verdicts", live.err), live.err
-    assert re.search(r"chosen on \d+ fresh safe gestures", " ".join((live.out + live.err).split()))
 
 
 @pytest.mark.slow

@@ -166,7 +166,7 @@ def test_a_group_refuses_a_setting_before_anything_is_made(configured, overrides
 
 
 LIVE = {"web_port": 8765, "top": 4.0, "touch": None, "drift": 0.2, "verdicts": None, "log": None,
-        "selftest": True, "patience": {"label": 0.15}}  # fmt: skip
+        "contacts": True, "selftest": True, "patience": {"label": 0.15}}  # fmt: skip
 
 
 @pytest.mark.parametrize(

@@ -82,6 +82,8 @@ def test_no_threads_are_refused(configured):
 def logged(folder):
     """Return (name, status, losses of validation by epoch) of every run that is no sweep, oldest first."""
     with sqlite3.connect(folder / "m.db") as database:
+        if not database.execute("select name from sqlite_master where name = 'runs'").fetchall():
+            return []
         found = database.execute(
             "select name, status, (select group_concat(value) from metrics "
             "where metrics.run_uuid = runs.run_uuid and key = 'val_loss') "

@@ -62,7 +62,8 @@ def test_positively_homogeneous(simulator, factor):
     once, more = simulator(frames), simulator(factor * frames)
     torch.testing.assert_close(more.readings, factor * once.readings, rtol=1e-5, atol=1e-5)
     if once.displacement is not None:
-        torch.testing.assert_close(more.displacement, factor * once.displacement, rtol=1e-5, atol=1e-9)
+        rounded = 2e-6 * float(more.displacement.abs().max())  # single precision
+        torch.testing.assert_close(more.displacement, factor * once.displacement, rtol=1e-5, atol=rounded)
 
 
 def test_nothing_reads_nothing_and_its_gradient_is_finite(simulator):

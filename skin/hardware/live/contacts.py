@@ -174,7 +174,7 @@ class Mechanics:
 
 
 class MeanReadings(NamedTuple):
-    """MeanReadings of a moment.
+    """The mean readings of a moment.
 
     Attributes:
         values: (S,), N above the untouched skin: the mean of some frames.

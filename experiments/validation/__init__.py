@@ -179,12 +179,12 @@ def _line(result: tuple[Law, CheckResult]) -> str:
 
 def _section(result: tuple[Law, CheckResult]) -> str:
     law, outcome = result
-    lines = [f"\n## {law.name}\n\n{law.statement}\n"]
     missed = [finding for finding in outcome.findings if not finding.ok]
-    lines += [f"\n- **missed**: {finding.case}, error {_error(finding)}" for finding in missed]
-    lines += [f"\n- {remark}" for remark in outcome.remarks]
-    lines += [f"\n\n![{plot.title}](results/physics/{plot.name}.png)" for plot in outcome.plots]
-    return "".join(lines).rstrip("\n") + "\n"
+    notes = [f"- **missed**: {finding.case}, error {_error(finding)}" for finding in missed]
+    notes += [f"- {remark}" for remark in outcome.remarks]
+    pictures = [f"![{plot.title}](results/physics/{plot.name}.png)" for plot in outcome.plots]
+    parts = [f"\n## {law.name}", law.statement, "\n".join(notes), *pictures]
+    return "\n\n".join(filter(None, parts)) + "\n"
 
 
 def _table(results: Results) -> Iterator[Sequence[str]]:

@@ -62,7 +62,14 @@ def keep_first_line(app, what, name, value, options, lines):
         lines.insert(0, "")
 
 
+def join_names(app, what, name, value, options, lines):
+    """Keep names with one description together; Sphinx takes the first of several words for a type."""
+    several = re.compile(r":(?:param|ivar) \w+(?:, \w+)+:")
+    lines[:] = [several.sub(lambda match: match[0].replace(", ", ","), line) for line in lines]
+
+
 def setup(app):
     """Connect the functions above; Sphinx calls this."""
     app.connect("source-read", link_cards)
     app.connect("autodoc-process-docstring", keep_first_line, priority=400)  # before Napoleon, at 500
+    app.connect("autodoc-process-docstring", join_names, priority=600)  # behind it

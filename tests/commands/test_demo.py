@@ -100,6 +100,14 @@ def test_the_page_is_there_while_the_threshold_is_chosen(begin, tmp_path, monkey
 
 
 @pytest.mark.slow
+def test_the_alarm_of_the_shipped_model_is_chosen_for_the_emulated_device(run, tmp_path):
+    """With the threshold for the devices of its training, dangerous touches were hidden, and it ended."""
+    done = run(tmp_path, "live", "demo=true", "live.web_port=0", "live.contacts=false", "seconds=2")
+    assert done.returncode == 0, done.stderr
+    assert "100.0 Hz" in done.stdout + done.stderr
+
+
+@pytest.mark.slow
 def test_what_is_killed_leaves_no_process_and_no_port(begin, tmp_path):
     with begin(
         tmp_path, "live", "demo=true", "live.web_port=0", "live.patience.above=0.97", "web=true"

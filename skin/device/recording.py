@@ -185,12 +185,8 @@ class Recorded(AbstractDevice):
         """Return the touches of the whole file, or of the first shard."""
         return self._read(0).touches
 
-    def with_labels(self, task: Task) -> "Recorded":
-        """Return the device with the labels of a run; those that the file lacks are unknown.
-
-        Raises:
-            InputError: it has none of them, or labels of another kind.
-        """
+    def with_labels(self, task: Task) -> AbstractDevice:
+        """Return the device with the labels of a run; those that the file lacks are unknown."""
         present = self.task
         if task == present:
             return self

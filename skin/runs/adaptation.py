@@ -34,7 +34,6 @@ from skin.core.messages import Steps
 from skin.core.rng import Stream, generator
 from skin.core.settings import checked, configured, import_target
 from skin.device.base import AbstractDevice, Blank
-from skin.device.recording import Recorded
 from skin.device.touches import Touches, touches_hash
 from skin.errors import InputError
 from skin.evaluation.metrics import compute_metrics
@@ -367,8 +366,7 @@ def find_target(
     simulated = replace(parent.configured(compose("adapt", words), words), evaluation=config.evaluation)
     device, twin = build_device(measured), threshold_device(simulated, simulated)
     _check(parent, device, twin)
-    if isinstance(device, Recorded):
-        device = device.with_labels(twin.task)
+    device = device.with_labels(twin.task)
     drawn = device.simulation is not None
     budget = simulated_budget(settings.gestures or _DEFAULT)
     gestures: dict[str, Any] = {"gestures": budget, "fresh": False} if drawn else {}

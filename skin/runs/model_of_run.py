@@ -28,7 +28,6 @@ from skin.core.settings import configured
 from skin.device import imperfection, sampling
 from skin.device.base import AbstractDevice, AbstractSimulated
 from skin.device.calibration import Calibration, read_calibration
-from skin.device.recording import Recorded
 from skin.device.touches import Touches
 from skin.errors import InputError
 from skin.evaluation import decisions, operating_point
@@ -537,7 +536,7 @@ def load_model(
 
 def _with_labels(stored: Config, device: AbstractDevice) -> AbstractDevice:
     """Return a device whose recorded touches have the labels of a run."""
-    if not isinstance(device, Recorded):
+    if device.real or device.reference is not None:
         return device
     try:
         task = build_device(stored).task

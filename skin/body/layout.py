@@ -412,6 +412,8 @@ def _read(path: Path) -> dict[str, np.ndarray]:
         reader.fieldnames = names = [name.strip() for name in reader.fieldnames or []]
         needed = {"x_m", "y_m"} | (set(_FACING) if set(_FACING) & set(names) else set())
         if missing := needed - set(names):
+            if any(";" in name for name in names):
+                raise ValueError("semicolons between its columns: save it with commas, and 0.04 for 0,04")
             present = ", ".join(names) or "nothing"
             raise ValueError(f"no column {' and '.join(sorted(missing))}, found {present[:_SHOWN]}")
         columns = [name for name in names if name in _PLACE + _FACING]

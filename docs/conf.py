@@ -56,6 +56,13 @@ def link_cards(app, name, source):
     source[0] = re.sub(r"\.\./models/(\w+)/README\.md", r"cards/\1.md", source[0])
 
 
+def keep_first_line(app, what, name, value, options, lines):
+    """Keep Napoleon from taking what is before a colon in the first line of an attribute for its type."""
+    if what in ("attribute", "data", "property"):
+        lines.insert(0, "")
+
+
 def setup(app):
-    """Connect the function above; Sphinx calls this."""
+    """Connect the functions above; Sphinx calls this."""
     app.connect("source-read", link_cards)
+    app.connect("autodoc-process-docstring", keep_first_line, priority=400)  # before Napoleon, at 500

@@ -45,6 +45,13 @@ def test_every_page_is_in_the_table_of_contents():
             assert f"\n{page.stem}\n" in text, page
 
 
+def test_every_model_has_a_page_of_its_card():
+    models = {path.parent.name for path in (ROOT / "models").glob("*/README.md")}
+    assert {path.stem for path in (DOCS / "cards").glob("*.md")} == models
+    for name in models:
+        assert f"../../models/{name}/README.md" in (DOCS / "cards" / f"{name}.md").read_text()
+
+
 def test_the_reference_lists_the_public_names():
     names = set(re.findall(r"^\| `skin\.(\w+)`", (DOCS / "api.md").read_text(), re.MULTILINE))
     assert names == set(skin.__all__)

@@ -69,11 +69,25 @@ def test_a_run_is_loaded_and_predicts_a_recording(run, tmp_path):
         skin.load_run("none", f"sqlite:///{tmp_path}/m.db")
 
 
-def test_the_example_of_the_readme_runs():
-    (code,) = re.findall(r"^```python\n(.*?)^```", (ROOT / "README.md").read_text(), re.DOTALL | re.MULTILINE)
-    assert len([line for line in code.splitlines() if line.strip()]) <= 12
-    made = {}
-    exec(code, made)
+def run_example(page):
+    """Return the variables of the Python example of a page after it has run."""
+    (code,) = re.findall(r"^```python\n(.*?)^```", (ROOT / page).read_text(), re.DOTALL | re.MULTILINE)
+    variables = {}
+    exec(code, variables)
+    return variables
+
+
+def test_the_example_of_the_readme_runs(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    made = run_example("README.md")
+    assert len(made["run"].labels) == 4
+    chances = dict(zip(made["run"].labels, made["run"].predict(made["readings"])[0], strict=True))
+    assert chances["press"] > 0.5 > chances["big"]
+    assert "dangerous" in capsys.readouterr().out
+
+
+def test_the_simulator_is_differentiable_as_documented():
+    made = run_example("docs/mechanics.md")
     assert made["readings"].shape == (20,)
     assert made["pressure"].grad.abs().max() > 0
 
@@ -81,13 +95,9 @@ def test_the_example_of_the_readme_runs():
 @pytest.fixture(scope="module")
 def example(tmp_path_factory):
     """Return the variables of the Python example of the page on ``any_skin`` after it has run."""
-    page = (ROOT / "docs" / "pretrained.md").read_text()
-    (code,) = re.findall(r"^```python\n(.*?)^```", page, re.DOTALL | re.MULTILINE)
-    variables = {}
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(tmp_path_factory.mktemp("example"))
-        exec(code, variables)
-    return variables
+        return run_example("docs/pretrained.md")
 
 
 def test_the_example_predicts_from_an_array(example):

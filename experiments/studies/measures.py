@@ -16,6 +16,7 @@ from skin.evaluation.settings import StreamSettings, check_evaluation
 if TYPE_CHECKING:
     import numpy as np
     from mlflow.entities import Run
+    from torch import Tensor
 
     from experiments.studies.pages import Page
     from skin.device.base import AbstractDevice
@@ -264,6 +265,61 @@ class TouchAlarms:
             lines.append(f"{name}: {reached.sentence()}")
         metrics |= {"touch/threshold": touch.threshold, "window/threshold": window.threshold}
         return Measurement(metrics, Page("\n".join(lines), {}, []))
+
+
+@dataclass(frozen=True)
+class Motion:
+    """How far touches change the distances of neighbouring sensors; needs no run.
+
+    Args:
+        gestures: number of gestures.
+        count: neighbours of a sensor are its nearest so many (``representation.count``).
+    """
+
+    gestures: Annotated[int, Ge(1)] = 1000
+    count: Annotated[int, Ge(1)] = 6
+
+    def __call__(self, subject: Subject) -> Measurement:
+        import numpy as np
+        import torch
+
+        from experiments.studies.pages import Page
+        from skin.core.rng import Stream, generator
+        from skin.learning.graph import neighbours
+
+        device = subject.device.simulated("motions of sensors are simulated")
+        positions = torch.tensor(device.sensors.positions)
+        if len(positions) < 2:
+            raise InputError("one sensor has no neighbours whose distance could change: add sensors")
+        pairs = np.nonzero(np.triu(neighbours(device.sensors.positions, "knn", self.count)))
+        movie = device.sampler.sample(self.gestures, generator(Stream.TEST, 8))
+        motion = device.model.motion(movie.frames)[movie.index] * movie.scale[..., None, None]
+        changes = distance_changes(positions, motion[motion.flatten(2).any(dim=-1)], *pairs)
+        largest, quantile = float(changes.max()), float(np.quantile(changes, 0.99))
+        return Measurement(
+            {"distance/largest": largest, "distance/quantile": quantile},
+            Page(
+                f"Over {self.gestures} gestures neighbours change their distance by {largest:.2%} at most, "
+                f"99 % quantile {quantile:.2%} of pairs and frames in contact."
+            ),
+        )
+
+
+def distance_changes(
+    positions: "Tensor", motion: "Tensor", first: "np.ndarray", second: "np.ndarray"
+) -> "Tensor":
+    """Return relative changes of the distance of pairs of sensors, (..., P), without sign.
+
+    Args:
+        positions: of the sensors at rest (S, 3), m.
+        motion: of the sensors (..., S, 3), m.
+        first, second: sensors of each pair (P,).
+    """
+    rest, moved = (
+        (places[..., first, :] - places[..., second, :]).norm(dim=-1)
+        for places in (positions, positions + motion)
+    )
+    return (moved / rest - 1).abs()
 
 
 @dataclass(frozen=True)

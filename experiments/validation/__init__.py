@@ -1,7 +1,7 @@
 """The result of checking a law: our number, the reference and the tolerance; and the page of all results."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 from itertools import cycle
 from pathlib import Path
@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
+from experiments.studies.pages import csv_text
 from skin.core.files import json_line, whole, write
 from skin.plot.figures import MARKS
 
@@ -108,10 +109,10 @@ Results = Sequence[tuple[Law, CheckResult]]
 _HEAD = """# Physics, verified
 
 Written by `make physics`, which exits with code 1 if a law does not hold: each is checked against an
-independent solution. Only digits that are the same on every processor are shown; rounding errors are an
-upper bound. `results/physics.json` holds all digits of one machine. `pytest tests/mechanics` checks what
-small examples can show: balance and reciprocity, `solid` against scikit-fem, `fem` against PyNite,
-relaxation, `naive`, and contact.
+independent solution. [All numbers](results/physics/physics.csv) have the digits that are the same on every
+processor; rounding errors are an upper bound. `results/physics.json` holds all digits of one machine.
+`pytest tests/mechanics` checks what small examples can show: balance and reciprocity, `solid` against
+scikit-fem, `fem` against PyNite, relaxation, `naive`, and contact.
 
 | law | reference | worst error | tolerance | |
 |---|---|---|---|---|
@@ -142,8 +143,9 @@ _LIMITS = """
 
 
 def publish_physics(folder: Path, json_path: Path, results: Results) -> None:
-    """Write physics.md and its plots into a folder, and the findings as JSON, each file atomically."""
+    """Write physics.md, its numbers and plots into a folder, and findings as JSON, each file atomically."""
     write(as_json(results), json_path)
+    write(csv_text(_table(results)), folder / "results" / "physics" / "physics.csv")
     for _, outcome in results:
         for plot in outcome.plots:
             draw(plot, folder / "results" / "physics" / f"{plot.name}.png")
@@ -177,17 +179,22 @@ def _line(result: tuple[Law, CheckResult]) -> str:
 
 def _section(result: tuple[Law, CheckResult]) -> str:
     law, outcome = result
-    lines = [f"\n## {law.name}\n\n{law.statement}\n\n"]
-    lines.append("| | ours | reference | error | tolerance |\n|---|---|---|---|---|\n")
-    for finding in outcome.findings:
-        ours = f"{finding.ours:.5g}" if finding.reference else _error(finding)
-        lines.append(
-            f"| {finding.case} | {ours} | {finding.reference:.5g} | {_error(finding)} | "
-            f"{finding.tolerance:.0e}{'' if finding.ok else ', **missed**'} |\n"
-        )
-    lines += [f"\n- {remark}" for remark in outcome.remarks]
-    lines += [f"\n\n![{plot.title}](results/physics/{plot.name}.png)" for plot in outcome.plots]
-    return "".join(lines).rstrip("\n") + "\n"
+    missed = [finding for finding in outcome.findings if not finding.ok]
+    notes = [f"- **missed**: {finding.case}, error {_error(finding)}" for finding in missed]
+    notes += [f"- {remark}" for remark in outcome.remarks]
+    pictures = [f"![{plot.title}](results/physics/{plot.name}.png)" for plot in outcome.plots]
+    parts = [f"\n## {law.name}", law.statement, "\n".join(notes), *pictures]
+    return "\n\n".join(filter(None, parts)) + "\n"
+
+
+def _table(results: Results) -> Iterator[Sequence[str]]:
+    """Yield the header and a line per finding, with digits that do not depend on the processor."""
+    yield "law", "case", "ours", "reference", "error", "tolerance", "ok"
+    for law, outcome in results:
+        for finding in outcome.findings:
+            ours = f"{finding.ours:.5g}" if finding.reference else _error(finding)
+            numbers = f"{finding.reference:.5g}", _error(finding), f"{finding.tolerance:.0e}"
+            yield law.name, finding.case, ours, *numbers, "yes" if finding.ok else "no"
 
 
 def _excess(finding: Finding) -> float:

@@ -121,13 +121,14 @@ def check_quickly(config: Config, overrides: Sequence[str]) -> None:
     """
     # They import numpy, for which a mistyped setting must not wait.
     from skin.body.base import check_plausibility
-    from skin.hardware.wire.reader import PortSettings, check_port
 
     groups: dict[str, Any] = {name: group for name in _GROUPS if (group := getattr(config, name))}
     check_groups({name: groups[name] for name in ("body", "layout") if name in groups})
     check_plausibility(groups)
     device = groups.get("device", {})
     if isinstance(port := device.get("port"), str):
+        from skin.hardware.wire.reader import PortSettings, check_port
+
         PortSettings.select({name: value for name, value in device.items() if value is not None})
         check_port(port)
     named = {override.split("=")[0].split(".")[0] for override in overrides}

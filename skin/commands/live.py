@@ -28,6 +28,7 @@ from skin.runs.configuration import Config, overrides, validate_config
 if TYPE_CHECKING:
     from skin.hardware.live.engine_builder import LiveSettings
     from skin.hardware.live.loop import Display
+    from skin.runs.trained_model import TrainedModel
 
 
 _DEMO = (
@@ -131,6 +132,7 @@ def show(config: Config, changes: Sequence[str], own_mechanics: bool = False) ->
     from skin.hardware.live.contacts import LiveContacts
     from skin.hardware.live.engine_builder import LiveSettings, watch_exported, watch_run
     from skin.hardware.live.loop import Display, DisplayInfo, LiveLoop
+    from skin.hardware.live.terminal import show_in_terminal
     from skin.runs.exported_model import check_overrides
 
     live = LiveSettings.of(config.live)
@@ -145,21 +147,28 @@ def show(config: Config, changes: Sequence[str], own_mechanics: bool = False) ->
             opened.enter_context(ends_on_signal())
             contacts = LiveContacts("live.contacts=false")
             opened.callback(contacts.close)
+            displays = list[Display]()
+
+            def open_views(model: "TrainedModel", name: str) -> None:
+                span = model.window / model.rate
+                info = DisplayInfo(model.title, name, model.positions, model.size, live.top, span)
+                displays.append(Display(info, contacts))
+                displays[0].set_verdict(None, "the threshold of the alarm is being chosen")
+                for text in _views(displays[0], config, live, opened):
+                    say(text)
+
             if exported:
-                watched = watch_exported(str(config.run), config.device, live, say, opened)
+                watched = watch_exported(str(config.run), config.device, live, say, opened, open_views)
                 if live.contacts:
                     contacts.explain(_EXPORTED)
                     say(f"no contacts: {_EXPORTED}")
             else:
-                watched = watch_run(config, live, say, changes, opened, contacts, own_mechanics)
-            source, model = watched.source, watched.model
-            display = Display(
-                DisplayInfo(model.title, source.name, model.positions, model.size, live.top, watched.span),
-                contacts,
-            )
-            for text in _views(display, config, live, opened):
-                say(text)
+                watched = watch_run(config, live, say, changes, opened, contacts, open_views, own_mechanics)
+            (display,) = displays
+            if live.verdicts != "stdout":
+                opened.enter_context(show_in_terminal(display, Console()))
             before = partial(watched.check, live.selftest, say)
+            source = watched.source
             session = LiveLoop(source.skin, source.tare, watched.settings.build(), display, before)
             opened.callback(lambda: say(f"{session.verdicts} verdicts, {session.line}"))
             session.run(config.seconds)
@@ -181,9 +190,3 @@ def _views(display: "Display", config: Config, live: "LiveSettings", open_: Exit
         from skin.hardware.live.loop import stream_verdicts
 
         yield f"verdicts: {open_.enter_context(stream_verdicts(display, live.verdicts))}"
-    if live.verdicts != "stdout":
-        from rich.console import Console
-
-        from skin.hardware.live.terminal import show_in_terminal
-
-        open_.enter_context(show_in_terminal(display, Console()))

@@ -67,6 +67,7 @@ def measure(
     force: Tensor,
     model_rate: float,
     noise: np.random.Generator,
+    ongoing: bool = False,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return what a device measures, at the rate of a model.
 
@@ -81,13 +82,14 @@ def measure(
         force: (B, T, S), true readings, N, at the model's rate.
         model_rate: Hz.
         noise: source of the noise and of the phases.
+        ongoing: touches may go on after the window; otherwise they end in it, whatever the phase.
 
     Returns:
         readings (B, T, S), N, float32, valid and saturated (B, T, S), bool.
     """
     rate = imperfection.rate
     if not imperfection.aligned or imperfection.framed or not isinstance(rate, int | float):
-        return _measure_each(imperfection, constants, force, model_rate, noise)
+        return _measure_each(imperfection, constants, force, model_rate, noise, ongoing)
     if rate <= model_rate:
         return imperfection.apply(force, constants, noise)
     fine = between_frames(force, model_rate, rate, noise.random(len(force)))
@@ -101,6 +103,7 @@ def _measure_each(
     force: Tensor,
     model_rate: float,
     noise: np.random.Generator,
+    ongoing: bool,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return what :func:`measure` does, each gesture read at the rate of its device and at a phase.
 
@@ -113,8 +116,9 @@ def _measure_each(
     if imperfection.aligned:
         shifts = (0.5 - shifts) / ratios
     else:
-        # Later by part of an interval; earlier where the window ends with the touch.
-        shifts -= (force[:, -1] != 0).any(dim=1).cpu().numpy()
+        # Later by part of an interval; earlier where the window ends with the touch. One that goes on is
+        # shown to the middle of its last frame at least, which its labels count.
+        shifts -= (force[:, -1] != 0).any(dim=1).cpu().numpy() * (0.5 if ongoing else 1)
     if imperfection.framed:
         framed = noise.random(batch) < imperfection.framed
         ratios, shifts = np.where(framed, 1, ratios), np.where(framed, 0, shifts)

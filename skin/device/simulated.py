@@ -380,7 +380,8 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
         force, constants, rate = true.touches.readings, self.constants, self.model_rate
         if self.randomise:
             constants = draw_constants(self.imperfection, len(self.sensors), rate, noise, len(true))
-        readings, valid, saturated = measure(self.imperfection, constants, force, rate, noise)
+        ongoing = self.sampler.settings.ongoing > 0
+        readings, valid, saturated = measure(self.imperfection, constants, force, rate, noise, ongoing)
         clipped = {"clipped": saturated.flatten(1).any(1).float()}
         touches = replace(true.touches, readings=readings, valid=valid, saturated=saturated)
         return replace(true, touches=touches, parameters=true.parameters | clipped)

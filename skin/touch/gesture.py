@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
 Draws = dict[str, np.ndarray]
 """Named parameters of gestures, one entry each along the first axis."""
+_RELEASE = 0.3  # s after a touch in which it is still judged; skin.evaluation.decisions.RELEASE
 _From0 = Annotated[tuple[NonNegativeFloat, PositiveFloat], RISING]
 _Above0 = Annotated[tuple[PositiveFloat, PositiveFloat], RISING]
 
@@ -121,6 +122,9 @@ class TouchSettings(ABC):
         over_sensors: a touch is dangerous if the mean pressure over the footprint of a sensor exceeds the
             threshold; False: over an equal area anywhere on the sheet, so that touches between the sensors
             count.
+        ongoing: share of touches whose window ends at some moment from their begin to 0.3 s after their end,
+            as the windows of a live view do. Labels are those of what the window shows. It has no effect on
+            touches that begin at the first frame.
 
     Raises:
         InputError: a range that is empty, out of order, or on the wrong side of its threshold.
@@ -138,6 +142,7 @@ class TouchSettings(ABC):
     shear: NonNegativeFloat = 0.0
     redraws: PositiveInt = 30
     over_sensors: bool = True
+    ongoing: Annotated[float, Ge(0), Le(1)] = 0.0
     gap: _Above0 = (1.0, 6.0)
     stride: _Above0 = (1.5, 4.5)
     thresholds: Thresholds = field(default_factory=Thresholds)
@@ -306,7 +311,15 @@ def draw_times(
     chance = generator.random((len(labels), 2))
     duration = least + (chance[:, 0] * (most - least + 1)).astype(int)
     free = frames.window - duration if padded else np.zeros_like(duration)
-    return {"duration": duration, "onset": (chance[:, 1] * (free + 1)).astype(int)}
+    onset = (chance[:, 1] * (free + 1)).astype(int)
+    if padded and settings.ongoing:
+        ongoing, moment = generator.random((2, len(labels)))
+        # Whether a touch is a press, and whether it moves, shows after so many frames.
+        earliest = np.where(press, frames.duration + 1, 1 + dynamic)
+        latest = np.minimum(duration + round(_RELEASE * settings.rate), frames.window)
+        shown = earliest + (moment * (latest - earliest + 1)).astype(int)
+        onset = np.where(ongoing < settings.ongoing, frames.window - shown, onset)
+    return {"duration": duration, "onset": onset}
 
 
 def draw_paths(

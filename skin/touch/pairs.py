@@ -14,7 +14,7 @@ def add_second(movie: Movie, share: float, contact: float, generator: np.random.
 
     The second gesture overlaps the first in time, nowhere on the sheet, and has no label that the first does
     not have. The sum then keeps the labels of the first: a label holds if it holds for one of the two.
-    A gesture that leaves no room for any other of the movie stays alone.
+    A gesture that leaves no room for any other of the movie stays alone. The second one ends in the window.
 
     Args:
         movie: gestures (B,), whose pressures add up; without friction.
@@ -28,7 +28,9 @@ def add_second(movie: Movie, share: float, contact: float, generator: np.random.
     """
     first = torch.from_numpy(np.flatnonzero(generator.random(len(movie)) < share))
     chance = torch.from_numpy(generator.random((len(first), len(movie) + 1)))
-    allowed = (movie.labels <= movie.labels[first][:, None]).all(dim=2) & _apart(movie, first, contact)
+    whole = movie.parameters["onset"] + movie.parameters["duration"] <= movie.index.shape[1]
+    allowed = whole & (movie.labels <= movie.labels[first][:, None]).all(dim=2)
+    allowed &= _apart(movie, first, contact)
     score, second = chance[:, :-1].where(allowed, -1).max(dim=1)
     first, second, moment = first[score >= 0], second[score >= 0], chance[score >= 0, -1]
     contacts = torch.ones(len(movie))

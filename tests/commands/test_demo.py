@@ -88,6 +88,18 @@ def test_a_device_is_refused(run, tmp_path):
 
 
 @pytest.mark.slow
+def test_the_page_is_there_while_the_threshold_is_chosen(begin, tmp_path, monkeypatch):
+    monkeypatch.setenv("SKIN_CACHE", str(tmp_path))
+    with begin(tmp_path, "live", "demo=true", "live.web_port=0") as demo:
+        first = next(pictures(page_of(demo)))
+        assert "choosing the alarm's threshold" not in demo.err.partition("page: ")[0]
+        assert first["verdict"] is None
+        assert "threshold of the alarm is being chosen" in json.dumps(first)
+        demo.send_signal(signal.SIGINT)
+        assert demo.wait(PATIENCE) == 0, demo.err
+
+
+@pytest.mark.slow
 def test_what_is_killed_leaves_no_process_and_no_port(begin, tmp_path):
     with begin(
         tmp_path, "live", "demo=true", "live.web_port=0", "live.patience.above=0.97", "web=true"

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from scipy.stats import chi2
 
 from skin.body.base import Sheet
 from skin.body.layout import Grid
@@ -143,5 +144,7 @@ def test_the_most_probable_place_has_the_local_precision():
     found = estimate(simulator, fingertip, readings, true, noise, centre, priors)
     error = (found - true).square().unflatten(0, (200, draws)).mean(1)
     place = (error[:, :2].mean(1) / variances[:, :2].mean(1)).sqrt()
-    assert 0.9 < place.median() < 1.3
-    assert 0.9 < (error[:, 3] / variances[:, 3]).sqrt().median() < 1.3
+    # Medians of the root of the mean of eight and of four squared normal values: 0.96 and 0.92, not 1.
+    normal = [(chi2(number).median() / number) ** 0.5 for number in (2 * draws, draws)]
+    assert 0.9 < place.median() / normal[0] < 1.3
+    assert 0.9 < (error[:, 3] / variances[:, 3]).sqrt().median() / normal[1] < 1.3

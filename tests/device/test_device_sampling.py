@@ -178,6 +178,19 @@ def test_touches_begin_anywhere_in_an_interval():
     assert not readings[:, 0].any()
 
 
+def test_a_touch_that_goes_on_is_shown_to_the_middle_of_its_last_frame():
+    rising = torch.arange(-2.0, 4.0).clamp(min=0)[None, :, None].expand(2000, -1, 1)
+    device = Imperfection(rate=1000.0, aligned=False, noise=0.0, offset=0.0, gain_spread=0.0)
+    constants = device.constants(1, np.random.default_rng(0))
+    readings = measure(device, constants, rising, 10.0, np.random.default_rng(1), ongoing=True)[0][:, :, 0]
+    # A reading is up to 1 ms from the middle, in which it falls by 0.06.
+    torch.testing.assert_close(readings[:, -1], torch.full((2000,), 3.0), atol=0.06, rtol=0)
+    # With a uniform phase: the first interval of the touch holds from nothing to its first frame.
+    assert 0.2 < (readings[:, 2] > 0.01).float().mean() < 0.8
+    assert readings[:, 4].min() < 2.1
+    assert readings[:, 4].max() > 2.4
+
+
 @pytest.mark.parametrize("drawn", [0.0, 1e-12, 30.0])
 def test_rare_draws_of_noise_are_finite(drawn):
     class Rare(np.random.Generator):
@@ -199,6 +212,16 @@ def test_a_share_of_devices_reads_the_frames_of_the_model():
     readings = measure(device, constants, force, 10.0, np.random.default_rng(1))[0]
     framed = (readings - force).abs().amax(dim=(1, 2)) < 1e-6
     assert framed.float().mean().item() == pytest.approx(0.3, abs=0.05)
+
+
+def test_a_share_of_devices_has_no_lag():
+    ranges = {"time_constant": (0.02, 0.1), "hysteresis": (0.01, 0.1), "independent": True}
+    device = Imperfection(prompt=0.4, **ranges)
+    constants = device.constants(3, np.random.default_rng(0), 2000)
+    assert (constants.time_constant == 0).float().mean().item() == pytest.approx(0.4, abs=0.04)
+    assert (constants.hysteresis > 0).all()
+    former = Imperfection(**ranges).constants(3, np.random.default_rng(0), 2000)
+    assert torch.equal(former.gain, constants.gain)  # other constants stay what they were
 
 
 def test_independent_ranges_are_not_correlated():

@@ -64,6 +64,18 @@ def test_a_label_holds_if_it_holds_for_one_of_the_two(single, paired):
         assert torch.equal(paired.parameters[name][rows] > limit, single.labels[rows, column] == 1)
 
 
+def test_only_a_gesture_that_ends_in_the_window_is_added():
+    cut = sample(ongoing=1.0)
+    paired = add_second(cut, 1.0, 0.02, np.random.default_rng(4))
+    rows = torch.nonzero(paired.parameters["contacts"] == 2)[:, 0]
+    assert len(rows) > 20
+    second = (paired.pressure()[rows].double() - cut.pressure()[rows].double()).amax(dim=(2, 3)) > 100
+    highest = (paired.pressure()[rows].double() - cut.pressure()[rows].double()).amax(dim=(2, 3))
+    begins, ends = second.int().argmax(dim=1), 29 - second.int().flip(1).argmax(dim=1)
+    for row, (begin, end) in enumerate(zip(begins.tolist(), ends.tolist(), strict=True)):
+        assert highest[row, end] < 1.5 * highest[row, begin] + 100  # it falls as it rises
+
+
 def test_without_a_share_nothing_changes(single):
     assert "contacts" not in single.parameters
     assert torch.equal(sample(second=0.0).frames, single.frames)

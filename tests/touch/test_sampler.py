@@ -154,6 +154,29 @@ def test_unpadded_touches_begin_at_the_first_frame():
     assert (movie.parameters["onset"] == 0).all()
 
 
+def test_windows_that_end_during_a_touch_are_labelled_by_what_they_show():
+    settings = {"ongoing": 0.5, "press": [0.4, 2.8]}
+    source, padded = (
+        sampler(SHEETS["default"], **settings),
+        sampler(SHEETS["default"], **settings, padded=False),
+    )
+    movie = source.sample(1600, np.random.default_rng(5))
+    onset, duration, frames = (movie.parameters[name] for name in ("onset", "duration", "frames"))
+    rest = 30 - onset - duration  # frames after the touch
+    cut = rest < 0
+    assert 0.15 < cut.float().mean() < 0.3
+    assert (rest <= 3).float().mean() > 0.5
+    torch.testing.assert_close(frames, torch.minimum(duration, 30 - onset))
+    assert torch.equal(movie.labels[:, 2] == 1, frames > 3)
+    sensors = movie.pressure().flatten(2) @ source.footprints.T
+    assert torch.equal(movie.labels[:, 3] == 1, sensors.amax(dim=(1, 2)) > 90.5e3)
+    peak = movie.scale.amax(dim=1)
+    assert (peak[cut] < 1).any()  # before their highest force
+    assert torch.equal(peak[~cut], torch.ones(int((~cut).sum())))
+    assert (movie.labels.mean(dim=0) == 0.5).all()
+    assert (padded.sample(160, np.random.default_rng(5)).parameters["onset"] == 0).all()
+
+
 def test_the_same_seed_is_the_same_movie_and_another_is_not():
     source = sampler(SHEETS["default"])
     one, same, other = (source.sample(32, np.random.default_rng(seed)) for seed in (1, 1, 2))

@@ -46,7 +46,10 @@ def test_a_miss_is_written_as_one(tmp_path):
     publish_physics(tmp_path, tmp_path / "physics.json", [(LAW, outcome)])
     text = (tmp_path / "physics.md").read_text()
     assert "| [gravity](#gravity) | an apple | 0.2 | 1e-01 | **fails** |" in text
-    assert "| this | 1.2 | 1 | 0.2 | 1e-01, **missed** |" in text
+    assert "- **missed**: this, error 0.2\n" in text
+    assert "that, error" not in text
+    table = (tmp_path / "results" / "physics" / "physics.csv").read_text().splitlines()
+    assert table[1:] == ["gravity,this,1.2,1,0.2,1e-01,no", "gravity,that,1,1,< 1e-06,1e-01,yes"]
     assert "a remark" in text
     assert (tmp_path / "results" / "physics" / "apple.png").stat().st_size > 2000
     assert not list(tmp_path.rglob("*.part"))
@@ -60,23 +63,24 @@ def test_a_miss_is_written_as_one(tmp_path):
     assert "NaN" not in as_json([(LAW, CheckResult([Finding("lost", math.nan, 1, math.nan, 0.1)]))])
 
 
-def test_the_page_is_the_same_where_rounding_differs():
+def test_the_files_are_the_same_where_rounding_differs(tmp_path):
     """Noise of double and of single precision, of either sign, and other laws worst by it."""
 
-    def written(noise: float) -> str:
+    def write_files(noise: float) -> tuple[str, str]:
         exact = relative_finding("exact", 2.23588314 * (1 + 1e-13 * noise), 2.23588314, 1e-8)
         single = relative_finding("single", 66867.31 * (1 + 1e-7 * noise), 66867.31, 1e-6)
         nothing = relative_finding("nothing", 1e-14 * noise, 0.0, 1e-10)
         real = relative_finding("real", 0.98361523 * (1 + 1e-9 * noise), 0.98768812, 0.05)
-        return physics_page(
-            [(LAW, CheckResult(found)) for found in ([exact, nothing], [exact, single], [real])]
-        )
+        results = [(LAW, CheckResult(found)) for found in ([exact, nothing], [exact, single], [real])]
+        publish_physics(tmp_path, tmp_path / "physics.json", results)
+        table = tmp_path / "results" / "physics" / "physics.csv"
+        return (tmp_path / "physics.md").read_text(), table.read_text()
 
-    text = written(0.0)
-    assert all(written(noise) == text for noise in (-3.1, -1.0, 0.4, 1.7, 3.0))
-    assert "| exact | 2.2359 | 2.2359 | < 1e-10 | 1e-08 |" in text
-    assert "| nothing | < 1e-10 | 0 | < 1e-10 | 1e-10 |" in text
-    assert "| real | 0.98362 | 0.98769 | 0.0041 | 5e-02 |" in text
+    files = write_files(0.0)
+    assert all(write_files(noise) == files for noise in (-3.1, -1.0, 0.4, 1.7, 3.0))
+    assert "gravity,exact,2.2359,2.2359,< 1e-10,1e-08,yes\n" in files[1]
+    assert "gravity,nothing,< 1e-10,0,< 1e-10,1e-10,yes\n" in files[1]
+    assert "gravity,real,0.98362,0.98769,0.0041,5e-02,yes\n" in files[1]
 
 
 def test_laws_are_chosen_by_name():
@@ -95,3 +99,6 @@ def test_the_page_in_the_docs_knows_every_law_and_its_pictures():
     for name in re.findall(r"\((results/physics/[^)]+)\)", text):
         assert (ROOT / "docs" / name).is_file()
     assert "missed" not in text
+    table = (ROOT / "docs" / "results" / "physics" / "physics.csv").read_text().splitlines()[1:]
+    assert {line.split(",")[0] for line in table} == {law.name for law in LAWS}
+    assert all(line.endswith(",yes") for line in table)

@@ -242,11 +242,6 @@ class Watched:
     nominal: EngineSettings
 
     @property
-    def span(self) -> float:
-        """Length of the window, s."""
-        return self.settings.frames / self.settings.rate
-
-    @property
     def selftest(self) -> SelfTest | None:
         """The test of the alarm; None where no alarm is raised, or no touches are known."""
         if self.nominal.presses is None or not self.model.alarms:
@@ -272,8 +267,17 @@ class Watched:
             selftest.run(conversion, self.source.raw_range, say)
 
 
+Loaded = Callable[[TrainedModel, str], None]
+"""Called with the model and the name of its device before the threshold of the alarm is chosen."""
+
+
 def watch_exported(
-    path: str, device: Mapping[str, Any], live: LiveSettings, say: Callable[[str], None], opened: ExitStack
+    path: str,
+    device: Mapping[str, Any],
+    live: LiveSettings,
+    say: Callable[[str], None],
+    opened: ExitStack,
+    loaded: Loaded,
 ) -> Watched:
     """Return an exported network and a skin at a port.
 
@@ -283,6 +287,7 @@ def watch_exported(
         live: settings of the live view.
         say: called with each message for the user.
         opened: closes the port in the end.
+        loaded: opens the views.
 
     Raises:
         InputError: the file cannot be used, or the device is no skin at a port, or cannot be opened.
@@ -296,6 +301,7 @@ def watch_exported(
     source = SerialSource(PortSettings.select(device), len(model.positions), model.rate).open_source()
     opened.enter_context(source.skin)
     say(f"loaded {model.title} from {path}, exported by version {model.metadata.version}")
+    loaded(model, source.name)
     return Watched(model, source, *used_and_nominal(model, source, live, say))
 
 
@@ -306,6 +312,7 @@ def watch_run(
     overrides: Sequence[str],
     opened: ExitStack,
     contacts: LiveContacts,
+    loaded: Loaded,
     own_mechanics: bool = False,
 ) -> Watched:
     """Return a finished run and the device of a configuration.
@@ -317,6 +324,7 @@ def watch_run(
         overrides: settings that replace those of the run; ``config`` has their values.
         opened: closes the device in the end.
         contacts: is started as soon as the mechanics are known.
+        loaded: opens the views, which then show that the threshold is being chosen.
         own_mechanics: the device has the mechanics of the run, though it is at a port.
 
     Raises:
@@ -355,6 +363,7 @@ def watch_run(
         except InputError as error:
             contacts.explain(str(error))
             say(f"no contacts: {error}")
+    loaded(model, device.name if port is None else port.name)
     settings = used_and_nominal(model, port, live, say)
     if port is None:
         port = open_source(device)

@@ -112,7 +112,7 @@ def test_it_runs_without_torch_and_writes_json_lines(model, skin, tmp_path):
 
 def test_only_a_skin_at_a_port_is_watched(model):
     with pytest.raises(InputError, match="add device=serial"), ExitStack() as opened:
-        watch_exported(str(model), {"seed": 0}, LIVE, print, opened)
+        watch_exported(str(model), {"seed": 0}, LIVE, print, opened, lambda *_: None)
 
 
 @pytest.mark.parametrize(("rates", "threshold"), [(None, 0.25), ({"20": 0.3, "100": 0.35, "500": 0.4}, 0.35)])
@@ -120,10 +120,15 @@ def test_the_settings_of_the_file_and_of_the_command(trained, skin, tmp_path, ra
     """The threshold is the one for the rate of the device, which sends 100 frames a second."""
     of, touches = trained
     path, said = tmp_path / "skin.onnx", []
+    loaded = []  # what is said before the views open
     write_model(of.learner.pipeline(of.places), of.describe(rates), touches, path)
     with ExitStack() as opened:
-        watched = watch_exported(str(path), {"port": skin, "labels": "announced"}, LIVE, said.append, opened)
-    assert (watched.model.title, watched.span, len(watched.model.positions)) == ("untrained", 3.0, 6)
+        device = {"port": skin, "labels": "announced"}
+        ready = lambda model, name: loaded.extend([model.title, name, *said])  # noqa: E731
+        watched = watch_exported(str(path), device, LIVE, said.append, opened, ready)
+    assert (watched.model.title, len(watched.model.positions)) == ("untrained", 6)
+    assert loaded[:2] == ["untrained", watched.source.name]
+    assert not any("alarm above" in text for text in loaded)
     assert said[-1] == f"alarm above {threshold:.4f}"
     assert ("single windows" in said[-2]) == (rates is None)
     assert watched.nominal.presses.shape == (6, 6)
@@ -133,7 +138,7 @@ def test_the_settings_of_the_file_and_of_the_command(trained, skin, tmp_path, ra
 def test_the_command_replaces_settings_of_the_file(model, skin):
     said, other = [], replace(LIVE, touch=0.5, patience=DebounceSettings(above=0.75))
     with ExitStack() as opened:
-        watched = watch_exported(str(model), {"port": skin}, other, said.append, opened)
+        watched = watch_exported(str(model), {"port": skin}, other, said.append, opened, lambda *_: None)
     assert said[-1] == "alarm above 0.75"
     assert (watched.settings.detection.threshold, watched.nominal.detection.threshold) == (0.5, 0.3)
 

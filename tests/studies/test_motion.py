@@ -1,0 +1,37 @@
+"""The distances of sensors change with the touch, as positions that are moved by hand say."""
+
+import numpy as np
+import pytest
+import torch
+
+from experiments.studies.measures import Motion, Subject, distance_changes
+from skin.errors import InputError
+from skin.runs.build import build_device
+
+FREE = "simulator=fem", "simulator.constraint=free", "body.cells=[10,10]", "layout=grid", "layout.rows=2"
+
+
+def measure(configured, *settings: str):
+    """Return what is measured of a device."""
+    config = configured(*settings)
+    return Motion(gestures=20)(Subject(config, build_device(config)))
+
+
+def test_the_largest_change_is_that_of_two_neighbours(configured):
+    result = measure(configured, *FREE, "layout.columns=1")
+    assert 1e-6 < result.metrics["distance/quantile"] <= result.metrics["distance/largest"] < 0.1
+    assert f"{result.metrics['distance/largest']:.2%}" in result.page.about
+
+
+def test_changes_are_those_of_sensors_moved_by_hand():
+    positions = torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.02, 0.0], [0.03, 0.0, 0.0]])
+    motion = torch.tensor([[[0.0, 0.0, 0.0], [0.0, 0.001, 0.0], [-0.003, 0.0, 0.0]]])
+    changes = distance_changes(positions, motion, np.array([0, 0]), np.array([1, 2]))
+    torch.testing.assert_close(changes, torch.tensor([[0.05, 0.1]]))
+
+
+def test_what_cannot_move_is_refused(configured):
+    with pytest.raises(InputError, match=r"simulator\.constraint=free"):
+        measure(configured, "simulator=fem", *FREE[2:], "layout.columns=1")
+    with pytest.raises(InputError, match="add sensors"):
+        measure(configured, *FREE[:4], "layout.rows=1", "layout.columns=1")

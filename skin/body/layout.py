@@ -409,7 +409,7 @@ def _read(path: Path) -> dict[str, np.ndarray]:
         # utf-8-sig, because spreadsheets write a byte order mark.
         lines = StringIO(read_file(path, _BYTES).decode("utf-8-sig"), newline="")
         reader = csv.DictReader(lines, skipinitialspace=True)
-        reader.fieldnames = names = [name.strip() for name in reader.fieldnames or []]
+        reader.fieldnames = names = [" ".join(name.split()) for name in reader.fieldnames or []]
         needed = {"x_m", "y_m"} | (set(_FACING) if set(_FACING) & set(names) else set())
         if missing := needed - set(names):
             if any(";" in name for name in names):

@@ -11,7 +11,7 @@ import pandas as pd
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
-from experiments.studies.real_presses import run_sessions
+from experiments.studies.real_presses import run_places, run_sessions
 from experiments.studies.real_rows import (
     RESAMPLES,
     Presses,
@@ -102,6 +102,7 @@ def read_places(
     train: Sequence[str],
     test: Sequence[str],
     reach: float = np.inf,
+    new: bool = False,
 ) -> Presses:
     """Return frames near the full depth; each file is a session, and the test files are the last together.
 
@@ -110,6 +111,7 @@ def read_places(
         path: of the folder.
         train, test: beginnings of the names of files.
         reach: mm, largest place.
+        new: places, not presses, are held out together.
     """
     parts = list[Presses]()
     names = [*train, *test]
@@ -119,12 +121,13 @@ def read_places(
         deep = (frames.depth > DEEP * frames.depth.max()) & (frames.x <= reach)
         deep = np.flatnonzero(deep)[::EACH]
         session = np.full(len(deep), min(number, len(train)))
+        place = np.rint(frames.x[deep]).astype(int) if new else frames.press[deep] + 1000 * number
         parts.append(
             Presses(
                 press_inputs(frames.readings[deep]),
                 frames.x[deep, None],
                 session,
-                frames.press[deep] + 1000 * number,
+                place,
             )
         )
     inputs = {name: np.concatenate([part.inputs[name] for part in parts]) for name in parts[0].inputs}
@@ -344,12 +347,19 @@ _other = "gains of 6 July 2023, 17:54 -> presses of 17:01, place of the robot fr
 def _rows_of_places(
     name: str, split: str, goal: float, train: Sequence[str], test: Sequence[str]
 ) -> Iterator[RealRow]:
-    """Yield the row for all places, and for those near sensors."""
-    run = partial(run_sessions, train=set(range(len(train))), test=len(train))
+    """Yield the rows for all places and for those near sensors; places are then new, too, in five folds."""
+    sessions: dict[str, Any] = {"train": set(range(len(train))), "test": len(train)}
     for words, reach in ((" near sensors", REACH), (" everywhere", np.inf)):
         read = partial(read_places, train=train, test=test, reach=reach)
         place = split if np.isinf(reach) else f"{split}, places up to {reach:g} mm"
-        yield _x(name=name + words, split=place, goal=goal, read=read, run=run)
+        yield _x(name=name + words, split=place, goal=goal, read=read, run=partial(run_sessions, **sessions))
+        yield _x(
+            name=f"{name} at new places{words}",
+            split=f"{place}; 5 folds by place",
+            goal=None,
+            read=partial(read, new=True),
+            run=partial(run_places, **sessions),
+        )
 
 
 ROWS = (

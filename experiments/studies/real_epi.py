@@ -15,10 +15,11 @@ from skin.body.layout import Grid
 from skin.device.base import Blank
 from skin.device.conversion import convert_files
 from skin.device.formats import read_format
+from skin.device.recording import label_as
 from skin.device.resampling import resample
 from skin.device.touches import CLASS, Recording, Touches, one_hot
 from skin.learning.few import ExtraTrees, KernelRidge, few_features, predict_held_out, touch_losses
-from skin.runs.adaptation import Adaptation, FineTuning, fine_tune, label_as, learn_from_scratch
+from skin.runs.adaptation import Adaptation, FineTuning, fine_tune, learn_from_scratch
 from skin.runs.build import build_data, build_learner, build_skin, default_option, with_skin
 from skin.runs.configuration import Tracking
 from skin.runs.finished_run import find_run

@@ -85,10 +85,16 @@ def place_folds(presses: Presses, seed: int) -> Iterator[tuple[Presses, Presses]
         yield presses[fit], presses[test]
 
 
-def run_places(row: RealRow, presses: Presses, settings: RealSettings) -> Iterator[dict[str, Any]]:
-    """Test on places that no training press has touched, in folds."""
-    squares, places, pairs = [], [], list[str]()
+def run_places(
+    row: RealRow, presses: Presses, settings: RealSettings, train: set[int] | None = None, test: int = 0
+) -> Iterator[dict[str, Any]]:
+    """Test on places that no training press has touched, in folds; on another session, if some train."""
+    squares, places, pairs, sizes = [], [], list[str](), list[int]()
     for training, tested in place_folds(presses, settings.seed):
+        if train is not None:
+            training = training[np.isin(training.session, list(train))]
+            tested = tested[tested.session == test]
+        sizes.append(len(training))
         pair = choose(training, settings.seed, by_place=True)
         squares.append(square_errors(predict(pair, training, tested, settings.seed), tested))
         places.append(tested.place)
@@ -96,9 +102,16 @@ def run_places(row: RealRow, presses: Presses, settings: RealSettings) -> Iterat
     joined = np.concatenate(squares)
     low, high = interval(joined, np.concatenate(places), settings.seed)
     words, value = "; ".join(sorted(set(pairs))), float(np.sqrt(joined.mean()))
-    size = len(presses) - len(presses) // FOLDS
     yield result_line(
-        row, size, len(joined), words, metric="rms", value=value, low=low, high=high, over="places"
+        row,
+        round(float(np.mean(sizes))),
+        len(joined),
+        words,
+        metric="rms",
+        value=value,
+        low=low,
+        high=high,
+        over="places",
     )
 
 

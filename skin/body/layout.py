@@ -409,9 +409,11 @@ def _read(path: Path) -> dict[str, np.ndarray]:
         # utf-8-sig, because spreadsheets write a byte order mark.
         lines = StringIO(read_file(path, _BYTES).decode("utf-8-sig"), newline="")
         reader = csv.DictReader(lines, skipinitialspace=True)
-        reader.fieldnames = names = [name.strip() for name in reader.fieldnames or []]
+        reader.fieldnames = names = [" ".join(name.split()) for name in reader.fieldnames or []]
         needed = {"x_m", "y_m"} | (set(_FACING) if set(_FACING) & set(names) else set())
         if missing := needed - set(names):
+            if any(";" in name for name in names):
+                raise ValueError("semicolons between its columns: save it with commas, and 0.04 for 0,04")
             present = ", ".join(names) or "nothing"
             raise ValueError(f"no column {' and '.join(sorted(missing))}, found {present[:_SHOWN]}")
         columns = [name for name in names if name in _PLACE + _FACING]

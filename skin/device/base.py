@@ -99,6 +99,16 @@ class AbstractDevice(ABC):
         """
         return self
 
+    def with_labels(self, task: Task) -> "AbstractDevice":
+        """Return a device whose touches have the labels of a run, as far as they are known.
+
+        By default it is the device itself.
+
+        Raises:
+            InputError: it knows none of these labels.
+        """
+        return self
+
     def strips(self) -> Iterator[Touches]:
         """Yield touches, N, that can be played one after the other as a stream of frames.
 

@@ -1,6 +1,7 @@
 """Touches from a file or a data set."""
 
 from collections.abc import Iterator, Sequence
+from copy import copy
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -80,6 +81,7 @@ class Recorded(AbstractDevice):
         self._whole = folder.suffix != "" and not folder.is_dir()
         self._stored = _File(path) if self._whole else DataSet(path)
         self._what, self._targets = task, targets
+        self._learned: Task | None = None
         count = sum(self._stored.counts)
         if count < 10 and test == "holdout":
             raise InputError(
@@ -183,6 +185,21 @@ class Recorded(AbstractDevice):
         """Return the touches of the whole file, or of the first shard."""
         return self._read(0).touches
 
+    def with_labels(self, task: Task) -> AbstractDevice:
+        """Return the device with the labels of a run; those that the file lacks are unknown."""
+        present = self.task
+        if task == present:
+            return self
+        plain = task.kind == present.kind == "binary" and (task.gate is None or task.gate in present.names)
+        if self._example.touches.labels is not None and not (plain and set(present.names) & set(task.names)):
+            raise InputError(
+                f"{self.path} has the labels {', '.join(present.names)}, and the run learned "
+                f"{', '.join(task.names)}: give a recording with labels of the run, or without any"
+            )
+        other = copy(self)
+        other.task = other._learned = task
+        return other
+
     def blank(self) -> AbstractDevice:
         """Return a device that has labels, which the file may lack."""
         blank = Blank.of(self.task, self.size, self._example.touches)
@@ -234,7 +251,9 @@ class Recorded(AbstractDevice):
         return self._read(number, complete)[rows]
 
     def _read(self, number: int, complete: bool = True) -> Recording:
-        return choose_task(self._stored.read(number, complete), self._what, self._targets, self.path)
+        recording = choose_task(self._stored.read(number, complete), self._what, self._targets, self.path)
+        task = self._learned or recording.task
+        return replace(recording, task=task, touches=label_as(recording.touches, recording.task, task))
 
 
 def choose_task(
@@ -277,6 +296,17 @@ def choose_task(
         raise InputError(f"{path} has no target: give targets in the mapping, or device.targets=[NAME]")
     values = torch.stack([parameters[name] for name in chosen], dim=1)
     return _relabelled(recording, Task(tuple(chosen), "regression"), values)
+
+
+def label_as(touches: Touches, present: Task, task: Task) -> Touches:
+    """Return touches with the labels of another task; those that are not present are unknown, NaN."""
+    if present == task or (labels := touches.labels) is None:
+        return touches
+    unknown = labels.new_full((len(labels),), torch.nan)
+    columns = [
+        labels[:, present.names.index(name)] if name in present.names else unknown for name in task.names
+    ]
+    return replace(touches, labels=torch.stack(columns, dim=1))
 
 
 def _relabelled(recording: Recording, task: Task, labels: Tensor) -> Recording:

@@ -99,9 +99,14 @@ def evaluate(
         if pairs:
             predicted, true = (torch.cat(parts) for parts in zip(*pairs, strict=True))
             metrics |= _add_prefix(column, compute_metrics(predicted, true, task, point))
+    never = same.known_labels.isnan().all(dim=0)
+    if unknown := [name for name, missing in zip(task.names, never, strict=True) if missing]:
+        cannot["labels"] = f"the touches of the test tell nothing of {', '.join(unknown)}"
+        hidden = [*unknown, *(["direction"] if task.direction and never[-1] else [])]
+        metrics = {name: value for name, value in metrics.items() if name.split("/")[1] not in hidden}
     cannot |= {name: _UNDEFINED for name, value in metrics.items() if isnan(value) and name.endswith(_SHOWN)}
     table = count_confusions(chances, same.known_labels, task) if task.kind == "binary" else None
-    reached = None if point is None else point.reached(chances, same.known_labels, task)
+    reached = None if point is None or LABEL in unknown else point.reached(chances, same.known_labels, task)
     outcomes = encode(chances, same.known_labels, task, point)
     predictions = _predictions(chances, same, task, drawn)
     return Report(metrics, cannot, table, predictions, point, reached, outcomes, device.split)

@@ -490,5 +490,5 @@ def _engineered(touches: Touches) -> Tensor:
 def _no_geometry() -> InputError:
     return InputError(
         "representation=sites needs to know what each sensor responds to, and this device has no mechanics: "
-        "use device=simulated, recording or serial, or another representation"
+        "use device=simulated, device=serial, a recording with positions: layout, or another representation"
     )

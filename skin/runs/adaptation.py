@@ -366,6 +366,7 @@ def find_target(
     simulated = replace(parent.configured(compose("adapt", words), words), evaluation=config.evaluation)
     device, twin = build_device(measured), threshold_device(simulated, simulated)
     _check(parent, device, twin)
+    device = device.with_labels(twin.task)
     drawn = device.simulation is not None
     budget = simulated_budget(settings.gestures or _DEFAULT)
     gestures: dict[str, Any] = {"gestures": budget, "fresh": False} if drawn else {}
@@ -403,18 +404,6 @@ def _check(parent: FinishedRun, device: AbstractDevice, twin: AbstractDevice) ->
             f"run {parent.identity} predicts {', '.join(twin.task.names)}, the gestures have the labels "
             f"{', '.join(device.task.names)}: give gestures with the labels of the run"
         )
-
-
-def label_as(touches: Touches, present: Task, wanted: Task) -> Touches:
-    """Return touches with the labels of another task; those that are not present are unknown, NaN."""
-    if present == wanted:
-        return touches
-    labels = touches.known_labels
-    unknown = labels.new_full((len(labels),), torch.nan)
-    columns = [
-        labels[:, present.names.index(name)] if name in present.names else unknown for name in wanted.names
-    ]
-    return replace(touches, labels=torch.stack(columns, dim=1))
 
 
 def choose_gestures(device: AbstractDevice, settings: FineTuning) -> tuple[Touches, AbstractDevice | None]:
@@ -484,19 +473,12 @@ def _adapt(config: Config, overrides: Sequence[str], steps: Steps) -> None:
         print(f"run {earlier[0].info.run_id} did this before: tracking.resume=false repeats it")
         return
     task, evaluation = target.twin.task, check_evaluation(target.config.evaluation)
-    blank, present = target.device.blank(), target.device.task
-    if present != task:
-        blank = Blank.of(task, blank.size, blank.touches("train"))
-        blank.configured = target.device.configured
-    learner, data = build_learner(target.config), build_data(target.config, blank)
+    learner, data = build_learner(target.config), build_data(target.config, target.device.blank())
     parent.load_weights(learner, data)
     network = learner.network  # refuses another learner before gestures are read from a port
     steps.begin("reading or simulating the gestures")
     steps.silent = target.device.real
     touches, others = choose_gestures(target.device, settings)
-    touches = label_as(touches, present, task)
-    if others is not None and present != task:
-        others = Blank(task, target.device.size, label_as(others.touches("test"), present, task))
     steps.silent = False
     steps.begin("choosing the threshold of the alarm")
     point = alarm_point(parent, learner, target.config, one_skin=True, device=target.twin)

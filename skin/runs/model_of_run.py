@@ -526,12 +526,23 @@ def load_model(
     if device is None:
         _warn_of_unknown_skin(run.stored, config)
     with run.described():
-        device = device or build_device(config)
+        device = device or _with_labels(run.stored, build_device(config))
         learner = build_learner(config)
         data = build_data(config, device.blank())
     run.load_weights(learner, data)
     point = alarm_point(run, learner, config, one_skin) if alarm else None
     return RunModel(device, learner, data.example, point, touch, run, watched or config)
+
+
+def _with_labels(stored: Config, device: AbstractDevice) -> AbstractDevice:
+    """Return a device whose recorded touches have the labels of a run."""
+    if device.real or device.reference is not None:
+        return device
+    try:
+        task = build_device(stored).task
+    except InputError:  # the recording of its training is gone
+        return device
+    return device.with_labels(task)
 
 
 def _warn_of_unknown_skin(stored: Config, config: Config) -> None:

@@ -2,10 +2,13 @@
 
 import re
 from contextlib import ExitStack
+from dataclasses import replace
 from time import monotonic, sleep
 
 import pytest
 
+from skin.device.files import read_recording, write_recording
+from skin.touch.labels import Task
 from tests.commands.test_evaluate import metrics
 
 TRAINED = [
@@ -43,6 +46,25 @@ def test_a_recording_gets_the_geometry_of_the_configured_skin(run, folder):
     done = run(folder, "evaluate", "device=recording", *own, *OWN)
     assert done.returncode == 0, done.stderr
     assert 0 < metrics(folder)[-1]["same/overall/accuracy"] < 1
+
+
+@pytest.mark.slow
+def test_a_recording_with_one_of_the_labels_is_judged_by_it(run, folder):
+    done = run(folder, "generate", "n=40", "out=four.parquet", *OWN, store=False)
+    assert done.returncode == 0, done.stderr
+    four = read_recording(folder / "four.parquet")
+    labels = four.touches.labels[:, 2:3]
+    some = replace(four, task=Task(("press",)), touches=replace(four.touches, labels=labels))
+    write_recording(some, folder / "some.parquet")
+    done = run(folder, "evaluate", "device=recording", "device.path=some.parquet", "device.test=all", *OWN)
+    assert done.returncode == 0, done.stderr
+    assert "press/accuracy" in done.stdout
+    assert "big/accuracy" not in done.stdout
+    assert "labels: the touches of the test tell nothing of big, dynamic, dangerous" in done.stdout
+    write_recording(replace(some, task=Task(("firm",))), folder / "other.parquet")
+    done = run(folder, "evaluate", "device=recording", "device.path=other.parquet", "device.test=all", *OWN)
+    assert done.returncode == 2
+    assert "has the labels firm, and the run learned big, dynamic, press, dangerous" in done.stderr
 
 
 @pytest.mark.slow

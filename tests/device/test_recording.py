@@ -196,3 +196,33 @@ def test_one_class_or_value_to_train_on_is_refused(simulated, tmp_path, name):
     message = {"class": "pat lacks a class", "x": "x has less than two values"}[name]
     with pytest.raises(InputError, match=f"{message} in the touches to train on"):
         Recorded(BODY, LAYOUT, stored, task=task, test_groups="b").touches("train")
+
+
+def test_a_recording_with_some_labels_serves_a_run_with_more(simulated, tmp_path):
+    names = ("dangerous", "press", "firm")
+    labels = simulated.touches.labels[:, [3, 2, 0]]
+    some = replace(simulated, task=Task(names), touches=replace(simulated.touches, labels=labels))
+    path = str(write_recording(some, tmp_path / "x.parquet"))
+    device = Recorded(BODY, LAYOUT, path, test="all")
+    same = device.with_labels(simulated.task)
+    assert (same.task, same.blank().task) == (simulated.task, simulated.task)
+    assert same.blank().touches("test").labels.shape == (1, 4)
+    known = same.touches("test").labels
+    torch.testing.assert_close(known[:, 2:], simulated.touches.labels[:, 2:])
+    assert known[:, :2].isnan().all()
+    assert device.touches("test").labels.shape[1] == 3
+    assert device.with_labels(device.task) is device
+    message = "has the labels dangerous, press, firm, and the run learned soft"
+    for task in (Task(("soft",)), replace(simulated.task, names=("soft", "press"), kind="exclusive")):
+        with pytest.raises(InputError, match=message):
+            device.with_labels(task)
+    with pytest.raises(InputError, match="and the run learned press, touch"):
+        device.with_labels(Task(("press", "touch"), gate="touch"))
+
+
+def test_a_recording_without_labels_takes_those_of_a_run(simulated, tmp_path):
+    bare = replace(simulated, touches=replace(simulated.touches, labels=None))
+    path = str(write_recording(bare, tmp_path / "x.parquet"))
+    device = Recorded(BODY, LAYOUT, path, test="all").with_labels(Task(("a", "b", "c"), "exclusive"))
+    assert len(device.task) == 3
+    assert device.touches("test").labels is None

@@ -144,3 +144,23 @@ def test_what_is_not_defined_has_a_reason_and_is_shown_as_a_dash(made_up_device,
     assert line.count(" - ") == 2
     assert "same/dangerous/false_alarm_rate: not defined" in seen.getvalue()
     assert "| dangerous/false_alarm_rate | - | - |" in evaluation_markdown(found, TOUCH, "title", "about")
+
+
+class Guesses:
+    """Answers 0.9 to everything."""
+
+    def probabilities(self, touches):
+        return torch.full((len(touches), 4), 0.9)
+
+
+def test_labels_that_nobody_knows_have_a_sentence_instead_of_figures(made_up_device, monkeypatch):
+    touches = made_up_device.touches("test")
+    labels = touches.labels.clone()
+    labels[:, [0, 3]] = torch.nan
+    monkeypatch.setattr(made_up_device, "touches", lambda *_: replace(touches, labels=labels))
+    report = evaluate(Guesses(), made_up_device, SETTINGS, POINT)
+    assert not [name for name in report.metrics if name.split("/")[1] in ("big", "dangerous")]
+    assert {"same/press/accuracy", "same/overall/accuracy"} <= set(report.metrics)
+    assert report.cannot["labels"] == "the touches of the test tell nothing of big, dangerous"
+    assert "/big" not in "".join(report.cannot)
+    assert report.reached is None

@@ -74,6 +74,8 @@ def test_a_relative_path_is_looked_for_here_first(tmp_path, monkeypatch):
     ("text", "says"),
     [
         ("", "no column x_m and y_m, found nothing"),
+        ('x_m,"y\nm"\n0.1,0.1\n', "no column y_m, found x_m, y m"),
+        ("x_m;y_m\n0,04;0,013\n", "semicolons between its columns: save it with commas, and 0.04 for 0,04"),
         ("x_m,y_m\n", "no sensor below the header"),
         ("x,y_m\n0.1,0.1\n", "no column x_m, found x, y_m"),
         ("x_m,y_m\n0.1,0.1\n0.1,abc\n", "line 3: y_m must be a number in m, got 'abc'"),

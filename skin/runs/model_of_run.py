@@ -171,7 +171,7 @@ def alarm_point_for_touches(
         run: the run; its task has the label ``dangerous``.
         learner: of the run, trained.
         config: its configuration with the skin, the device and the profile to use; without a profile, a run
-            trained on devices of independent properties takes ``mild``.
+            trained on drawn skins takes ``mild``.
         watching: how the device is watched.
         say: called with each message for the user.
 
@@ -184,7 +184,7 @@ def alarm_point_for_touches(
         assert point is not None  # it has the label
         return point
     path = config.device.get("calibration") if config.device.get("port") else None
-    if settings.profile is None and path is None and run.stored.device.get("independent"):
+    if settings.profile is None and path is None and "skins" in run.stored.device:
         # Such trainings have devices so different that a threshold for all of them hides dangerous touches.
         settings = replace(settings, profile=_USUAL)
         config = replace(config, evaluation=settings)

@@ -113,18 +113,37 @@ def force_resistors(hydra, tmp_path):
     return hydra("device=serial", "device.port=x", f"device.calibration={path}")
 
 
-def test_the_noise_of_curved_sensors_is_that_of_the_force(hydra, force_resistors, tmp_path, monkeypatch):
+@pytest.fixture
+def device_of(tmp_path, monkeypatch):
+    """Return a function that gives the device on which the threshold for touches is chosen."""
     devices = []
 
     def choose(learner, device, watching, target, *counts):
         devices.append(device)
         return STORED
 
+    def device_of(stored, config):
+        watching = Watching(100.0, 0.1, 2.0, 0.1, 3)
+        alarm_point_for_touches(run_of(stored, STORED), Quiet(), config, watching, print)
+        return devices[-1]
+
     monkeypatch.setenv("SKIN_CACHE", str(tmp_path))
     monkeypatch.setattr("skin.runs.model_of_run.choose_for_touches", choose)
-    watching = Watching(100.0, 0.1, 2.0, 0.1, 3)
-    alarm_point_for_touches(run_of(hydra(), STORED), Quiet(), force_resistors, watching, print)
-    assert devices[0].imperfection.noise == pytest.approx(0.06, rel=0.01)
+    return device_of
+
+
+def test_the_noise_of_curved_sensors_is_that_of_the_force(hydra, force_resistors, device_of):
+    device = device_of(hydra(), force_resistors)
+    assert device.imperfection.noise == pytest.approx(0.06, rel=0.01)
+
+
+def test_touches_of_a_run_of_drawn_skins_are_measured_by_mild_devices(hydra, device_of):
+    """One threshold for all devices of its training would hide dangerous touches on a usual one."""
+    skins = hydra("device=skins", "device.count=1")
+    assert device_of(skins, skins).noise == profile_settings("mild")["noise"]
+    rough = hydra("device=skins", "device.count=1", "evaluation.profile=rough")
+    assert device_of(skins, rough).noise == profile_settings("rough")["noise"]
+    assert device_of(hydra("profile=rough"), hydra()).noise == profile_settings("rough")["noise"]
 
 
 def test_a_threshold_that_hides_dangerous_touches_is_refused(hydra):

@@ -46,6 +46,9 @@ sphinx_gallery_conf = {
     "show_signature": False,
 }
 
+# Words such as "shape" in front of a colon name several attributes; no page needs these links.
+suppress_warnings = ["ref.python"]
+
 html_theme = "furo"
 html_title = "Tactile skin"
 html_show_sphinx = False

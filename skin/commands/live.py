@@ -132,7 +132,6 @@ def show(config: Config, changes: Sequence[str], own_mechanics: bool = False) ->
     from skin.hardware.live.contacts import LiveContacts
     from skin.hardware.live.engine_builder import LiveSettings, watch_exported, watch_run
     from skin.hardware.live.loop import Display, DisplayInfo, LiveLoop
-    from skin.hardware.live.terminal import show_in_terminal
     from skin.runs.exported_model import check_overrides
 
     live = LiveSettings.of(config.live)
@@ -166,10 +165,11 @@ def show(config: Config, changes: Sequence[str], own_mechanics: bool = False) ->
                 watched = watch_run(config, live, say, changes, opened, contacts, open_views, own_mechanics)
             (display,) = displays
             if live.verdicts != "stdout":
+                from skin.hardware.live.terminal import show_in_terminal  # with torch
+
                 opened.enter_context(show_in_terminal(display, Console()))
-            before = partial(watched.check, live.selftest, say)
-            source = watched.source
-            session = LiveLoop(source.skin, source.tare, watched.settings.build(), display, before)
+            parts = watched.source.skin, watched.source.tare, watched.settings.build()
+            session = LiveLoop(*parts, display, partial(watched.check, live.selftest, say))
             opened.callback(lambda: say(f"{session.verdicts} verdicts, {session.line}"))
             session.run(config.seconds)
     except KeyboardInterrupt:

@@ -109,7 +109,7 @@ class ImperfectionSettings:
         independent: each range above has a share of its own.
         aligned: touches begin and end at the edges of the model's intervals; False: anywhere in them, as on
             a real skin.
-        prompt: share of devices without lag, whatever ``time_constant`` says.
+        without_lag: share of devices without lag, whatever ``time_constant`` says.
         framed: share of devices that read the frames of the model whatever ``rate`` and ``aligned`` say.
     """
 
@@ -133,7 +133,7 @@ class ImperfectionSettings:
     rate: PositiveFloat | Annotated[tuple[PositiveFloat, PositiveFloat], RISING] = 10.0
     independent: bool = False
     aligned: bool = True
-    prompt: Annotated[float, Ge(0), Le(1)] = 0.0
+    without_lag: Annotated[float, Ge(0), Le(1)] = 0.0
     framed: Annotated[float, Ge(0), Le(1)] = 0.0
 
     @property
@@ -243,8 +243,8 @@ class Imperfection(ImperfectionSettings):
             level = np.where(stuck, generator.uniform(0, self.clip, shape), level)
         if np.any(spread["scale_spread"]):
             gain = gain * np.exp(spread["scale_spread"] * generator.standard_normal((*shape[:-1], 1)))
-        if self.prompt:
-            lags = generator.random((*shape[:-1], 1)) >= self.prompt
+        if self.without_lag:
+            lags = generator.random((*shape[:-1], 1)) >= self.without_lag
             spread["time_constant"] = spread["time_constant"] * lags
         values = {name: np.asarray(float(getattr(self, name))) for name in ("clip", "quantum", "exponent_at")}
         values |= {name: spread[name] for name in ("noise", "hysteresis", "time_constant", "exponent")}

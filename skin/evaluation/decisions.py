@@ -4,14 +4,13 @@ from math import ceil
 
 import numpy as np
 
+from skin.touch.labels import RELEASE
+
 # When the alarm is decided, and on which window: shared by the live view and its simulation.
 
 
 DECISIONS = 20.0
 """Decisions per second of device time; one per frame of a slower device."""
-
-RELEASE = 0.3
-"""s without a rise that end a contact."""
 
 
 def held_frames(longest: float, rate: float, window: int) -> int:

@@ -23,9 +23,9 @@ from skin.device.base import AbstractDevice, AbstractSimulated
 from skin.device.sampling import between_frames, draw_constants
 from skin.device.touches import Touches
 from skin.errors import InputError
-from skin.evaluation.decisions import DECISIONS, RELEASE, as_press, held_frames, longest_shown
+from skin.evaluation.decisions import DECISIONS, as_press, held_frames, longest_shown
 from skin.evaluation.settings import ENOUGH, Evaluation, check_evaluation
-from skin.touch.labels import TOUCH, Task
+from skin.touch.labels import RELEASE, TOUCH, Task
 from skin.touch.movie import Movie
 
 LABEL = "dangerous"

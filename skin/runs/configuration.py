@@ -43,7 +43,7 @@ ADDED: dict[str, Any] = {
     "independent": False,
     "aligned": True,
     "framed": 0.0,
-    "prompt": 0.0,
+    "without_lag": 0.0,
     "ongoing": 0.0,
     "footprint_error": 0.0,
     "described": None,

@@ -16,7 +16,7 @@ from torch import Tensor
 from skin.body.base import AbstractBody
 from skin.core.settings import RISING, check_settings, checked, configured
 from skin.errors import InputError
-from skin.touch.labels import Thresholds
+from skin.touch.labels import RELEASE, Thresholds
 from skin.touch.shapes import Fit, Shapes, draw_bodies
 
 if TYPE_CHECKING:
@@ -24,7 +24,6 @@ if TYPE_CHECKING:
 
 Draws = dict[str, np.ndarray]
 """Named parameters of gestures, one entry each along the first axis."""
-_RELEASE = 0.3  # s after a touch in which it is still judged; skin.evaluation.decisions.RELEASE
 _From0 = Annotated[tuple[NonNegativeFloat, PositiveFloat], RISING]
 _Above0 = Annotated[tuple[PositiveFloat, PositiveFloat], RISING]
 
@@ -316,7 +315,7 @@ def draw_times(
         ongoing, moment = generator.random((2, len(labels)))
         # Whether a touch is a press, and whether it moves, shows after so many frames.
         earliest = np.where(press, frames.duration + 1, 1 + dynamic)
-        latest = np.minimum(duration + round(_RELEASE * settings.rate), frames.window)
+        latest = np.minimum(duration + round(RELEASE * settings.rate), frames.window)
         shown = earliest + (moment * (latest - earliest + 1)).astype(int)
         onset = np.where(ongoing < settings.ongoing, frames.window - shown, onset)
     return {"duration": duration, "onset": onset}

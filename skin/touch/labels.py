@@ -104,6 +104,9 @@ TOUCH_SLIDING = Task((*TOUCH.names, "slide_x", "slide_y"), direction=True)
 CONTACT = ("x", "y", "radius", "force", "peak")
 """Columns of contacts: centre and radius (m), force (N) and highest pressure (Pa)."""
 
+RELEASE = 0.3
+"""s without a rise that end a contact; so long a touch that has ended is still judged."""
+
 OPPOSITE = {"big": "small", "dynamic": "static", "press": "tap", "dangerous": "safe"}
 """Label -> name of its opposite."""
 

@@ -216,7 +216,7 @@ def test_a_share_of_devices_reads_the_frames_of_the_model():
 
 def test_a_share_of_devices_has_no_lag():
     ranges = {"time_constant": (0.02, 0.1), "hysteresis": (0.01, 0.1), "independent": True}
-    device = Imperfection(prompt=0.4, **ranges)
+    device = Imperfection(without_lag=0.4, **ranges)
     constants = device.constants(3, np.random.default_rng(0), 2000)
     assert (constants.time_constant == 0).float().mean().item() == pytest.approx(0.4, abs=0.04)
     assert (constants.hysteresis > 0).all()

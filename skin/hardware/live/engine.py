@@ -14,14 +14,13 @@ from skin.device.resampling import Frame, StreamClock, Window
 from skin.evaluation.decisions import (
     DECISIONS,
     DRIFT,
-    RELEASE,
     ContactDetector,
     as_press,
     held_frames,
     longest_shown,
 )
 from skin.hardware.wire.channels import EXPECTED, FROZEN, UnitConversion
-from skin.touch.labels import OPPOSITE, Task
+from skin.touch.labels import OPPOSITE, RELEASE, Task
 
 State = Literal["touch", "no touch", "unknown"]
 _NAMED = 3  # sensors

@@ -4,7 +4,7 @@ torch is not imported.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from time import monotonic
 from typing import Annotated, Any, Literal
@@ -20,7 +20,7 @@ from skin.evaluation.decisions import DRIFT
 from skin.hardware.live.contacts import LiveContacts, Mechanics
 from skin.hardware.live.engine import DebounceSettings, Detection, EngineSettings, sensor_list
 from skin.hardware.wire.channels import RawRange, UnitConversion, unit_conversion
-from skin.hardware.wire.reader import PortSettings, SkinTimeout
+from skin.hardware.wire.reader import PortSettings, SkinDisconnected, SkinTimeout
 from skin.hardware.wire.skin import SerialSource, Skin, Source
 from skin.runs.configuration import Config
 from skin.runs.exported_model import ExportedModel
@@ -223,6 +223,7 @@ USUAL_RATE = 100.0
 
 _PATIENCE = 3.0  # s
 _ENOUGH = 20  # frames that show the rate
+_ALL = 10**6  # frames, more than any queue holds
 
 
 @dataclass(frozen=True)
@@ -422,7 +423,8 @@ def used_and_nominal(
 
     Args:
         model: that predicts.
-        port: open source of a skin at a port; None: the skin is simulated or recorded.
+        port: open source of a skin at a port, whose waiting frames are discarded; None: the skin is simulated
+            or recorded.
         live: settings of the live view.
         say: called with each message for the user.
 
@@ -441,6 +443,10 @@ def used_and_nominal(
         usual = None
     nominal = engine_settings(model, DebounceSettings(above=usual))
     used = engine_settings(model, nominal.patience, live.touch, live.drift)
+    if port is not None:
+        # Frames that waited meanwhile would delay the verdicts about those of now.
+        with suppress(SkinTimeout, SkinDisconnected):
+            port.skin.read(_ALL, 0.0)
     return replace(used, patience=replace(live.patience, above=above)), nominal
 
 

@@ -7,6 +7,7 @@ import sys
 from contextlib import ExitStack, suppress
 from dataclasses import replace
 from threading import Event, Thread
+from time import monotonic, sleep
 
 import numpy as np
 import pytest
@@ -133,6 +134,15 @@ def test_the_settings_of_the_file_and_of_the_command(trained, skin, tmp_path, ra
     assert ("single windows" in said[-2]) == (rates is None)
     assert watched.nominal.presses.shape == (6, 6)
     assert (watched.nominal.presses.argmax(axis=1) == np.arange(6)).all()
+
+
+def test_no_frame_that_waited_while_the_threshold_was_chosen_is_judged(model, skin):
+    """The first verdicts would tell of touches of some seconds ago, and those of now would be late."""
+    with ExitStack() as opened:
+        slow = lambda *_: sleep(1.5)  # noqa: E731
+        watched = watch_exported(str(model), {"port": skin}, LIVE, print, opened, slow)
+        (frame,) = watched.source.skin.read(1)
+        assert monotonic() - frame.t_host < 0.5
 
 
 def test_the_command_replaces_settings_of_the_file(model, skin):

@@ -266,7 +266,7 @@ def publish_evaluation(path: Path, report: Report, task: Task, title: str, about
     return written
 
 
-def write_chances(chances: Tensor, task: Task, point: OperatingPoint | None, path: Path) -> tuple[str, Path]:
+def write_chances(chances: Tensor, task: Task, point: OperatingPoint | None, path: Path) -> str:
     """Write the probability of each label, gesture by gesture, where nobody knows the truth.
 
     Args:
@@ -276,12 +276,11 @@ def write_chances(chances: Tensor, task: Task, point: OperatingPoint | None, pat
         path: x.csv.
 
     Returns:
-        lines for a person, and the path.
+        lines for a person.
     """
     columns = {f"p_{name}": values.numpy() for name, values in zip(task.names, chances.T, strict=True)}
-    table = pa.table({"gesture": np.arange(len(chances)), **columns})
     with whole(path) as partial:
-        pa.csv.write_csv(table, partial)
+        pa.csv.write_csv(pa.table({"gesture": np.arange(len(chances)), **columns}), partial)
     levels = dict.fromkeys(task.binary, 0.5) | ({} if point is None else {LABEL: point.threshold})
     lines = [
         f"gesture {number}: "
@@ -292,7 +291,7 @@ def write_chances(chances: Tensor, task: Task, point: OperatingPoint | None, pat
         + (_slide(row, task) if task.direction else "")
         for number, row in enumerate(chances.tolist())
     ]
-    return "\n".join(lines), path
+    return "\n".join(lines)
 
 
 def _slide(row: Sequence[float], task: Task) -> str:

@@ -264,8 +264,9 @@ def checksums(folder: Path, learned: str) -> str:
         folder: with the files.
         learned: name of the file of weights.
     """
-    names = sorted((RECORD, CONFIG, CARD, learned))
-    return "".join(f"{file_sha256(folder / name)}  {name}\n" for name in names)
+    return "".join(
+        f"{file_sha256(folder / name)}  {name}\n" for name in sorted((RECORD, CONFIG, CARD, learned))
+    )
 
 
 def _record(folder: Path) -> dict[str, Any]:

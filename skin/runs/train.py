@@ -386,8 +386,8 @@ def _evaluate(config: Config, changes: Sequence[str], steps: Steps) -> None:
         # Evaluations do not overwrite each other's files.
         name = f"evaluation_{option_name(device)}_{evaluation.info.run_id[:8]}"
         if touches.labels is None:
-            chances = learner.probabilities(touches)
-            text, path = write_chances(chances, device.task, point, folder / f"{name}.csv")
+            path = folder / f"{name}.csv"
+            text = write_chances(learner.probabilities(touches), device.task, point, path)
             store.client.log_artifact(evaluation.info.run_id, str(path))
             print(f"{title}\n{text}\n{path}")
             return

@@ -109,8 +109,7 @@ class TrainedModel(ABC):
         if not windows.size:
             return np.empty((*windows.shape[:-2], len(self.labels)), np.float32)
         batch = windows.reshape(-1, *windows.shape[-2:])
-        chances = self.probabilities(np.nan_to_num(batch), ~np.isnan(batch))
-        return chances.reshape(*windows.shape[:-2], -1)
+        return self.probabilities(np.nan_to_num(batch), ~np.isnan(batch)).reshape(*windows.shape[:-2], -1)
 
     def _windows(self, readings: ArrayLike) -> np.ndarray:
         """Return readings as (B, T, S) or (T, S), float32."""

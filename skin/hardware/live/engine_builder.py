@@ -122,8 +122,8 @@ class SelfTest:
         device: RawRange,
     ) -> str:
         """Return why the settings in use are refused, with the one that is most likely wrong."""
-        count = f"{raised.sum()} of {len(raised)} dangerous presses raise the alarm, not {expected.sum()}"
-        text = f"self-test: {count}"
+        found = f"{raised.sum()} of {len(raised)}"
+        text = f"self-test: {found} dangerous presses raise the alarm, not {expected.sum()}"
         if len(missed):
             text += f"; {sensor_list(missed.tolist())} cannot raise it"
         if not expected.any():
@@ -223,6 +223,8 @@ USUAL_RATE = 100.0
 
 _PATIENCE = 3.0  # s
 _ENOUGH = 20  # frames that show the rate
+_SHOWN = 0.2  # s from which the rate of arrivals shows
+_BURSTS = 5.0  # times the rate that frames in bursts may seem to arrive with; a unit is wrong by 1000
 _ALL = 10**6  # frames, more than any queue holds
 
 
@@ -423,8 +425,8 @@ def used_and_nominal(
 
     Args:
         model: that predicts.
-        port: open source of a skin at a port, whose waiting frames are discarded; None: the skin is simulated
-            or recorded.
+        port: open source of a skin at a port, whose frames are discarded that wait while a threshold is
+            chosen; None: the skin is simulated or recorded.
         live: settings of the live view.
         say: called with each message for the user.
 
@@ -439,27 +441,30 @@ def used_and_nominal(
     elif model.alarms:
         rate = model.rate if port is None else measured_rate(port.skin)
         above = usual = model.threshold_at(rate, live.patience.alarm, port is None, say)
+        if port is not None:
+            # Frames that waited meanwhile would delay the verdicts about those of now.
+            with suppress(SkinTimeout, SkinDisconnected):
+                port.skin.read(_ALL, 0.0)
     else:
         usual = None
     nominal = engine_settings(model, DebounceSettings(above=usual))
     used = engine_settings(model, nominal.patience, live.touch, live.drift)
-    if port is not None:
-        # Frames that waited meanwhile would delay the verdicts about those of now.
-        with suppress(SkinTimeout, SkinDisconnected):
-            port.skin.read(_ALL, 0.0)
     return replace(used, patience=replace(live.patience, above=above)), nominal
 
 
 def measured_rate(skin: Skin) -> float:
     """Return the rate of a device, Hz: measured, else that of its header, else the usual one.
 
-    Waits some seconds for its first frames, which are discarded.
+    Waits some seconds for its first frames, which are discarded, and until they arrive at the rate of the
+    device's clock: its unit may have to be inferred.
     """
-    deadline = monotonic() + _PATIENCE
-    while skin.stats.frames < _ENOUGH and monotonic() < deadline:
-        try:
+    begin, before = monotonic(), skin.stats.frames
+    while (passed := monotonic() - begin) < _PATIENCE:
+        with suppress(SkinTimeout):
             skin.read(1, _PATIENCE / 10)
-        except SkinTimeout:
-            continue
+        stats = skin.stats
+        arrived = (stats.frames - before) / max(passed, _SHOWN)
+        if stats.frames >= _ENOUGH and arrived / _BURSTS < stats.rate_hz < arrived * _BURSTS:
+            break
     declared = skin.header.rate if skin.header is not None else None
     return skin.stats.rate_hz or declared or USUAL_RATE

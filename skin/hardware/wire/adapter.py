@@ -417,8 +417,7 @@ def _try(reader: Callable[[bytes], Line], line: bytes) -> Line | None:
 def _find_index(rows: Sequence[Sequence[float]], names: Sequence[str], field: int | str | None) -> int | None:
     """Return the field that numbers the rows; None if there is none."""
     if field is not None:
-        places = resolve([field], names, len(rows[0]))
-        return places[0]
+        return resolve([field], names, len(rows[0]))[0]
     table = np.array(rows)
     for column in range(min(2, table.shape[1] - 1)):
         numbers = table[:, column]

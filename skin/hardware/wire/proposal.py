@@ -148,9 +148,7 @@ def _candidates(data: bytes) -> Iterator[Adapter]:
 
 
 def _has_rows(adapter: Adapter, data: bytes) -> bool:
-    layout = adapter.detect(data, None).frame_format
-    count = getattr(layout, "rows", 0)
-    return 1 < count <= _MOST_ROWS
+    return 1 < getattr(adapter.detect(data, None).frame_format, "rows", 0) <= _MOST_ROWS
 
 
 def _named(adapter: Adapter, data: bytes, lines: Sequence[bytes]) -> Iterator[Adapter]:

@@ -16,8 +16,10 @@ from skin.core.files import ROOT
 from skin.errors import InputError
 from skin.evaluation.operating_point import OperatingPoint
 from skin.hardware.live.engine import DebounceSettings
-from skin.hardware.live.engine_builder import LiveSettings, watch_exported
+from skin.hardware.live.engine_builder import LiveSettings, measured_rate, watch_exported
 from skin.hardware.wire.protocol import Header, encode_header, encode_line
+from skin.hardware.wire.reader import PortSettings
+from skin.hardware.wire.skin import SerialSource
 from skin.learning.network import Network
 from skin.runs.onnx_writer import write_model
 
@@ -134,6 +136,27 @@ def test_the_settings_of_the_file_and_of_the_command(trained, skin, tmp_path, ra
     assert ("single windows" in said[-2]) == (rates is None)
     assert watched.nominal.presses.shape == (6, 6)
     assert (watched.nominal.presses.argmax(axis=1) == np.arange(6)).all()
+
+
+@pytest.mark.parametrize("at_once", [1, 25])
+def test_the_rate_of_a_device_is_that_of_its_arrivals_until_its_clock_is_known(at_once):
+    """A clock in ms without a header counts as one in us at first: 100 Hz would be 100,000 Hz."""
+
+    def serve():
+        peer, begin = server.accept()[0], monotonic()
+        with peer, suppress(OSError):  # the reader has ended
+            for number in range(10**6):
+                peer.sendall(
+                    f"{number},{1000 + 10 * number},{','.join(['100', '101', '99'] * 3)}\r\n".encode()
+                )
+                if (number + 1) % at_once == 0:
+                    sleep(max(0.0, begin + (number + 1) / RATE - monotonic()))
+
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        Thread(target=serve, daemon=True).start()
+        settings = PortSettings(port=f"socket://127.0.0.1:{server.getsockname()[1]}")
+        with SerialSource(settings, 9, 10.0).open_source().skin as skin:
+            assert measured_rate(skin) == pytest.approx(RATE, rel=0.3)
 
 
 def test_no_frame_that_waited_while_the_threshold_was_chosen_is_judged(model, skin):

@@ -513,8 +513,7 @@ def _adapt(config: Config, overrides: Sequence[str], steps: Steps) -> None:
         else:
             report = evaluate(learner, others, evaluation, point)
             log_report(store, run, report, task, figures)
-            same = {key: value for key, value in report.metrics.items() if key.startswith("same/")}
-            figures |= same
+            figures |= {key: value for key, value in report.metrics.items() if key.startswith("same/")}
         store.client.log_text(run.info.run_id, _table(adaptation.trials), "adapt.csv")
         store.client.set_tag(run.info.run_id, "chosen", choice)
     Console().print(metrics_table(figures, f"{name}, run {run.info.run_id}"))

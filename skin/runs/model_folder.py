@@ -179,7 +179,8 @@ def _training(record: Mapping[str, Any], config: Mapping[str, Any]) -> Iterator[
     tags, day = record["tags"], datetime.fromtimestamp(record["start_time"] / 1000, UTC)
     dirty = {"true": ", with uncommitted changes", "false": ""}.get(tags["source_dirty"], ", changes unknown")
     yield "row, seed", f"`{tags['row']}`, {tags['seed']}"
-    yield "commit", f"{tags['source_commit']}{dirty}"
+    again = f"; figures below measured at {tags['measured_commit']}" if "measured_commit" in tags else ""
+    yield "commit", f"{tags['source_commit']}{dirty}{again}"
     yield "run, fingerprint", f"{record['run']}, {tags['fingerprint']}"
     yield "date, processor", f"{day:%Y-%m-%d}, {tags['processor']}"
     yield "data", _settings(config["data"])

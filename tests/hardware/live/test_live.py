@@ -96,7 +96,7 @@ def test_the_simulator_is_watched_without_hardware(run, store, tmp_path):
     live = run(tmp_path, "live.py", "seconds=5", *store, store=False)
     assert live.returncode == 0, live.stderr
     assert re.search(r"\d+ verdicts, 10\.0 Hz", live.stderr)
-    assert "unknown: waiting for the first frame" in live.stdout
+    assert "unknown: the threshold of the alarm is being chosen" in live.stdout
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,7 @@ device= the simulator of the run is used: no hardware is needed. demo=true emula
 model at a port of this machine and serves the page. Ctrl-C stops.
 """
 
+import gc
 import re
 import sys
 from collections.abc import Iterator, Sequence
@@ -82,8 +83,7 @@ def emulated_skin(words: Sequence[str]) -> Iterator[tuple[Config, list[str]]]:
         raise InputError(f"demo=true emulates a skin at a port: leave out {devices[0]}, or demo=true")
     words, touched = _demo_overrides(words)
     config = validate_config(compose("live", words))
-    run = FinishedRun.named(config)
-    device = build_device(run.configured(compose("train", touched), touched))
+    device = build_device(FinishedRun.named(config).configured(compose("train", touched), touched))
     port = open_port("tcp:0", None)
     emulator = Emulator(device.simulated("a skin is emulated"), port, EmulatorSettings(), Faults())
     thread = Thread(target=emulator.run, name="skin-emulator", daemon=True)
@@ -149,9 +149,19 @@ def show(config: Config, changes: Sequence[str], own_mechanics: bool = False) ->
             displays = list[Display]()
 
             def open_views(model: "TrainedModel", name: str) -> None:
-                span = model.window / model.rate
-                info = DisplayInfo(model.title, name, model.positions, model.size, live.top, span)
-                displays.append(Display(info, contacts))
+                displays.append(
+                    Display(
+                        DisplayInfo(
+                            model.title,
+                            name,
+                            model.positions,
+                            model.size,
+                            live.top,
+                            model.window / model.rate,
+                        ),
+                        contacts,
+                    )
+                )
                 displays[0].set_verdict(None, "the threshold of the alarm is being chosen")
                 for text in _views(displays[0], config, live, opened):
                     say(text)
@@ -168,9 +178,14 @@ def show(config: Config, changes: Sequence[str], own_mechanics: bool = False) ->
                 from skin.hardware.live.terminal import show_in_terminal  # with torch
 
                 opened.enter_context(show_in_terminal(display, Console()))
-            parts = watched.source.skin, watched.source.tare, watched.settings.build()
-            session = LiveLoop(*parts, display, partial(watched.check, live.selftest, say))
+            source, engine = watched.source, watched.settings.build()
+            session = LiveLoop(
+                source.skin, source.tare, engine, display, partial(watched.check, live.selftest, say)
+            )
             opened.callback(lambda: say(f"{session.verdicts} verdicts, {session.line}"))
+            # A search for garbage among all that is loaded would stop the loop for 0.3 s, every few seconds.
+            gc.collect()
+            gc.freeze()
             session.run(config.seconds)
     except KeyboardInterrupt:
         print("ended", file=sys.stderr)

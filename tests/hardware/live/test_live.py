@@ -1,8 +1,11 @@
 """The command, with an emulated skin before it and a browser behind it."""
 
+import os
 import re
 import signal
 import socket
+import subprocess
+import sys
 from contextlib import ExitStack, suppress
 from threading import Event, Thread
 from time import monotonic, sleep
@@ -10,6 +13,7 @@ from time import monotonic, sleep
 import numpy as np
 import pytest
 
+from skin.core.files import ROOT
 from skin.hardware.wire.protocol import Header, encode_header, encode_line
 
 SMALL = [
@@ -150,3 +154,39 @@ def test_a_skin_that_lost_its_power_is_found_again(begin, store, tmp_path):
                 peer.close()
     assert "Traceback" not in live.err
     assert "1 reconnected" in live.err
+
+
+COLLECTING = """
+import gc, runpy, sys, time
+from skin.hardware.live.loop import LiveLoop
+
+def take(loop, frames, take=LiveLoop._take):
+    take(loop, frames)
+    began = time.perf_counter()
+    gc.collect()
+    pauses.append(time.perf_counter() - began)
+
+pauses, LiveLoop._take = [], take
+try:
+    runpy.run_module("skin", run_name="__main__")
+finally:
+    print(len(pauses), sorted(pauses)[len(pauses) // 2], file=sys.stderr)
+"""
+
+
+@pytest.mark.slow
+def test_a_search_for_garbage_does_not_delay_a_verdict(tmp_path):
+    """Among all that torch loads it takes 0.3 s, every few seconds."""
+    settings = ["run=any_skin", "seconds=3", "live.patience.above=0.5", "live.contacts=false"]
+    done = subprocess.run(
+        [sys.executable, "-c", COLLECTING, "live", *settings, f"tracking.uri=sqlite:///{tmp_path}/m.db"],
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    count, pause = done.stderr.split()[-2:]
+    assert int(count) > 10
+    assert float(pause) < 0.05

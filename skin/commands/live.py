@@ -149,19 +149,9 @@ def show(config: Config, changes: Sequence[str], own_mechanics: bool = False) ->
             displays = list[Display]()
 
             def open_views(model: "TrainedModel", name: str) -> None:
-                displays.append(
-                    Display(
-                        DisplayInfo(
-                            model.title,
-                            name,
-                            model.positions,
-                            model.size,
-                            live.top,
-                            model.window / model.rate,
-                        ),
-                        contacts,
-                    )
-                )
+                span = model.window / model.rate
+                info = DisplayInfo(model.title, name, model.positions, model.size, live.top, span)
+                displays.append(Display(info, contacts))
                 displays[0].set_verdict(None, "the threshold of the alarm is being chosen")
                 for text in _views(displays[0], config, live, opened):
                     say(text)

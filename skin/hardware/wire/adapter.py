@@ -228,8 +228,7 @@ class Adapter:
         self, layout: FrameFormat, columns: Columns, header: Header | None = None
     ) -> DetectedFormat:
         """Return a format with what its columns show of the clock."""
-        fixed = self.time_unit is not None
-        return DetectedFormat(layout, None, header, columns.unit, fixed, columns.summary)
+        return DetectedFormat(layout, None, header, columns.unit, self.time_unit is not None, columns.summary)
 
     def _detect_lines(self, data: bytes, sensors: int | None) -> DetectedFormat:
         lines, header, count_seen = self._lines(data), None, None

@@ -118,8 +118,7 @@ def _try(adapter: Adapter, pieces: Sequence[tuple[float, bytes]]) -> Proposal | 
     middle = np.median([frame.values for frame in frames], axis=0)[:_MOST_ROWS]
     levels = ", ".join(f"{value:.4g}" for value in middle)
     words = [f"{decoder.sensors} values{rate}", detected.summary, decoder.stats.clock, f"medians {levels}"]
-    summary = "; ".join(word for word in words if word)
-    return Proposal(adapter, summary, decoder.sensors or 0)
+    return Proposal(adapter, "; ".join(word for word in words if word), decoder.sensors or 0)
 
 
 def _candidates(data: bytes) -> Iterator[Adapter]:

@@ -4,8 +4,7 @@ Accuracy against the number of sensors
 
 Overall accuracy on 4000 test touches of the default sheet, on regular grids and on layouts that
 ``skin design`` placed. ``any_skin`` is one network, not trained for any of these layouts
-(:doc:`/pretrained`). The others were trained for each layout: boosted trees (``features``) on 3230
-gestures, and ``best_fresh`` on new gestures for 40 epochs.
+(:doc:`/pretrained`). The boosted trees (``features``) were trained for each layout, on 3230 gestures.
 """
 
 from csv import DictReader
@@ -33,7 +32,6 @@ def accuracies(study: str, column: str, name: str) -> dict[int, float]:
 
 models = {
     "any_skin, not trained for the layout": ("any_skin", "condition", "{}", "o"),
-    "best_fresh": ("sensors_networks", "variant", "best_fresh {}", "s"),
     "trees (features)": ("sensors", "variant", "{}", "^"),
 }
 figure, axes = plt.subplots(figsize=(8, 5), layout="constrained")

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from skin.mechanics.simulator.solid import Solid as Solid
     from skin.runs.model_of_run import load_run as load_run
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 __all__ = ["Arm", "Grid", "InputError", "LayoutFile", "PlatesAndBeams", "Sheet", "Solid"]
 __all__ += ["FingertipPrior", "Noise", "Posterior", "load_run", "open_skin", "read_recording"]
 

@@ -111,11 +111,11 @@ class Accuracy:
 
         touches = subject.device.touches("test")
         task = subject.device.task
-        point = subject.point() if subject.trained.point else None
         try:
             chances = subject.learner.probabilities(touches)
         except InputError as reason:  # another number of sensors, for example
             return Measurement({}, cannot=str(reason))
+        point = subject.point() if subject.trained.point else None
         values = compute_metrics(chances, touches.known_labels, task, point)
         outcomes = encode(chances, touches.known_labels, task, point)
         return Measurement({f"same/{name}": value for name, value in values.items()}, outcomes=outcomes)

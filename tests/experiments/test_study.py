@@ -274,6 +274,24 @@ def test_a_study_of_ones_own_needs_a_file_only(run, tmp_path):
 
 
 @pytest.mark.slow
+def test_a_row_that_cannot_take_a_skin_is_named_so_also_where_thresholds_are_chosen(run, trained):
+    (trained / "own" / "study").mkdir(parents=True)
+    (trained / "own" / "study" / "four.yaml").write_text(
+        "about: four sensors\nrows: [gru]\ntest: {evaluation.profile: mild}\n"
+        "conditions: {own: {}, four: {layout: grid, layout.rows: 2, layout.columns: 2}}\n"
+    )
+    done = run(trained, "train", "experiment=gru", *NAIVE)
+    assert done.returncode == 0, done.stderr
+    words = ["study.seeds=[0]", "evaluation.safe_gestures=64", "out=four"]
+    done = run(trained, "study", "--config-dir", trained / "own", "study=four", *words, *NAIVE)
+    assert done.returncode == 0, done.stderr
+    found = {line["condition"]: line for line in lines(trained / "four" / "study_four.csv")}
+    assert float(found["own"]["same/overall/accuracy"]) > 0
+    assert not found.get("four", {}).get("same/overall/accuracy")
+    assert "cannot" in (trained / "four" / "study_four.md").read_text()
+
+
+@pytest.mark.slow
 def test_a_multirun_of_studies_is_no_run_itself(run, trained):
     few = ["study=ensemble", "study.train=false", "study.seeds=[0]", "study.rows=[rules]", "out=one,two"]
     before = runs(trained)

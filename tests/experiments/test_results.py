@@ -25,8 +25,8 @@ PARTS = [
     "{run: 'study study=table study.rows=[rules] study.seeds=[0,1,2,3]', hours: 1}]",
     "results.parts.studies=[{run: 'study study=ensemble study.rows=[rules] study.seeds=[0,1] "
     "study.train=false', hours: 1}]",
-    "results.parts.shifts=[]",
-    "results.parts.peers=[]",
+    "results.parts.table_solid=[]",
+    "results.parts.best_fresh_solid=[]",
     "results.parts.sensors=[]",
     "results.parts.any_skin=[]",
     "results.parts.design=[]",
@@ -95,8 +95,9 @@ def test_bounds_are_published_in_a_folder_of_their_own(run, tmp_path):
     [
         (
             ["results.part=tables"],
-            "results.part=tables is none of all, best_fresh, table, peers, shifts, sensors, any_skin, "
-            "studies, design, weights, graphs, other_skins, image_head, image_size, image_representation",
+            "results.part=tables is none of all, table, table_solid, best_fresh, best_fresh_solid, sensors, "
+            "any_skin, studies, design, devices, graphs, other_skins, image_head, image_size, "
+            "image_representation",
         ),
         (["results.parts.table=[{run: study, hours: 0}]"], "hours"),
         (["results.optional=[image]"], "results.optional=['image']: there is no part image"),

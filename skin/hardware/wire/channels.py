@@ -48,10 +48,11 @@ class ChannelHealth:
     """Checks channels frame by frame.
 
     A value at a limit is saturated and valid: the force is at least that. A channel that does not change for
-    five seconds while most others do is stuck, or dead if it has never changed. Neither state is detected if
-    the noise of the untouched skin is below one count. A single change makes the channel valid again. A
-    channel that stays at the largest value it has ever sent, far above its smallest, is saturated at an
-    unknown limit rather than stuck, because a held press must not be masked.
+    five seconds while most others do is stuck, or dead if it has never changed. A channel that has never
+    changed is also dead if another has had noise of more than one count for five seconds. Neither state is
+    detected if the noise of the untouched skin is below one count. A single change makes the channel valid
+    again. A channel that stays at the largest value it has ever sent, far above its smallest, is saturated at
+    an unknown limit rather than stuck, because a held press must not be masked.
 
     A value that the converter cannot give is invalid at once.
 
@@ -86,10 +87,10 @@ class ChannelHealth:
             self._smallest = np.full(len(values), np.inf)
             self._ever = np.zeros(len(values), dtype=bool)
         if self._begin_time:
-            self._changed_at, self._lively_since, self._begin_time = np.full(len(values), t), t, False
-        step = np.abs(values - self._last)
+            self._changed_at, self._noisy_since, self._coarse_at = np.full((3, len(values)), t)
+            self._lively_since, self._begin_time = t, False
+        step, self._last = np.abs(values - self._last), values
         changed = step > 0
-        self._last = values
         self._changed_at[changed] = t
         self._ever |= changed
         self._smallest = np.minimum(self._smallest, np.where(changed, step, np.inf))
@@ -98,7 +99,12 @@ class ChannelHealth:
         silent = t - self._changed_at
         if 2 * np.count_nonzero(silent < _LIVELY) <= len(values):
             self._lively_since = t
-        dull = (silent >= _SILENT) & (t - self._lively_since >= _SILENT)
+        # Noise below half a step changes only values near an edge; a double step is more than that.
+        self._coarse_at[step > 1.5 * self._smallest.min()] = t
+        self._noisy_since[t - self._coarse_at >= _LIVELY] = t
+        dull = (silent >= _SILENT) & (
+            (t - self._lively_since >= _SILENT) | (~self._ever & (t - self._noisy_since.min() >= _SILENT))
+        )
         low, high = self.limits
         at_limit = (values >= (np.inf if high is None else high)) | (
             values <= (-np.inf if low is None else low)
@@ -106,10 +112,8 @@ class ChannelHealth:
         loaded = self._ever & (self._most - self._least >= _FAR * self._smallest)
         impossible = (values > self.largest) | (values < -_BELOW * self.largest)
         saturated = at_limit | (dull & loaded & (values >= self._most))
-        dull &= ~saturated
-        saturated &= ~impossible
-        worst = np.where(dull & ~self._ever, 3, np.where(dull, 2, saturated))
-        self._worst = np.where(impossible, 4, worst)
+        dull, saturated = dull & ~saturated, saturated & ~impossible
+        self._worst = np.select([impossible, dull & ~self._ever, dull], [4, 3, 2], saturated.astype(int))
         return ~dull & ~impossible, saturated
 
     def states(self) -> tuple[ChannelState, ...]:

@@ -83,6 +83,32 @@ def test_an_untouched_skin_without_visible_noise_is_no_defect():
     assert check(ChannelHealth(), frames).all()
 
 
+@pytest.mark.parametrize("alive", [1, 2])
+def test_most_channels_dead_from_the_start_are_found_by_the_noise_of_the_others(alive):
+    frames = noisy(700)
+    frames[:, alive:] = 0
+    health = ChannelHealth()
+    valid = check(health, frames)
+    assert valid[:500].all()
+    assert not valid[620:, alive:].any()
+    assert valid[:, :alive].all()
+    assert health.states() == ("ok",) * alive + ("dead",) * (5 - alive)
+    assert health.check(np.array([500, 505, 1, 0, 0]), 7.0)[0].tolist() == [True, True, True, False, False]
+
+
+def test_a_channel_near_the_edge_of_a_step_makes_no_other_one_dead():
+    """Noise of a fifth of a count: only the value that rests near an edge ever changes."""
+    draw = np.random.default_rng(0)
+    frames = np.round(np.array([500.5, 77.0, 12.0, 300.1, 8.9]) + draw.normal(scale=0.1, size=(2000, 5)))
+    assert check(ChannelHealth(), frames).all()
+
+
+def test_a_short_touch_of_a_skin_without_noise_makes_no_channel_dead():
+    frames = np.zeros((2000, 5))
+    frames[300:700, 0] = np.random.default_rng(0).integers(200, 210, 400)
+    assert check(ChannelHealth(), frames).all()
+
+
 def test_a_value_that_the_converter_cannot_give_is_invalid_at_once():
     health = ChannelHealth((None, 1023.0))
     health.largest = 1023.0

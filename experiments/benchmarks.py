@@ -26,6 +26,7 @@ import torch
 from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 
+from experiments import run_script
 from skin.core.files import CONF, ROOT, results, write
 from skin.core.messages import quiet
 from skin.device.base import AbstractSimulated
@@ -316,8 +317,4 @@ def _seconds(engine: Engine, frame: Frame) -> tuple[float, float, int]:
 
 
 if __name__ == "__main__":
-    try:
-        main(sys.argv[1:])
-    except InputError as error:
-        print(error, file=sys.stderr)
-        sys.exit(2)
+    run_script(main)

@@ -7,9 +7,6 @@ Writes contact.csv into docs/results, or into ``out=``. ``rows=``: only rows who
 that raise no sensor above three standard deviations of a frame are left out.
 """
 
-import csv
-import io
-import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -19,6 +16,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from experiments import run_script
+from experiments.studies.pages import csv_text
 from skin.body.base import AbstractBody, Layer, Sensors, Sheet
 from skin.body.layout import AbstractLayout, Grid, Hexagonal, Random
 from skin.body.material import Material
@@ -261,11 +260,8 @@ def main(words: Sequence[str]) -> None:
     for row in chosen:
         lines.append(run_row(row, int(settings["touches"]), int(settings["seed"])))
         print(*(f"{k}={_text(v)}" for k, v in lines[-1].items()), flush=True)
-    text = io.StringIO()
-    table = csv.DictWriter(text, list(lines[0]), lineterminator="\n")
-    table.writeheader()
-    table.writerows({name: _text(value) for name, value in line.items()} for line in lines)
-    print(write(text.getvalue(), Path(settings["out"]) / "contact.csv"))
+    table = [[*lines[0]], *([*map(_text, line.values())] for line in lines)]
+    print(write(csv_text(table), Path(settings["out"]) / "contact.csv"))
 
 
 def _text(value: object) -> str:
@@ -273,8 +269,4 @@ def _text(value: object) -> str:
 
 
 if __name__ == "__main__":
-    try:
-        main(sys.argv[1:])
-    except InputError as error:
-        print(error, file=sys.stderr)
-        sys.exit(2)
+    run_script(main)

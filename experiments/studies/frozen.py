@@ -12,7 +12,6 @@ results by default. ``conf/benchmark.yaml`` describes the sets.
 
 import hashlib
 import importlib
-import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -22,6 +21,7 @@ import torch
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
+from experiments import run_script
 from experiments.studies.known_loads import write_rows
 from skin.core.files import CONF, results
 from skin.core.settings import checked, configured
@@ -152,8 +152,4 @@ def main(words: Sequence[str]) -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main(sys.argv[1:])
-    except InputError as error:
-        print(f"error: {error}", file=sys.stderr)
-        sys.exit(2)
+    run_script(main)

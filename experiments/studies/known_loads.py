@@ -7,9 +7,6 @@ Writes known_loads.csv to the folder out=, results by default. Every device has 
 moduli than the calibration supposes, and the pressure below a base or a board is uneven.
 """
 
-import csv
-import io
-import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
@@ -23,6 +20,8 @@ from matplotlib.figure import Figure
 from omegaconf import OmegaConf
 from scipy.ndimage import gaussian_filter
 
+from experiments import run_script
+from experiments.studies.pages import csv_text
 from skin.body.base import Layer, Sheet
 from skin.body.layout import Grid
 from skin.body.material import Material
@@ -30,7 +29,6 @@ from skin.core.files import write
 from skin.core.settings import checked, configured
 from skin.device.calibration import Calibration
 from skin.device.simulated import Simulated
-from skin.errors import InputError
 from skin.hardware.bench import BenchSession
 from skin.hardware.bench_protocol import Protocol
 from skin.hardware.known_loads import KnownLoad, emulate_placements, fit_known_load
@@ -252,11 +250,7 @@ def write_rows(rows: Iterator[dict[str, Any]], path: Path) -> None:
         shown = {name: round(value, 2) if isinstance(value, float) else value for name, value in row.items()}
         print(*shown.values(), sep=", ", flush=True)
         whole.append(shown)
-    text = io.StringIO()
-    table = csv.DictWriter(text, whole[0], lineterminator="\n")
-    table.writeheader()
-    table.writerows(whole)
-    print(write(text.getvalue(), path))
+    print(write(csv_text([[*whole[0]], *([*row.values()] for row in whole)]), path))
 
 
 def main(words: list[str]) -> None:
@@ -271,7 +265,4 @@ def main(words: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main(sys.argv[1:])
-    except InputError as error:
-        sys.exit(f"error: {error}")
+    run_script(main)

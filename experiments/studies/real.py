@@ -9,7 +9,6 @@ cross-validation on the training touches alone: sessions, blocks of time or plac
 """
 
 import csv
-import io
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -17,7 +16,9 @@ from typing import Any
 
 from omegaconf import OmegaConf
 
+from experiments import run_script
 from experiments.studies import real_barometers, real_epi, real_presses
+from experiments.studies.pages import csv_text
 from experiments.studies.real_rows import RealSettings
 from skin.core.files import write
 from skin.core.settings import configured
@@ -53,15 +54,12 @@ def write_lines(lines: Iterator[dict[str, Any]], path: Path) -> None:
         }
         print(*rounded.values(), sep=", ", flush=True)
         whole.append(rounded)
-    names, text = {values["row"] for values in whole}, io.StringIO()
+    names = {values["row"] for values in whole}
     if path.is_file():
         with path.open(encoding="utf-8") as file:
             whole += [values for values in csv.DictReader(file) if values["row"] in {*order} - names]
     whole.sort(key=lambda values: order.index(values["row"]))
-    table = csv.DictWriter(text, whole[0], lineterminator="\n")
-    table.writeheader()
-    table.writerows(whole)
-    print(write(text.getvalue(), path))
+    print(write(csv_text([[*whole[0]], *([values[name] for name in whole[0]] for values in whole)]), path))
 
 
 def main(words: Sequence[str]) -> None:
@@ -72,8 +70,4 @@ def main(words: Sequence[str]) -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main(sys.argv[1:])
-    except InputError as error:
-        print(f"error: {error}", file=sys.stderr)
-        sys.exit(2)
+    run_script(main)

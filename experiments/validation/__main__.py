@@ -15,6 +15,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import track
 
+from experiments import run_script
 from experiments.validation import CheckResult, Law, publish_physics, solid
 from skin.core.files import ROOT, results
 from skin.errors import InputError
@@ -118,8 +119,4 @@ def print_outcome(law: Law, outcome: CheckResult) -> None:
 
 
 if __name__ == "__main__":
-    try:
-        sys.exit(0 if main(sys.argv[1:]) else 1)
-    except InputError as error:
-        print(error, file=sys.stderr)
-        sys.exit(2)
+    run_script(main)

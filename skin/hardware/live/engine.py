@@ -71,7 +71,8 @@ class Verdict:
     @property
     def state(self) -> State:
         """``touch``; ``unknown``, where a dangerous touch on a sensor could not be felt; or ``no touch``."""
-        return "touch" if self.touched else "unknown" if self.unknown else "no touch"
+        touching = self.touched or self.contact is not None
+        return "touch" if touching else "unknown" if self.unknown else "no touch"
 
     @property
     def reason(self) -> str:

@@ -244,14 +244,7 @@ class Watched:
     settings: EngineSettings
     nominal: EngineSettings
 
-    @property
-    def selftest(self) -> SelfTest | None:
-        """The test of the alarm; None where no alarm is raised, or no touches are known."""
-        if self.nominal.presses is None or not self.model.alarms:
-            return None
-        return SelfTest(self.nominal.presses, self.settings, self.nominal)
-
-    def check(self, test: bool, say: Callable[[str], None], conversion: UnitConversion) -> None:
+    def check(self, test: bool, say: Callable[[str], None], conversion: UnitConversion) -> int:
         """Run the self-test with the conversion that is in use.
 
         Args:
@@ -259,15 +252,22 @@ class Watched:
             say: called with each message for the user.
             conversion: of the device's values to N.
 
+        Returns:
+            The largest number of sensors that may prove dead afterwards.
+
         Raises:
             InputError: the settings in use hide dangerous touches.
         """
+        sensors = len(self.model.positions)
         if not test:
             say("no self-test: live.selftest=false")
-        elif (selftest := self.selftest) is None:
+        elif self.nominal.presses is None or not self.model.alarms:
             say("no self-test: this run brings no alarm or no simulated skin")
         else:
+            selftest = SelfTest(self.nominal.presses, self.settings, self.nominal)
             selftest.run(conversion, self.source.raw_range, say)
+            return int(_MASKED * sensors)
+        return sensors
 
 
 Loaded = Callable[[TrainedModel, str], None]

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
-from math import isfinite
+from math import inf, isfinite
 from pathlib import Path
 from queue import Empty, Queue
 from threading import Event, Lock, Thread
@@ -21,7 +21,7 @@ from skin.core.files import json_line, unwritable
 from skin.device.resampling import Frame
 from skin.errors import InputError
 from skin.hardware.live.contacts import LiveContacts, unknown_contacts
-from skin.hardware.live.engine import Engine, Verdict
+from skin.hardware.live.engine import Engine, Verdict, sensor_list
 from skin.hardware.wire.channels import Tare, UnitConversion
 from skin.hardware.wire.reader import SkinDisconnected, SkinTimeout
 from skin.hardware.wire.skin import Skin
@@ -204,8 +204,10 @@ class Display:
 
 STALE = 1.5
 """s without frames after which nothing is known of the skin."""
+OLD_READINGS = f"the latest readings are over {STALE:g} s old"
 FROZEN_READINGS = "readings are frozen: no channel has changed for 5 s"
 _PATIENCE = 0.3  # s for which one read waits
+_PROVED = 10.0  # s after the self-test in which sensors may prove dead
 _AT_ONCE = 1024  # frames
 _STATUS = 0.5  # s between two updates of the status
 _ENOUGH = 10  # frames for each one of the model: with n, a tap of one frame reads 1/n too low at worst
@@ -223,7 +225,8 @@ class LiveLoop:
         tare: gives the conversion of values to N.
         engine: gives verdicts.
         display: shows them.
-        before: called once with the conversion, before the first decision; it may raise InputError.
+        before: called once with the conversion, before the first decision; returns the largest number of
+            sensors that may prove dead soon after. It may raise InputError.
 
     Attributes:
         verdicts: number of verdicts so far.
@@ -235,10 +238,11 @@ class LiveLoop:
         tare: Tare,
         engine: Engine,
         display: Display,
-        before: Callable[[UnitConversion], None] | None = None,
+        before: Callable[[UnitConversion], int] | None = None,
     ) -> None:
         self._skin, self._tare, self._engine, self._display = skin, tare, engine, display
         self._before, self._heard_at = before, monotonic()
+        self._most_dead, self._tested_at = inf, 0.0
         self._delays: deque[float] = deque(maxlen=_DELAYS)
         self._updated_at = -np.inf
         self.verdicts = 0
@@ -293,9 +297,7 @@ class LiveLoop:
             return
         if self._tare.count > taken:
             self._engine.reset()
-        if self._before is not None:
-            self._before(conversion)
-            self._before = None
+        self._test(conversion)
         for frame in frames:
             self._display.add_frame(frame, conversion)
         verdicts = self._engine.push(frames, conversion)
@@ -304,11 +306,27 @@ class LiveLoop:
             return
         for verdict in verdicts:
             self.verdicts += 1
-            self._display.set_verdict(verdict)
+            if monotonic() - verdict.t_host < STALE:
+                self._display.set_verdict(verdict)
+            else:
+                self._display.set_verdict(None, OLD_READINGS, verdict.dangerous)
         if verdicts:
             self._delays.append(monotonic() - verdicts[-1].t_host)
         # After the verdict is shown: it waits for nothing.
         self._display.contacts.look(frames, conversion, verdicts, self._engine.baseline)
+
+    def _test(self, conversion: UnitConversion) -> None:
+        """Test the alarm before the first decision; refuse a skin of which much proves dead soon after."""
+        if self._before is not None:
+            self._most_dead, self._before = self._before(conversion), None
+            self._tested_at = monotonic()
+        dead = [number for number, state in enumerate(self._skin.channels) if state == "dead"]
+        if len(dead) > self._most_dead and monotonic() - self._tested_at < _PROVED:
+            raise InputError(
+                f"self-test: {sensor_list(dead)} have never changed and are dead, more than "
+                f"{self._most_dead} of {len(self._skin.channels)}: check their wires; live.selftest=false "
+                "skips this test"
+            )
 
     @property
     def line(self) -> str:
@@ -541,28 +559,28 @@ class AlarmLog:
         self._file: TextIO | None = file
         self._contacts = contacts
         self._alarm, self._stale, self._unknown = False, True, False
+        self._state: tuple[Verdict | None, str, bool] = None, "", False
 
     def observe(self, verdict: Verdict | None, reason: str, alarm: bool) -> None:
         """Write what has changed since the last call."""
+        self._state = verdict, reason, alarm
         now, stale = (alarm, True) if verdict is None else (verdict.dangerous, False)
         if stale != self._stale:
-            self.write("stale" if stale else "resumed", verdict, reason, alarm)
+            self.write("stale" if stale else "resumed")
         if now != self._alarm:
-            self.write("alarm" if now else "cleared", verdict, reason, alarm)
+            self.write("alarm" if now else "cleared")
         unknown = verdict is not None and bool(verdict.unknown)
         if unknown != self._unknown and not stale:
-            self.write("unknown" if unknown else "known", verdict, reason, alarm)
+            self.write("unknown" if unknown else "known")
             self._unknown = unknown
         self._alarm, self._stale = now, stale
 
-    def write(
-        self, event: str, verdict: Verdict | None = None, reason: str = "", alarm: bool = False
-    ) -> None:
-        """Write one line."""
+    def write(self, event: str) -> None:
+        """Write one line with the latest state."""
         if self._file is None:
             return
         try:
-            message = verdict_message(verdict, reason, alarm, self._contacts.state())
+            message = verdict_message(*self._state, self._contacts.state())
             self._file.write(json_line({"event": event, **message}) + "\n")
             self._file.flush()
         except OSError as error:

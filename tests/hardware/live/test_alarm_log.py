@@ -32,14 +32,18 @@ def test_each_change_is_a_line_with_its_time(tmp_path):
             shown.set_verdict(verdict(dangerous))
         shown.set_verdict(None, "unplugged", True)
         shown.set_verdict(verdict(True))
+        shown.request_tare()
         shown.set_verdict(verdict(False))
+        shown.set_verdict(verdict(True))
     shown.set_verdict(verdict(True))  # after the end
     found = [json.loads(line) for line in path.read_text().splitlines()]
-    events = ["started", "resumed", "alarm", "stale", "resumed", "cleared", "ended"]
+    events = ["started", "resumed", "alarm", "stale", "resumed", "tare_refused", "cleared", "alarm", "ended"]
     assert [one["event"] for one in found] == events
     alarm, stale = found[2], found[3]
     assert (alarm["probabilities"], alarm["contact"]) == ({"dangerous": 0.9}, 0.4)
     assert (stale["reason"], stale["alarm"]) == ("unplugged", True)
+    for event in (found[5], found[8]):  # of an operator, or the end: while the alarm lasts
+        assert (event["alarm"], event["stale"], event["state"]) == (True, False, "touch")
     times = [datetime.fromisoformat(one["time"]) for one in found]
     slack = timedelta(milliseconds=2)
     assert all(before - slack <= time <= datetime.now(UTC) + slack for time in times)

@@ -1,6 +1,7 @@
 """Streams of boards that restart, freeze, break or come in bursts: no dangerous touch is hidden or late."""
 
 import socket
+from contextlib import nullcontext, suppress
 from dataclasses import replace
 from threading import Thread
 from time import monotonic, sleep
@@ -12,7 +13,7 @@ import torch
 from skin.errors import InputError
 from skin.hardware.live.engine import DebounceSettings, Detection, EngineSettings
 from skin.hardware.live.engine_builder import SelfTest
-from skin.hardware.live.loop import Display, DisplayInfo, LiveLoop
+from skin.hardware.live.loop import STALE, Display, DisplayInfo, LiveLoop
 from skin.hardware.wire.channels import RawRange, UnitConversion
 from skin.hardware.wire.protocol import Header, encode_header, encode_line
 from skin.hardware.wire.reader import PortSettings
@@ -60,10 +61,13 @@ def lines(values, restart=None, header=HEADER, encode=lambda row: row.round(4)):
 
 
 class Watching:
-    """A live view of a stream; ``said`` has (frames sent, verdict or None, reason, alarm)."""
+    """A live view of a stream; ``said`` has (frames sent, verdict or None, reason, alarm).
 
-    def __init__(self, stream, speed=SPEED, each=1, acts=(), **source):
-        self.said, self.sent = [], 0
+    ``oldest`` is the largest age of a verdict when it was shown, s.
+    """
+
+    def __init__(self, stream, speed=SPEED, each=1, acts=(), before=None, **source):
+        self.said, self.sent, self.oldest = [], 0, 0.0
         self.server = socket.create_server(("127.0.0.1", 0))
         self.thread = Thread(target=self._serve, args=(stream, speed, each), daemon=True)
         self.thread.start()
@@ -73,16 +77,18 @@ class Watching:
         self.display = Display(DisplayInfo("loud", port, np.zeros((SENSORS, 3)), (0.1, 0.1), 4.0))
         self.display.observers.append(self._note)
         self.acts = list(acts)
-        self.loop = LiveLoop(self.skin, source.tare(self.skin), settings().build(), self.display)
-        with self.skin:
-            self.loop.run()
-        self.thread.join(20)
-        self.server.close()
+        self.loop = LiveLoop(self.skin, source.tare(self.skin), settings().build(), self.display, before)
+        try:
+            with self.skin:
+                self.loop.run()
+        finally:
+            self.thread.join(20)
+            self.server.close()
 
     def _serve(self, stream, speed, each):
         client, _ = self.server.accept()
         begin, waiting = monotonic(), b""
-        with client:
+        with client, suppress(ConnectionError):  # the live view may end first
             for number, data in enumerate(stream, 1):
                 waiting += data
                 if number % each == 0:
@@ -92,6 +98,7 @@ class Watching:
 
     def _note(self, verdict, reason, alarm):
         on = alarm if verdict is None else verdict.dangerous
+        self.oldest = max(self.oldest, monotonic() - verdict.t_host if verdict else 0.0)
         self.said.append((self.sent / RATE, verdict, reason, on))
         if self.acts and self.sent / RATE >= self.acts[0][0]:
             self.acts.pop(0)[1](self.display)
@@ -195,34 +202,51 @@ def test_silence_is_unknown_after_a_second_and_a_half():
         sleep(3)
         yield from lines(force(1))
 
-    begin, seen = monotonic(), []
+    begin = monotonic()
     watching = Watching(stream(), speed=SPEED)
     silent = [verdict for _, verdict, reason, _ in watching.said if "stopped sending" in reason]
     assert silent
     assert all(verdict is None for verdict in silent)
     assert monotonic() - begin < 30
-    assert not seen
 
 
-def test_a_tare_under_an_alarm_is_refused_and_hides_nothing():
-    answers = []
-    acts = [(7.0, lambda display: answers.append(display.request_tare()))]
-    seen = Watching(lines(force(14, (6, 12, 4, 6.0))), acts=acts)
-    assert "something touches the skin" in answers[0]
-    assert seen.kept(6.5 + LATE, 12)
+def test_what_came_before_a_silence_is_no_verdict_of_now():
+    """A press of the last two frames, which nothing has decided: its alarm is kept, and is stale."""
+
+    def stream():
+        yield from lines(force(4.03, (4.01, 4.03, 4, 6.0)))
+        sleep(STALE + 1)
+        yield from lines(force(1, (0, 1, 4, 6.0)))
+
+    seen = Watching(stream())
+    assert seen.oldest < STALE
+    told = [(verdict, on) for _, verdict, reason, on in seen.said if "1.5 s old" in reason]
+    assert told == [(None, True)]
+    assert seen.kept(4.05, 5)
 
 
-def test_a_touch_that_begins_after_a_request_is_no_baseline():
-    acts = [(5.0, lambda display: display.request_tare())]
-    seen = Watching(lines(force(16, (5.5, 12, 4, 6.0))), acts=acts)
-    assert seen.kept(6.0 + LATE, 12)
+def test_a_touch_is_never_shown_as_no_touch():
+    """Not even before it has lasted long enough for its labels."""
+    seen = Watching(lines(force(12, (6, 8, 4, 2.0))))
+    touching = [verdict.state for _, verdict, _, _ in seen.said if verdict and verdict.contact is not None]
+    assert set(touching) == {"touch"}
 
 
-def test_a_forced_tare_ends_an_alarm():
-    acts = [(7.0, lambda display: display.request_tare()), (7.2, lambda display: display.request_tare(True))]
-    seen = Watching(lines(force(16, (6, 16, 4, 6.0))), acts=acts)
-    assert seen.kept(6.5 + LATE, 9)
-    assert not seen.kept(11, 16)
+@pytest.mark.parametrize("dead", [2, 3])
+def test_sensors_that_prove_dead_after_the_self_test_are_counted(dead):
+    """More than a quarter of nine: refused, after the five seconds that show it."""
+    values = force(12)
+    values[:, :dead] = 0.0
+    refused = pytest.raises(InputError, match=r"sensors 0, 1, 2 .* dead, more than 2 of 9.*selftest=false")
+    with refused if dead > 2 else nullcontext():
+        Watching(lines(values), before=lambda conversion: 2)
+
+
+def test_sensors_that_break_later_end_no_live_view():
+    values = force(15)
+    values[700:, :6] = values[700, :6]
+    seen = Watching(lines(values), before=lambda conversion: 2)
+    assert seen.states(13, 15) == {"unknown"}
 
 
 class TestSelfTest:

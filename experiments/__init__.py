@@ -1,7 +1,7 @@
 """What this project runs with the package ``skin``: comparisons, checks of the mechanics, benchmarks."""
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 
 from skin.errors import InputError
 
@@ -16,3 +16,18 @@ def run_script(main: Callable[[list[str]], bool | None]) -> None:
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(2)
+
+
+def script_settings(words: Sequence[str], defaults: Mapping[str, str]) -> dict[str, str]:
+    """Return all settings from words ``name=value``.
+
+    Raises:
+        InputError: an unknown name, or a missing value.
+    """
+    settings = dict(defaults)
+    for word in words:
+        name, _, value = word.partition("=")
+        if name not in settings or not value:
+            raise InputError(f"{word} is no setting: give some of {', '.join(f'{key}=' for key in settings)}")
+        settings[name] = value
+    return settings

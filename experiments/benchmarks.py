@@ -26,7 +26,7 @@ import torch
 from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 
-from experiments import run_script
+from experiments import run_script, script_settings
 from skin.core.files import CONF, ROOT, results, write
 from skin.core.messages import quiet
 from skin.device.base import AbstractSimulated
@@ -108,12 +108,7 @@ def benchmark_settings(arguments: Sequence[str]) -> dict[str, str]:
     Raises:
         InputError: an unknown name or a bad value.
     """
-    settings = dict(_DEFAULTS)
-    for word in arguments:
-        name, _, value = word.partition("=")
-        if name not in settings or not value:
-            raise InputError(f"{word} is no setting: give some of {', '.join(f'{key}=' for key in settings)}")
-        settings[name] = value
+    settings = script_settings(arguments, _DEFAULTS)
     if not settings["repeats"].isdecimal() or int(settings["repeats"]) < 3:
         raise InputError(
             f"repeats={settings['repeats']} must be a number of at least 3: medians are returned"

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from experiments import run_script
+from experiments import run_script, script_settings
 from experiments.studies.pages import csv_text
 from skin.body.base import AbstractBody, Layer, Sensors, Sheet
 from skin.body.layout import AbstractLayout, Grid, Hexagonal, Random
@@ -245,12 +245,8 @@ def summarise_estimates(
 
 def main(words: Sequence[str]) -> None:
     """Run the rows and write contact.csv."""
-    settings = {"touches": "2000", "rows": "", "out": str(ROOT / "docs/results"), "seed": "0"}
-    for word in words:
-        key, _, value = word.partition("=")
-        if key not in settings:
-            raise InputError(f"{word} is no setting: give {', '.join(settings)}, as in touches=200")
-        settings[key] = value
+    defaults = {"touches": "2000", "rows": "", "out": str(ROOT / "docs/results"), "seed": "0"}
+    settings = script_settings(words, defaults)
     begins = tuple(settings["rows"].split(","))
     chosen = [row for row in rows() if row.name.startswith(begins)]
     if not chosen:

@@ -15,7 +15,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import track
 
-from experiments import run_script
+from experiments import run_script, script_settings
 from experiments.validation import CheckResult, Law, publish_physics, solid
 from skin.core.files import ROOT, results
 from skin.errors import InputError
@@ -98,12 +98,7 @@ def validation_settings(words: Sequence[str]) -> dict[str, str]:
     Raises:
         InputError: an unknown name or a bad value.
     """
-    settings = {"quick": "false", "laws": "all", "out": ""}
-    for word in words:
-        name, _, value = word.partition("=")
-        if name not in settings or not value:
-            raise InputError(f"{word} is no setting: give quick=true, laws=hertz,punch or out=FOLDER")
-        settings[name] = value
+    settings = script_settings(words, {"quick": "false", "laws": "all", "out": ""})
     if settings["quick"] not in ("true", "false"):
         raise InputError(f"quick={settings['quick']} must be true or false")
     return settings

@@ -184,7 +184,7 @@ def show(config: Config, changes: Sequence[str], own_mechanics: bool = False) ->
 def _views(display: "Display", config: Config, live: "LiveSettings", open_: ExitStack) -> Iterator[str]:
     """Open what shows the verdicts; yield messages."""
     if live.log is not None:
-        from skin.hardware.live.loop import log_alarms
+        from skin.hardware.live.verdicts import log_alarms
 
         open_.enter_context(log_alarms(display, Path(live.log).expanduser()))
     if config.web:
@@ -192,6 +192,6 @@ def _views(display: "Display", config: Config, live: "LiveSettings", open_: Exit
 
         yield f"page: {open_.enter_context(serve_page(display, live.web_port))}"
     if live.verdicts is not None:
-        from skin.hardware.live.loop import stream_verdicts
+        from skin.hardware.live.verdicts import stream_verdicts
 
         yield f"verdicts: {open_.enter_context(stream_verdicts(display, live.verdicts))}"

@@ -10,7 +10,8 @@ import pytest
 from skin.errors import InputError
 from skin.hardware.live.contacts import LiveContacts
 from skin.hardware.live.engine import Verdict
-from skin.hardware.live.loop import AlarmLog, Display, DisplayInfo, log_alarms
+from skin.hardware.live.loop import Display, DisplayInfo
+from skin.hardware.live.verdicts import AlarmLog, log_alarms
 
 
 def display():

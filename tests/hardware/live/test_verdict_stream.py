@@ -15,7 +15,8 @@ import pytest
 from skin.core.files import ROOT
 from skin.errors import InputError
 from skin.hardware.live.engine import Verdict
-from skin.hardware.live.loop import HEARTBEAT, Display, DisplayInfo, stream_verdicts
+from skin.hardware.live.loop import Display, DisplayInfo
+from skin.hardware.live.verdicts import HEARTBEAT, stream_verdicts
 
 PATIENCE = 60  # s
 

@@ -66,8 +66,12 @@ def contact_message(estimate: "FrameEstimate", time: float) -> dict[str, Any]:
         time: s, the device's clock at their latest frame.
     """
     none = estimate.number == 0 and estimate.fit >= _IDLE_FITS and estimate.large < 0.5
-    base = {"reason": estimate.unknown or "", "device_time": time}
-    base |= {"fit": round(estimate.fit, 6), "large": round(estimate.large, 6)}
+    base = {
+        "reason": estimate.unknown or "",
+        "device_time": time,
+        "fit": round(estimate.fit, 6),
+        "large": round(estimate.large, 6),
+    }
     if not (estimate.fingertip or none):
         # The best fingertips are none of those that press: a reader must not find them.
         return unknown_contacts("") | base | {"state": "not a fingertip"}
@@ -107,13 +111,12 @@ def _contact(contact: "ContactEstimate") -> dict[str, Any]:
 
 def contact_text_lines(message: dict[str, Any]) -> list[str]:
     """Return what is known of contacts in words, a line for each."""
-    state, chance = message["state"], message["probability"]
+    state, number = message["state"], message["number"]
     if state == "unknown":
         return [f"contacts unknown: {message['reason']}"]
     if state == "not a fingertip":
         return [state]
-    number = message["number"]
-    head = f"{number or 'no'} contact{'s' * (number > 1)} ({100 * chance:.0f} %)"
+    head = f"{number or 'no'} contact{'s' * (number > 1)} ({100 * message['probability']:.0f} %)"
     return [head, *map(_words, message["contacts"])]
 
 
@@ -171,6 +174,25 @@ class Mechanics:
         offset = 0.0 if settings.tare else settings.offset
         nominal = Noise(noise, gain=gain, offset=offset, position=_PLACED)
         return cls(device.simulator, device.body, device.sensors, nominal)
+
+    def posterior(self) -> "Posterior":
+        """Return the estimator, for a skin that is watched all the time and therefore idle most of it.
+
+        Touches are ten times less frequent than by default, in the same proportions. By default the prior
+        expects a touch, which few sensors that feel nothing cannot rule out between them.
+
+        Raises:
+            InputError: readings of the simulator do not add up.
+        """
+        from skin.inference.candidates import FingertipPrior
+        from skin.inference.posterior import Posterior
+
+        return Posterior(
+            self.simulator(self.body, self.sensors),
+            self.noise,
+            self.body,
+            FingertipPrior(numbers=(0.93, 0.04, 0.015, 0.005), large=0.01),
+        )
 
 
 class MeanReadings(NamedTuple):
@@ -284,13 +306,10 @@ def _answers(receive: Callable[[], Any]) -> Any:
     """Yield an empty text once everything is prepared, then a message for each reading; or why not."""
     import torch
 
-    from skin.inference.posterior import Posterior
-
     torch.set_num_threads(1)
     mechanics = receive()
     try:
-        simulator = mechanics.simulator(mechanics.body, mechanics.sensors)
-        posterior = Posterior(simulator, mechanics.noise, mechanics.body)
+        posterior = mechanics.posterior()
     except InputError as error:
         yield str(error)
         return

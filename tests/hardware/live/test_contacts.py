@@ -34,7 +34,7 @@ from skin.hardware.live.engine import Detection, Engine, Verdict
 from skin.hardware.wire.channels import UnitConversion
 from skin.inference.candidates import disc_readings
 from skin.inference.noise import Noise
-from skin.inference.posterior import Posterior
+from skin.mechanics.simulator.naive import Naive
 from skin.mechanics.simulator.solid import Solid
 from skin.runs.build import build_device
 from skin.touch.labels import TOUCH
@@ -58,8 +58,8 @@ def simulator():
 
 
 @pytest.fixture(scope="module")
-def posterior(simulator):
-    return Posterior(simulator, NOISE, BODY)
+def posterior():
+    return MECHANICS.posterior()
 
 
 @pytest.fixture(scope="module")
@@ -130,6 +130,24 @@ def test_an_untouched_skin_has_no_contact(posterior):
     message = estimate_contacts(posterior, NOISE, moment(np.zeros(SENSORS)))
     assert (message["state"], message["number"], message["contacts"]) == ("no contact", 0, [])
     assert contact_text_lines(message)[0].startswith("no contact (")
+
+
+def test_few_sensors_that_feel_nothing_show_no_contact_but_a_light_touch():
+    """They cannot rule out a contact between them, which is no reason to show one."""
+    body, count = Sheet((0.2, 0.2), (32, 32), BODY.layers), 12
+    mechanics = Mechanics(Naive, body, Grid(3, 4).sensors(body), NOISE)
+    posterior, rng = mechanics.posterior(), np.random.default_rng(0)
+    # 0.3 N at the first sensor, which reads 0.1 N.
+    place = np.array([[0.028, 0.033, 0.008]])
+    light = 0.3 * disc_readings(Naive(body, mechanics.sensors), body, place, 0.0015)[0]
+    works = {"valid": np.ones(count, dtype=bool), "saturated": np.zeros(count, dtype=bool)}
+    for _ in range(6):
+        noise = rng.normal(scale=NOISE.frame / 10**0.5, size=count)
+        idle, touched = (
+            estimate_contacts(posterior, NOISE, moment(noise + felt, **works)) for felt in (0.0, light)
+        )
+        assert (idle["state"], touched["state"]) == ("no contact", "contacts")
+        assert touched["probabilities"][0] < 0.1 < 0.8 < idle["probabilities"][0]
 
 
 @pytest.mark.parametrize("values", [np.full(SENSORS, 3.0), [0, 0, 0, 0, -3.0, 0, 0, 0, 0]])

@@ -58,6 +58,7 @@ def require_port(device: AbstractDevice) -> "Serial":
 
 
 _LABELS = ("announced", "prompted", "none")
+_FELT = 5.0  # standard deviations of a frame above rest
 
 
 @dataclass(kw_only=True, eq=False)
@@ -74,7 +75,8 @@ class Serial(PortSettings, AbstractDevice):
         labels: ``announced``, ``prompted`` or ``none``.
         gestures: number of gestures.
         seed: of the order of prompts.
-        trigger: force above which a window begins with ``labels=none``, N.
+        trigger: force above which a window begins with ``labels=none``, N; without a tare, which tells the
+            noise, also that above which a prompted gesture is felt.
         touch: rate and window of the model (``conf/touch``).
         stream: add the label ``touch``.
 
@@ -160,7 +162,20 @@ class Serial(PortSettings, AbstractDevice):
         left = (
             (number, labels) for number, labels in planned if number < self.gestures and number not in done
         )
-        return PromptedSegmenter(window, left, _print)
+        least = self._least_felt(conversion, first)
+        return PromptedSegmenter(
+            window, left, _print, lambda seen: bool((conversion(seen.values, seen.valid)[0] > least).any())
+        )
+
+    def _least_felt(self, conversion: UnitConversion, first: Sequence[Frame]) -> np.ndarray | float:
+        """Return the reading of each sensor (S,), N, that neither its noise nor a count explains."""
+        if conversion.noise is None or conversion.rest is None:
+            return self.trigger
+        whole = all((frame.values % 1 == 0).all() for frame in first)
+        return np.maximum(
+            _FELT * conversion.noise + conversion.rest,
+            whole * np.minimum(np.abs(conversion.scale), self.trigger),
+        )
 
     def to_recording(self, gestures: Sequence[RecordedGesture], conversion: UnitConversion) -> Recording:
         """Return gestures as a recording."""
@@ -191,13 +206,13 @@ class Serial(PortSettings, AbstractDevice):
             try:
                 for frame in skin:
                     gesture = segmenter.add(frame)
-                    if gesture is not None and gesture.broken:
-                        _print(f"gesture {gesture.number} was interrupted: the device restarted")
-                    elif gesture is not None:
+                    if gesture is not None and not gesture.broken:
                         gestures.append(gesture)
                         words = "" if gesture.labels is None else f": {label_text(gesture.labels)}"
                         lost = f" ({gesture.lost} frames lost)" * bool(gesture.lost)
                         _print(f"{len(gestures)}/{self.gestures}{words}{lost}")
+                    elif gesture is not None and self.labels != "prompted":  # which says so itself
+                        _print(f"gesture {gesture.number} was interrupted: the device restarted")
                     if segmenter.over or len(gestures) == self.gestures:
                         break
             except (SkinTimeout, SkinDisconnected) as end:

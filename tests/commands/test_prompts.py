@@ -27,7 +27,8 @@ def address(played):
         rng = np.random.default_rng(0)
         reader.sendall(encode_header(Header(n=4, rate=100.0, unit="N")))
         for number in count():
-            values = rng.normal(scale=0.02, size=4) + 2.0 * (number > 600 and number % 100 > 80)
+            # After the tare, every window of half a second feels something.
+            values = rng.normal(scale=0.02, size=4) + 2.0 * (number > 230 and number % 40 > 20)
             reader.sendall(encode_line(values.round(4), number, 10_000 * number))
             if stop.wait(PACE):
                 return

@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from queue import Empty, SimpleQueue
+from queue import SimpleQueue
 from threading import Thread
 
 import numpy as np
@@ -26,6 +26,8 @@ _KEPT = 64  # announcements that are kept unread
 Labels = Mapping[str, int]
 
 _LATE = 0.25  # share of an announced window that may be missed at its beginning
+_INTERRUPTED = "the gesture was interrupted: the skin was unplugged or restarted"
+_UNFELT = "nothing was felt, so the gesture does not count: no working sensor read more than its noise"
 
 
 @dataclass
@@ -39,7 +41,7 @@ class RecordedGesture:
         segment: of the device's clock.
         frames: of the window.
         lost: number of frames known to be missing.
-        broken: the device restarted within the window, so it cannot be used.
+        broken: it cannot be used: the device restarted within the window, or felt nothing.
         resampled: the window at the model's rate, in the device's unit; None until it is complete.
         contacts: (T, K, 5) at the model's rate, as of :class:`skin.device.touches.Touches`; None if unknown.
     """
@@ -196,9 +198,13 @@ class AnnouncedSegmenter(AbstractSegmenter):
                 if missing := [name for name in self._task.names if name not in labels]:
                     raise InputError(f"the skin announces no {missing[0]}: give device.labels=prompted")
                 task_labels = {name: labels[name] for name in self._task.names}
-                contacts = self._take_contacts(announced.number)
                 return RecordedGesture(
-                    announced.number, task_labels, begin, frame.segment, lost=late, contacts=contacts
+                    announced.number,
+                    task_labels,
+                    begin,
+                    frame.segment,
+                    lost=late,
+                    contacts=self._take_contacts(announced.number),
                 )
         return None
 
@@ -212,10 +218,13 @@ class AnnouncedSegmenter(AbstractSegmenter):
 class PromptedSegmenter(AbstractSegmenter):
     """Prompts for each gesture, which begins when Enter is pressed: s skips one, q ends.
 
+    It prompts again where the skin was interrupted, or felt nothing although the labels say a touch.
+
     Args:
         window: as in :class:`AbstractSegmenter`.
-        wanted: (number, labels) of the gestures.
+        plan: (number, labels) of the gestures.
         notify: called with each message for the user.
+        felt: tells whether the skin has felt something in a window.
         lines: typed lines; None: standard input. Lines typed before a prompt count, unless they come from a
             keyboard.
     """
@@ -225,13 +234,13 @@ class PromptedSegmenter(AbstractSegmenter):
         window: Window,
         plan: Iterator[tuple[int, Labels]],
         notify: Callable[[str], None],
+        felt: Callable[[Resampled], bool],
         lines: Iterator[str] | None = None,
     ) -> None:
         super().__init__(window)
-        self._wanted, self._notify = plan, notify
+        self._wanted, self._notify, self._felt = plan, notify, felt
         self._typed: SimpleQueue[str] = SimpleQueue()
         self._asked: tuple[int, Labels] | None = None
-        self._over_now = False
         self._hasty = lines is None and sys.stdin.isatty()
         # A thread, because frames arrive while the program waits for a line.
         Thread(target=self._listen, args=(lines or typed_lines(sys.stdin.fileno()),), daemon=True).start()
@@ -242,40 +251,33 @@ class PromptedSegmenter(AbstractSegmenter):
         self._hasty = False
         self._typed.put("q")
 
-    def _close(self, frame: Frame) -> RecordedGesture | None:
-        done = super()._close(frame)
-        # Prompt one frame later, so that the message about this gesture is printed first.
-        self._over_now = done is not None
-        return done
-
     def add(self, frame: Frame) -> RecordedGesture | None:
-        """As in the base class; prompts again for a broken gesture."""
+        """As in the base class; a gesture that was not felt is broken, too."""
         done = super().add(frame)
-        if done is not None and done.broken and done.labels is not None:
-            self._notify("the gesture was interrupted: the skin was unplugged or restarted")
-            self._ask((done.number, done.labels))
+        if done is not None and done.labels is not None:
+            done.broken = done.resampled is None or (
+                done.labels.get("touch") != 0 and not self._felt(done.resampled)
+            )
+            if done.broken:
+                self._notify(_INTERRUPTED if done.resampled is None else _UNFELT)
+                self._ask((done.number, done.labels))
+        elif self.gesture is None and self._asked is None and not self.over:
+            # A frame after a gesture, so that the message about that is printed first.
+            following = next(self._wanted, None)
+            self.over = following is None
+            if following is not None:
+                self._ask(following)
         return done
 
     def _begin(self, frame: Frame) -> RecordedGesture | None:
-        if self._over_now:
+        if self._asked is None or self._typed.empty():
             return None
-        if self._asked is None:
-            following = next(self._wanted, None)
-            if following is None:
-                self.over = True
-                return None
-            self._ask(following)
-        try:
-            line = self._typed.get_nowait()
-        except Empty:
-            return None
-        number, labels = self._asked or (0, {})
-        self._asked = None
+        line, asked, self._asked = self._typed.get(), self._asked, None
         self.over = line == "q"
         if line in ("q", "s"):
             return None
         self._notify(f"  now: {self._length:g} s")
-        return RecordedGesture(number, labels, frame.t, frame.segment)
+        return RecordedGesture(*asked, frame.t, frame.segment)
 
     def _ask(self, gesture: tuple[int, Labels]) -> None:
         self._asked = gesture

@@ -104,7 +104,11 @@ def test_every_combination_once_per_repetition_in_another_order():
 def test_a_person_begins_skips_and_ends():
     said = []
     segmenter = PromptedSegmenter(
-        window(0.1), enumerate(label_plan(TOUCH.names, 1, 0)), said.append, iter(["\n", "s\n", "\n"])
+        window(0.1),
+        enumerate(label_plan(TOUCH.names, 1, 0)),
+        said.append,
+        lambda seen: True,
+        iter(["\n", "s\n", "\n"]),
     )
     gestures = []
     for frame in frames(range(2000)):

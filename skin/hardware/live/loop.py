@@ -120,7 +120,7 @@ class Display:
         self._verdict: Verdict | None = None
         self._trouble, self._line, self._note = "waiting for the first frame", "", ""
         self._request: TareRequest = ""
-        self._refused_at = -np.inf
+        self._noted_at = -np.inf
 
     def add_frame(self, frame: Frame, conversion: UnitConversion) -> None:
         """Add a frame as sent, with the conversion of its values to N."""
@@ -155,17 +155,16 @@ class Display:
     def request_tare(self, force: bool = False) -> str:
         """Request a new baseline; return why it is refused, or an empty text.
 
-        It is refused while something touches the skin. Within a minute after that it can be forced, by a
-        second and explicit confirmation of the operator.
+        It is refused while something touches the skin. Within a minute after that it can be forced once, by
+        a second and explicit confirmation of the operator; :meth:`state` says so as long.
         """
         with self._lock:
-            contact = self._verdict is not None and self._verdict.contact is not None
-            refused = contact or self._alarm
-            if force and monotonic() - self._refused_at <= _CONFIRM:
+            refused = self._alarm or (self._verdict is not None and self._verdict.contact is not None)
+            if force and self._note == REFUSED and monotonic() - self._noted_at <= _CONFIRM:
                 self._request, event, self._note = "forced", "tare_forced", ""
             elif refused or force:
-                self._refused_at = monotonic() if refused else self._refused_at
-                event, self._note = "tare_refused", REFUSED if refused else "there is nothing to force"
+                event, self._noted_at = "tare_refused", monotonic()
+                self._note = REFUSED if refused else "there is nothing to force"
             else:
                 self._request, event, self._note = "tare", "tare", ""
             note = self._note
@@ -187,7 +186,8 @@ class Display:
         with self._lock:
             fresh = min(max(1, self._number - since), len(self._frames))
             latest = [self._frames[-1 - back] for back in range(fresh)]
-            line = ", ".join(text for text in (self._note, self._line) if text)
+            note = self._note if monotonic() - self._noted_at <= _CONFIRM else ""
+            line = ", ".join(text for text in (note, self._line) if text)
             state = self._verdict, self._trouble, line, self._alarm, self._peak
             number, valid = self._number, self._valid
         contacts = unknown_contacts(state[1]) if state[0] is None else self.contacts.state()

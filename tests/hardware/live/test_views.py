@@ -17,7 +17,7 @@ from scipy.interpolate import LinearNDInterpolator
 
 from skin.device.resampling import Frame
 from skin.errors import InputError
-from skin.hardware.live import terminal, web
+from skin.hardware.live import loop, terminal, web
 from skin.hardware.live.engine import Verdict
 from skin.hardware.live.loop import Display, DisplayInfo
 from skin.hardware.live.terminal import SkinPicture
@@ -259,6 +259,31 @@ def test_a_tare_is_refused_under_a_touch_until_it_is_confirmed():
     assert subject.request_tare() == ""
     refused = "tare_refused"
     assert events == [refused, refused, "tare_forced", refused, "tare_forced", refused, "tare"]
+
+
+def test_a_refused_tare_is_said_while_it_may_be_forced(monkeypatch):
+    subject, now = display(), [100.0]
+    monkeypatch.setattr(loop, "monotonic", lambda: now[0])
+    subject.set_status("99.9 Hz")
+    subject.set_verdict(PRESSED)
+    assert subject.request_tare() == loop.REFUSED
+    assert subject.request_tare(force=True) == ""
+    assert subject.state().line == "99.9 Hz"  # it was forced
+    assert subject.request_tare(force=True) == loop.REFUSED  # a refusal is for one
+    now[0] += 59.0
+    assert subject.state().line == f"{loop.REFUSED}, 99.9 Hz"
+    now[0] += 2.0
+    assert subject.state().line == "99.9 Hz"
+    subject.set_verdict(replace(PRESSED, touched=False, dangerous=False))
+    assert "nothing to force" in subject.request_tare(force=True)
+    assert subject.state().line == "there is nothing to force, 99.9 Hz"
+    now[0] += 61.0
+    assert subject.state().line == "99.9 Hz"
+    subject.set_verdict(PRESSED)
+    subject.request_tare()
+    subject.set_verdict(replace(PRESSED, touched=False, dangerous=False))
+    assert subject.request_tare() == ""
+    assert subject.state().line == "99.9 Hz"
 
 
 def test_the_map_of_an_alarm_is_held_and_goes_with_the_touch():

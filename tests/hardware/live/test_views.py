@@ -408,3 +408,48 @@ def test_the_page_announces_an_alarm_and_its_end_once(browser):
         assert browser.run("return document.getElementById('head').getAttribute('role')") == "status"
         subject.set_verdict(None, "the device has stopped sending")
         until([""])
+
+
+def shows(browser, script, wanted):
+    """Wait until a script gives what is wanted."""
+    deadline = monotonic() + 300
+    while (given := browser.run(f"return {script}")) != wanted:
+        assert monotonic() < deadline, given
+        sleep(0.1)
+
+
+CROSSED = "latest && latest.values.length + ' of ' + skin.positions.length + ' on ' + $('port').textContent"
+
+
+def test_the_page_goes_on_after_a_restart_with_more_sensors(browser):
+    subject, now = display(), "performance.now() - drawn < 1000"
+    subject.add_frame(frame([0, 0, 2.0, 0, 0]), PLAIN)
+    with web.serve_page(subject, 0) as address:
+        browser.open(address)
+        shows(browser, CROSSED, "5 of 5 on /dev/skin")
+    places = np.concatenate([PLACES, PLACES + np.array([0.01, 0.01, 0])])
+    other = Display(DisplayInfo("any_skin", "/dev/other", places, SIZE, 4.0))
+    other.set_verdict(replace(PRESSED, touched=False, dangerous=False, unknown=(7, 9), masked=(7, 9)))
+    with web.serve_page(other, int(address.rsplit(":", 1)[1])):
+        shows(browser, CROSSED, "10 of 10 on /dev/other")
+        before = browser.run("return pictures")
+        shows(browser, f"pictures > {before + 5} && {now}", True)
+        shows(browser, "$('title').textContent + ': ' + $('time').textContent", "any_skin: Map: now")
+
+
+def test_the_map_of_a_program_that_has_ended_is_outdated(browser):
+    subject = display()
+    subject.add_frame(frame([0, 0, 2.0, 0, 0]), PLAIN)
+    subject.set_verdict(replace(PRESSED, touched=False, dangerous=False))
+    subject.set_status("99.9 Hz")
+    bright = "getComputedStyle($('map')).filter"
+    with web.serve_page(subject, 0) as address:
+        browser.open(address)
+        shows(browser, "$('time').textContent", "Map: now")
+        assert browser.run(f"return {bright}") == "none"
+        subject.set_verdict(None, "the device has stopped sending")
+        shows(browser, "$('time').textContent", "Map: last readings")
+    shows(browser, "$('time').textContent", "Map: outdated, the program has ended")
+    assert "grayscale" in browser.run(f"return {bright}")
+    assert browser.run("return $('line').textContent") == ""
+    assert browser.run("return document.body.dataset.state") == "unknown"

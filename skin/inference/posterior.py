@@ -277,13 +277,14 @@ class Posterior:
         felt = self._search.felt(mode[None])[0][0]
         for number in range(2, most + 1):
             addition = self._search.add(frame, mode)
-            silent = evidence[-1] + addition.factor
-            odds = addition.factor + self._numbers[number] - self._numbers[number - 1]
+            # It explains no more than the first: where nothing is felt, it is hidden as well as that.
+            factor = min(addition.factor, single.evidence - evidence[0])
+            odds = factor + self._numbers[number] - self._numbers[number - 1]
             if gammaincc(sensors, misfit / 2) > _POOR and odds < math.log(_LIKELY):
-                evidence.append(silent)
+                evidence.append(evidence[-1] + factor)
                 continue
             mixture = self._refine(frame, self._search.extend(mode, addition), mode, felt)
-            evidence.append(max(silent, mixture.evidence))
+            evidence.append(max(evidence[-1] + factor, mixture.evidence))
             mixtures[number] = mixture
             mode, felt, misfit = mixture.mode, mixture.felt, mixture.misfit
         return evidence, mixtures

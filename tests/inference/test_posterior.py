@@ -203,6 +203,29 @@ def test_two_contacts_are_told_apart():
     assert np.sqrt(np.square(errors).mean() / 2) < 3e-3
 
 
+def test_contacts_that_no_sensor_feels_are_as_likely_as_brute_force_says():
+    body = Sheet((0.2, 0.2), (32, 32), THIN.layers)
+    simulator, noise = Naive(body, Grid(3, 4).sensors(body)), Noise(0.05, frames=10, gain=0.1)
+    prior = FingertipPrior(large=0.0)
+    rng, count = np.random.default_rng(0), 60_000
+    discs = np.column_stack([*rng.uniform(0, 0.2, (2, 3 * count)), rng.uniform(*prior.radii, 3 * count)])
+    force = prior.force * np.exp(prior.spread * rng.standard_normal(3 * count))
+    readings = np.concatenate(
+        [disc_readings(simulator, body, some, prior.rim) for some in np.array_split(discs, 30)]
+    )
+    alone = (readings * force[:, None]).reshape(3, count, 12)
+    subject = Posterior(simulator, noise, body, prior)
+    for _ in range(4):
+        seen = rng.normal(scale=np.sqrt(noise.floor), size=12)
+        ratios = [1.0]
+        for touched in np.cumsum(alone, axis=0):
+            variance = noise.floor + (noise.gain * touched) ** 2
+            misfit = (seen - touched) ** 2 / variance + np.log(variance / noise.floor)
+            ratios.append(np.exp(0.5 * (seen**2 / noise.floor - misfit).sum(1)).mean())
+        expected = np.array(ratios) * prior.numbers
+        assert subject.estimate(seen).probabilities == pytest.approx(expected / expected.sum(), abs=0.03)
+
+
 @pytest.mark.parametrize("thin", [False, True])
 def test_a_bar_is_no_fingertip(thin):
     x, y = (part.ravel() for part in np.meshgrid(np.linspace(0.04, 0.12, 21), np.linspace(0.06, 0.084, 7)))

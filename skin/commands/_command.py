@@ -2,11 +2,11 @@
 
 import re
 import shlex
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from difflib import get_close_matches
 from typing import Any
 
-from hydra import compose, initialize_config_dir
+from hydra import compose, initialize_config_dir, version
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException, OverrideParseException
 from omegaconf import DictConfig, OmegaConf
@@ -20,12 +20,10 @@ import os
 import signal
 import sys
 import warnings
-from collections.abc import Callable
 from functools import wraps
 from pathlib import Path
 from textwrap import indent
 
-from hydra import version
 from hydra._internal.utils import _run_hydra, get_args_parser  # what hydra.main itself calls, with sys.argv
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
@@ -211,8 +209,9 @@ def _run(job: Callable[[DictConfig], Any], name: str, words: Sequence[str]) -> N
     warnings.formatwarning = lambda message, *_: f"warning: {message}\n"
     version.setbase(_VERSION)
     parser = get_args_parser()
+    parser.usage = "skin VERB [--OPTION ...] [NAME=VALUE ...]"
     # Neither the shell nor Hydra expands ~ in device.path=~/x.csv.
-    options = parser.parse_args([word.replace("=~/", f"={Path.home()}/", 1) for word in words])
+    options = parser.parse_intermixed_args([word.replace("=~/", f"={Path.home()}/", 1) for word in words])
     if options.help:
         _print(_help(sys.modules[job.__module__].__doc__ or "", options.config_name or name, options))
         return

@@ -41,6 +41,24 @@ def test_a_name_that_is_near_to_none_keeps_the_answer_of_hydra(capsys):
     assert "Could not override 'qqqq'" in capsys.readouterr().err
 
 
+def test_an_option_may_stand_between_overrides(tmp_path, capsys):
+    (tmp_path / "body").mkdir()
+    (tmp_path / "body/mine.yaml").write_text("size: [0.3, 0.2]\n")
+    main(["device.seed=5", "--config-dir", str(tmp_path), "body=mine", "--cfg", "job"])
+    shown = capsys.readouterr().out
+    assert "- 0.3\n" in shown
+    assert "  seed: 5\n" in shown
+
+
+def test_an_option_that_does_not_exist_is_named_in_short(capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(["seed=5", "--confg-dir", "x", "body=mine"])
+    assert ended.value.code == 2
+    usage, error = capsys.readouterr().err.splitlines()
+    assert usage.startswith("usage: skin VERB ")
+    assert "--confg-dir" in error
+
+
 @pytest.mark.parametrize(
     "value", ["bench (1).csv", "it's.csv", 'a "b".csv', "a,b.csv", "x=y.csv", "(a", "ü {1}.csv"]
 )

@@ -275,8 +275,7 @@ def write_calibration(calibration: Calibration, path: str | Path) -> Path:
     lines.append(f"about: {json.dumps(dict(calibration.about))}")
     # Before the count, which no file lacks: who cuts off the checksum cuts off more than it.
     lines.insert(2, text_sum("\n".join(lines)))
-    path = Path(path).expanduser()
-    return files.write("\n".join(lines) + "\n", path)
+    return files.write("\n".join(lines) + "\n", Path(path).expanduser())
 
 
 def _known(names_given: Mapping[str, Any], names: Sequence[str] | Mapping[str, Any], group: str) -> None:

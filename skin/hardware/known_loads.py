@@ -259,8 +259,11 @@ def _build(
     for name, values in sensors.items():
         working = [value for n, value in enumerate(values) if value is not None and n not in dead]
         ranges[name] = [min(working), max(working)]
-    about: dict[str, Any] = {"unit": session.unit, "placements": len(placements.change)}
-    about |= {"weight": load.weight, "base": load.base} if load.board is None else {"board": load.board}
+    about: dict[str, Any] = {
+        "unit": session.unit,
+        "placements": len(placements.change),
+        **({"weight": load.weight, "base": load.base} if load.board is None else {"board": load.board}),
+    }
     polarity = tuple(int(sign) for sign in signs) if signs.min() < 0 else ()
     calibration = Calibration(sensors, {"dead": dead}, ranges, scale, zero, about, polarity)
     return LoadResult(calibration, counts, differ, never)

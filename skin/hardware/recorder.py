@@ -257,6 +257,13 @@ def _is_begun(path: Path, header: str) -> bool:
         return not header.encode().startswith(file.read(len(header) + 1))
 
 
+_SAME = {
+    "id": "from the device {}, this is {}",
+    "unit": "in {}, the device sends {}",
+    "bits": "with {} bits, the device sends {}",
+}
+
+
 def check_session(path: Path, about: Mapping[str, Any], now: Mapping[str, Any]) -> None:
     """Raise InputError if a session does not match the configuration or the device."""
     differ = {
@@ -264,9 +271,11 @@ def check_session(path: Path, about: Mapping[str, Any], now: Mapping[str, Any]) 
     }
     if "positions" in differ:
         raise InputError(f"{path} was recorded with another layout: give it, as in layout.path=FILE.csv")
-    for name, words in (("unit", "in {}, the device sends {}"), ("id", "from the device {}, this is {}")):
-        if None not in (pair := differ.get(name, (None,))):
-            raise InputError(f"{path} was recorded {words.format(*pair)}: give another out=")
+    for name, words in _SAME.items():
+        stored, found = differ.get(name, (None, None))
+        if stored is not None:
+            differs = words.format(stored, found or "unknown (header missing or incomplete)")
+            raise InputError(f"{path} was recorded {differs}: give another out=")
     if {"window", "rate"} & set(differ):
         window, rate = about["window"], about["rate"]
         raise InputError(

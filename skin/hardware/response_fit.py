@@ -182,8 +182,7 @@ def _centre(values: np.ndarray, press: np.ndarray) -> np.ndarray:
 
 
 def _fit_power(points: Points) -> np.ndarray:
-    exponent = max(_fit_exponent(points), 0.01)
-    return np.array([[0.0, exponent], [0.0, 1.0]])
+    return np.array([[0.0, max(_fit_exponent(points), 0.01)], [0.0, 1.0]])
 
 
 def _fit_table(points: Points) -> np.ndarray:

@@ -28,7 +28,8 @@ def skin(*lives):
     """Serve a skin at 100 Hz, in N, to one reader after the other; give its address.
 
     A life is what the skin is like in a connection: ``frames`` after which it falls silent without closing,
-    its ``sensors``, and ``period`` of its clock. The last one is that of all further connections.
+    its ``sensors``, ``period`` of its clock, its ``id``, and number of the frame before which it sends its
+    ``header``. The last one is that of all further connections.
     """
     server, stop, peers = socket.create_server(("127.0.0.1", 0)), Event(), []
 
@@ -39,10 +40,12 @@ def skin(*lives):
                 peers.append(server.accept()[0])
                 if stop.is_set():
                     return
-                life = {"frames": 10**9, "sensors": 4, "period": 10_000} | lives[min(number, len(lives) - 1)]
-                if life["frames"]:
-                    peers[-1].sendall(encode_header(Header(n=life["sensors"], rate=100.0, unit="N")))
+                usual = {"frames": 10**9, "sensors": 4, "period": 10_000, "id": "arm-L", "header": 0}
+                life = usual | lives[min(number, len(lives) - 1)]
+                header = Header(n=life["sensors"], rate=100.0, unit="N", id=life["id"])
                 for seq in range(life["frames"]):
+                    if seq == life["header"]:
+                        peers[-1].sendall(encode_header(header))
                     values = rng.normal(scale=0.02, size=life["sensors"]).round(4)
                     peers[-1].sendall(encode_line(values, seq, life["period"] * seq))
                     if stop.wait(PACE):
@@ -148,6 +151,28 @@ def test_another_window_or_rate_is_refused_in_finishing_and_going_on(record, rec
         refused(record(*FREE, change, port, "device.tare=2", "seconds=6"), reason)
     assert recorded.read_bytes() == before
     assert not recorded.with_suffix(".parquet").exists()
+
+
+def test_another_device_is_refused_however_late_its_header_comes(record, recorded):
+    before = recorded.read_bytes()
+    with skin({"id": "arm-R", "header": 500}) as port:
+        refused(record(*FREE, port, "device.scale=1", "seconds=30"), "from the device arm-L, this is arm-R")
+    assert recorded.read_bytes() == before
+
+
+def test_the_device_itself_goes_on_however_late_its_header_comes(record, recorded):
+    with skin({"header": 500}) as port:
+        done = record(*FREE, port, "device.scale=1", "seconds=9")
+    assert done.returncode == 0, done.stderr
+    assert "going on" in done.stderr
+
+
+def test_another_device_at_the_port_is_not_recorded(record, tmp_path):
+    with skin({"frames": 400}, {"id": "arm-R", "header": 100}) as port:
+        done = record(*FREE, port, "seconds=30", "device.timeout=1", "device.silence=0.3")
+    assert done.returncode == 0, done.stderr
+    assert re.search(r"another device is connected: proto=1 n=4 rate=100 unit=N id=arm-R\n", done.stderr)
+    assert "reconnect" not in (tmp_path / "s.csv").read_text()
 
 
 def test_damaged_lines_are_skipped_and_named(record, recorded):

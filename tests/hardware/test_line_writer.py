@@ -177,16 +177,17 @@ def test_half_a_header_is_begun_anew(tmp_path, beginning):
         ),
         ({"unit": "N"}, "recorded in adc, the device sends N: give another out="),
         ({"id": "arm-R"}, "recorded from the device arm-L, this is arm-R: give another out="),
+        ({"id": None}, r"recorded from the device arm-L, this is unknown \(header missing"),
+        ({"bits": 12}, "recorded with 10 bits, the device sends 12: give another out="),
     ],
 )
 def test_a_session_goes_on_as_it_was_begun(tmp_path, change, reason):
-    about = ABOUT | {"window": 30, "rate": 10.0, "id": "arm-L"}
+    about = ABOUT | {"window": 30, "rate": 10.0, "id": "arm-L", "bits": 10}
     SessionLog(tmp_path / "x.csv", about, 2).close()
     log = SessionLog(tmp_path / "x.csv", about, 2)
     log.conversion(conversion())
     recorded(log, 0)
     log.close()
-    SessionLog(tmp_path / "x.csv", about | {"id": None}, 2).close()
     with pytest.raises(InputError, match=reason):
         SessionLog(tmp_path / "x.csv", about | change, 2)
 

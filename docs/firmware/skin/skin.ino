@@ -7,7 +7,7 @@ const uint8_t N = sizeof(PINS);
 const uint32_t BAUD = 115200;         // 16 channels reach about 149 Hz at it, 64 channels 43 Hz
 const uint32_t PERIOD_US = 10000;     // 100 Hz
 const uint16_t BITS = 10;             // resolution of the converter
-const uint16_t HEADER_EVERY = 500;    // frames between two headers
+const uint16_t HEADER_EVERY = 1 + 1000000 / PERIOD_US;  // frames between two headers: a second
 
 char line[32 + 6 * N];
 uint32_t seq = 0, due_us = 0;

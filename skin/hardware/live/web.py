@@ -117,8 +117,12 @@ def _application(display: Display) -> Starlette:
 
     # Other host names are refused, so that pages of other sites cannot read the skin.
     local = Middleware(TrustedHostMiddleware, allowed_hosts=[_HOST, "localhost"])
-    routes = [Route("/", page), Route("/skin.json", skin), Route("/pictures", pictures)]
-    routes.append(Route("/tare", tare, methods=["POST"]))
+    routes = [
+        Route("/", page),
+        Route("/skin.json", skin),
+        Route("/pictures", pictures),
+        Route("/tare", tare, methods=["POST"]),
+    ]
     return Starlette(routes=routes, middleware=[local])
 
 

@@ -261,9 +261,7 @@ class Adapter:
                 reader.padded,
                 self.kind,
             )
-            return DetectedFormat(
-                layout, None, header, columns.unit, self.time_unit is not None, columns.summary
-            )
+            return self._detected(layout, columns, header)
         return DetectedFormat(count_seen=count_seen, header=header)
 
     def _detect_rows(self, data: bytes, sensors: int | None) -> DetectedFormat:
@@ -295,8 +293,7 @@ class Adapter:
         if sensors not in (None, total):
             return DetectedFormat(count_seen=total)
         line = TextFormat(columns.roles, "none", reader.trailing, reader, self._delimiter(data), False)
-        layout = RowsFormat(line, count, index, first)
-        return self._detected(layout, columns)
+        return self._detected(RowsFormat(line, count, index, first), columns)
 
     def _detect_struct(self, data: bytes, sensors: int | None) -> DetectedFormat:
         head, tail, seen = self._mark(self.head), self._mark(self.tail), None
@@ -397,9 +394,8 @@ def read_adapter(described: str | Mapping[str, Any] | Adapter) -> Adapter:
     else:
         described_settings = described
     check_settings(Adapter, described_settings, "device.adapter", whole=True)
-    pairs = described_settings.items()
     settings: dict[str, Any] = {
-        name: tuple(value) if isinstance(value, list) else value for name, value in pairs
+        name: tuple(value) if isinstance(value, list) else value for name, value in described_settings.items()
     }
     return Adapter(**settings)
 

@@ -300,7 +300,8 @@ MakeConversion = Callable[[np.ndarray | None, Header | None], UnitConversion]
 """Returns the conversion for a baseline (S,), or None, and a header, or None; InputError if the scale is
 unknown."""
 
-_HEADER = 3.0  # s within which a device must send its header
+HEADER = 6.0
+"""s within which a device must send its header: many repeat it every five."""
 _OFTEN = 0.2  # s between two attempts to take a baseline
 PATIENCE = 60.0  # s for which a touch may delay the baseline
 _UNTOUCHED = "taking the baseline: do not touch the skin"
@@ -385,7 +386,7 @@ class Tare:
             plain = self._conversion(None, header)
         except InputError:
             # The header may arrive a little late.
-            if header is not None or frame.t_host - self._first > _HEADER:
+            if header is not None or frame.t_host - self._first > HEADER:
                 raise
             self.status = "waiting for the header of the device"
             return

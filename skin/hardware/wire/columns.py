@@ -132,10 +132,7 @@ def _recognise(table: np.ndarray, names: Sequence[str], free: Sequence[int], beh
     """Return the field that behaves as a counter or a clock: with its name, or before the values."""
     named = [place for place in free if names and pattern.fullmatch(names[place].rpartition(".")[2])]
     leading = [place for place in free if place < _LEADING and (not names or names[place].isdigit())]
-    for place in [*named, *leading]:
-        if behaves(table[:, place]):
-            return place
-    return None
+    return next((place for place in [*named, *leading] if behaves(table[:, place])), None)
 
 
 def _unit(

@@ -112,9 +112,9 @@ def parse_contact_line(line: bytes) -> ContactLine | None:
     except (KeyError, ValueError):
         return None
     sound = (
-        0 <= frame < frames <= _MOST_FRAMES and most <= MOST_CONTACTS and set(contacts) <= set(range(most))
-    )
-    sound = sound and all(
-        len(values) == len(CONTACT) and all(map(isfinite, values)) for values in contacts.values()
+        0 <= frame < frames <= _MOST_FRAMES
+        and most <= MOST_CONTACTS
+        and set(contacts) <= set(range(most))
+        and all(len(values) == len(CONTACT) and all(map(isfinite, values)) for values in contacts.values())
     )
     return ContactLine(number, lines, rate, frames, most, frame, contacts) if sound else None

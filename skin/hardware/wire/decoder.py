@@ -2,7 +2,7 @@
 
 from collections import Counter, deque
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import log10
 from typing import NamedTuple
 
@@ -185,19 +185,17 @@ class ClockUnit:
         unit = min(_UNITS, key=lambda unit: abs(log10(measured / unit)))
         if abs(log10(measured / unit)) > _CLOSE:
             return False
-        if unit == self.unit:
-            self.summary = f"the device's clock counts {_UNITS[unit]}, by {witness}"
-            return False
-        if self._fixed:
+        if unit != self.unit and self._fixed:
             self.error = InputError(
                 f"the device's clock counts {_UNITS[unit]} by {witness}, not {_UNITS[self.unit]}: correct "
                 "time_unit of the adapter, or the rate that the firmware sends"
             )
             self._done = True
             return False
-        self.unit, self._fixed = unit, True
+        before, self.unit = self.unit, unit
+        self._fixed |= unit != before
         self.summary = f"the device's clock counts {_UNITS[unit]}, by {witness}"
-        return True
+        return unit != before
 
 
 class FrameClock:
@@ -343,10 +341,10 @@ class Stats:
 
     def list_counts(self, **words: str) -> list[str]:
         """Return counts above 0 in words, as ``3 lost``; ``words`` has the word of each."""
-        counts = [(getattr(self, name), word) for name, word in words.items()]
-        return [f"{count} {word}" for count, word in counts if count]
+        return [f"{count} {word}" for name, word in words.items() if (count := getattr(self, name))]
 
 
+_AGAIN = "the device has not sent its header since it was connected again"
 _LONGEST = 65536  # bytes of a line
 _ENOUGH = 4096  # bytes in which the format must show
 _PATIENCE = 2.0  # s of receiving in which it must
@@ -363,6 +361,9 @@ class Decoder:
     The format is detected, as the adapter describes it (of our protocol: two binary frames with a correct
     CRC, or three lines with equal numbers of fields), and then kept. Without a CRC, the bytes before the
     first delimiter are skipped: they may be half a frame.
+
+    After a reconnection another device may be at the port. If the one before sent a header, frames count only
+    once the same header has arrived, apart from its rate.
 
     Args:
         sensors: S; None: taken from the header or from eight lines.
@@ -391,6 +392,7 @@ class Decoder:
         self._good = self._bad = 0
         self._latest_bad = FrameError("")
         self.header: Header | None = None
+        self._headers, self._doubt = set[Header](), ""  # of this device; why its frames do not count
         self._order, self._clock, self._counted = (
             SequenceTracker(modulus=self.adapter.modulus),
             HostClock(),
@@ -415,6 +417,7 @@ class Decoder:
         """Start another connection: detect the format again, with the same number of sensors."""
         self._begin()
         self._order.cut(after)
+        self.stats.trouble = self._doubt = _AGAIN if self._headers else ""
         self._counted.restart()
         self._unit.restart()
 
@@ -475,7 +478,7 @@ class Decoder:
         self.frame_format, self._count_seen = detected.frame_format, detected.count_seen
         if self.frame_format is None:
             return False
-        self.header = detected.header or self.header
+        self._hear(detected.header)
         self.sensors = self.frame_format.sensors
         self.stats.format, self.stats.check = self.frame_format.name, self.frame_format.check
         if detected.unit is not None and self._unit.unit == self._order.unit and not self._unit.summary:
@@ -496,11 +499,11 @@ class Decoder:
                 raise FrameError("long")
             raw = self.frame_format.read(piece)
             if isinstance(raw, bytes):
-                self.header = parse_header(raw) or self.header
+                self._hear(parse_header(raw))
                 return None
             if first and self.frame_format.check != "crc16":
                 raise FrameError("structure")
-            return self._place_frame(raw, now)
+            return None if self._doubt else self._place_frame(raw, now)
         except FrameError as bad:
             if self._synchronous or self._missing:
                 self._synchronous, self._latest_bad = False, bad
@@ -509,6 +512,18 @@ class Decoder:
             else:
                 self.stats.skipped += 1
             return None
+
+    def _hear(self, header: Header | None) -> None:
+        """Take a header; one that differs from those before a reconnection is of another device."""
+        if header is None:
+            return
+        lasting = replace(header, rate=None)  # it may be measured
+        if self._doubt:
+            other = "" if lasting in self._headers else f"another device is connected: {header}"
+            self.stats.trouble = self._doubt = other
+        if not self._doubt:
+            self.header = header
+            self._headers.add(lasting)
 
     def _place_frame(self, raw: RawFrame, now: float) -> Frame:
         ticks, rate = raw.ticks, None if self.header is None else self.header.rate
@@ -555,7 +570,7 @@ class Decoder:
         self._bad += bad
         if now - self._compared_at < _SPAN:
             return
-        trouble = ""
+        trouble = self._doubt
         if self._bad > max(self._good, _FEW):
             share = f"{self._bad} of {self._bad + self._good} frames in {_SPAN:g} s were bad"
             trouble = f"{share} ({self._latest_bad.reason}): wrong baud rate or format?"

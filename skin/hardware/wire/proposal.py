@@ -133,8 +133,7 @@ def _candidates(data: bytes) -> Iterator[Adapter]:
     lines = [line.strip(b"\r\n ") for line in data.split(mark)[1:-1]]
     lines = [line for line in lines if line and not line.startswith(b"#")]
     yield from _named(Adapter(kind="json"), data, lines)
-    plain = [Adapter(kind="text", decimal=".")]
-    plain += [Adapter(kind="text", decimal=",")]
+    plain = [Adapter(kind="text", decimal=sign) for sign in (".", ",")]
     labelled = [Adapter(kind="text", label=mark, decimal=sign) for mark in (":", "=") for sign in (".", ",")]
     patterns = [*_indexed(lines), *_skeleton(lines)]
     for adapter in chain(plain, labelled, patterns):
@@ -152,7 +151,6 @@ def _has_rows(adapter: Adapter, data: bytes) -> bool:
 
 def _named(adapter: Adapter, data: bytes, lines: Sequence[bytes]) -> Iterator[Adapter]:
     """Yield an adapter with names of its fields and without those that are no force, and the adapter."""
-    names: Sequence[str] = ()
     try:
         detected = adapter.detect(data, None).frame_format
     except InputError:
@@ -187,9 +185,7 @@ def _skeleton(lines: Sequence[bytes]) -> Iterator[Adapter]:
     if not shapes:
         return
     shape = shapes.most_common(1)[0][0]
-    alike = [
-        line for line in lines if tuple(b" ".join(text.split()) for text in _NUMBER.split(line)) == shape
-    ]
+    alike = [line for line in lines if _shape(line) == shape]
     count = len(shape) - 1
     if count < 1 or len(alike) < _FRAMES:
         return

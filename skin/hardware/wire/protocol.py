@@ -81,6 +81,11 @@ class Header:
     bits: int | None = None
     id: str | None = None
 
+    def __str__(self) -> str:
+        """Return what is known, as ``proto=1 n=25``."""
+        settings = {name: value for name, value in vars(self).items() if value is not None}
+        return " ".join(f"{name}={_number(value)}" for name, value in settings.items())
+
 
 def encode_line(values: Sequence[float], seq: int, t_us: int, check: Check = "crc16") -> bytes:
     """Return a line, LF at its end.
@@ -96,9 +101,7 @@ def encode_line(values: Sequence[float], seq: int, t_us: int, check: Check = "cr
 
 def encode_header(header: Header, check: Check = "crc16") -> bytes:
     """Return the header's line, LF at its end."""
-    settings = {name: value for name, value in vars(header).items() if value is not None}
-    words = " ".join(f"{name}={_number(value)}" for name, value in settings.items())
-    return _checked(f"# skin {words}", check)
+    return _checked(f"# skin {header}", check)
 
 
 def parse_line(line: bytes) -> Line:

@@ -47,7 +47,8 @@ class PortSettings:
         limits: smallest and largest value of a channel, as in
             :class:`skin.hardware.wire.channels.ChannelHealth`; None: the largest count, if the header gives
             the bits.
-        timeout: s without a frame after which iterating and reading raise ``SkinTimeout``.
+        timeout: s without a frame after which iterating and reading raise ``SkinTimeout``: longer than
+            between two headers, because after a reconnection frames count only after one.
         backoff: s before the first attempt to reconnect, and the longest between two.
         silence: s without a byte after which a socket is closed and opened again, if it is to be reconnected;
             None or 0: never. A computer that lost its power closes no connection. Serial ports are left open:
@@ -65,7 +66,7 @@ class PortSettings:
     format: Format = "auto"
     adapter: str | Mapping[str, Any] = "protocol"
     limits: Annotated[Limits, AfterValidator(_check_order)] | None = None
-    timeout: PositiveFloat = 5.0
+    timeout: PositiveFloat = 6.0
     backoff: Annotated[tuple[PositiveFloat, PositiveFloat], RISING] = (1.0, 10.0)
     silence: NonNegativeFloat | None = 5.0
     tare: float = 2.0
@@ -314,8 +315,10 @@ class Prompter:
         if self._started or not self._attempts:
             return ""
         name, text = ("start", self._start) if self._start else ("poll", self._poll)
-        sent = f"the {name} string {text.decode()!r} of the adapter"
-        return f"{sent} was sent {self._attempts} times without an answer"
+        return (
+            f"the {name} string {text.decode()!r} of the adapter was sent {self._attempts} times without an "
+            "answer"
+        )
 
     def stop(self) -> None:
         """Send the stop string."""

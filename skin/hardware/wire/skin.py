@@ -20,6 +20,7 @@ from skin.device.calibration import read_calibration
 from skin.device.resampling import Frame, check_rate
 from skin.errors import InputError
 from skin.hardware.wire.channels import (
+    HEADER,
     PATIENCE,
     ChannelState,
     Limits,
@@ -32,7 +33,7 @@ from skin.hardware.wire.channels import (
     unit_conversion,
 )
 from skin.hardware.wire.decoder import Decoder, Stats
-from skin.hardware.wire.protocol import Header, encode_header
+from skin.hardware.wire.protocol import Header
 from skin.hardware.wire.reader import (
     ByteStream,
     PlaybackFeed,
@@ -400,9 +401,8 @@ class PortMonitor:
         reasons = ", ".join(f"{count} {reason}" for reason, count in sorted(stats.bad.items()))
         frames = ", ".join([f"{stats.frames} frames", *counts]) + (f" ({reasons})" if reasons else "")
         checksum = f"checksum {stats.check}" if stats.check != "none" else "NO CHECKSUM"
-        trouble = f"; {stats.trouble}" if stats.trouble else ""
-        trouble = f"; {stats.clock}{trouble}" if stats.clock else trouble
-        return f"{stats.format}, {checksum}, {sensors} sensors, {stats.rate_hz:.4g} Hz, {frames}{trouble}"
+        line = f"{stats.format}, {checksum}, {sensors} sensors, {stats.rate_hz:.4g} Hz, {frames}"
+        return "; ".join(filter(None, (line, stats.clock, stats.trouble)))
 
     def summary(self) -> str:
         """Return the header, and the minimum, median, maximum, noise and state of each channel."""
@@ -413,9 +413,7 @@ class PortMonitor:
         states = self._skin.channels or ("ok",) * values.shape[1]
         # Of a channel that is never valid, the values that it repeats.
         rows = [row[mask] if mask.any() else row for row, mask in zip(values.T, valid.T, strict=True)]
-        header = self._skin.header
-        words = "none" if header is None else encode_header(header, "none").decode()[len("# skin ") :].strip()
-        lines = [f"header: {words}", "channel     least    median   largest     noise"]
+        lines = [f"header: {self._skin.header or 'none'}", "channel     least    median   largest     noise"]
         for channel, (row, state, share) in enumerate(zip(rows, states, valid.mean(axis=0), strict=True)):
             middle = np.median(row)
             noise = _SPREAD * np.median(np.abs(row - middle))
@@ -452,8 +450,7 @@ class Source:
         header, limits = self.skin.header, self.limits or (None, None)
         if header is not None and header.bits:
             largest = 2.0**header.bits - 1
-            saturation = limits if self.limits else (None, largest)
-            return RawRange(0.0, largest, header.unit != "N", saturation)
+            return RawRange(0.0, largest, header.unit != "N", self.limits or (None, largest))
         return RawRange(limits[0], limits[1], False, limits)
 
     @classmethod
@@ -528,14 +525,21 @@ class SerialSource:
         return unit_conversion(self._sensors, baseline, self._settings.scale, self._calibration, header)
 
     def warm_up(self, skin: Skin, notify: Callable[[str], None]) -> tuple[list[Frame], UnitConversion]:
-        """Read frames until rate and conversion are known; return all frames read, and the conversion.
+        """Read frames until rate, conversion and device are known; return all of them, and the conversion.
 
         Raises:
             InputError: no frames arrive, the device is too slow, or the scale is unknown.
             SkinTouched: the skin was still touched after a minute.
         """
         try:
-            return warm_up(skin, self.tare(skin), self._rate, self._settings.tare, notify)
+            frames, conversion = warm_up(skin, self.tare(skin), self._rate, self._settings.tare, notify)
+            while (
+                skin.header is None
+                and self._settings.frames.kind == "protocol"  # other formats have no header
+                and frames[-1].t_host - frames[0].t_host < HEADER
+            ):
+                frames += skin.read(1)
+            return frames, conversion
         except (SkinTimeout, SkinDisconnected) as error:
             raise InputError(f"{self._settings.port}: {error}") from error
 

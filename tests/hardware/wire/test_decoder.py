@@ -1,10 +1,12 @@
 """Bytes to frames: formats found, counts kept, wires that are set wrongly."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from skin.hardware.wire.decoder import Decoder
-from skin.hardware.wire.protocol import Header, encode_frame, encode_header, encode_line
+from skin.hardware.wire.protocol import Header, encode_comment, encode_frame, encode_header, encode_line
 
 
 def lines(count, sensors=4, first=0, check="crc16"):
@@ -192,6 +194,56 @@ def test_after_a_restart_the_number_of_sensors_is_demanded_again():
     for number in range(0, 400, 40):
         decoder.feed(b"".join(lines(40, sensors=3, first=number)))
     assert "3 values per frame, the layout has 4" in str(decoder.error())
+
+
+HEADER = Header(n=4, rate=100.0, unit="adc", bits=10, id="arm-L")
+
+
+def comment(header, binary):
+    return encode_comment(encode_header(header, "none").rstrip()) if binary else encode_header(header)
+
+
+@pytest.mark.parametrize("binary", [False, True])
+def test_frames_after_a_reconnection_count_only_once_the_same_header_came(binary):
+    def send(first):
+        values = [1, 0, 3, 4]
+        encode = encode_frame if binary else encode_line
+        return decoder.feed(b"".join(encode(values, n, 1000 * n) for n in range(first, first + 20)))
+
+    decoder = Decoder(4)
+    decoder.feed(comment(HEADER, binary))
+    assert len(send(0)) == 20
+    decoder.restart()
+    assert send(0) == send(20) == []
+    assert decoder.stats.trouble == "the device has not sent its header since it was connected again"
+    decoder.feed(comment(replace(HEADER, id="arm-R"), binary))
+    assert send(40) == []
+    assert decoder.stats.trouble == (
+        "another device is connected: proto=1 n=4 rate=100 unit=adc bits=10 id=arm-R"
+    )
+    assert decoder.header == HEADER
+    decoder.feed(comment(replace(HEADER, rate=99.7), binary))
+    frames = send(60)
+    assert [(frame.seq, frame.segment, frame.after, frame.lost) for frame in frames[:2]] == [
+        (60, 1, "reconnect", 0),
+        (61, 1, "", 0),
+    ]
+    assert (decoder.stats.trouble, decoder.stats.frames, decoder.stats.bad_frames) == ("", 40, 0)
+
+
+def test_a_damaged_header_without_a_checksum_does_not_lock_the_device_out():
+    decoder = Decoder(4)
+    for header in (HEADER, replace(HEADER, id="arm-M")):
+        decoder.feed(encode_header(header, "none") + b"".join(lines(10)))
+    decoder.restart()
+    assert len(decoder.feed(encode_header(HEADER, "none") + b"".join(lines(10)))) == 10
+
+
+def test_a_device_that_never_sent_a_header_needs_none():
+    decoder = Decoder(4)
+    decoder.feed(b"".join(lines(10)))
+    decoder.restart()
+    assert len(decoder.feed(b"".join(lines(10)))) == 10
 
 
 def test_a_long_first_piece_is_read_from_its_first_frame():

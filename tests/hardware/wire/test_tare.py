@@ -97,7 +97,21 @@ def test_counts_without_a_scale_are_refused():
         watched(header=Header(unit="adc", bits=10))(frames(noisy(1))[0])
     watch = watched()
     with pytest.raises(InputError, match=r"values of no unit, .* device\.scale="):
-        list(map(watch, frames(noisy(400))))
+        list(map(watch, frames(noisy(700))))
+
+
+def test_a_device_that_sends_its_header_every_five_seconds_has_a_unit():
+    told = []
+    tare = Tare(
+        lambda baseline, header: unit_conversion(3, baseline, None, None, header),
+        0.0,
+        RATE,
+        lambda: told[0] if told else None,
+    )
+    watch = Watch(tare)
+    assert all(watch(frame) is None for frame in frames(noisy(500)))
+    told.append(Header(unit="N"))
+    assert watch(frames(noisy(1), start=5.0)[0]) is not None
 
 
 def test_a_tare_too_short_for_a_baseline_is_refused():

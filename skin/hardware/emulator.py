@@ -213,9 +213,7 @@ def open_port(port: str, link: str | None) -> AbstractPort:
 class _Pty(AbstractPort):
     def __init__(self, link: str | None) -> None:
         super().__init__()
-        self._link = None if link is None else Path(link).expanduser().absolute()
-        if self._link and self._link.exists() and not self._link.is_symlink():
-            raise InputError(f"link={link} would replace a file: give another name")
+        self._link, self._master = None if link is None else Path(link).expanduser().absolute(), -1
         self.plug()
 
     def plug(self) -> None:
@@ -226,19 +224,23 @@ class _Pty(AbstractPort):
                 "this system has no pseudo-terminals: add port=tcp:5555, and read it with "
                 "device.port=socket://127.0.0.1:5555"
             ) from error
+        if self._link and self._link.exists():
+            used = f"leads to {self._link.resolve()}, which is in use: end the other skin emulate, or"
+            what = used if self._link.is_symlink() else "would replace a file:"
+            raise InputError(f"link={self._link} {what} give another name")
         with self._lock:
             self._master, slave = os.openpty()
             tty.setraw(slave)
             os.set_blocking(self._master, False)
-            name = os.ttyname(slave)
+            self._name = os.ttyname(slave)
             # Opened and closed once, it signals when a reader opens it.
             os.close(slave)
-        self.address = name if self._link is None else str(self._link)
+        self.address = self._name if self._link is None else str(self._link)
         if self._link is not None:
             partial = self._link.with_name(self._link.name + ".part")
             try:
                 partial.unlink(missing_ok=True)
-                partial.symlink_to(name)
+                partial.symlink_to(self._name)
                 partial.replace(self._link)
             except OSError as error:
                 raise InputError(f"cannot make link={self._link}: {error}") from error
@@ -254,10 +256,10 @@ class _Pty(AbstractPort):
     def unplug(self) -> None:
         with self._lock:
             if self._master >= 0:
+                if self._link and self._link.is_symlink() and os.readlink(self._link) == self._name:
+                    self._link.unlink()
                 os.close(self._master)
                 self._master = -1
-        if self._link is not None and self._link.is_symlink():
-            self._link.unlink()
 
     def _send(self, data: bytes) -> int:
         return os.write(self._master, data)

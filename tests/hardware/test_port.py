@@ -120,6 +120,36 @@ def test_a_link_leads_to_it_and_is_followed_again(tmp_path):
     port.unplug()
 
 
+def test_a_link_in_use_is_left_alone(tmp_path):
+    link = tmp_path / "skin"
+    first = open_port("pty", str(link))
+    target = os.readlink(link)
+    with pytest.raises(
+        InputError, match=rf"link=\S+ leads to {target}, which is in use: end .* another name"
+    ):
+        open_port("pty", str(link))
+    assert os.readlink(link) == target
+    first.unplug()
+    second = open_port("pty", str(link))  # while the first is away
+    with pytest.raises(InputError, match="in use"):
+        first.plug()
+    first.unplug()
+    assert link.exists()
+    second.unplug()
+    assert not link.is_symlink()
+
+
+def test_a_link_that_leads_nowhere_is_taken_over_and_another_ones_is_not_removed(tmp_path):
+    link = tmp_path / "skin"
+    link.symlink_to("/dev/pts/nothing")
+    port = open_port("pty", str(link))
+    assert link.exists()
+    link.unlink()
+    link.symlink_to("/dev/pts/other")
+    port.unplug()
+    assert os.readlink(link) == "/dev/pts/other"
+
+
 @pytest.mark.parametrize("name", ["usb", "tcp:", "tcp:70000", "tcp:x"])
 def test_other_ports_are_refused(name):
     with pytest.raises(InputError, match="pty or tcp"):

@@ -63,18 +63,16 @@ def serve_page(display: Display, port: int) -> Iterator[str]:
 def message(state: DisplayState, picture: SkinPicture) -> dict[str, Any]:
     """Return the data of each picture: forces in N, the picture as base64 of uint8 row by row."""
     verdict = state.verdict
-    answer = None
-    if verdict is not None:
-        answer = {
-            "touched": verdict.touched,
-            "dangerous": verdict.dangerous,
-            "state": verdict.state,
-            "reason": verdict.reason,
-            "contact": verdict.contact is not None,
-            "gap": verdict.gap,
-            "since": contact_text(verdict.contact),
-            "words": verdict.words(),
-        }
+    answer = verdict and {
+        "touched": verdict.touched,
+        "dangerous": verdict.dangerous,
+        "state": verdict.state,
+        "reason": verdict.reason,
+        "contact": verdict.contact is not None,
+        "gap": verdict.gap,
+        "since": contact_text(verdict.contact),
+        "words": verdict.words(),
+    }
     return {
         "number": state.number,
         "values": [round(value, 3) for value in state.values.tolist()],

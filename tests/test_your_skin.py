@@ -54,11 +54,22 @@ def started(command: str, home: Path) -> str:
 
 def test_the_page_has_the_files_and_commands_of_the_walk():
     assert sorted(FILES) == ["my-skin/body/mine.yaml", "my-skin/sensors.csv"]
-    assert ["--cfg job" in command for command in COMMANDS] == [True, False, False, False, True, False]
+    assert ["--cfg job" in command for command in COMMANDS] == [False, False, False, False, True, False]
 
 
-def test_the_configuration_that_the_page_prints_is_the_users(home):
-    shown = OmegaConf.create(started(COMMANDS[0], home))
+def test_the_check_of_the_page_draws_the_skin_and_refuses_a_wrong_layout(home):
+    assert "touch.png: " in started(COMMANDS[0], home)
+    path = home / "my-skin" / "sensors.csv"
+    path.write_text(path.read_text().replace("0.131,", "0.231,"))
+    try:
+        with pytest.raises(AssertionError, match=r"the first is sensor 8 at x = 0\.231 m"):
+            started(COMMANDS[0], home)
+    finally:
+        path.write_text(FILES["my-skin/sensors.csv"])
+
+
+def test_the_configuration_of_the_page_is_the_users(home):
+    shown = OmegaConf.create(started(f"{COMMANDS[0].strip()} --cfg job", home))
     body = instantiate(shown.body)
     assert (body.size, body.cells, len(body.layers)) == ((0.15, 0.10), (30, 20), 3)
     assert [layer.material.young for layer in body.layers] == [560e3, 40e3, 69e3]

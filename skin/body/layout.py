@@ -396,9 +396,8 @@ class File(AbstractLayout):
 
 def _find(name: str | Path) -> Path:
     places = candidates(name)
-    for path in places:
-        if path.is_file():
-            return path
+    if path := next(filter(Path.is_file, places), None):
+        return path
     looked = " and ".join(dict.fromkeys(map(str, places)))
     raise InputError(f"no layout file {name}: looked for {looked}; give layout.path=FILE.csv")
 

@@ -9,7 +9,7 @@ Listens for seconds=, or until Ctrl-C.
 
 import signal
 import sys
-from contextlib import suppress
+from contextlib import closing, suppress
 from typing import TYPE_CHECKING
 
 from skin.commands._command import command
@@ -31,6 +31,7 @@ def main(config: Config) -> None:
             "device.port is missing: add device.port=/dev/ttyACM0 or device.port=socket://HOST:NUMBER"
         )
 
+    from skin.hardware.wire.formats import SensorCountError
     from skin.hardware.wire.reader import PortSettings, SkinDisconnected, SkinTimeout
     from skin.hardware.wire.skin import PortMonitor, open_skin
 
@@ -48,6 +49,11 @@ def main(config: Config) -> None:
                     print(line, flush=True)
         except (SkinTimeout, SkinDisconnected) as error:
             raise InputError(f"{device['port']}: {error}") from error
+        except SensorCountError as error:
+            raise InputError(
+                f"n={config.n}, but the device sends {error.sent} values per frame: give n={error.sent}, or "
+                "leave it out"
+            ) from error
         print(listener.summary())
 
 
@@ -56,11 +62,8 @@ def _propose(settings: "PortSettings", seconds: float | None) -> None:
     from skin.hardware.wire.proposal import listen_raw, propose
     from skin.hardware.wire.reader import open_stream
 
-    stream = open_stream(str(settings.port), settings.baudrate)
-    try:
+    with closing(open_stream(str(settings.port), settings.baudrate)) as stream:
         pieces = listen_raw(stream, _ENOUGH if seconds is None else min(seconds, _ENOUGH))
-    finally:
-        stream.close()
     proposal = propose(pieces)
     print(f"# {proposal.summary}", proposal.adapter.describe(), sep="\n")
     print("save it, as board.yaml, and give device.adapter=board.yaml", file=sys.stderr)

@@ -216,9 +216,8 @@ def _explain_refusal(hint: Any, value: Any) -> str:
         taken = _adapter(hint).validate_python(value)
     except ValidationError as error:
         # Of a union, the message for the closest member: the deepest, or one whose type fits.
-        nearest = max(
-            error.errors(), key=lambda detail: (len(detail["loc"]), detail["type"] == "value_error")
-        )
+        fits = ("value_error", "greater_than", "greater_than_equal", "less_than", "less_than_equal")
+        nearest = max(error.errors(), key=lambda detail: (len(detail["loc"]), detail["type"] in fits))
         sentence = nearest["msg"].removeprefix("Value error, ").replace("Input should be", "must be")
         sentence = sentence.split(", unable to parse")[0].replace("an instance of Sequence", "a list")
         sentence = _LENGTHS.get(nearest["type"], sentence.replace("a valid tuple", "a list"))

@@ -239,6 +239,10 @@ def _refused(path: Path) -> Iterator[None]:
 
 def _described(path: Path) -> tuple[dict[str, Any], Task]:
     about = _read_about(path)
+    if isinstance(about, dict) and "started_unix" in about:
+        raise InputError(
+            f"{path} is a session of skin record: give its recording, {path.with_suffix('.parquet')}"
+        )
     if isinstance(about, dict) and about.get("format") != FORMAT:
         raise ValueError(f"it has format {about.get('format')}, this version reads format {FORMAT}")
     task = check_metadata(about, str(path))

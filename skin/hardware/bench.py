@@ -192,8 +192,7 @@ class Units:
         hint = "check the column time"
         if near:
             unit = fits[near[0]]
-            rate = 1 / (step * unit)
-            hint = f"{near[0]} would be {rate:.4g} Hz: add {self.command}.time_scale={unit:g}"
+            hint = f"{near[0]} would be {1 / (step * unit):.4g} Hz: add {self.command}.time_scale={unit:g}"
         raise InputError(
             f"{where}: a row every {step:.4g} s is no rate of a bench "
             f"({_SLOWEST:g} to {_FASTEST:g} Hz); {hint}"

@@ -84,11 +84,23 @@ def emulate_session(
     frames = round((gauge.time[-1] + protocol.rest) * protocol.rate)
     time = np.arange(frames) / protocol.rate
     true = true_readings(gauge, per_newton(device.model, device.body, gauge), time)
+    return sent_session(device, true, time, generator, bits, gauge)
+
+
+def sent_session(
+    device: AbstractSimulated,
+    true: np.ndarray,
+    time: np.ndarray,
+    generator: np.random.Generator,
+    bits: int | None,
+    gauge: Gauge | None = None,
+) -> BenchSession:
+    """Return what a device sends of true readings (T, S), N, at times (T,), s: N, or counts of ``bits``."""
     measured = device.imperfection.raw(
         torch.from_numpy(true)[None].float(), device.constants, generator, torch.from_numpy(time).float()
     )[0].numpy() * device.imperfection.signs(true.shape[1])
-    values = Converter(bits, device.imperfection.clip)(measured)
-    return BenchSession(time, values, "N" if bits is None else "adc", gauge, bits)
+    sent = Converter(bits, device.imperfection.clip)(measured)
+    return BenchSession(time, sent, "N" if bits is None else "adc", gauge, bits)
 
 
 def write_demo_session(device: AbstractSimulated, settings: Mapping[str, Any], path: str) -> str:

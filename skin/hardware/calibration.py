@@ -534,8 +534,8 @@ def print_calibration(calibration: Calibration, outcome: HeldOutErrors) -> None:
     weak = [n for n, gain in gains.items() if gain < _WEAK * float(np.median(list(gains.values())))]
     broken = {number for group in calibration.broken.values() for number in group}
     unknown = [n for n in range(len(calibration)) if n not in gains and n not in broken]
-    groups = [(kind, numbers, " (from 0)") for kind, numbers in calibration.broken.items()]
-    groups += [
+    groups = [
+        *((kind, numbers, " (from 0)") for kind, numbers in calibration.broken.items()),
         ("inverse, values fall with force", np.flatnonzero(calibration.signs < 0).tolist(), ""),
         (f"weak, less than {_WEAK:.0%} of the median gain", weak, ""),
         ("not pressed, or at the limit, so of median gain", unknown, ""),

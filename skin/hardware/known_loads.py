@@ -18,8 +18,7 @@ from skin.device.base import AbstractSimulated
 from skin.device.calibration import Calibration
 from skin.errors import InputError
 from skin.hardware.bench import BenchSession, Gauge, per_newton
-from skin.hardware.bench_protocol import Protocol
-from skin.hardware.emulator import Converter
+from skin.hardware.bench_protocol import Protocol, sent_session
 from skin.hardware.placements import Placements, find_placements
 from skin.hardware.wiring import find_quantum, list_numbers, measure_idle
 
@@ -31,6 +30,7 @@ _FLOOR = 0.03  # of the largest reading: what a model leaves beside a base
 _TILT = 0.25  # standard deviation of the tilt of a board's pressure, share from the middle to an edge
 _UNEVEN = 0.1  # of the pressure of foam, share
 _RELIEVED = 0.5  # weight of the inverse of a reading, over that of its median, in its error
+_QUIETER = 200.0  # times that the noise of sensors may be below that of the simulated device
 _MISSED = 0.25  # share of the sensors that may have no gain
 
 
@@ -118,7 +118,7 @@ def fit_known_load(device: AbstractSimulated, session: BenchSession, load: Known
     placements = find_placements(session)
     fit = _fit_weight if load.weight is not None else _fit_board
     gains, counts, differ = fit(device, placements, load)
-    return _build(session, placements, load, gains, counts, differ)
+    return _build(session, placements, load, gains, counts, differ, float(device.constants.noise.median()))
 
 
 def base_readings(device: AbstractSimulated, base: float) -> np.ndarray:
@@ -225,8 +225,12 @@ def _build(
     gains: np.ndarray,
     counts: np.ndarray,
     differ: float,
+    usual: float,
 ) -> LoadResult:
-    """Return the calibration of gains (S,), in the session's unit per N, NaN if unknown."""
+    """Return the calibration of gains (S,), in the session's unit per N, NaN if unknown.
+
+    A load in another unit makes the noise, N, that of no sensor; ``usual`` is that of the simulated device.
+    """
     signs = _sign(placements)
     dead = [int(n) for n in np.flatnonzero(~placements.reached)]
     never = [int(n) for n in np.flatnonzero(placements.reached & ~(gains * signs > 0))]
@@ -246,6 +250,13 @@ def _build(
     offset, noise, step_sizes = np.array(rests).T
     absolute = np.where(np.isfinite(gains), gains * signs, np.nan)
     typical = float(np.nanmedian(absolute))
+    quiet = float(np.median(np.maximum(noise, step_sizes / math.sqrt(12)))) / typical
+    if quiet < usual / _QUIETER:
+        name = f"weight={load.weight:g} (kg)" if load.board is None else f"board={load.board:g} (N)"
+        raise InputError(
+            f"{name} would mean a noise of {quiet:.2g} N, device.noise is {usual:g}: give the load in this "
+            "unit, or device.noise= if the sensors are so quiet"
+        )
     in_newton = session.unit == "N"
     scale = 1.0 if in_newton else 1 / typical
     zero = 0.0 if in_newton else float(np.median(offset[placements.reached]))
@@ -325,11 +336,7 @@ def emulate_placements(
     corners = [0.0, protocol.ramp, protocol.ramp + 2.0, 2 * protocol.ramp + 2.0]
     share = np.where(number >= 0, np.interp(inside, corners, [0.0, 1.0, 1.0, 0.0]), 0.0)
     true = share[:, None] * readings[np.maximum(number, 0)]
-    measured = device.imperfection.raw(
-        torch.from_numpy(true)[None].float(), device.constants, generator, torch.from_numpy(time).float()
-    )[0].numpy() * device.imperfection.signs(true.shape[1])
-    values = Converter(bits, device.imperfection.clip)(measured)
-    return BenchSession(time, values, "N" if bits is None else "adc", None, bits)
+    return sent_session(device, true, time, generator, bits)
 
 
 def emulate_known_load(

@@ -6,7 +6,7 @@ import numpy as np
 
 from skin.errors import InputError
 from skin.hardware.bench import BenchSession
-from skin.hardware.wiring import find_quantum
+from skin.hardware.wiring import find_medians, find_quantum
 
 _BLOCK = 0.2  # s, whose median is one value
 _REST = 5  # blocks without a load before the first one
@@ -56,8 +56,7 @@ def find_placements(session: BenchSession) -> Placements:
     block = np.floor((time - time[0]) / _BLOCK).astype(int)
     _, first = np.unique(block, return_index=True)
     parts = np.split(np.arange(len(time)), first[1:])
-    values = np.array([_medians(raw[part]) for part in parts])
-    values = _fill(values)
+    values = _fill(np.array([find_medians(raw[part]) for part in parts]))
     steps = np.array([find_quantum(column[np.isfinite(column)]) for column in raw.T])
     noise = _MAD / np.sqrt(2) * np.median(np.abs(np.diff(values, axis=0)), axis=0)
     noise = np.maximum(noise, steps / np.sqrt(12))
@@ -89,13 +88,6 @@ def find_placements(session: BenchSession) -> Placements:
     few = noise * np.sqrt(1 / 5 + 1 / (2 * _AFTER))
     reached = (np.abs(change) > np.maximum(_LOADED * few, _STEPS * steps)).any(axis=0)
     return Placements(change, moments[:, 0], moments[:, 1], idle, few, unsteady, reached)
-
-
-def _medians(values: np.ndarray) -> np.ndarray:
-    present = np.isfinite(values).any(axis=0)
-    middle = np.full(values.shape[1], np.nan)
-    middle[present] = np.nanmedian(values[:, present], axis=0)
-    return middle
 
 
 def _fill(values: np.ndarray) -> np.ndarray:

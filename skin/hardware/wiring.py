@@ -138,17 +138,17 @@ def collect_responses(bench: BenchData) -> Responses:
     raw, (force, press) = bench.session.raw, bench.applied
     idle = np.flatnonzero(bench.idle)
     rows, forces, numbers, counts, rests = [], [], [], [], []
-    resting = _find_medians(raw[idle])
+    resting = find_medians(raw[idle])
     for number in range(len(bench.gauge)):
         frames = np.flatnonzero((press == number) & bench.loading)
         if not len(frames):
             continue
         before = idle[idle < frames[0]][-_BEFORE:]
-        level = _find_medians(raw[before]) if len(before) >= _FEW else resting
+        level = find_medians(raw[before]) if len(before) >= _FEW else resting
         level = np.where(np.isfinite(level), level, resting)
         rests.append(level)
         for step in np.array_split(frames, min(_STEPS, len(frames))):
-            rows.append(_find_medians(raw[step]) - level)
+            rows.append(find_medians(raw[step]) - level)
             forces.append(force[step].mean())
             numbers.append(number)
             counts.append(len(step))
@@ -156,7 +156,7 @@ def collect_responses(bench: BenchData) -> Responses:
     noise, step = _noise(bench, idle)
     error = noise * _MEDIAN * math.sqrt(1 / float(np.median(counts)) + 1 / _BEFORE)
     if len(rests) > 2:  # slow noise, which no mean reduces
-        error = np.maximum(error, _MAD * np.nan_to_num(_find_medians(np.abs(np.diff(rests, axis=0)))))
+        error = np.maximum(error, _MAD * np.nan_to_num(find_medians(np.abs(np.diff(rests, axis=0)))))
     floor = np.maximum(np.maximum(_SURE * error, _VISIBLE * noise), _STEP * step)
     responding = np.abs(measured).max(axis=0) > floor
     return Responses(measured, np.array(forces), np.array(numbers), error, responding)
@@ -208,7 +208,7 @@ def find_polarity(responses: Responses, per_newton: np.ndarray) -> np.ndarray:
     return np.where(responses.responding, signs, most)
 
 
-def _find_medians(values: np.ndarray) -> np.ndarray:
+def find_medians(values: np.ndarray) -> np.ndarray:
     """Return the median of each column, (S,); NaN where a column has no number."""
     measured = np.isfinite(values).any(axis=0) if len(values) else np.zeros(values.shape[1], dtype=bool)
     middle = np.full(values.shape[1], np.nan)
@@ -500,9 +500,8 @@ def _phrase_refusal(
 
 def _is_conclusive(explanation: _Explanation, straight: _Explanation | None, responding: np.ndarray) -> bool:
     """Return whether an explanation is sure and explains enough to be named."""
-    if not explanation.parts or not explanation.sure:
-        return False
-    if len(explanation.unexplained) > _MOST * responding.sum():
+    few = len(explanation.unexplained) <= _MOST * responding.sum()
+    if not (explanation.parts and explanation.sure and few):
         return False
     if straight is None:
         return True

@@ -145,6 +145,7 @@ def _processor() -> str:
 
 
 _TOO_LARGE = 2**63
+_COUNTED = (("seconds",), ("gestures",), ("n",))  # settings of commands
 _PATIENCE = 5.0  # s until a server that accepts no connection counts as away
 
 # Settings without effect on results.
@@ -292,6 +293,8 @@ def validate_config(config: Any) -> Config:
             if unfit or (isinstance(value, float) and isnan(value)):
                 reason = "too large" if unfit else "nan"
                 raise InputError(f"{'.'.join(path)} is {reason}: give a number")
+            if path in _COUNTED and value is not None and value < 0:
+                raise InputError(f"{path[0]}={value:g} is below 0: give a number above 0")
         return cast(Config, OmegaConf.to_object(whole))
     except OmegaConfBaseException as error:
         raise InputError(one_line(error)) from error

@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Annotated, Any, Literal
 
 import pytest
-from annotated_types import Ge, Gt
+from annotated_types import Ge, Gt, Le
 
 from skin.core.settings import ONCE, RISING, check_groups, check_settings, checked, configured
 from skin.errors import InputError
@@ -23,6 +23,7 @@ class Thing:
         widths: Sequence[int] = (),
         name: str = "",
         on: bool = False,
+        where: Literal["out"] | Annotated[int, Le(9)] | None = None,
         copies: Mapping[str, int] | None = None,
         span: Annotated[tuple[float, float], RISING] = (1, 10),
         labels: Annotated[Sequence[str], ONCE] = (),
@@ -48,6 +49,8 @@ def test_what_fits_is_taken():
         ({"share": float("nan")}, "thing.share=nan must be a finite number"),
         ({"share": float("inf")}, "thing.share=inf must be a finite number"),
         ({"width": 0}, "thing.width=0 must be greater than 0"),
+        ({"where": 10}, "thing.where=10 must be less than or equal to 9"),
+        ({"where": "in"}, "thing.where=in must be 'out'"),
         ({"kind": "c"}, "thing.kind=c must be 'a' or 'b'"),
         ({"widths": 8}, "thing.widths=8 must be a list"),
         ({"widths": ["x"]}, r"thing.widths=\['x'\] must be a valid integer"),

@@ -50,6 +50,16 @@ def recording(**changes) -> Recording:
     return Recording(**(parts | changes))
 
 
+def test_a_session_is_refused_with_the_name_of_its_recording(tmp_path):
+    path = tmp_path / "s.csv"
+    path.write_text("time,seq,raw_00\n")
+    path.with_name("s.csv.json").write_text('{"format": 2, "started_unix": 1, "positions": [[0, 0, 0]]}')
+    with pytest.raises(
+        InputError, match=r"s\.csv is a session of skin record: give its recording, \S+s\.parq"
+    ):
+        read_recording(path)
+
+
 def by_hand(path: Path) -> Path:
     """Remove the checksums beside a CSV file, as a person does who changes it."""
     beside = path.with_name(path.name + ".json")

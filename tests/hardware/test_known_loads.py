@@ -97,6 +97,17 @@ def test_a_touch_or_a_sliding_load_is_no_placement():
         find_placements(session)
 
 
+@pytest.mark.parametrize("bits", [None, 12])
+def test_a_load_in_another_unit_shows_in_the_noise(bits):
+    session = weighed(device(), ORDER, bits)
+    with pytest.raises(
+        InputError, match=r"^weight=0\.002 \(kg\) would mean a noise of \S+ N, device.noise is 0.05"
+    ):
+        fit_known_load(device(), session, KnownLoad(0.002, 0.02, None))
+    fit_known_load(device(), session, KnownLoad(0.1, 0.02, None))
+    fit_known_load(device(noise=0.0), session, KnownLoad(0.002, 0.02, None))
+
+
 @pytest.mark.parametrize(
     ("load", "reason"),
     [

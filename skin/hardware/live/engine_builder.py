@@ -152,7 +152,14 @@ class SelfTest:
         yield "live.drift", replace(used, detection=drift), conversion, device
         yield "live.patience.above", replace(used, patience=above), conversion, device
         yield "live.patience", replace(used, patience=nominal.patience), conversion, device
-        yield "the mask of broken sensors (device.calibration, or a tare at the limit)", used, masked, device
+        yield (
+            f"{conversion.broken.sum()} of {len(self.presses)} sensors have no valid reading (at most a "
+            "quarter may): they are dead, or the mask of broken sensors (device.calibration, or a tare at "
+            "the limit)",
+            used,
+            masked,
+            device,
+        )
         yield "device.limits", used, conversion, replace(device, limits=(None, None))
         yield "device.scale or device.calibration", used, unit, RawRange()
 

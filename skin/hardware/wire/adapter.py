@@ -24,10 +24,10 @@ from skin.hardware.wire.formats import (
     FixedFormat,
     FrameFormat,
     RowsFormat,
+    SensorCountError,
     TextFormat,
     detect_format,
     detection_error,
-    mismatch_error,
 )
 from skin.hardware.wire.lines import (
     JsonReader,
@@ -346,7 +346,7 @@ class Adapter:
         if self.kind == "protocol":
             return detection_error(data, count_seen, sensors)
         if count_seen is not None and sensors is not None:
-            return mismatch_error(count_seen, sensors)
+            return SensorCountError(count_seen, sensors)
         hint = "skin listen adapter=auto proposes an adapter"
         if self.kind == "binary" or self.length is not None or len(lines := self._lines(data)) < 2:
             return InputError(

@@ -364,7 +364,7 @@ def detection_error(data: bytes, count_seen: int | None, sensors: int | None) ->
     if _has_constant_time(run := [line for line in run if len(line.fields) > 2]):
         return stopped_clock_error(len(run), run[0].fields[1])
     if count_seen is not None and sensors is not None:
-        return mismatch_error(count_seen, sensors)
+        return SensorCountError(count_seen, sensors)
     text = data[:64].decode("ascii", "replace")
     readable = sum(character.isprintable() or character in "\r\n\t" for character in text) > 0.9 * len(text)
     sample = repr(text) if readable else data[:64].hex(" ")
@@ -374,12 +374,19 @@ def detection_error(data: bytes, count_seen: int | None, sensors: int | None) ->
     )
 
 
-def mismatch_error(count_seen: int, sensors: int) -> InputError:
-    """Return the error for a device with another number of sensors than the layout."""
-    return InputError(
-        f"the device sends {count_seen} values per frame, the layout has {sensors} sensors: give its "
-        "own layout, as in layout=file layout.path=FILE.csv"
-    )
+class SensorCountError(InputError):
+    """The device has another number of sensors than the layout.
+
+    Attributes:
+        sent: values per frame.
+    """
+
+    def __init__(self, sent: int, sensors: int) -> None:
+        self.sent = sent
+        super().__init__(
+            f"the device sends {sent} values per frame, the layout has {sensors} sensors: give its own "
+            "layout, as in layout=file layout.path=FILE.csv"
+        )
 
 
 def stopped_clock_error(frames: int, ticks: float) -> InputError:

@@ -383,7 +383,5 @@ def frames_ahead(before: int, seq: int, modulus: int | None = None) -> int:
     if modulus is not None:
         ahead = seq - before + modulus
         return ahead if 0 < ahead <= max(1, modulus // 2) else 0
-    for wrap in _WRAPS:
-        if wrap - _ACROSS <= before < wrap and seq - before + wrap <= _ACROSS:
-            return seq - before + wrap
-    return 0
+    near = (wrap for wrap in _WRAPS if wrap - _ACROSS <= before < wrap and seq - before + wrap <= _ACROSS)
+    return next((seq - before + wrap for wrap in near), 0)

@@ -304,6 +304,13 @@ class TestSelfTest:
         with pytest.raises(InputError, match=r"9 of 14 .* the mask of broken sensors"):
             self.run(conversion=conversion)
 
+    def test_sensors_that_are_really_dead_are_counted(self):
+        conversion = UnitConversion(np.full(SENSORS, SCALE), np.full(SENSORS, 200.0), np.arange(SENSORS) < 3)
+        with pytest.raises(
+            InputError, match=r"3 of 9 sensors have no valid reading .*: they are dead, or the"
+        ):
+            self.run(conversion=conversion)
+
     def test_one_dead_sensor_of_nine_is_no_reason_to_stop(self):
         """Its place is shown as unknown."""
         broken = np.arange(SENSORS) == 4

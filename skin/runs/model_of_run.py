@@ -53,6 +53,8 @@ from skin.runs.trained_model import TrainedModel
 
 _RATIOS = (1, 2, 3, 5, 7, 10, 15, 20, 30, 50, 70, 100)  # of the rate of a device to that of the model
 _USUAL = "mild"
+# Of the evaluated device: how it samples, and that it has the lag of the profile.
+_SAMPLING = "rate", "aligned", "framed", "without_lag"
 _DEVICE = "device"  # in place of a profile: the imperfections of the device that is evaluated
 _FAINT = 0.3  # N, default contact threshold
 _MANY = 4000  # windows of streams, a tenth of which tunes the contact threshold
@@ -131,7 +133,8 @@ def threshold_device(stored: Config, config: Config) -> AbstractSimulated:
     """Return the device whose fresh gestures determine the threshold of the alarm.
 
     It is the device of the training on the skin of ``config``. If ``evaluation.profile`` is set, every
-    gesture is measured by another device of this profile; ``device``: with the imperfections of ``config``.
+    gesture is measured by another device of this profile, sampled as by the simulated device of ``config``;
+    ``device``: with its imperfections.
 
     Args:
         stored: configuration of a training.
@@ -149,7 +152,8 @@ def threshold_device(stored: Config, config: Config) -> AbstractSimulated:
     skin = {group: getattr(config, group) for group in ("body", "layout", "simulator")}
     settings = settings | skin
     if profile is not None:
-        settings |= _evaluated(config) if profile == _DEVICE else profile_settings(profile)
+        sampled = {name: config.device[name] for name in _SAMPLING if name in config.device}
+        settings |= _evaluated(config) if profile == _DEVICE else sampled | profile_settings(profile)
         # Drawn skins draw a device for every gesture without being told.
         every = {} if "skins" in settings else {"randomise": True, "calibration": None}
         settings = {name: value for name, value in settings.items() if name != "randomise"} | every

@@ -53,8 +53,7 @@ from skin.runs.trained_model import TrainedModel
 
 _RATIOS = (1, 2, 3, 5, 7, 10, 15, 20, 30, 50, 70, 100)  # of the rate of a device to that of the model
 _USUAL = "mild"
-# Of the evaluated device: how it samples, and that it has the lag of the profile.
-_SAMPLING = "rate", "aligned", "framed", "without_lag"
+_EVERY = {"without_lag": 0.0, "framed": 0.0}  # every device is as described, whatever the training mixed in
 _DEVICE = "device"  # in place of a profile: the imperfections of the device that is evaluated
 _FAINT = 0.3  # N, default contact threshold
 _MANY = 4000  # windows of streams, a tenth of which tunes the contact threshold
@@ -152,8 +151,10 @@ def threshold_device(stored: Config, config: Config) -> AbstractSimulated:
     skin = {group: getattr(config, group) for group in ("body", "layout", "simulator")}
     settings = settings | skin
     if profile is not None:
-        sampled = {name: config.device[name] for name in _SAMPLING if name in config.device}
-        settings |= _evaluated(config) if profile == _DEVICE else sampled | profile_settings(profile)
+        sampled = {name: config.device[name] for name in ("rate", "aligned") if name in config.device}
+        settings |= _EVERY | (
+            _evaluated(config) if profile == _DEVICE else sampled | profile_settings(profile)
+        )
         # Drawn skins draw a device for every gesture without being told.
         every = {} if "skins" in settings else {"randomise": True, "calibration": None}
         settings = {name: value for name, value in settings.items() if name != "randomise"} | every
@@ -238,7 +239,7 @@ def _remaining(calibration: Calibration) -> dict[str, Any]:
     left = {name: float(np.median(values[name])) for name in names}
     clip = float(np.median(values["clip"]))
     limit = {"clip": clip} if np.isfinite(clip) else {}
-    return left | limit | {"gain_spread": 0.02, "dead": 0, "tare": True}
+    return _EVERY | left | limit | {"gain_spread": 0.02, "dead": 0, "tare": True}
 
 
 def _evaluated(config: Config) -> dict[str, Any]:

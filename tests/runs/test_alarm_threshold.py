@@ -154,6 +154,15 @@ def test_the_noise_of_curved_sensors_is_that_of_the_force(hydra, force_resistors
     assert device.imperfection.noise == pytest.approx(0.06, rel=0.01)
 
 
+def test_a_calibrated_device_has_the_lag_of_its_calibration(hydra, device_of, tmp_path):
+    """A run of drawn devices was trained on half of them without lag, and on some with frames."""
+    sensors = {"gain": [1.0] * 25, "noise": [0.03] * 25, "time_constant": [0.05] * 25}
+    path = write_calibration(Calibration(sensors), tmp_path / "slow.yaml")
+    mixed = hydra("device=skins", "device.count=1", "device.framed=0.2", "device.without_lag=0.5")
+    device = device_of(mixed, hydra("device=serial", "device.port=x", f"device.calibration={path}"))
+    assert (device.time_constant, device.without_lag, device.framed) == (0.05, 0.0, 0.0)
+
+
 def test_touches_of_a_run_of_drawn_skins_are_measured_by_mild_devices(hydra, device_of):
     """One threshold for all devices of its training would hide dangerous touches on a usual one."""
     skins = hydra("device=skins", "device.count=1")

@@ -7,6 +7,7 @@ The session holds gestures (of `skin record`) or presses of a bench. Writes comp
 out=; run= compares the predictions of a run, too.
 """
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from skin.commands._command import command
@@ -45,7 +46,7 @@ def main(config: Config) -> None:
 def _compare_predictions(
     config: Config, device: "AbstractSimulated", comparison: "SessionComparison"
 ) -> "Agreement":
-    """Return the predictions of a run for both sides."""
+    """Return the predictions of a run for both sides; warn if it learned another mechanics."""
     import numpy as np
 
     from skin.device.base import Blank
@@ -53,8 +54,10 @@ def _compare_predictions(
     from skin.runs.finished_run import FinishedRun
     from skin.runs.model_of_run import load_model
 
-    blank = Blank.of(device.task, device.size, comparison.touches[0])
-    model = load_model(FinishedRun.named(config), device=blank, alarm=False)
+    run, blank = FinishedRun.named(config), Blank.of(device.task, device.size, comparison.touches[0])
+    if (learned := run.stored.simulator["_target_"]) != config.simulator["_target_"]:
+        print(f"run {run.identity} was trained with {learned}: give its simulator=\n")
+    model = load_model(run, replace(run.stored, layout=config.layout), device=blank, alarm=False)
     simulated, measured = ((model.predict(side) > 0.5).numpy() for side in comparison.touches)
     labels = [pair.labels for pair in comparison.pairs if pair.labels is not None]
     truth = np.array([[bool(row[name]) for name in device.task.names] for row in labels])

@@ -119,8 +119,13 @@ def _export_file(config: Config, steps: "Steps") -> None:
         steps.begin(_THRESHOLDS)
         patience = DebounceSettings().alarm
         points = {f"{rate:g}": model.point_at(rate, patience, False, print) for rate in settings.rates}
+        hiding = [at.warning() for at in points.values() if at and at.useless]
+        refused = "".join(f"{text}: skin live refuses the file at this rate\n" for text in hiding)
+        print(refused, end="", file=sys.stderr)
         described = replace(
-            described, thresholds={rate: point.threshold for rate, point in points.items() if point}
+            described,
+            # One of 1 raises no alarm, and is refused.
+            thresholds={rate: 1.0 if at.useless else at.threshold for rate, at in points.items() if at},
         )
     path = path or results(None) / f"{run.title.split()[0]}_{run.identity[:8]}.onnx"
     steps.begin("simulating touches to compare")

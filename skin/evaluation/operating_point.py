@@ -127,13 +127,15 @@ class OperatingPoint:
 
     @property
     def silent(self) -> bool:
-        """Whether the threshold is so high that no probability raises the alarm."""
-        return self.threshold >= 1
+        """Whether the threshold is so high, or not a number, that no probability raises the alarm."""
+        return not self.threshold < 1
 
     @property
-    def hides(self) -> bool:
-        """Whether more than a quarter of the dangerous touches raise no alarm of the live view."""
-        return self.rate is not None and self.dangerous - self.found > _HIDDEN * self.dangerous
+    def useless(self) -> bool:
+        """Whether it is silent, or more than a quarter of the dangerous touches raise no alarm when live."""
+        return self.silent or (
+            self.rate is not None and self.dangerous - self.found > _HIDDEN * self.dangerous
+        )
 
     def alarm(self, chance: Tensor) -> Tensor:
         """Return which probabilities raise the alarm, bool, in the shape of ``chance``."""
@@ -165,7 +167,7 @@ class OperatingPoint:
                 f"no threshold has {100 * self.target:g} % false alarms or fewer: "
                 "safe gestures have the highest probabilities too, no alarm will be raised"
             )
-        if self.hides:
+        if self.useless:
             return f"{self.sentence()}: it hides dangerous touches"
         if self.safe < ENOUGH:
             return f"{self.sentence()}; {ENOUGH} are needed to rely on that rate"

@@ -167,8 +167,15 @@ class TouchClassifier(LightningModule):
         return {"accuracy": overall} | {f"accuracy_{name}": share for name, share in label_shares.items()}
 
     def training_step(self, batch: "Batch", index: int) -> Tensor:
-        """Return the loss of one batch."""
-        return self._step(batch, "train")
+        """Return the loss of one batch.
+
+        Raises:
+            InputError: it is not a number.
+        """
+        loss = self._step(batch, "train")
+        if not loss.isfinite():
+            raise InputError(f"the loss is {loss:g}: lower optimizer.lr, or correct the model")
+        return loss
 
     def validation_step(self, batch: "Batch", index: int) -> None:
         """Keep the loss and the accuracy of one batch."""

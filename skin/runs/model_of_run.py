@@ -411,7 +411,7 @@ class RunModel(TrainedModel):
         point = self.point_at(rate, patience, aligned, say)
         if point is None:
             return None
-        if point.silent or point.hides:
+        if point.useless:
             raise InputError(f"{point.warning()}: give live.patience.above=0.5, or train another run")
         say(point.sentence())
         return point.threshold

@@ -172,13 +172,9 @@ def expected_seconds(store: "Store", config: Config, tags: Mapping[str, str]) ->
         info = finished[0].info
         return (info.end_time - info.start_time) / 1e3
     published = ROOT / "docs" / "results" / "table.csv"
-    if not published.is_file():
-        return None
-    with published.open(newline="") as file:
-        for line in csv.DictReader(file):
-            if same.items() <= line.items() and line["seconds_per_epoch"]:
-                return 5 + 1.3 * config.trainer["max_epochs"] * float(line["seconds_per_epoch"])
-    return None
+    lines = csv.DictReader(published.read_text().splitlines()) if published.is_file() else ()
+    epochs = [line["seconds_per_epoch"] for line in lines if same.items() <= line.items()]
+    return 5 + 1.3 * config.trainer["max_epochs"] * float(epochs[0]) if any(epochs) else None
 
 
 class SweepCallback(Callback):

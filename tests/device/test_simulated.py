@@ -15,8 +15,8 @@ from skin.device.touches import concatenate
 from skin.errors import InputError
 from skin.mechanics.simulator.fem import PlatesAndBeams
 from skin.mechanics.simulator.naive import Naive
-from skin.touch.movie import movie_labels
 from skin.touch.sampler import balanced
+from tests.touch.movie_labels import movie_labels
 
 LAYERS = [
     {"material": "Dragon Skin 10 Medium", "thickness": 0.010},

@@ -11,7 +11,8 @@ from skin.mechanics.contact.prescribed import Prescribed
 from skin.touch.fingertips import FingertipSampler, FingertipSettings, read_touch
 from skin.touch.gesture import GestureSettings
 from skin.touch.labels import Thresholds
-from skin.touch.movie import join_movies, movie_labels
+from skin.touch.movie import join_movies
+from tests.touch.movie_labels import movie_labels
 
 LAYER = [{"material": "EcoFlex 00-30", "thickness": 0.005}]
 BODIES = {

@@ -2,7 +2,8 @@
 
 import torch
 
-from skin.touch.movie import measure_gestures, movie_labels, sliding
+from skin.touch.movie import measure_gestures, sliding
+from tests.touch.movie_labels import movie_labels
 
 CELL = (0.01, 0.02)
 # Two sensors on a sheet of 10 x 10 cells: one over a whole cell, one over four quarters.

@@ -13,7 +13,7 @@ from skin.errors import InputError
 from skin.mechanics.simulator.naive import Naive
 from skin.touch.gesture import GestureSettings
 from skin.touch.labels import TOUCH_OR_NOT
-from skin.touch.movie import movie_labels
+from tests.touch.movie_labels import movie_labels
 
 LAYERS = [
     {"material": "Dragon Skin 10 Medium", "thickness": 0.010},

@@ -84,12 +84,21 @@ class Verdict:
             return f"{text}, below rest: a broken wire, device.scale of the wrong sign, or a tare under load"
         return f"{text}, without a valid reading"
 
+    @property
+    def known(self) -> dict[str, bool | None]:
+        """The labels; ``dangerous`` is None where a sensor without reading may hide a dangerous touch."""
+        return self.labels | (
+            {"dangerous": None} if self.unknown and not self.labels.get("dangerous", True) else {}
+        )
+
     def words(self) -> list[tuple[str, float]]:
         """Return the predicted classes, each with its probability; empty without touch."""
         chances = self.chances | self.agreeing
         pairs = [
-            (name, chances[name]) if yes else (OPPOSITE.get(name, ""), 1 - chances[name])
-            for name, yes in self.labels.items()
+            (OPPOSITE.get(name, ""), 1 - chances[name])
+            if yes is False
+            else (name if yes else f"{name}?", chances[name])
+            for name, yes in self.known.items()
         ]
         return [(word, chance) for word, chance in pairs if word]
 
@@ -485,21 +494,22 @@ class _Freshness:
     def __init__(self, sensors: int) -> None:
         self.frozen, self.stuck = False, np.zeros(sensors, dtype=bool)
         self._values: np.ndarray | None = None
-        self._changed_at, self._unchanged = np.zeros(sensors), 0
+        self._changed_at, self._unchanged, self._time, self._clock = np.zeros(sensors), 0, 0.0, 0.0
 
     def add(self, frame: Frame, time: float, conversion: UnitConversion | None) -> None:
-        """Compare a frame with the one before."""
+        """Compare a frame with the one before; nothing is known of a time without frames."""
+        self._clock, self._time = self._clock + min(time - self._time, _GAP), time
         if self._values is None or frame.after not in ("", "gap"):
             changed = np.ones(len(frame.values), dtype=bool)
         else:
             changed = frame.values != self._values
-        self._changed_at[changed] = time
+        self._changed_at[changed] = self._clock
         self._unchanged = 0 if changed.any() else self._unchanged + 1
         self._values = frame.values
         changing = None if conversion is None else conversion.changing
         if changing is None:
             return
-        silent = time - self._changed_at >= FROZEN - _ROUNDING
+        silent = self._clock - self._changed_at >= FROZEN - _ROUNDING
         limited = np.zeros_like(silent) if frame.saturated is None else frame.saturated
         self.stuck = silent & (changing >= _CHANGING) & ~limited
         # Noise alone would have changed some reading so many times.

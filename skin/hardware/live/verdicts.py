@@ -45,10 +45,11 @@ def verdict_message(
         "alarm": verdict.dangerous,
         "device_time": verdict.t,
         "touched": verdict.touched,
-        "labels": verdict.labels,
-        # JSON has no NaN.
+        "labels": verdict.known,
+        # JSON has no NaN, and the probabilities of an untouched skin mean nothing.
         "probabilities": {
-            name: round(value, 6) if isfinite(value) else None for name, value in verdict.chances.items()
+            name: round(value, 6) if isfinite(value) and verdict.state == "touch" else None
+            for name, value in verdict.chances.items()
         },
         "contact": verdict.contact,
         "gap": verdict.gap,

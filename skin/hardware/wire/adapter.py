@@ -41,7 +41,6 @@ from skin.hardware.wire.protocol import INVALID, Format, Header, Line, parse_hea
 
 _RUN = 12  # frames alike that show a format: that noise rises as often by chance is improbable
 _MOST_REPEATS = 256
-_ORDERLY = 0.9  # share of the lines whose index is one more than that before
 _NUMBER = rb"[-+.\d ]"
 
 

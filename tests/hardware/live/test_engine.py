@@ -1,5 +1,7 @@
 """The engine against a learner asked directly, and its patience."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -231,6 +233,30 @@ def test_a_channel_that_stops_changing_leaves_its_place_unknown():
     said = engine().push([frame(n / 100, row) for n, row in enumerate(noise)], conversion)
     assert [verdict.unknown for verdict in said if verdict.t < 7.9] == [()] * sum(v.t < 7.9 for v in said)
     assert said[-1].unknown == (2,)
+
+
+def test_a_value_that_is_the_same_behind_a_silence_is_not_stuck():
+    noise = np.random.default_rng(0).normal(scale=0.05, size=(300, 4))
+    conversion = UnitConversion(*PLAIN_PARTS, noise=np.full(4, 0.05), changing=np.full(4, 0.9))
+    subject = engine()
+    subject.push([frame(n / 100, row) for n, row in enumerate(noise)], conversion)
+    behind = np.array([noise[-1, 0], noise[-1, 1], 0.01, 0.01])
+    said = subject.push([frame(12 + n / 100, behind, after="gap" * (n == 0)) for n in range(30)], conversion)
+    assert all(verdict.unknown == () for verdict in said)
+
+
+def test_a_safe_touch_beside_a_dead_sensor_may_hide_a_dangerous_one():
+    """What presses on the dead sensor cannot be felt: its neighbours read a part of the force."""
+    said = engine(threshold=0.3).push(
+        [frame(n / 100, np.full(4, 0.4), valid=np.arange(4) != 2) for n in range(100)], PLAIN
+    )
+    last = said[-1]
+    assert (last.state, last.dangerous, last.unknown) == ("touch", False, (2,))
+    assert last.known["dangerous"] is None
+    assert {word for word, _ in last.words()} >= {"dangerous?"}
+    assert "safe" not in {word for word, _ in last.words()}
+    assert replace(last, unknown=()).known["dangerous"] is False
+    assert replace(last, dangerous=True, labels={"dangerous": True}).known["dangerous"] is True
 
 
 @pytest.mark.parametrize("broken", [-20.0, -2.0, None])

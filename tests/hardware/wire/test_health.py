@@ -77,6 +77,18 @@ def test_a_channel_that_stays_while_others_change(first, state):
     assert health.check(np.array([500, 78, 500, 500, 500]), 7.0)[0].all()
 
 
+def test_a_silence_makes_no_channel_stuck():
+    """An untouched channel often has the same value behind a silence as before it."""
+    frames, health = noisy(500), ChannelHealth()
+    check(health, frames)
+    valid, _ = health.check(frames[-1].astype(float), 20.0)
+    assert valid.all()
+    frozen = np.where(np.arange(5) == 1, frames[-1], noisy(600))
+    seen = [health.check(row.astype(float), 20.01 + n * 0.01)[0] for n, row in enumerate(frozen)]
+    assert not seen[-1][1], "what stays is found after it"
+    assert np.array(seen)[:, [0, 2, 3, 4]].all()
+
+
 def test_an_untouched_skin_without_visible_noise_is_no_defect():
     frames = np.full((2000, 5), 12)
     frames[900:950, :2] = 200  # a touch of two of five

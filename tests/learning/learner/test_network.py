@@ -8,6 +8,7 @@ from pytorch_lightning.loggers import CSVLogger
 from skin.body.layout import Scattered
 from skin.errors import InputError
 from skin.learning.data import TouchData
+from skin.learning.model import Mlp
 from skin.runs.build import build_data, build_device, build_learner
 
 
@@ -78,6 +79,14 @@ def test_choices_that_do_not_fit_are_refused(overrides, words, configured, made_
     data = TouchData(made_up_device, instantiate(config.representation))
     with pytest.raises(InputError, match=words):
         build_learner(config).fit(data)
+
+
+def test_a_model_whose_answers_are_no_numbers_is_refused(configured, made_up_device, monkeypatch):
+    config = configured("representation=readings", "model=mlp", "fusion=early", "trainer.max_epochs=1")
+    forward = Mlp.forward
+    monkeypatch.setattr(Mlp, "forward", lambda *arguments: forward(*arguments) * float("nan"))
+    with pytest.raises(InputError, match=r"the loss is nan: lower optimizer\.lr"):
+        build_learner(config).fit(TouchData(made_up_device, instantiate(config.representation)))
 
 
 def test_readings_of_another_number_of_sensors_are_refused(configured, made_up_device):

@@ -15,9 +15,9 @@ from skin.mechanics.contact.rigid import Rigid
 from skin.mechanics.simulator.base import AbstractSimulator, Response
 from skin.mechanics.simulator.naive import Naive
 from skin.touch.gesture import GestureSettings, Trajectories
-from skin.touch.movie import movie_labels
 from skin.touch.sampler import ContactProblem, TouchSampler
 from skin.touch.shapes import Shapes
+from tests.touch.movie_labels import movie_labels
 
 from .halfspace import love
 

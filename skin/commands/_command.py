@@ -210,8 +210,13 @@ def _run(job: Callable[[DictConfig], Any], name: str, words: Sequence[str]) -> N
     version.setbase(_VERSION)
     parser = get_args_parser()
     parser.usage = "skin VERB [--OPTION ...] [NAME=VALUE ...]"
-    # Neither the shell nor Hydra expands ~ in device.path=~/x.csv.
-    options = parser.parse_intermixed_args([word.replace("=~/", f"={Path.home()}/", 1) for word in words])
+    # Neither the shell nor Hydra expands ~ in device.path=~/x.csv. An id such as 3e066519 is no number.
+    options = parser.parse_intermixed_args(
+        [
+            re.sub(r"^run=(\d[\da-f]*)$", r"run='\1'", word.replace("=~/", f"={Path.home()}/", 1))
+            for word in words
+        ]
+    )
     if options.help:
         _print(_help(sys.modules[job.__module__].__doc__ or "", options.config_name or name, options))
         return

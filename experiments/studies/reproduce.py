@@ -26,7 +26,7 @@ _HEAD = """# Reproduction of the report's statements
 Written by `python -m experiments.studies.reproduce` from the statements in `conf/` and the published results.
 
 - `study=…` is short for `skin study study=…`. An empty cell repeats the command above.
-- “b855708”: measured at that commit; the code is gone, or no published file has the value.
+- A commit in parentheses: measured there; no published file has the value.
 - Finite elements, default settings, three or five seeds, unless stated. In parentheses: report sections.
 - Differences are in percentage points.
 - *agree* and *disagree* need a difference beyond the [margin](protocol.md#intervals-and-comparisons) (±) and

@@ -56,7 +56,9 @@ def _compare_predictions(
 
     run, blank = FinishedRun.named(config), Blank.of(device.task, device.size, comparison.touches[0])
     if (learned := run.stored.simulator["_target_"]) != config.simulator["_target_"]:
-        print(f"run {run.identity} was trained with {learned}: give its simulator=\n")
+        print(
+            f"run {run.identity} was trained with {learned}: add simulator= to simulate the session with it\n"
+        )
     model = load_model(run, replace(run.stored, layout=config.layout), device=blank, alarm=False)
     simulated, measured = ((model.predict(side) > 0.5).numpy() for side in comparison.touches)
     labels = [pair.labels for pair in comparison.pairs if pair.labels is not None]

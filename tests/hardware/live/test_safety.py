@@ -285,6 +285,13 @@ class TestSelfTest:
             with pytest.raises(InputError, match=rf"{named} is most likely wrong.*live\.selftest=false"):
                 self.run(used)
 
+    def test_a_model_that_finds_less_than_half_of_the_presses_is_refused(self):
+        felt = np.where(np.arange(SENSORS) < SENSORS // 3, 4.0, 1e-3)
+        conversion = UnitConversion(np.full(SENSORS, SCALE), np.full(SENSORS, 200.0), np.zeros(SENSORS, bool))
+        test = SelfTest(np.diag(felt), settings(), settings())
+        with pytest.raises(InputError, match="even with nominal settings: train another run"):
+            test.run(conversion, self.COUNTED, print)
+
     @pytest.mark.parametrize("scale", [1e-9, 1e-300, 1e9, 0.02 / 1e6])
     def test_a_scale_that_blinds_is_named(self, scale):
         conversion = UnitConversion(np.full(SENSORS, scale), np.full(SENSORS, 200.0), np.zeros(SENSORS, bool))

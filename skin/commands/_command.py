@@ -10,6 +10,7 @@ from hydra import compose, initialize_config_dir, version
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException, OverrideParseException
 from omegaconf import DictConfig, OmegaConf
+from yaml import YAMLError
 
 from skin.core.files import CONF
 from skin.core.settings import check_groups
@@ -90,8 +91,10 @@ def _names(name: str, words: Sequence[str], unknown: str) -> list[str]:
             config = compose(name, settings)
         except HydraException:
             config = compose(name)
-    groups = [folder.name for folder in CONF.iterdir() if folder.is_dir()]
-    return [*groups, *_settings(OmegaConf.to_container(config), "")]
+    return [
+        *(folder.name for folder in CONF.iterdir() if folder.is_dir()),
+        *_settings(OmegaConf.to_container(config), ""),
+    ]
 
 
 def _settings(part: Any, above: str) -> Iterator[str]:
@@ -139,8 +142,18 @@ def check_quickly(config: Config, overrides: Sequence[str]) -> None:
 
 
 _VERSION = "1.3"  # of Hydra, whose defaults hold
-# What Hydra raises on overrides such as layout=[[1]] or model=1, before a command starts.
-_WORDS = (ArithmeticError, AssertionError, AttributeError, LookupError, RecursionError, TypeError, ValueError)
+# What Hydra raises on overrides such as layout=[[1]] or model=1, and on files that are not YAML, before a
+# command starts.
+_WORDS = (
+    ArithmeticError,
+    AssertionError,
+    AttributeError,
+    LookupError,
+    RecursionError,
+    TypeError,
+    ValueError,
+    YAMLError,
+)
 
 
 def command(name: str = "train") -> Callable[[Callable[[Config], Any]], Callable[..., None]]:

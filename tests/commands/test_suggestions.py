@@ -50,6 +50,17 @@ def test_an_option_may_stand_between_overrides(tmp_path, capsys):
     assert "  seed: 5\n" in shown
 
 
+def test_a_file_that_is_not_yaml_is_refused_with_the_line(tmp_path, capsys):
+    (tmp_path / "body").mkdir()
+    (tmp_path / "body/mine.yaml").write_text("size: [0.3, 0.2\ncells: 3\n")
+    with pytest.raises(SystemExit) as ended:
+        main(["--config-dir", str(tmp_path), "body=mine"])
+    assert ended.value.code == 2
+    error = capsys.readouterr().err
+    assert "line 2" in error
+    assert len(error.splitlines()) == 1
+
+
 def test_an_option_that_does_not_exist_is_named_in_short(capsys):
     with pytest.raises(SystemExit) as ended:
         main(["seed=5", "--confg-dir", "x", "body=mine"])

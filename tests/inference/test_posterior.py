@@ -10,7 +10,7 @@ from scipy.stats import kstest
 import skin
 from skin.body.base import Arm, Sheet
 from skin.body.layout import Grid
-from skin.inference.candidates import FingertipPrior, disc_readings
+from skin.inference.candidates import CandidateReadings, FingertipPrior, disc_readings
 from skin.inference.noise import Noise
 from skin.inference.posterior import ContactEstimate, FrameEstimate, Posterior
 from skin.mechanics.simulator.fem import PlatesAndBeams
@@ -25,6 +25,23 @@ THIN = Sheet(
     [{"material": "Dragon Skin 10 Medium", "thickness": 0.01}, SOFT | {"thickness": 0.005}],
 )
 NOISE = Noise(0.05, frames=10)
+SINGLE = FingertipPrior(numbers=(0.0, 1.0, 0.0, 0.0), large=0.0)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def shared_candidates():
+    """Readings of candidates, which take seconds, once for each skin and kind of fingertip."""
+    known = {}
+
+    def candidates(simulator, body, prior):
+        key = (simulator, prior.radii, prior.rim)
+        if key not in known:
+            known[key] = CandidateReadings(simulator, body, prior)
+        return known[key]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("skin.inference.posterior.CandidateReadings", candidates)
+        yield
 
 
 def sensors_of(body, depth):
@@ -123,7 +140,7 @@ def _moments(weight, values):
 def test_a_contact_agrees_with_brute_force(thin, noise):
     touches = draw(60, seed=3, margin=0.02)
     true = felt(touches, thin)
-    estimated, compared = posterior(thin, noise, FingertipPrior(numbers=(0.0, 1.0, 0.0, 0.0))), False
+    estimated, compared = posterior(thin, noise, SINGLE), False
     for row in np.flatnonzero((true > 0.15).any(1))[:16]:
         readings = measure(true[row], noise, row)
         (contact,) = estimated.estimate(readings).contacts
@@ -144,9 +161,7 @@ def test_truth_drawn_from_the_prior_has_uniform_ranks(thin, noise):
     readings = measure(felt(touches, thin), noise, seed=9)
     contacts = [
         estimate.contacts[0] if estimate.contacts else None
-        for estimate in posterior(thin, noise, FingertipPrior(numbers=(0.0, 1.0, 0.0, 0.0))).estimate(
-            readings
-        )
+        for estimate in posterior(thin, noise, SINGLE).estimate(readings)
     ]
     place = np.array(
         [place_ranks(contact, touch[0]) for contact, touch in zip(contacts, touches, strict=True)]
@@ -297,11 +312,12 @@ def test_two_sensors_say_what_cannot_be_known():
     body = DEEP
     sensors = sensors_of(body, 0.0295)
     two = type(sensors)(sensors.positions[[11, 13]], sensors.footprint)
-    estimate = Posterior(Solid(body, two), NOISE, body).estimate(np.array([0.3, 0.0]))
+    subject = Posterior(Solid(body, two), NOISE, body)
+    estimate = subject.estimate(np.array([0.3, 0.0]))
     assert "cannot be told apart" in estimate.unknown
     assert estimate.number >= 1
     assert estimate.contacts[0].region().area > 5e-4
-    nothing = Posterior(Solid(body, two), NOISE, body).estimate(np.array([np.nan, np.nan]))
+    nothing = subject.estimate(np.array([np.nan, np.nan]))
     assert "nothing is known" in nothing.unknown
 
 
@@ -330,7 +346,7 @@ def test_every_simulator_that_adds_up_and_an_arm_work():
     ]
     for simulator, body, most in skins:
         readings = 8 * disc_readings(simulator, body, touch, 0.0015)[0]
-        estimate = Posterior(simulator, NOISE, body, contacts=most).estimate(readings)
+        estimate = Posterior(simulator, NOISE, body, FingertipPrior(large=0.0), most).estimate(readings)
         assert estimate.number == 1
         assert np.linalg.norm(estimate.contacts[0].place - touch[0, :2]) < 0.012
 

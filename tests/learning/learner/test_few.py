@@ -57,6 +57,7 @@ def data_of(task, configured) -> TouchData:
     return TouchData(Presses(task), instantiate(configured("representation=readings").representation), 32)
 
 
+@pytest.mark.usefixtures("few_trees")
 @pytest.mark.parametrize("make", [KernelRidge, ExtraTrees])
 def test_classes_and_targets_are_learned_and_stored(make, configured, tmp_path):
     for task in (GESTURES, PLACE):
@@ -114,6 +115,7 @@ def test_the_trees_are_those_of_scikit_learn():
     np.testing.assert_allclose(learner.predict(matrix[40:])[:, 0], plain.predict_proba(matrix[40:])[:, 1])
 
 
+@pytest.mark.usefixtures("few_trees")
 def test_the_member_with_the_lower_held_out_loss_is_kept(configured, tmp_path, capsys):
     data = data_of(GESTURES, configured)
     members = {"kernel_ridge": partial(KernelRidge), "extra_trees": partial(ExtraTrees)}
@@ -140,6 +142,7 @@ def test_a_single_class_is_refused(make):
         make().learn(matrix, np.ones((20, 1)), Task(("press",)))
 
 
+@pytest.mark.usefixtures("few_trees")
 @pytest.mark.parametrize(
     ("make", "name", "change"),
     [

@@ -164,17 +164,19 @@ class SweepProgress:
 def expected_seconds(store: "Store", config: Config, tags: Mapping[str, str]) -> float | None:
     """Return the duration of the last finished run of the same row and simulator, s.
 
-    Without one, it is estimated from the published table: seconds per epoch times epochs, plus a third for
-    the evaluation. None if the row is not in the table.
+    Without one, it is estimated from the published table: 25 s for data and thresholds, and seconds per epoch
+    times epochs, plus a third for the evaluation. None if the row is not in the table.
     """
     same = {name: tags[name] for name in ("row", "simulator")}
     if finished := store.find("FINISHED", **same):
         info = finished[0].info
         return (info.end_time - info.start_time) / 1e3
-    published = ROOT / "docs" / "results" / "table.csv"
+    published = ROOT / "docs" / "results" / "study_table.csv"
     lines = csv.DictReader(published.read_text().splitlines()) if published.is_file() else ()
-    epochs = [line["seconds_per_epoch"] for line in lines if same.items() <= line.items()]
-    return 5 + 1.3 * config.trainer["max_epochs"] * float(epochs[0]) if any(epochs) else None
+    epochs = [
+        line["seconds_per_epoch"] for line in lines if line["variant"] == f"{tags['simulator']} {tags['row']}"
+    ]
+    return 25 + 1.3 * config.trainer["max_epochs"] * float(epochs[0]) if any(epochs) else None
 
 
 class SweepCallback(Callback):

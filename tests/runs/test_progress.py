@@ -63,7 +63,7 @@ def test_the_published_table_tells_where_no_run_does(configured):
         )
         for count in (10, 20)
     )
-    assert two - 5 == pytest.approx(2 * (one - 5))
+    assert two - 25 == pytest.approx(2 * (one - 25))
     assert expected_seconds(Empty(), configured(), known | {"row": "custom"}) is None
 
 

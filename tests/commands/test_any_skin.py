@@ -8,7 +8,6 @@ from time import monotonic, sleep
 import pytest
 
 from skin.device.files import read_recording, write_recording
-from skin.runs.exported_model import ExportedModel
 from skin.touch.labels import Task
 from tests.commands.test_evaluate import metrics
 
@@ -97,10 +96,6 @@ def test_it_is_exported_for_a_layout_from_a_file(run, folder):
     model = onnxruntime.InferenceSession(folder / "nine.onnx")
     shapes = {one.name: one.shape[1:] for one in [*model.get_inputs(), *model.get_outputs()]}
     assert shapes == {"readings": [30, 9], "valid": [30, 9], "probabilities": [4]}
-    # A training of one epoch finds few dangerous touches.
-    assert "it hides dangerous touches: skin live refuses the file at this rate" in done.stderr
-    thresholds = ExportedModel(folder / "nine.onnx").metadata.thresholds
-    assert set(thresholds.values()) == {1.0}
 
 
 @pytest.mark.slow

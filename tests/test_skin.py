@@ -94,10 +94,11 @@ def test_the_simulator_is_differentiable_as_documented():
 
 @pytest.fixture(scope="module")
 def example(tmp_path_factory):
-    """Return the variables of the Python example of the page on ``any_skin`` after it has run."""
+    """Return the variables of the example of the page on ``any_skin`` and its prediction."""
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(tmp_path_factory.mktemp("example"))
-        return run_example("docs/pretrained.md")
+        made = run_example("docs/pretrained.md")
+        return made | {"probabilities": made["run"].predict(made["readings"])}
 
 
 def test_the_example_predicts_from_an_array(example):

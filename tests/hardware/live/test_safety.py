@@ -3,7 +3,7 @@
 import socket
 from contextlib import nullcontext, suppress
 from dataclasses import replace
-from threading import Thread
+from threading import Event, Thread
 from time import monotonic, sleep
 
 import numpy as np
@@ -61,19 +61,22 @@ def lines(values, restart=None, header=HEADER, encode=lambda row: row.round(4)):
 
 
 class Watching:
-    """A live view of a stream; ``said`` has (frames sent, verdict or None, reason, alarm).
+    """A live view of a stream; ``said`` has (s of the stream sent, verdict or None, reason, alarm).
 
+    The next frame is sent after the view has taken the last one, so that a busy computer delays both.
     ``oldest`` is the largest age of a verdict when it was shown, s.
     """
 
     def __init__(self, stream, speed=SPEED, each=1, acts=(), before=None, **source):
         self.said, self.sent, self.oldest = [], 0, 0.0
+        self.opened, self.ended = Event(), Event()
         self.server = socket.create_server(("127.0.0.1", 0))
         self.thread = Thread(target=self._serve, args=(stream, speed, each), daemon=True)
         self.thread.start()
         port = f"socket://127.0.0.1:{self.server.getsockname()[1]}"
         source = SerialSource(PortSettings(port=port, timeout=10.0, **source), SENSORS, 10.0)
         self.skin, _ = source.open()
+        self.opened.set()
         self.display = Display(DisplayInfo("loud", port, np.zeros((SENSORS, 3)), (0.1, 0.1), 4.0))
         self.display.observers.append(self._note)
         self.acts = list(acts)
@@ -82,19 +85,27 @@ class Watching:
             with self.skin:
                 self.loop.run()
         finally:
+            self.ended.set()
             self.thread.join(20)
             self.server.close()
 
     def _serve(self, stream, speed, each):
         client, _ = self.server.accept()
-        begin, waiting = monotonic(), b""
+        self.opened.wait(20)
+        begin, waiting, sent = monotonic(), b"", 0
         with client, suppress(ConnectionError):  # the live view may end first
             for number, data in enumerate(stream, 1):
                 waiting += data
                 if number % each == 0:
                     client.sendall(waiting)
-                    waiting, self.sent = b"", number
+                    sent, waiting, self.sent = sent + len(waiting), b"", number
                     sleep(max(0.0, begin + number / RATE / speed - monotonic()))
+                    while not (self._taken(sent) or self.ended.is_set()):
+                        sleep(0.0005)
+
+    def _taken(self, sent):
+        """Return whether the view has read the bytes sent and has taken all frames in them."""
+        return self.skin._stats.bytes >= sent and not self.skin._frames
 
     def _note(self, verdict, reason, alarm):
         on = alarm if verdict is None else verdict.dangerous
@@ -123,7 +134,7 @@ class Watching:
         return bool(inside) and all(inside)
 
 
-LATE = 0.35  # s of the stream: the delay of a busy computer, at this speed
+LATE = 0.1  # s of the stream: frames that are under way when an alarm is shown
 
 
 def test_a_press_is_found_though_the_device_restarts_every_two_and_a_half_seconds():

@@ -264,8 +264,9 @@ def test_the_order_of_sensors_does_not_matter():
     sensors = sensors_of(DEEP, 0.0295)
     shuffled = Solid(DEEP, type(sensors)(sensors.positions[order], sensors.footprint, sensors.normals[order]))
     readings = measure(felt(draw(4, 14, margin=0.03)), NOISE, 15)
+    other = Posterior(shuffled, NOISE, DEEP)
     for row in readings:
-        first, second = posterior().estimate(row), Posterior(shuffled, NOISE, DEEP).estimate(row[order])
+        first, second = posterior().estimate(row), other.estimate(row[order])
         assert first.number == second.number
         for a, b in zip(first.contacts, second.contacts, strict=True):
             np.testing.assert_allclose(moments(a)[0], moments(b)[0], rtol=1e-3)

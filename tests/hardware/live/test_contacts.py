@@ -6,6 +6,7 @@ import pickle
 import signal
 import subprocess
 import sys
+from contextlib import contextmanager
 from dataclasses import replace
 from time import monotonic, sleep
 
@@ -68,15 +69,23 @@ def felt(simulator):
     return 5 * disc_readings(simulator, BODY, TRUTH, 0.0015)[0]
 
 
-@pytest.fixture
-def running():
-    """Return contacts whose process is ready."""
+@contextmanager
+def started():
+    """Return contacts whose process is started."""
     contacts = LiveContacts()
     contacts.start(MECHANICS, bool)
     try:
         yield contacts
     finally:
         contacts.close()
+
+
+@pytest.fixture(scope="module")
+def running():
+    """Return contacts whose process is ready; it takes seconds to begin."""
+    with started() as contacts:
+        assert contacts.state()["reason"] == PREPARING
+        yield contacts
 
 
 def frames(values, count=10, end=1.0, **changes):
@@ -218,7 +227,6 @@ def test_readings_are_means_above_the_rest_of_the_sensors_that_work():
 
 
 def test_the_process_estimates_what_is_left_for_it(running, posterior, felt):
-    assert running.state()["reason"] == PREPARING
     state_of(running, "contacts", felt)
     running._newest = moment(felt, time=-1.0)
     running._wake.set()
@@ -254,15 +262,16 @@ def test_looking_never_waits_and_only_the_newest_counts(running, felt):
     assert len([t for t in times if t > 1e6]) <= 3
 
 
-def test_a_process_that_dies_is_said_and_stops_nothing(running, felt):
-    state_of(running, "contacts", felt)
-    os.kill(running._process.pid, signal.SIGKILL)
-    deadline = monotonic() + PATIENCE
-    while "has ended" not in running.state()["reason"]:
-        assert monotonic() < deadline
-        running.look(frames(felt, end=monotonic()), CONVERSION, [TOUCHED], np.zeros(SENSORS))
-        sleep(0.01)
-    assert running.state()["state"] == "unknown"
+def test_a_process_that_dies_is_said_and_stops_nothing(felt):
+    with started() as contacts:
+        state_of(contacts, "contacts", felt)
+        os.kill(contacts._process.pid, signal.SIGKILL)
+        deadline = monotonic() + PATIENCE
+        while "has ended" not in contacts.state()["reason"]:
+            assert monotonic() < deadline
+            contacts.look(frames(felt, end=monotonic()), CONVERSION, [TOUCHED], np.zeros(SENSORS))
+            sleep(0.01)
+        assert contacts.state()["state"] == "unknown"
 
 
 def test_the_process_ends_with_the_command_however_it_ends(tmp_path):
@@ -274,11 +283,13 @@ def test_the_process_ends_with_the_command_however_it_ends(tmp_path):
         "print(contacts._process.pid, flush=True); time.sleep(600)"
     )
     begin = [sys.executable, "-c", script]
-    for number, wait in ((signal.SIGKILL, 0.0), (signal.SIGKILL, 5.0), (signal.SIGTERM, 1.0)):
-        with subprocess.Popen(begin, cwd=tmp_path, stdout=subprocess.PIPE) as command:
-            child = psutil.Process(int(command.stdout.readline()))
-            sleep(wait)
-            assert child.is_running()
+    commands = [subprocess.Popen(begin, cwd=tmp_path, stdout=subprocess.PIPE) for _ in range(3)]
+    children = [psutil.Process(int(command.stdout.readline())) for command in commands]
+    for number, wait in ((signal.SIGKILL, 0.0), (signal.SIGTERM, 1.0), (signal.SIGKILL, 4.0)):
+        sleep(wait)
+        command, child = commands.pop(0), children.pop(0)
+        assert child.is_running()
+        with command:
             command.send_signal(number)
         child.wait(PATIENCE)
 

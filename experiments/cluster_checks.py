@@ -84,8 +84,9 @@ class Killer:
 
     def _running(self) -> list[int]:
         """Return the processes of this machine that train now."""
-        running = self._store.find("RUNNING", row="rules")
-        return sorted(json.loads(run.data.tags[PROCESS])[1] for run in running)
+        return sorted(
+            json.loads(run.data.tags[PROCESS])[1] for run in self._store.find("RUNNING", row="rules")
+        )
 
 
 def table(folder: Path, uri: str) -> bytes:

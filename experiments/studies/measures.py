@@ -353,5 +353,4 @@ class Embeddings(ProbeSettings):
         count = (len(self.attributes) * 3 + (learner is not None) + 2) * len(self.seeds)
         steps = probe(device, self, learner)
         results = list(track(steps, "probing", count, console=Console(stderr=True)))
-        names = device.task.names
-        return Measurement({}, build_embeddings_page(results, names))
+        return Measurement({}, build_embeddings_page(results, device.task.names))

@@ -120,8 +120,10 @@ def read_reference(path: str | None) -> Reference:
     if not files:
         raise InputError(f"there is no file study.reference={path}: give another, or null")
     with files[0].open(newline="", encoding="utf-8") as file:
-        lines = csv.DictReader(file)
-        return {(line["row"], line["simulator"], line["label"]): float(line["value"]) for line in lines}
+        return {
+            (line["row"], line["simulator"], line["label"]): float(line["value"])
+            for line in csv.DictReader(file)
+        }
 
 
 def variants_table(

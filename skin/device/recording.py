@@ -286,8 +286,7 @@ def choose_task(
             raise InputError(
                 f"{path} has no classes: give task=labels or task=regression, or classes in the mapping"
             )
-        labels = one_hot(parameters[CLASS], len(names))
-        return _relabelled(recording, Task(tuple(names), "exclusive"), labels)
+        return _relabelled(recording, Task(tuple(names), "exclusive"), one_hot(parameters[CLASS], len(names)))
     measured = [name for name in parameters if name != CLASS and not name.startswith(GROUP)]
     chosen = [name for name in measured if target_unit(name)] if targets is None else list(targets)
     if unknown := [name for name in chosen if name not in measured]:

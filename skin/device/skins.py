@@ -410,8 +410,7 @@ class Skins(ImperfectionSettings, AbstractDevice):
         chosen = np.concatenate([order.permutation(len(skins)) for _ in range(rounds)])
 
         def draw(number: int) -> Touches:
-            skin = skins[chosen[number]]
-            return skin.draw(Stream.SKIN, sizes[number], *key, number)
+            return skins[chosen[number]].draw(Stream.SKIN, sizes[number], *key, number)
 
         return join_skins(in_threads(draw, len(sizes)))
 

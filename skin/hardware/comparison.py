@@ -300,8 +300,7 @@ def _contacts(device: AbstractSimulated, bench: BenchData, begins: list[float]) 
 
 def _subtract_idle(values: np.ndarray, idle: np.ndarray) -> np.ndarray:
     """Return readings (T, S) without their idle medians; NaN for a channel without values."""
-    medians = np.ma.median(np.ma.masked_invalid(values[idle]), axis=0)
-    return values - np.ma.filled(medians, np.nan)
+    return values - np.ma.filled(np.ma.median(np.ma.masked_invalid(values[idle]), axis=0), np.nan)
 
 
 def _cut_press(

@@ -459,13 +459,12 @@ class EfficientNet(AbstractModel):
     def forward(self, x: Tensor, adjacency: Tensor | None) -> Tensor:
         """Return the embeddings (N, 1280) of images (N, C, H, W)."""
         parts = [x] if self.features.training else x.split(CHUNK)
-        embedding = torch.cat([self._encode(part) for part in parts])
-        return F.dropout(embedding, self.dropout, self.training)
+        return F.dropout(torch.cat([self._encode(part) for part in parts]), self.dropout, self.training)
 
     def _encode(self, x: Tensor) -> Tensor:
         x = (x - self.mean) / self.spread  # a single channel becomes three
-        x = x.contiguous(memory_format=torch.channels_last)  # 1.7 times faster
-        return self.features(x).mean(dim=(2, 3))
+        # With the channels last, 1.7 times faster.
+        return self.features(x.contiguous(memory_format=torch.channels_last)).mean(dim=(2, 3))
 
 
 def _stages() -> Iterator[nn.Sequential]:

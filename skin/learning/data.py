@@ -230,8 +230,7 @@ class TouchData(pl.LightningDataModule):
 
     def frames(self, touches: Touches) -> Batch:
         """Return the frames of touches and their labels (B, L), on the touches' device."""
-        labels = touches.known_labels
-        return self.show(touches), labels
+        return self.show(touches), touches.known_labels
 
     def show(self, touches: Touches) -> Frames:
         """Return the frames of touches, on the touches' device."""

@@ -28,7 +28,7 @@ from skin.errors import InputError
 from skin.learning.callbacks import Clock, RandomState
 from skin.learning.fusion import AbstractFusion
 from skin.learning.learner import AbstractLearner
-from skin.learning.model import make_activation
+from skin.learning.model import AbstractModel, make_activation
 from skin.learning.representation import AbstractRepresentation, Frames
 from skin.touch.labels import Task
 
@@ -358,6 +358,7 @@ class Network(AbstractLearner):
         with torch.random.fork_rng():
             network = self.build(data)
         self._begin(network)
+        _check_widths(network, data.frames(data.example)[0])
         self._trainer_of(None, [])
         settings = self._optimizer.keywords if isinstance(self._optimizer, partial) else {}
         if text := [name for name, value in settings.items() if isinstance(value, str)]:
@@ -533,6 +534,27 @@ class Network(AbstractLearner):
         self._data, self._classifier = data, classifier
         self.parameters = sum(p.numel() for p in classifier.parameters() if p.requires_grad)
         return classifier
+
+
+def _check_widths(network: TouchClassifier, frames: Frames) -> None:
+    """Check that the models of a network give embeddings as wide as they say.
+
+    Raises:
+        InputError: one does not.
+    """
+
+    def compare(model: AbstractModel, inputs: tuple[Tensor, ...], output: Tensor) -> None:
+        if output.shape != (expected := (len(inputs[0]), model.width)):
+            raise InputError(
+                f"{type(model).__name__}.forward returned {tuple(output.shape)} for {expected[0]} frames: it "
+                f"must return {expected}, (N, width)"
+            )
+
+    hooks = [m.register_forward_hook(compare) for m in network.modules() if isinstance(m, AbstractModel)]
+    with torch.no_grad():
+        network.eval()(frames)
+    for hook in hooks:
+        hook.remove()
 
 
 def _check(trainer: Trainer) -> None:

@@ -303,10 +303,8 @@ class Interpolation(AbstractRepresentation):
     def forward(self, readings: Tensor, valid: Tensor) -> Frames:
         """Return frames (B, T, C, pixels, pixels) of readings (B, T, S), N."""
         values = channels(readings, valid, self.scale, self.mask).mT @ self.matrix.mT
-        images = values.unflatten(
-            -1, (-1, self.pixels, self.pixels)
-        )  # (B, T, readings or mask, methods, ...)
-        return Frames(images.flatten(2, 3), None)
+        # Images (B, T, readings or mask, methods, H, W), whose methods become channels.
+        return Frames(values.unflatten(-1, (-1, self.pixels, self.pixels)).flatten(2, 3), None)
 
 
 # The spectrum of the sensor image.

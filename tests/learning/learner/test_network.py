@@ -89,6 +89,18 @@ def test_a_model_whose_answers_are_no_numbers_is_refused(configured, made_up_dev
         build_learner(config).fit(TouchData(made_up_device, instantiate(config.representation)))
 
 
+@pytest.mark.parametrize("fusion", ["early", "late"])
+def test_a_model_that_is_not_as_wide_as_it_says_is_refused(configured, made_up_device, monkeypatch, fusion):
+    config = configured("representation=readings", "model=mlp", f"fusion={fusion}")
+    data = TouchData(made_up_device, instantiate(config.representation))
+    learner = build_learner(config)
+    learner.check(data)
+    forward = Mlp.forward
+    monkeypatch.setattr(Mlp, "forward", lambda *arguments: forward(*arguments)[:, 1:])
+    with pytest.raises(InputError, match=r"Mlp.forward returned \(\d+, \d+\) .* must return .* \(N, width\)"):
+        learner.check(data)
+
+
 def test_readings_of_another_number_of_sensors_are_refused(configured, made_up_device):
     config = configured("representation=readings", "model=mlp", "trainer.max_epochs=1")
     data = TouchData(made_up_device, instantiate(config.representation))

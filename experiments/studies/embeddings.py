@@ -372,8 +372,7 @@ def planes(vectors: np.ndarray, points: int = 400) -> np.ndarray:
     if np.ptp(few, axis=0).max() < 1e-9:
         return np.zeros((len(few), 2))
     reduced = PCA(min(30, *few.shape), random_state=0).fit_transform(few)
-    near = min(30.0, (len(few) - 1) / 3)
-    return TSNE(perplexity=near, init="pca", random_state=0).fit_transform(reduced)
+    return TSNE(perplexity=min(30.0, (len(few) - 1) / 3), init="pca", random_state=0).fit_transform(reduced)
 
 
 def spaces(results: Sequence[ProbeResult], names: Sequence[str], points: int = 400) -> Figure:

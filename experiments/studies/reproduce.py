@@ -113,8 +113,7 @@ def _tested(settings: dict[str, Any]) -> str:
 def _line(statement: Statement, command: str, trials: Sequence[TrialResult]) -> str:
     says = statement.says + (f" ({statement.section})" if statement.section else "")
     result = judge(statement, trials)
-    text = comparison_text(result).replace(" points", "")
-    return f"| {says} | {command} | {text}: *{result.verdict}* |\n"
+    return f"| {says} | {command} | {comparison_text(result).replace(' points', '')}: *{result.verdict}* |\n"
 
 
 def _told(line: Mapping[str, str]) -> str:

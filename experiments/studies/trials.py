@@ -7,6 +7,7 @@ and shards share none. All files of a folder together are one table: ``pandas.re
 
 import hashlib
 import json
+import logging
 import os
 import re
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
@@ -43,6 +44,8 @@ from skin.runs.store import Store, note_reuse, note_source
 from skin.runs.sweep import LEFT_OUT, Shard
 from skin.runs.train import SWEPT, simulator
 from skin.touch.labels import TOUCH
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -180,6 +183,10 @@ def _another_command() -> Iterator[None]:
 def load_outcomes(store: Store, run: Run) -> np.ndarray | None:
     """Return the outcomes of the test gestures of a run, (B,), uint8; None if it has none."""
     if OUTCOMES not in {file.path for file in store.client.list_artifacts(run.info.run_id)}:
+        _log.warning(
+            "%s keeps no outcomes of its test gestures: its intervals are over trainings alone",
+            run.info.run_name,
+        )
         return None
     with TemporaryDirectory() as folder:
         return np.load(FinishedRun(store, run).fetch(OUTCOMES, folder))

@@ -254,8 +254,7 @@ class SqueezeExcitation(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Return x (N, C, H, W), weighted."""
-        means = x.mean(dim=(2, 3), keepdim=True)
-        return x * self.fc2(F.silu(self.fc1(means))).sigmoid()
+        return x * self.fc2(F.silu(self.fc1(x.mean(dim=(2, 3), keepdim=True)))).sigmoid()
 
 
 class Bottleneck(nn.Module):

@@ -537,20 +537,24 @@ class Network(AbstractLearner):
 
 
 def _check_widths(network: TouchClassifier, frames: Frames) -> None:
-    """Check that the models of a network give embeddings as wide as they say.
+    """Check that the model and the fusion of a network give embeddings as wide as they say.
 
     Raises:
         InputError: one does not.
     """
 
-    def compare(model: AbstractModel, inputs: tuple[Tensor, ...], output: Tensor) -> None:
-        if output.shape != (expected := (len(inputs[0]), model.width)):
+    def compare(part: AbstractModel | AbstractFusion, inputs: tuple[Tensor | Frames], output: Tensor) -> None:
+        if output.shape != (expected := (len(getattr(inputs[0], "x", inputs[0])), part.width)):
             raise InputError(
-                f"{type(model).__name__}.forward returned {tuple(output.shape)} for {expected[0]} frames: it "
-                f"must return {expected}, (N, width)"
+                f"{type(part).__name__}.forward returned {tuple(output.shape)}, and must return embeddings "
+                f"{expected}, as wide as its attribute width says"
             )
 
-    hooks = [m.register_forward_hook(compare) for m in network.modules() if isinstance(m, AbstractModel)]
+    hooks = [
+        part.register_forward_hook(compare)
+        for part in network.modules()
+        if isinstance(part, AbstractModel | AbstractFusion)
+    ]
     with torch.no_grad():
         network.eval()(frames)
     for hook in hooks:

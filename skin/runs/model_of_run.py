@@ -87,10 +87,13 @@ def alarm_point(
         device: on which another threshold is chosen; None: that of :func:`threshold_device`.
 
     Raises:
-        InputError: the stored operating point cannot be read; see also :func:`threshold_device`.
+        InputError: the stored operating point cannot be read, or a profile is set and the device draws many
+            skins; see also :func:`threshold_device`.
     """
     settings, stored = check_evaluation(config.evaluation), run.stored
     all_skins = "skins" in config.device and not one_skin
+    if all_skins and settings.profile is not None:
+        raise InputError("evaluation.profile chooses the threshold for one skin: add device=simulated")
     same_profile = settings.profile == (stored.evaluation and stored.evaluation.profile)
     if all_skins or ("skins" not in stored.device and same_profile):
         return stored_point(run, learner, settings)

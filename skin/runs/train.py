@@ -370,8 +370,6 @@ def _evaluate(config: Config, changes: Sequence[str], steps: Steps) -> None:
     run, folder = FinishedRun.named(config), results(config.out)
     config = run.configured(compose("evaluate", [*changes]), changes)
     settings = check_evaluation(config.evaluation)
-    if "skins" in config.device and settings.profile is not None:
-        raise InputError("evaluation.profile chooses the threshold for one skin: add device=simulated")
     model = load_model(run, config)
     device, learner, point = model.device, model.learner, model.point
     steps.begin("reading or simulating the touches")

@@ -122,6 +122,12 @@ def test_another_profile_and_one_of_many_skins_have_a_threshold_of_their_own(hyd
         assert 0.25 < point.threshold < 0.2501
 
 
+def test_a_profile_is_refused_where_the_device_draws_many_skins(hydra):
+    many = hydra("device=skins", "device.count=1", "evaluation.profile=device")
+    with pytest.raises(InputError, match="the threshold for one skin: add device=simulated"):
+        alarm_point(run_of(many, STORED), Quiet(), many)
+
+
 @pytest.fixture
 def force_resistors(hydra, tmp_path):
     """The configuration of sensors that follow the root of the force, with a noise of 0.06 N at 4 N."""

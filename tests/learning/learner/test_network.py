@@ -8,6 +8,7 @@ from pytorch_lightning.loggers import CSVLogger
 from skin.body.layout import Scattered
 from skin.errors import InputError
 from skin.learning.data import TouchData
+from skin.learning.fusion import Early, Late
 from skin.learning.model import Mlp
 from skin.runs.build import build_data, build_device, build_learner
 
@@ -89,15 +90,19 @@ def test_a_model_whose_answers_are_no_numbers_is_refused(configured, made_up_dev
         build_learner(config).fit(TouchData(made_up_device, instantiate(config.representation)))
 
 
-@pytest.mark.parametrize("fusion", ["early", "late"])
-def test_a_model_that_is_not_as_wide_as_it_says_is_refused(configured, made_up_device, monkeypatch, fusion):
+@pytest.mark.parametrize(
+    ("fusion", "part"), [("early", Mlp), ("late", Mlp), ("early", Early), ("late", Late)]
+)
+def test_an_embedding_that_is_not_as_wide_as_it_says_is_refused(
+    configured, made_up_device, monkeypatch, fusion, part
+):
     config = configured("representation=readings", "model=mlp", f"fusion={fusion}")
     data = TouchData(made_up_device, instantiate(config.representation))
     learner = build_learner(config)
     learner.check(data)
-    forward = Mlp.forward
-    monkeypatch.setattr(Mlp, "forward", lambda *arguments: forward(*arguments)[:, 1:])
-    with pytest.raises(InputError, match=r"Mlp.forward returned \(\d+, \d+\) .* must return .* \(N, width\)"):
+    forward = part.forward
+    monkeypatch.setattr(part, "forward", lambda *arguments: forward(*arguments)[:, 1:])
+    with pytest.raises(InputError, match=rf"{part.__name__}.forward returned \(\d+, \d+\), and must return"):
         learner.check(data)
 
 

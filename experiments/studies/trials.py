@@ -42,7 +42,7 @@ from skin.runs.finished_run import TAG, FinishedRun, find_run
 from skin.runs.model_of_run import RunModel, load_model
 from skin.runs.store import Store, note_reuse, note_source
 from skin.runs.sweep import LEFT_OUT, Shard
-from skin.runs.train import SWEPT, simulator
+from skin.runs.train import simulator
 from skin.touch.labels import TOUCH
 
 _log = logging.getLogger(__name__)
@@ -174,7 +174,7 @@ def _another_command() -> Iterator[None]:
         yield
     finally:
         Singleton.set_state(state)
-        for name in (PARENT, SWEPT, LEFT_OUT):  # of a sweep, which has ended
+        for name in (PARENT, LEFT_OUT):  # of a sweep, which has ended
             os.environ.pop(name, None)
         if traceback is not None:
             os.environ["HYDRA_FULL_ERROR"] = traceback

@@ -109,12 +109,13 @@ Results = Sequence[tuple[Law, CheckResult]]
 _HEAD = """# Physics, verified
 
 Written by `make physics`, which exits with code 1 if a law does not hold: each is checked against an
-independent solution. [All numbers](results/physics/physics.csv) have the digits that are the same on every
-processor; rounding errors are an upper bound. `results/physics.json` holds all digits of one machine.
+independent solution; the table has the error nearest to its tolerance.
+[Its numbers](results/physics/physics.csv) have the digits that are the same on every processor; rounding
+errors are an upper bound. `results/physics.json` holds all digits of one machine.
 `pytest tests/mechanics` checks what small examples can show: balance and reciprocity, `solid` against
 scikit-fem, `fem` against PyNite, relaxation, `naive`, and contact.
 
-| law | reference | worst error | tolerance | |
+| law | reference | error | tolerance | |
 |---|---|---|---|---|
 """
 

@@ -235,7 +235,7 @@ class SweepCallback(Callback):
         Path(config.hydra.sweep.dir).mkdir(parents=True, exist_ok=True)
 
         from skin.runs.store import Store
-        from skin.runs.train import SWEPT, tags
+        from skin.runs.train import tags
 
         identities = [tags(job) if job else {} for job in composed]
         self._fingerprints = [identity.get("fingerprint", "") for identity in identities]
@@ -244,7 +244,7 @@ class SweepCallback(Callback):
         name = config.hydra.runtime.choices.get("sweep") or sweep_title(self._jobs, self._swept) or "sweep"
         self._parent, self._resume = store.create(name, {"sweep": name}), settings.resume
         atexit.register(self._close)
-        os.environ |= {PARENT: self._parent.info.run_id, SWEPT: " ".join(self._swept)}
+        os.environ[PARENT] = self._parent.info.run_id
         _share_cores(config.hydra.launcher)
         mine = [(composed[number], identities[number]) for number in self._own]
         self._progress = SweepProgress(

@@ -56,9 +56,6 @@ from skin.touch.labels import Task
 
 _log = logging.getLogger(__name__)
 
-SWEPT = "SKIN_SWEPT"
-"""Environment variable with the settings that a sweep varies, for its jobs."""
-
 _STEERING = ("hydra", "shard", "tracking", "trust", "sweep")  # no result depends on them
 _NETWORK = ("representation", "model", "fusion", "optimizer", "trainer")  # a network consists of these
 # A run's name has the first ones in any case; the others choose the machine.
@@ -89,7 +86,9 @@ def train(config: Config) -> bool:
     data, learner = build_data(config, device), build_learner(config)
     learner.check(data)
     report_balance(device, shown=PARENT not in os.environ)
-    name = " ".join([identity["row"], identity["simulator"], *_differences(config), f"seed {config.seed}"])
+    changes = " ".join(_differences(config))[:200]  # a server's names have 250 characters
+    words = identity["row"], identity["simulator"], changes, f"seed {config.seed}"
+    name = " ".join(filter(None, words))
     store = Store.open(config.tracking)
     with alone(config.tracking, identity["fingerprint"]):
         if _is_finished(store, config, identity):  # by a process that began earlier
@@ -273,10 +272,8 @@ def log_configuration(store: Store, run: str, config: Config, data_hash: str) ->
 
 
 def _differences(config: Config) -> list[str]:
-    """Return the overrides that distinguish this run: in a sweep, those that are swept."""
+    """Return the overrides that distinguish this run."""
     changes = {key: value for key, value in relevant_overrides(config).items() if key not in _NAMED}
-    if SWEPT in os.environ:
-        changes = {key: value for key, value in changes.items() if key in os.environ[SWEPT].split()}
     return [f"{key.split('.')[-1]}={value}" for key, value in changes.items()]
 
 

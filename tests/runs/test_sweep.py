@@ -26,6 +26,7 @@ SMALL = [
     "evaluation.layouts=1",
     "evaluation.safe_gestures=64",
 ]
+NAME = "rules naive gestures=64 test_gestures=32 devices=1 layouts=1 safe_gestures=64"
 
 
 def test_jobs_come_in_hydras_order():
@@ -93,7 +94,7 @@ def test_a_sweep_that_was_killed_goes_on_where_it_was(run, begin, tmp_path):
         next(line for line in first.lines() if line.startswith("[2/3]"))
     assert [one[:2] for one in runs(tmp_path)][:2] == [
         ("seed=0,1,2", "RUNNING"),
-        ("rules naive seed 0", "FINISHED"),
+        (f"{NAME} seed 0", "FINISHED"),
     ]
     again = run(tmp_path, *sweep(tmp_path, "seed=0,1,2"), store=False)
     assert again.returncode == 0, again.stderr
@@ -101,7 +102,7 @@ def test_a_sweep_that_was_killed_goes_on_where_it_was(run, begin, tmp_path):
         line for line in again.stdout.splitlines() if line.startswith("[1/3]") and "…" not in line
     ]
     finished = [name for name, status, parent in runs(tmp_path) if status == "FINISHED" and parent]
-    assert finished == ["rules naive seed 0", "rules naive seed 1", "rules naive seed 2"]
+    assert finished == [f"{NAME} seed 0", f"{NAME} seed 1", f"{NAME} seed 2"]
 
 
 @pytest.mark.slow
@@ -131,7 +132,7 @@ def test_a_bad_job_fails_and_the_others_run(run, tmp_path):
     done = run(tmp_path, *sweep(tmp_path, "device.offset=-1,0.1"), store=False)
     assert done.returncode == 1
     assert "offset" in done.stderr
-    assert [one[:2] for one in runs(tmp_path) if one[2]] == [("rules naive offset=0.1 seed 0", "FINISHED")]
+    assert [one[:2] for one in runs(tmp_path) if one[2]] == [(f"{NAME} offset=0.1 seed 0", "FINISHED")]
     assert [status for name, status, parent in runs(tmp_path) if not parent] == ["FAILED"]
 
 
@@ -164,9 +165,9 @@ def test_a_run_is_nested_under_the_sweep_that_trained_it(run, tmp_path):
     assert (first.info.run_name, first.info.status) == ("seed=0,1", "FINISHED")
     children = {one[0]: one[2] for one in runs(tmp_path) if one[2]}
     assert children == {
-        "rules naive seed 0": first.info.run_id,
-        "rules naive seed 1": first.info.run_id,
-        "rules naive seed 2": second.info.run_id,
+        f"{NAME} seed 0": first.info.run_id,
+        f"{NAME} seed 1": first.info.run_id,
+        f"{NAME} seed 2": second.info.run_id,
     }
 
 
@@ -217,7 +218,7 @@ def test_shards_train_every_job_once(run, tmp_path):
         said.append(done.stdout)
     assert "shard 3/3 has no job: the sweep has only 2" in said[2]
     children = [(name, status) for name, status, parent in runs(tmp_path) if parent]
-    assert sorted(children) == [(f"rules naive seed {seed}", "FINISHED") for seed in (0, 1)]
+    assert sorted(children) == [(f"{NAME} seed {seed}", "FINISHED") for seed in (0, 1)]
     assert [parent.info.status for parent in parents(tmp_path)] == ["FINISHED", "FINISHED"]
 
 

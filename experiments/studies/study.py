@@ -189,8 +189,8 @@ def sweeps(
     for block in blocks:
         chosen = {key: value for key, value in {**block, **rows}.items() if key not in fixed}
         settings = {key: value for key, value in chosen.items() if key != "name"}
-        given = {key: value for key, value in study.common.items() if value is not None}
-        shared = {key: value for key, value in given.items() if key not in chosen}
+        common = {key: value for key, value in study.common.items() if value is not None}
+        shared = {key: value for key, value in common.items() if key not in chosen}
         yield chosen, [*as_overrides(settings), *as_overrides(shared), *last]
 
 

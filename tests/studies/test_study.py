@@ -143,6 +143,12 @@ def test_settings_of_a_variant_hold_instead_of_the_common_ones(composed):
     assert len({one.configs["0"].simulator["_target_"] for one in given}) == 1
 
 
+def test_a_common_setting_of_null_is_that_of_a_training(composed):
+    plain, small = composed("study=gestures"), composed("study=gestures", "evaluation.devices=3")
+    for (_, every), devices in ((plain, 10), (small, 3)):
+        assert {one.configs["0"].evaluation.devices for one in every} == {devices}
+
+
 def test_one_row_is_a_list_of_one():
     """As text, best_fresh would contain best."""
     assert chosen(*words("robustness", "dead"), "study.rows=best_fresh").rows == ["best_fresh"]

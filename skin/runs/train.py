@@ -1,5 +1,6 @@
 """One run: build, train, evaluate, log; and evaluate it again on other touches."""
 
+import hashlib
 import json
 import logging
 import math
@@ -86,9 +87,7 @@ def train(config: Config) -> bool:
     data, learner = build_data(config, device), build_learner(config)
     learner.check(data)
     report_balance(device, shown=PARENT not in os.environ)
-    changes = " ".join(_differences(config))[:200]  # a server's names have 250 characters
-    words = identity["row"], identity["simulator"], changes, f"seed {config.seed}"
-    name = " ".join(filter(None, words))
+    name = _name(config, identity)
     store = Store.open(config.tracking)
     with alone(config.tracking, identity["fingerprint"]):
         if _is_finished(store, config, identity):  # by a process that began earlier
@@ -271,10 +270,13 @@ def log_configuration(store: Store, run: str, config: Config, data_hash: str) ->
     store.client.log_batch(run, params=[Param(name, str(value)) for name, value in params.items()])
 
 
-def _differences(config: Config) -> list[str]:
-    """Return the overrides that distinguish this run."""
+def _name(config: Config, identity: Mapping[str, str]) -> str:
+    """Return the name of a run, which tells it from those of other changes."""
     changes = {key: value for key, value in relevant_overrides(config).items() if key not in _NAMED}
-    return [f"{key.split('.')[-1]}={value}" for key, value in changes.items()]
+    text = " ".join(f"{key.split('.')[-1]}={value}" for key, value in changes.items())
+    # A server's names have 250 characters.
+    short = text if len(text) <= 200 else f"{text[:191]} {hashlib.sha256(text.encode()).hexdigest()[:8]}"
+    return " ".join(filter(None, (identity["row"], identity["simulator"], short, f"seed {config.seed}")))
 
 
 def relevant_overrides(config: Config) -> dict[str, str]:

@@ -4,9 +4,12 @@ import re
 import sqlite3
 
 import pytest
+from hydra import compose, initialize_config_dir
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import OmegaConf
 
 import skin.runs.train
-from skin.core.files import ROOT
+from skin.core.files import CONF, ROOT
 from skin.errors import InputError
 from skin.runs.configuration import validate_config
 from skin.runs.store import Store
@@ -34,6 +37,27 @@ def config(configured, tmp_path):
             *SMALL, f"tracking.uri=sqlite:///{tmp_path}/runs.db", f"tracking.artifacts={tmp_path}/artifacts"
         )
     )
+
+
+def name_of(*changes):
+    """Return the name of the run of a command."""
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        composed = compose("train", list(changes), return_hydra_config=True)
+        HydraConfig.instance().set_config(composed)
+        own = validate_config(OmegaConf.masked_copy(composed, [key for key in composed if key != "hydra"]))
+        try:
+            return skin.runs.train._name(own, skin.runs.train.tags(own))
+        finally:
+            HydraConfig.instance().cfg = None
+
+
+def test_runs_of_other_settings_have_other_names():
+    assert name_of("experiment=rules", "seed=2") == "rules fem seed 2"
+    assert name_of("data.gestures=64", "simulator=naive").endswith("naive gestures=64 seed 0")
+    many = [f"+touch.setting_{number}={number}.123456" for number in range(10)]
+    names = {name_of(*many, f"data.gestures={count}") for count in (64, 65)}
+    assert len(names) == 2
+    assert max(map(len, names)) < 250
 
 
 @pytest.mark.slow

@@ -39,28 +39,26 @@ class Fingertip:
             (torch.arange(count * number, dtype=torch.float64) + 0.5) * (cell / number)
             for count, cell, number in zip(body.cells, body.cell, samples, strict=True)
         )
-        self._shape = body.shape
-        self._splines: tuple[Tensor, ...] = ()
-        if smooth:
-            axes = zip((self._x, self._y), body.cells, body.cell, samples, strict=True)
-            self._splines = tuple(
-                torch.from_numpy(splines.spline_values(places.numpy() / cell, count) / number)
-                for places, count, cell, number in axes
+        # Weights of the samples along an axis in the load of each cell.
+        self._across, self._down = (
+            torch.from_numpy(
+                splines.spline_values(places.numpy() / cell, count) / number
+                if smooth
+                else np.repeat(np.eye(count), number, axis=0) / number
             )
+            for places, count, cell, number in zip(
+                (self._x, self._y), body.cells, body.cell, samples, strict=True
+            )
+        )
 
     def __call__(self, touches: Tensor) -> Tensor:
         """Return the loads (B, H, W), Pa, of touches (B, 4) as in :data:`PARAMETERS`, in their dtype."""
         x, y, radius, force = touches[:, :, None, None].unbind(1)
-        across, down = self._x.to(touches) - x, self._y.to(touches)[:, None] - y
+        across, down = (self._x.to(touches) - x) / self._rim, (self._y.to(touches)[:, None] - y) / self._rim
         # The root of 0 has no derivative; a micrometre changes nothing.
-        distance = (across.square() + down.square() + 1e-12).sqrt()
-        share = torch.sigmoid((radius - distance) / self._rim)
-        if self._splines:
-            across, down = (values.to(touches) for values in self._splines)
-            cells = down.T @ (share @ across)
-        else:
-            height, width = self._shape
-            cells = share.unflatten(1, (height, -1)).unflatten(3, (width, -1)).mean((2, 4))
+        distance = (across.square() + (down.square() + (1e-6 / self._rim) ** 2)).sqrt()
+        share = torch.sigmoid(radius / self._rim - distance)
+        cells = self._down.to(touches).T @ (share @ self._across.to(touches))
         return force * cells / (self._area * cells.sum((1, 2), keepdim=True))
 
 

@@ -10,6 +10,7 @@ import atexit
 import gc
 import json
 import os
+import pickle
 import runpy
 import shutil
 import signal
@@ -17,7 +18,6 @@ import socket
 import sys
 import threading
 from collections.abc import Callable
-from copy import deepcopy
 from importlib import import_module
 from io import StringIO
 from pathlib import Path
@@ -120,15 +120,18 @@ def copying(empty: Callable[[], Path]) -> Callable[[Any], Any]:
 
 
 def remembering(load: Callable[[Any], Any]) -> Callable[[Any], Any]:
-    """Return ``OmegaConf.load``, which parses the text of an open file once: a third of each composition."""
-    parsed: dict[str, Any] = {}
+    """Return ``OmegaConf.load``, which parses the text of an open file once: a third of each composition.
+
+    A pickle makes a copy in a seventh of the time of ``deepcopy``.
+    """
+    parsed: dict[str, bytes] = {}
 
     def loaded(file: Any) -> Any:
         if not hasattr(file, "read"):
             return load(file)
         if (text := file.read()) not in parsed:
-            parsed[text] = load(StringIO(text))
-        return deepcopy(parsed[text])
+            parsed[text] = pickle.dumps(load(StringIO(text)))
+        return pickle.loads(parsed[text])
 
     return loaded
 

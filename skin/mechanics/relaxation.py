@@ -29,22 +29,23 @@ def first_order_lag(readings: Tensor, time_constant: Tensor, time: Tensor) -> Te
     constant = time_constant.to(readings.dtype)
     constant = constant[:, 0] if constant.ndim == 3 else constant
     steps = time.diff(prepend=2 * time[:1] - time[1:2]).to(readings.dtype)
-    state, output = torch.zeros_like(readings[:, 0]), torch.empty_like(readings)
-    for number, frame in enumerate(readings.unbind(1)):
-        # A constant of 0 gives exp(-inf) = 0; the clamp avoids 0 / 0.
-        state = torch.lerp(frame, state, torch.exp(-steps[number] / constant.clamp(min=1e-9)))
-        output[:, number] = state
-    return output
+    # A constant of 0 gives exp(-inf) = 0; the clamp avoids 0 / 0.
+    decays = torch.exp(-steps.view(-1, 1, 1) / constant.clamp(min=1e-9))
+    state, states = torch.zeros_like(readings[:, 0]), []
+    for frame, decay in zip(readings.unbind(1), decays, strict=True):
+        state = torch.lerp(frame, state, decay)
+        states.append(state)
+    return torch.stack(states, dim=1)
 
 
 def running_peak(readings: Tensor) -> Tensor:
     """Return the largest magnitude of the reading since a sensor was last at rest, (B, T, S), N."""
-    size, peaks = readings.abs(), torch.empty_like(readings)
-    peak = torch.zeros_like(size[:, 0])
-    for number, frame in enumerate(size.unbind(1)):
-        peak = torch.where(frame > 0, torch.maximum(peak, frame), 0)
-        peaks[:, number] = peak
-    return peaks
+    size, peaks = readings.abs(), []
+    peak, rest = torch.zeros_like(size[:, 0]), ~(size > 0)
+    for frame, resting in zip(size.unbind(1), rest.unbind(1), strict=True):
+        peak = torch.maximum(peak, frame).masked_fill(resting, 0)
+        peaks.append(peak)
+    return torch.stack(peaks, dim=1)
 
 
 def apply_hysteresis(readings: Tensor, hysteresis: Tensor) -> Tensor:

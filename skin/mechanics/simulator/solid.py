@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar
+from weakref import WeakValueDictionary
 
 import numpy as np
 import scipy.sparse as sp
@@ -246,6 +247,7 @@ _SOURCES = [
     Path(splines.__file__),
 ]
 _INWARDS = 2
+_BODIES = WeakValueDictionary[tuple[str, int], Elastic]()
 
 
 @checked("simulator")
@@ -405,7 +407,9 @@ class Solid(AbstractSimulator):
 
     @cached_property
     def _elastic(self) -> Elastic:
-        return Elastic(self._mesh, self._refinement)
+        """The body, whose factors take seconds: one for all living simulators of it."""
+        body = self._key, self._refinement
+        return _BODIES.setdefault(body, Elastic(self._mesh, self._refinement))
 
     def _operator(self, sensors: Sensors) -> np.ndarray:
         """Return the rows of readings, D_s, D_t and displacements along x and y, (3, 5 S, cells)."""

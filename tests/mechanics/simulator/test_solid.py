@@ -9,6 +9,7 @@ from scipy.sparse.linalg import spsolve
 from skin.body.base import Arm, Sensors, Sheet
 from skin.errors import InputError
 from skin.mechanics.simulator._hexahedra import Hexahedra
+from skin.mechanics.simulator.base import factorised
 from skin.mechanics.simulator.solid import Elastic, Solid, build_mesh, reading_rows
 from skin.touch import splines
 
@@ -177,6 +178,23 @@ def test_operators_are_kept(tmp_path, monkeypatch):
     first = solid(cache=tmp_path)
     monkeypatch.setattr(Elastic, "transfer", None)
     assert torch.equal(solid(cache=tmp_path).transfer, first.transfer)
+
+
+def test_simulators_of_one_body_share_its_factors(tmp_path, monkeypatch):
+    made, kept = [], {"cache": tmp_path}
+    monkeypatch.setattr(
+        "skin.mechanics.simulator.solid.factorised", lambda k: made.append(k) or factorised(k)
+    )
+    coarse, fine = (Sheet([0.06, 0.06], [count, count], LAYERS) for count in (6, 12))
+    skins = [solid(sensors((x, 0.03, 0.005)), coarse, **kept) for x in (0.03, 0.02)]
+    assert len(made) == 1
+    # The same elements under smaller cells.
+    skins.append(solid(sensors((0.03, 0.03, 0.005)), fine, refinement=1, **kept))
+    assert [skin.transfer.shape[1] for skin in skins] == [36, 36, 144]
+    assert len(made) == 2
+    del skins
+    solid(sensors((0.04, 0.03, 0.005)), coarse, **kept)
+    assert len(made) == 3
 
 
 @pytest.mark.parametrize(

@@ -26,8 +26,7 @@ def first_order_lag(readings: Tensor, time_constant: Tensor, time: Tensor) -> Te
         time_constant: s, broadcast with (B, S) or (B, 1, S); 0: none.
         time: of every frame, (T,), s.
     """
-    constant = time_constant.to(readings.dtype)
-    constant = constant[:, 0] if constant.ndim == 3 else constant
+    constant = (time_constant[:, 0] if time_constant.ndim == 3 else time_constant).to(readings.dtype)
     steps = time.diff(prepend=2 * time[:1] - time[1:2]).to(readings.dtype)
     # A constant of 0 gives exp(-inf) = 0; the clamp avoids 0 / 0.
     decays = torch.exp(-steps.view(-1, 1, 1) / constant.clamp(min=1e-9))

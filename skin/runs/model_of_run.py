@@ -415,7 +415,10 @@ class RunModel(TrainedModel):
         if point is None:
             return None
         if point.useless:
-            raise InputError(f"{point.warning()}: give live.patience.above=0.5, or train another run")
+            raise InputError(
+                f"{point.warning()}: train with more gestures, or give a lower threshold, which has more "
+                f"false alarms, such as live.patience.above={min(point.threshold, 1.0) / 2:.1g}"
+            )
         say(point.sentence())
         return point.threshold
 

@@ -51,6 +51,7 @@ class Verdict:
         unknown: sensors at which a dangerous touch could not be felt, because no valid sensor would respond.
         below: sensors that read below their rest: their wire is broken, their values fall with force, or the
             tare was taken under a load.
+        pause: s without a frame before the latest one; 0 if no touch of the training fits in between.
         agreeing: label -> its probability in the latest window that agreed with the debounced label; where it
             is missing, that of this window.
     """
@@ -66,6 +67,7 @@ class Verdict:
     contact: float | None = None
     unknown: tuple[int, ...] = ()
     below: tuple[int, ...] = ()
+    pause: float = 0.0
     agreeing: dict[str, float] = field(default_factory=dict)
 
     @property
@@ -79,6 +81,8 @@ class Verdict:
         """Where the state is unknown and why, in words; empty where it is known everywhere."""
         if not self.unknown:
             return ""
+        if self.pause:
+            return f"unknown: no frame for {self.pause:.2f} s, in which a touch may have come and gone"
         text = f"unknown near {sensor_list(self.unknown)}"
         if self.below:
             return f"{text}, below rest: a broken wire, device.scale of the wrong sign, or a tare under load"
@@ -215,6 +219,7 @@ class _Decision(NamedTuple):
         masked: sensors without a valid reading now.
         unknown: sensors at which a dangerous touch could not be felt.
         below: sensors that read below their rest.
+        pause: s without a frame before the latest; 0 if it was short.
         last: the stream is interrupted behind it.
     """
 
@@ -229,6 +234,7 @@ class _Decision(NamedTuple):
     masked: tuple[int, ...]
     unknown: tuple[int, ...]
     below: tuple[int, ...]
+    pause: float
     last: bool
 
 
@@ -278,7 +284,7 @@ class Engine:
         self._above = 0.5 if self._patience.above is None else self._patience.above
         self._responds = np.eye(sensors, dtype=bool) if presses is None else presses >= detection.threshold
         self._clock, self._freshness = StreamClock(), _Freshness(sensors)
-        self._latest: tuple[Frame, float] | None = None
+        self._latest: tuple[Frame, float, float] | None = None  # with its time, and that since the one before
         self._tick = -1
         self._decided = True
         self.reset()
@@ -328,11 +334,12 @@ class Engine:
     def _add(self, frame: Frame, conversion: UnitConversion | None) -> list[_Decision]:
         """Add a frame to the window; return the decisions that are due."""
         time, due = self._clock(frame), list[_Decision]()
+        pause = 0.0 if self._latest is None else time - self._latest[1]
         if self._interrupted(frame, time):
             # What came last before the interruption would be forgotten undecided.
             due += self._decide(conversion, last=True)
             self.window.clear()
-        self._latest, self._decided = (frame, time), False
+        self._latest, self._decided = (frame, time, pause), False
         self.window.add(frame._replace(t=time, segment=0))
         self._freshness.add(frame, time, conversion)
         tick = floor((time + _ROUNDING) * DECISIONS)
@@ -344,7 +351,7 @@ class Engine:
     def _interrupted(self, frame: Frame, time: float) -> bool:
         if self._latest is None:
             return False
-        latest, before = self._latest
+        latest, before, _ = self._latest
         return frame.segment != latest.segment or time - before > max(_GAP, 3 * self.window.period)
 
     def _decide(self, conversion: UnitConversion | None, last: bool = False) -> list[_Decision]:
@@ -353,7 +360,9 @@ class Engine:
         if self._decided or conversion is None or seen is None or self._latest is None:
             return []
         self._decided = True
-        frame, time = self._latest
+        frame, time, pause = self._latest
+        # In more than two and a half intervals of the model, a touch may come and go.
+        pause = pause if pause * self.window.rate > 2.5 else 0.0
         readings, valid = conversion(seen.values, seen.valid)
         if conversion.noise is not None:
             self._contact.noise = conversion.noise
@@ -370,7 +379,7 @@ class Engine:
         if not contact and not risen:
             self._idle = readings, valid
         lasted = None if self._contact.since is None else time - self._contact.since
-        unknown = ~self._responds[:, valid[-1]].any(axis=1)
+        unknown = ~self._responds[:, valid[-1]].any(axis=1) | (pause > 0)
         readings, presented = self._cut_window(readings, valid, lasted or 0.0)
         return [
             _Decision(
@@ -385,6 +394,7 @@ class Engine:
                 masked=_numbers(~valid[-1]),
                 unknown=_numbers(unknown),
                 below=_numbers(below[-1]),
+                pause=pause,
                 last=last,
             )
         ]
@@ -474,6 +484,7 @@ class Engine:
             contact=decision.lasted,
             unknown=decision.unknown,
             below=decision.below,
+            pause=decision.pause,
             agreeing=dict(self._agreeing),
         )
 

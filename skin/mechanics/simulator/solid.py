@@ -408,8 +408,7 @@ class Solid(AbstractSimulator):
     @cached_property
     def _elastic(self) -> Elastic:
         """The body, whose factors take seconds: one for all living simulators of it."""
-        body = self._key, self._refinement
-        return _BODIES.setdefault(body, Elastic(self._mesh, self._refinement))
+        return _BODIES.setdefault((self._key, self._refinement), Elastic(self._mesh, self._refinement))
 
     def _operator(self, sensors: Sensors) -> np.ndarray:
         """Return the rows of readings, D_s, D_t and displacements along x and y, (3, 5 S, cells)."""

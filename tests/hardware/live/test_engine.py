@@ -196,6 +196,20 @@ def test_a_press_is_found_at_once_after_each_restart(rate, away):
         assert all(verdict.dangerous for verdict in said if verdict.t >= since + 0.15)
 
 
+@pytest.mark.parametrize("rate", [2, 3])
+def test_a_stream_that_becomes_slow_is_unknown_as_taps_fall_between_its_frames(rate):
+    subject = engine()
+    said = subject.push([frame(n / 100, np.zeros(4)) for n in range(500)], PLAIN)
+    assert {verdict.state for verdict in said} == {"no touch"}
+    slow = subject.push([frame(5 + n / rate, np.zeros(4), lost=40, after="gap") for n in range(9)], PLAIN)
+    assert {verdict.state for verdict in slow[1:]} == {"unknown"}
+    assert f"no frame for {1 / rate:.2f} s" in slow[-1].reason
+    end = 5 + 8 / rate
+    # Two frames of the model's rate may be lost in between.
+    fast = subject.push([frame(end + n / 4.1, np.zeros(4)) for n in range(1, 9)], PLAIN)
+    assert {verdict.state for verdict in fast} == {"no touch"}
+
+
 def test_a_tap_after_a_restart_or_a_gap_is_found():
     for start, segment in ((0.5, 1), (40.0, 0)):
         subject = engine(window=30)
@@ -242,7 +256,9 @@ def test_a_value_that_is_the_same_behind_a_silence_is_not_stuck():
     subject.push([frame(n / 100, row) for n, row in enumerate(noise)], conversion)
     behind = np.array([noise[-1, 0], noise[-1, 1], 0.01, 0.01])
     said = subject.push([frame(12 + n / 100, behind, after="gap" * (n == 0)) for n in range(30)], conversion)
-    assert all(verdict.unknown == () for verdict in said)
+    # The last decision before the silence, and the first behind it.
+    assert [verdict.pause > 8 for verdict in said[:3]] == [False, True, False]
+    assert all(verdict.unknown == () for verdict in said if not verdict.pause)
 
 
 def test_a_safe_touch_beside_a_dead_sensor_may_hide_a_dangerous_one():

@@ -51,7 +51,7 @@ class Verdict:
         unknown: sensors at which a dangerous touch could not be felt, because no valid sensor would respond.
         below: sensors that read below their rest: their wire is broken, their values fall with force, or the
             tare was taken under a load.
-        pause: s without a frame before the latest one; 0 if no touch of the training fits in between.
+        pause: s without a frame before the latest one; 0 if it was too short to hide a tap.
         agreeing: label -> its probability in the latest window that agreed with the debounced label; where it
             is missing, that of this window.
     """
@@ -361,8 +361,8 @@ class Engine:
             return []
         self._decided = True
         frame, time, pause = self._latest
-        # In more than two and a half intervals of the model, a touch may come and go.
-        pause = pause if pause * self.window.rate > 2.5 else 0.0
+        # A tap may come and go; but a device of the rate of a slow model may lose two frames, too.
+        pause = pause if pause > max(_GAP / 2, 2.5 / self.window.rate) else 0.0
         readings, valid = conversion(seen.values, seen.valid)
         if conversion.noise is not None:
             self._contact.noise = conversion.noise

@@ -205,9 +205,15 @@ def test_a_stream_that_becomes_slow_is_unknown_as_taps_fall_between_its_frames(r
     assert {verdict.state for verdict in slow[1:]} == {"unknown"}
     assert f"no frame for {1 / rate:.2f} s" in slow[-1].reason
     end = 5 + 8 / rate
-    # Two frames of the model's rate may be lost in between.
     fast = subject.push([frame(end + n / 4.1, np.zeros(4)) for n in range(1, 9)], PLAIN)
     assert {verdict.state for verdict in fast} == {"no touch"}
+
+
+def test_a_fast_model_is_not_blind_after_each_lost_frame():
+    subject = engine(rate=100.0)
+    said = subject.push([frame(n / 100, np.zeros(4)) for n in range(500) if n % 20 > 4], PLAIN)
+    assert len(said) > 50
+    assert {verdict.state for verdict in said} == {"no touch"}
 
 
 def test_a_tap_after_a_restart_or_a_gap_is_found():

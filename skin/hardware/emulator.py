@@ -540,7 +540,8 @@ class Emulator:
 
     def _header(self) -> None:
         settings, unit = self.settings, "N" if self.settings.bits is None else "adc"
-        header = Header(1, len(self.device.sensors), settings.rate, unit, settings.bits, settings.id)
+        speed = None if settings.speed == 1 else settings.speed
+        header = Header(1, len(self.device.sensors), settings.rate, unit, settings.bits, settings.id, speed)
         if self.binary:
             self._send(encode_comment(encode_header(header, "none").rstrip()))
         else:

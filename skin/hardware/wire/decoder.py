@@ -2,9 +2,10 @@
 
 from collections import Counter, deque
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
-from math import log10
-from typing import NamedTuple
+from dataclasses import dataclass, field
+from itertools import pairwise
+from math import inf, log10
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -98,8 +99,10 @@ class SequenceTracker:
 
     def _ahead(self, before: int, seq: int, elapsed: float, clocked: bool) -> int:
         """Return by how many frames ``seq`` is ahead; 0 if the counter began again."""
+        if seq == before and elapsed > 0:
+            return 1  # a counter that stands still tells nothing
         ahead = frames_ahead(before, seq, self.modulus)
-        if ahead or self._fixed or elapsed < 0 or seq == before or not self._period:
+        if ahead or self._fixed or elapsed < 0 or not self._period:
             return ahead
         frames = round(elapsed / self._period) if clocked else 1
         uneven = abs(elapsed - frames * self._period) > _UNEVEN * self._period and clocked
@@ -196,6 +199,55 @@ class ClockUnit:
         self._fixed |= unit != before
         self.summary = f"the device's clock counts {_UNITS[unit]}, by {witness}"
         return unit != before
+
+
+class ClockWatch:
+    """Tells whether a device's clock can be trusted, by the host's.
+
+    Over the longer of 2 s and four deliveries it must advance by half to twice as much, and in steps that are
+    finer than the decisions of a live view if the frames are. What was buffered while host or bridge were
+    suspended arrives at once and does not count against it.
+    """
+
+    _SPAN, _DELIVERIES = 2.0, 4  # s
+    _COARSE = 0.05  # s
+    _CAUGHT_UP = 0.2  # s in which a buffer is read
+
+    def __init__(self) -> None:
+        self.restart()
+
+    def restart(self) -> None:
+        """Compare again: another segment of the device's clock has begun."""
+        self._deliveries = deque[tuple[float, float, int, int]]()
+        self._frames = self._steps = 0
+        self._doubtful_since: float | None = None
+
+    def trust(self, times: Sequence[float], arrival: float, speed: float) -> bool:
+        """Return whether the clock is still trusted after a delivery.
+
+        Args:
+            times: of its frames by the device's clock, s.
+            arrival: by the host's, s.
+            speed: at which a replay declares to run its clock; 1 of a real device.
+        """
+        before = self._deliveries[-1][1] if self._deliveries else times[0]
+        self._frames += len(times)
+        self._steps += sum(time > last for last, time in pairwise([before, *times]))
+        self._deliveries.append((arrival, times[-1], self._frames, self._steps))
+        while len(self._deliveries) > self._DELIVERIES + 1 and arrival - self._deliveries[1][0] >= self._SPAN:
+            self._deliveries.popleft()
+        first = self._deliveries[0]
+        passed = arrival - first[0]
+        if len(self._deliveries) <= self._DELIVERIES or passed < self._SPAN:
+            return True
+        advanced, steps = (times[-1] - first[1]) / speed, self._steps - first[3]
+        coarse = advanced > self._COARSE * steps and self._frames - first[2] >= 2 * steps
+        doubtful = coarse or not passed / 2 <= advanced <= 2 * passed
+        if not doubtful:
+            self._doubtful_since = None
+        elif self._doubtful_since is None:
+            self._doubtful_since = arrival
+        return self._doubtful_since is None or arrival - self._doubtful_since < self._CAUGHT_UP
 
 
 class FrameClock:
@@ -344,7 +396,12 @@ class Stats:
         return [f"{count} {word}" for name, word in words.items() if (count := getattr(self, name))]
 
 
-_AGAIN = "the device has not sent its header since it was connected again"
+Identity = Literal["known", "missing", "other", "changed"]
+"""Of the device by its headers: known; none since it was connected again; another; another without that."""
+
+_CORRECTED = (
+    6.0  # s in which the next header must correct one that has changed: many devices repeat it every five
+)
 _LONGEST = 65536  # bytes of a line
 _ENOUGH = 4096  # bytes in which the format must show
 _PATIENCE = 2.0  # s of receiving in which it must
@@ -392,13 +449,15 @@ class Decoder:
         self._good = self._bad = 0
         self._latest_bad = FrameError("")
         self.header: Header | None = None
-        self._headers, self._doubt = set[Header](), ""  # of this device; why its frames do not count
+        self._identity: Identity = "known"
+        self._changed_at = inf  # s, when another header came on an open connection
         self._order, self._clock, self._counted = (
             SequenceTracker(modulus=self.adapter.modulus),
             HostClock(),
             FrameClock(),
         )
         self._unit = ClockUnit(self._order.unit, False)
+        self._watch, self._trusted, self._clocked = ClockWatch(), True, False
         self._latest = np.zeros(sensors or 0)
         self._channels = np.array(channels) if len(channels) else None
         self._polarity = np.array(polarity, dtype=float) if min(polarity, default=1) < 0 else None
@@ -417,9 +476,12 @@ class Decoder:
         """Start another connection: detect the format again, with the same number of sensors."""
         self._begin()
         self._order.cut(after)
-        self.stats.trouble = self._doubt = _AGAIN if self._headers else ""
+        self._identity, self._changed_at = "missing" if self.header else "known", inf
+        self.stats.trouble = self._doubt
         self._counted.restart()
         self._unit.restart()
+        self._watch.restart()
+        self._trusted = True
 
     def feed(self, data: bytes, now: float = 0.0) -> list[Frame]:
         """Return the frames that end in ``data``.
@@ -429,16 +491,20 @@ class Decoder:
             now: s, the host's monotonic clock at their arrival.
         """
         self.stats.bytes += len(data)
+        passed, self._fed_at = now - self._fed_at, now
         if self.frame_format is None:
+            self._receiving += min(passed, _PAUSE) if passed > 0 else 0.0
             # Bounds the search while no format is recognised.
             self._buffer = self._buffer[-2 * self._enough :]
         self._buffer += data
-        if self.frame_format is None and not self._recognise(data, now):
+        if self.frame_format is None and not self._recognise(data):
             return []
         assert self.frame_format is not None
         pieces, self._buffer = self.frame_format.split(self._buffer)
         good, bad = self.stats.frames, self.stats.bad_frames
         frames = [frame for piece in pieces if (frame := self._frame(piece, now))]
+        if frames and self._trusted:
+            self._judge_clock(frames, now)
         if len(self._buffer) > _LONGEST:
             self._buffer, self._overlong = b"", True
         self._compare(now, self.stats.frames - good, self.stats.bad_frames - bad)
@@ -447,10 +513,12 @@ class Decoder:
     def error(self) -> InputError | None:
         """Return an error once 2 s of receiving or 4 kB (or four frames) show no format; else None.
 
-        Also if the device's clock contradicts what is said of it.
+        Also if the device's clock contradicts what is said of it, or its header has changed.
         """
         if self.frame_format is not None and self._unit.error is not None:
             return self._unit.error
+        if self._fed_at - self._changed_at > _CORRECTED:
+            return InputError(f"{self._doubt}: start the command again to read this device")
         patience = _PATIENCE if self.adapter.kind == "protocol" else _LONG
         if self.frame_format or (self._receiving < patience and len(self._buffer) < self._enough):
             return None
@@ -467,18 +535,15 @@ class Decoder:
             return _MANY
         return max(_ENOUGH, 4 * _PER_FIELD * (2 + (self.sensors or 0)))
 
-    def _recognise(self, data: bytes, now: float) -> bool:
+    def _recognise(self, data: bytes) -> bool:
         """Buffer the first bytes until they show the format; they are then decoded from the first one on."""
-        passed = now - self._fed_at
-        self._receiving += min(passed, _PAUSE) if passed > 0 else 0.0
-        self._fed_at = now
         if not self.adapter.may_end(data):
             return False
         detected = self.adapter.detect(self._buffer, self.sensors)
         self.frame_format, self._count_seen = detected.frame_format, detected.count_seen
         if self.frame_format is None:
             return False
-        self._hear(detected.header)
+        self._update_header(detected.header)
         self.sensors = self.frame_format.sensors
         self.stats.format, self.stats.check = self.frame_format.name, self.frame_format.check
         if detected.unit is not None and self._unit.unit == self._order.unit and not self._unit.summary:
@@ -499,11 +564,11 @@ class Decoder:
                 raise FrameError("long")
             raw = self.frame_format.read(piece)
             if isinstance(raw, bytes):
-                self._hear(parse_header(raw))
+                self._update_header(parse_header(raw))
                 return None
             if first and self.frame_format.check != "crc16":
                 raise FrameError("structure")
-            return None if self._doubt else self._place_frame(raw, now)
+            return self._place_frame(raw, now) if self._identity == "known" else None
         except FrameError as bad:
             if self._synchronous or self._missing:
                 self._synchronous, self._latest_bad = False, bad
@@ -513,28 +578,41 @@ class Decoder:
                 self.stats.skipped += 1
             return None
 
-    def _hear(self, header: Header | None) -> None:
-        """Take a header; one that differs from those before a reconnection is of another device."""
+    def _update_header(self, header: Header | None) -> None:
+        """Take a header. One that differs is of another device: frames count once the one before is back."""
         if header is None:
             return
-        lasting = replace(header, rate=None)  # it may be measured
-        if self._doubt:
-            other = "" if lasting in self._headers else f"another device is connected: {header}"
-            self.stats.trouble = self._doubt = other
-        if not self._doubt:
-            self.header = header
-            self._headers.add(lasting)
+        if self.header is None or not header.changes(self.header):
+            self.header = self.header or header
+            self._identity, self._changed_at = "known", inf
+        elif self._identity in ("known", "changed"):
+            self._identity, self._changed_at = "changed", min(self._changed_at, self._fed_at)
+        else:
+            self._identity = "other"
+        self._other, self.stats.trouble = header, self._doubt
+
+    @property
+    def _doubt(self) -> str:
+        """Why frames do not count, in words; empty if they do."""
+        if self._identity == "known" or self.header is None:
+            return ""
+        if self._identity == "missing":
+            return "the device has not sent its header since it was connected again"
+        if self._identity == "other":
+            return f"another device is connected: {self._other}"
+        return f"the header of the device has changed, {self._other.changes(self.header)}"
 
     def _place_frame(self, raw: RawFrame, now: float) -> Frame:
         ticks, rate = raw.ticks, None if self.header is None else self.header.rate
+        self._clocked = ticks is not None and self._trusted
         frames = self._order.ahead(raw.seq, self._missing)
-        if ticks is None:
+        if ticks is None or not self._clocked:
             ticks = self._counted(now, frames, rate) / self._order.unit
         elif self._unit.add(ticks, now, frames, rate):
             self._order.unit = self._unit.unit
             self._order.cut("reset")
-        t, segment, lost, after = self._order.place(raw.seq, ticks, self._missing, raw.ticks is not None)
-        if self._unit.summary:
+        t, segment, lost, after = self._order.place(raw.seq, ticks, self._missing, self._clocked)
+        if self._unit.summary and self._trusted:
             modulus = f", its counter wraps at {self._order.modulus}" if self._order.modulus else ""
             self.stats.clock = self._unit.summary + modulus
         stats = self.stats
@@ -562,6 +640,16 @@ class Decoder:
         counted = self.header is not None and self.header.bits is not None
         at_limit = (self._polarity < 0) & (values <= 0)
         return frame._replace(polarity=self._polarity, saturated=at_limit if counted else None)
+
+    def _judge_clock(self, frames: Sequence[Frame], now: float) -> None:
+        """From the next frame on, take the time from the host if the device's clock cannot be trusted."""
+        if frames[0].segment != frames[-1].segment or frames[-1].after not in ("", "gap"):
+            self._watch.restart()
+        speed = (self.header and self.header.speed) or 1.0
+        if self._clocked and not self._watch.trust([frame.t for frame in frames], now, speed):
+            self._trusted = False
+            self._order.cut("reset")
+            self.stats.clock = "the device's clock cannot be trusted: the host's is used"
 
     def _compare(self, now: float, good: int, bad: int) -> None:
         """Compare the good frames received by ``now``, s, with the bad ones, over two seconds at a time."""

@@ -359,10 +359,6 @@ def detect_format(data: bytes, sensors: int | None, format: Format) -> DetectedF
 
 def detection_error(data: bytes, count_seen: int | None, sensors: int | None) -> InputError:
     """Return the error for data in which no format was detected."""
-    # The first piece may be half a line.
-    run = [line for piece in data.split(b"\n")[1:-1] if (line := _parse_numbers(piece))]
-    if _has_constant_time(run := [line for line in run if len(line.fields) > 2]):
-        return stopped_clock_error(len(run), run[0].fields[1])
     if count_seen is not None and sensors is not None:
         return SensorCountError(count_seen, sensors)
     text = data[:64].decode("ascii", "replace")
@@ -389,14 +385,6 @@ class SensorCountError(InputError):
         )
 
 
-def stopped_clock_error(frames: int, ticks: float) -> InputError:
-    """Return the error for frames whose clock does not move: no window would ever fill."""
-    return InputError(
-        f"the device's clock stands still: t_us was {ticks:.0f} in all of {frames} frames; let the firmware "
-        "send micros(), or lines of values alone"
-    )
-
-
 def _parse_numbers(line: bytes) -> Line | None:
     """Return a line if more than half of its fields are numbers; only such lines show a format."""
     try:
@@ -404,15 +392,6 @@ def _parse_numbers(line: bytes) -> Line | None:
     except FrameError:
         return None
     return read if 2 * sum(map(isfinite, read.fields)) > len(read.fields) else None
-
-
-def _has_constant_time(run: Sequence[Line]) -> bool:
-    """Return whether the first column counts while the next one, the time, is constant."""
-    run = [line for line in run if len(line.fields) > 2]
-    times = {line.fields[1] for line in run}
-    if len(run) < _LINES_UNKNOWN or len(times) > 1 or not all(map(isfinite, times)):
-        return False
-    return _all_count([Line([line.fields[0], place, 0], line.check) for place, line in enumerate(run)])
 
 
 def _detect_text(data: bytes, sensors: int | None, count_seen: int | None) -> DetectedFormat:
@@ -446,7 +425,7 @@ def _judge(run: Sequence[Line], sensors: int | None, learn: bool) -> TextFormat 
         return TextFormat(protocol_roles(count, False), check)
     if sensors is not None and count == sensors + 2 and counting:
         return TextFormat(protocol_roles(sensors, True), check)
-    if not learn or len(run) < _LINES_UNKNOWN or _has_constant_time(run):
+    if not learn or len(run) < _LINES_UNKNOWN:
         return None
     counting = _all_count(run)
     return TextFormat(protocol_roles(count - 2 * counting, counting), check)
@@ -460,5 +439,6 @@ def _all_count(run: Sequence[Line]) -> bool:
 def _counts(before: Sequence[float], line: Sequence[float]) -> bool:
     if len(line) < 3 or any(field < 0 or field % 1 for field in (before[0], line[0])):
         return False
-    later = line[1] > before[1] or line[1] < 2**31 < before[1]
+    # A clock of whole seconds, or one that stands still, is one too: the decoder judges it.
+    later = line[1] >= before[1] or line[1] < 2**31 < before[1]
     return later and 0 < frames_ahead(int(before[0]), int(line[0])) <= _STEP

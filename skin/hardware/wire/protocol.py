@@ -17,7 +17,7 @@ import struct
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import reduce
-from math import isfinite, nan
+from math import isclose, isfinite, nan
 from operator import xor
 from typing import Literal, NamedTuple
 
@@ -47,6 +47,9 @@ INVALID = frozenset(
 """Fields, in lower case, that firmware sends instead of a value that it could not read; also an empty one."""
 
 
+_MEASURED = 0.05  # part by which a rate that firmware measures may vary
+
+
 class Line(NamedTuple):
     """The numbers of a line, and the kind of its checksum.
 
@@ -72,6 +75,7 @@ class Header:
         unit: of the values: ``adc``, ``N``.
         bits: of the converter: the largest count is ``2**bits - 1``.
         id: name of the device.
+        speed: of the clock of a replay, relative to real time; None: 1.
     """
 
     proto: int = 1
@@ -80,6 +84,17 @@ class Header:
     unit: str | None = None
     bits: int | None = None
     id: str | None = None
+    speed: float | None = None
+
+    def changes(self, before: "Header") -> str:
+        """Return what differs from an earlier header, as ``unit=adc -> N``; a rate may be a measured one."""
+        words = []
+        for name, value in vars(self).items():
+            earlier = getattr(before, name)
+            measured = name == "rate" and None not in (value, earlier)
+            if not (isclose(value, earlier, rel_tol=_MEASURED) if measured else value == earlier):
+                words.append(f"{name}={earlier} -> {value}")
+        return ", ".join(words)
 
     def __str__(self) -> str:
         """Return what is known, as ``proto=1 n=25``."""
@@ -171,6 +186,7 @@ def parse_header(line: bytes) -> Header | None:
         words_by_name.get("unit"),
         _whole(words_by_name.get("bits")),
         words_by_name.get("id"),
+        _positive(words_by_name.get("speed")),
     )
 
 

@@ -22,7 +22,6 @@ from skin.errors import InputError
 from skin.hardware.wire.adapter import Adapter, read_adapter
 from skin.hardware.wire.channels import ChannelHealth, ChannelState, Limits
 from skin.hardware.wire.decoder import Decoder
-from skin.hardware.wire.formats import stopped_clock_error
 from skin.hardware.wire.protocol import Format
 
 _log = logging.getLogger("skin.hardware.wire")
@@ -266,7 +265,6 @@ def _existing() -> str:
 
 
 _AT_ONCE = 256  # frames, where time does not matter
-_STILL = 2.0, 10  # s and frames: a device's clock that is the same for as long stands still
 _WEAK = {
     "none": "no checksum: a wrong value passes in 29 % of flipped bits and 76 % of lost bytes",
     "xor": "a weak checksum (*HH): 2 % of double flipped bits and 6 % of double lost bytes pass",
@@ -364,14 +362,13 @@ class WireFeed:
         self._prompter = Prompter(self._decoder.adapter, self._stream)
         self._reported = Counter(self._decoder.stats.bad)
         self._reported_at = self._heard_at = monotonic()
-        self._clock, self._clock_since, self._clock_frames = -inf, 0.0, 0
         self._clock_told = ""
 
     def poll(self) -> list[Frame]:
         """Return the frames received since the last call.
 
         Raises:
-            InputError: no format is detected, or the device's clock stands still.
+            InputError: no format is detected, or another device is connected.
             OSError: the stream is closed, or silent for too long.
         """
         self._prompter.ask(monotonic())
@@ -386,12 +383,6 @@ class WireFeed:
             raise error
         if frames:
             self._prepare()
-            if frames[-1].t != self._clock:
-                self._clock, self._clock_since, self._clock_frames = frames[-1].t, now, 0
-            self._clock_frames += len(frames)
-            least, few = _STILL
-            if now - self._clock_since >= least and self._clock_frames >= few:
-                raise stopped_clock_error(self._clock_frames, self._clock * 1e6)
         stats = self._decoder.stats
         if now - self._reported_at >= 1:
             fresh, self._reported, self._reported_at = stats.bad - self._reported, Counter(stats.bad), now

@@ -12,8 +12,7 @@ from time import monotonic, sleep
 import pytest
 
 from skin.errors import InputError
-from skin.hardware.wire import reader
-from skin.hardware.wire.protocol import Header, encode_frame, encode_header, encode_line
+from skin.hardware.wire.protocol import encode_line
 from skin.hardware.wire.reader import SkinTimeout
 from skin.hardware.wire.skin import open_skin
 
@@ -176,43 +175,3 @@ def test_a_cable_that_is_cut_in_between(silence, reason):
     assert done.returncode == 0, done.stderr
     assert reason in done.stdout
     assert done.stdout.endswith("['reconnect', '', '', ''] 1\n")
-
-
-def still(encode, count, first=0):
-    return b"".join(encode([5, number % 7, 7, 8], number, 1234) for number in range(first, first + count))
-
-
-@pytest.mark.parametrize("told", [b"", encode_header(Header(n=4))])
-@pytest.mark.parametrize("layout", [LAYOUT, None])
-def test_a_text_clock_that_never_moves_is_said(plug, layout, told):
-    with open_skin(plug.port, layout) as skin:
-        plug.send(b"boot\n", told, still(encode_line, 200))
-        with pytest.raises(InputError, match=r"clock stands still: t_us was 1234 in all of \d+ frames; let"):
-            skin.read(1, timeout=PATIENT)
-
-
-@pytest.mark.parametrize("kind", ["text", "binary"])
-def test_a_clock_that_stops_is_said(plug, kind, monkeypatch):
-    monkeypatch.setattr(reader, "_STILL", (0.5, 10))
-    encode = {"text": encode_line, "binary": encode_frame}[kind]
-    with open_skin(plug.port, LAYOUT) as skin:
-        plug.send(*(encode([5, 6, 7, 8], number, 10 * number) for number in range(5)))
-        start, number = monotonic(), 5
-        while skin._error is None:
-            assert monotonic() - start < PATIENT
-            plug.send(still(encode, 1, number))
-            number += 1
-            sleep(0.02)
-        assert monotonic() - start >= 0.5
-        with pytest.raises(InputError, match="clock stands still: t_us was 1234 in all of"):
-            skin.read(number, timeout=PATIENT)
-
-
-def test_lines_of_one_moment_are_no_clock_that_stands_still(plug, monkeypatch):
-    monkeypatch.setattr(reader, "_STILL", (0.3, 10))
-    with open_skin(plug.port, LAYOUT) as skin:
-        plug.send(*(encode_line([5, 6, 7, 8], number, number) for number in range(20)))
-        for burst in range(1, 12):
-            plug.send(*(encode_line([5, 6, 7, 8], 20 * burst + n, 1000 * burst) for n in range(20)))
-            sleep(0.05)
-        assert len(skin.read(200, timeout=PATIENT)) == 200

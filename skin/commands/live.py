@@ -131,7 +131,7 @@ def show(config: Config, changes: Sequence[str], own_mechanics: bool = False) ->
     from skin.core.messages import quiet
     from skin.hardware.live.contacts import LiveContacts
     from skin.hardware.live.engine_builder import LiveSettings, watch_exported, watch_run
-    from skin.hardware.live.loop import Display, DisplayInfo, LiveLoop
+    from skin.hardware.live.loop import Display, DisplayInfo, LiveLoop, watch_age
     from skin.runs.exported_model import check_overrides
 
     live = LiveSettings.of(config.live)
@@ -151,7 +151,7 @@ def show(config: Config, changes: Sequence[str], own_mechanics: bool = False) ->
             def open_views(model: "TrainedModel", name: str) -> None:
                 span = model.window / model.rate
                 info = DisplayInfo(model.title, name, model.positions, model.size, live.top, span)
-                displays.append(Display(info, contacts))
+                displays.append(Display(info, contacts, live.patience.calm))
                 displays[0].set_verdict(None, "the threshold of the alarm is being chosen")
                 for text in _views(displays[0], config, live, opened):
                     say(text)
@@ -164,6 +164,7 @@ def show(config: Config, changes: Sequence[str], own_mechanics: bool = False) ->
             else:
                 watched = watch_run(config, live, say, changes, opened, contacts, open_views, own_mechanics)
             (display,) = displays
+            opened.enter_context(watch_age(display))
             if live.verdicts != "stdout":
                 from skin.hardware.live.terminal import show_in_terminal  # with torch
 

@@ -58,6 +58,9 @@ _LONGEST = 1.0  # s for which the baseline drifts at most between two updates
 _SINK = 1.0  # thresholds per second by which the baseline follows downwards
 _MARGIN = 0.5  # of the threshold, below the baseline, from which on it does so
 _NOISE = 5.0  # standard deviations that noise does not exceed
+_HIGH, _BEGUN = 2.0, 0.5  # thresholds: a reading in the middle of a touch, and at its beginning
+_FAINT = 0.1  # thresholds: least reading that shows a touch beside a sensor, if there is no noise
+_STEADY = 0.3  # of a reading: a touch that moves away from one sensor changes its neighbours by more
 _LIFT = 0.1
 """Share of the largest reading below which no sensor beside a touch falls: 0.044 is the most that the solid
 shows, with friction of 0.5."""
@@ -74,34 +77,56 @@ class ContactDetector:
     touch: the tare may have been taken under a load.
 
     A sensor that becomes invalid during a contact, or jumps below its rest, keeps its part in the contact
-    until it was valid and at rest for a second.
+    until it was valid and at rest for a second. After a restart of the device, which may have tared itself, a
+    sensor in contact keeps its part until it falls.
 
     Args:
         sensors: S.
         rate: of the readings, Hz.
         threshold: N.
         drift: N/s.
+        overlap: (S, S), bool: sensors that respond to a touch on another; None: none does.
 
     Attributes:
         baseline: (S,), N, above which readings rise.
         rest: (S,), N, readings of the untouched skin: the baseline, but for sensors that jumped below it.
         noise: (S,), N, standard deviation of a reading of the untouched skin.
         since: s, when the contact began; None without contact.
+        void: (S,), bool, sensors that read below the baseline, faster than it may drift: something touched
+            them when it was taken, or the device has changed it. They stay void until the next tare.
+        beyond: (S,), bool, sensors that became invalid while their reading was high.
+        lost: (S,), bool, sensors that fell to rest at once while all that overlap stayed as they were, until
+            they rise again.
     """
 
-    def __init__(self, sensors: int, rate: float, threshold: float, drift: float = DRIFT) -> None:
+    def __init__(
+        self,
+        sensors: int,
+        rate: float,
+        threshold: float,
+        drift: float = DRIFT,
+        overlap: np.ndarray | None = None,
+    ) -> None:
         self._rate, self._threshold, self._drift = rate, threshold, drift
         self._recent, self._long = (max(1, ceil(span * rate - 1e-9)) for span in (RELEASE, _DOUBT))
-        self._touched, self._doubtful = np.zeros(sensors, dtype=bool), np.zeros(sensors, dtype=bool)
+        self._overlap = np.zeros((sensors, sensors), dtype=bool) if overlap is None else overlap
+        self._touched, self._doubtful, self._held = (np.zeros(sensors, dtype=bool) for _ in range(3))
         self.noise = np.zeros(sensors)
-        self.reset()
+        self.reset(np.zeros(sensors, dtype=bool))
 
-    def reset(self) -> None:
-        """Reset after a new tare."""
-        self.baseline, self.rest = np.zeros(len(self._touched)), np.zeros(len(self._touched))
-        self._touched[:] = self._doubtful[:] = False
+    def reset(self, void: np.ndarray) -> None:
+        """Reset after a new tare, which is void for some sensors (S,)."""
+        self.baseline, self.rest = np.zeros(len(void)), np.zeros(len(void))
+        self._touched[:] = self._doubtful[:] = self._held[:] = False
+        self.void, self.beyond, self.lost = void.copy(), void & False, void & False
+        self._top, self._levels, self._peak = np.full(len(void), -np.inf), np.full(len(void), np.inf), 0.0
         self.since: float | None = None
         self._updated_at: float | None = None
+
+    def restart(self) -> None:
+        """Take note that the device was restarted."""
+        self._held = self._touched.copy()
+        self._top[:] = -np.inf
 
     def rises(self, readings: np.ndarray, valid: np.ndarray) -> np.ndarray:
         """Return which readings (T, S), N, rise by the threshold above the baseline, (T, S), bool."""
@@ -115,8 +140,12 @@ class ContactDetector:
         The wire is broken, the values fall with force, or the tare was taken under a load.
         """
         rise = np.where(valid, readings - self.rest, 0.0)
-        least = np.maximum(self._threshold, _NOISE * self.noise)
-        return np.asarray(rise < -(least + _LIFT * rise.max(axis=-1, keepdims=True)))
+        return np.asarray(rise < -(self._least + _LIFT * rise.max(axis=-1, keepdims=True)))
+
+    @property
+    def _least(self) -> np.ndarray:
+        """(S,), N, that a reading falls below its rest where neither noise nor drift explains it."""
+        return np.maximum(self._threshold, _NOISE * self.noise)
 
     def update(self, readings: np.ndarray, valid: np.ndarray, t: float) -> bool:
         """Update with the window that ends now; return whether something touches the skin.
@@ -130,11 +159,13 @@ class ContactDetector:
         sound = valid & ~self.falls(readings, valid)
         rested, rested_long = ((sound & ~risen)[-span:].all(axis=0) for span in (self._recent, self._long))
         self._doubtful |= self._touched & ~sound[-1]
-        released = np.where(self._doubtful, rested_long, rested)
-        self._touched = risen[recent].any(axis=0) | (self._touched & ~released)
+        released = np.where(self._doubtful, rested_long, rested) | self._fall(readings, valid)
+        self._touched = risen[recent].any(axis=0) | (self._touched & ~released) | self._held
+        self._touched |= self._find_faults(readings, valid, risen[-1])
         self._doubtful &= self._touched
         if self._touched.any():
             if self.since is None:
+                self._peak = 0.0
                 idle = np.flatnonzero(~risen.any(axis=1))
                 before = int(idle[-1]) if len(idle) else -1
                 self.since = t - (len(risen) - 2 - before) / self._rate
@@ -144,6 +175,43 @@ class ContactDetector:
         self._follow(readings[recent], valid[recent], sound[recent].all(axis=0), passed)
         self._updated_at = t
         return self.since is not None
+
+    def _fall(self, readings: np.ndarray, valid: np.ndarray) -> np.ndarray:
+        """Return which sensors, held since a restart, have fallen, (S,); find void baselines."""
+        recent = slice(-self._recent, None)
+        rises = np.where(valid, readings - self.rest, np.inf)[recent].max(axis=0)
+        self._top = np.where(valid[-1], np.maximum(self._top, readings[-1] - self.rest), self._top)
+        fallen = self._held & (rises <= self._top - self._threshold)
+        self._held &= ~fallen
+        # The skin may sink below its rest for a while after a touch.
+        self.void |= rises < -(self._least + _LIFT * self._peak)
+        self._peak = max(self._peak, float(np.where(valid[-1], readings[-1] - self.rest, 0.0).max()))
+        return fallen
+
+    def _find_faults(self, readings: np.ndarray, valid: np.ndarray, risen: np.ndarray) -> np.ndarray:
+        """Find sensors whose range ends, or whose wire breaks, while something presses them.
+
+        Args:
+            readings, valid: (T, S), the latest of a window of two or more.
+            risen: (S,), bool, of the latest readings.
+
+        Returns:
+            (S,), bool, such sensors that something still presses.
+        """
+        self.lost &= ~risen
+        before, now = np.where(valid, readings - self.rest, np.nan)[-2:]
+        self.beyond = ~valid[-1] & (self.beyond | self._touched | (before >= _BEGUN * self._threshold))
+        change, visible = np.abs(now - before), np.maximum(_NOISE * self.noise, _FAINT * self._threshold)
+        steady = change <= _STEADY * np.maximum(before, visible)
+        pressed = self._overlap & (steady & (before >= visible))
+        moved = self._overlap & ~(steady | (change < visible))
+        fell = (before >= _HIGH * self._threshold) & (np.abs(now) < self._threshold)
+        fell &= pressed.any(axis=1) & ~moved.any(axis=1) & ~self.lost
+        if fell.any():
+            self.lost |= fell
+            self._levels = before
+        stay = now >= np.maximum(self._levels / 2, visible)
+        return self.beyond | self.lost & (self._overlap & stay).any(axis=1)
 
     def _follow(self, readings: np.ndarray, valid: np.ndarray, sound: np.ndarray, passed: float) -> None:
         """Move baseline and rest towards the latest readings, as far as ``passed`` s allow.

@@ -100,6 +100,6 @@ def test_a_sensor_that_fails_in_a_contact_does_not_end_it():
 def test_a_new_tare_ends_a_contact():
     contact = ContactDetector(3, RATE, THRESHOLD)
     follow(contact, on((0, 40), (1.0, 50)))
-    contact.reset()
+    contact.reset(np.zeros(3, dtype=bool))
     assert contact.since is None
     assert not any(follow(contact, on((0, 40))))

@@ -22,7 +22,7 @@ import numpy as np
 
 from skin.device.resampling import Frame
 from skin.errors import InputError
-from skin.hardware.live.engine import Verdict
+from skin.hardware.live.verdict import Verdict
 from skin.hardware.wire.channels import UnitConversion
 
 if TYPE_CHECKING:

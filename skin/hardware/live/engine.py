@@ -1,5 +1,6 @@
 """Classify a stream of frames, without input or output: verdicts, their debouncing, and the engine."""
 
+from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields
 from math import ceil, floor, inf
@@ -19,92 +20,9 @@ from skin.evaluation.decisions import (
     held_frames,
     longest_shown,
 )
-from skin.hardware.wire.channels import EXPECTED, FROZEN, UnitConversion
-from skin.touch.labels import OPPOSITE, RELEASE, Task
-
-State = Literal["touch", "no touch", "unknown"]
-_NAMED = 3  # sensors
-
-
-def sensor_list(sensors: Sequence[int]) -> str:
-    """Return the numbers of sensors in words."""
-    omitted = f" and {len(sensors) - _NAMED} more" if len(sensors) > _NAMED else ""
-    numbers = ", ".join(map(str, sensors[:_NAMED]))
-    return f"sensor{'s' * (len(sensors) > 1)} {numbers}{omitted}"
-
-
-@dataclass(frozen=True)
-class Verdict:
-    """Classification of a window.
-
-    Attributes:
-        t: s, the device's clock at the latest frame.
-        t_host: s, the host's clock at that frame.
-        chances: label -> its probability in this window; of ``dangerous`` the largest since the alarm was
-            raised, while it lasts.
-        touched: debounced; if False, nothing touches the skin and the labels are meaningless.
-        labels: label -> debounced prediction; empty without touch.
-        dangerous: the alarm, which lasts until the contact ends.
-        gap: whether frames are missing in the window.
-        masked: sensors without a valid reading.
-        contact: duration of the contact, s; None without contact.
-        unknown: sensors at which a dangerous touch could not be felt, because no valid sensor would respond.
-        below: sensors that read below their rest: their wire is broken, their values fall with force, or the
-            tare was taken under a load.
-        pause: s without a frame before the latest one; 0 if it was too short to hide a tap.
-        agreeing: label -> its probability in the latest window that agreed with the debounced label; where it
-            is missing, that of this window.
-    """
-
-    t: float
-    t_host: float
-    chances: dict[str, float]
-    touched: bool
-    labels: dict[str, bool]
-    dangerous: bool
-    gap: bool
-    masked: tuple[int, ...] = ()
-    contact: float | None = None
-    unknown: tuple[int, ...] = ()
-    below: tuple[int, ...] = ()
-    pause: float = 0.0
-    agreeing: dict[str, float] = field(default_factory=dict)
-
-    @property
-    def state(self) -> State:
-        """``touch``; ``unknown``, where a dangerous touch on a sensor could not be felt; or ``no touch``."""
-        touching = self.touched or self.contact is not None
-        return "touch" if touching else "unknown" if self.unknown else "no touch"
-
-    @property
-    def reason(self) -> str:
-        """Where the state is unknown and why, in words; empty where it is known everywhere."""
-        if not self.unknown:
-            return ""
-        if self.pause:
-            return f"unknown: no frame for {self.pause:.2f} s, in which a touch may have come and gone"
-        text = f"unknown near {sensor_list(self.unknown)}"
-        if self.below:
-            return f"{text}, below rest: a broken wire, device.scale of the wrong sign, or a tare under load"
-        return f"{text}, without a valid reading"
-
-    @property
-    def known(self) -> dict[str, bool | None]:
-        """The labels; ``dangerous`` is None where a sensor without reading may hide a dangerous touch."""
-        return self.labels | (
-            {"dangerous": None} if self.unknown and not self.labels.get("dangerous", True) else {}
-        )
-
-    def words(self) -> list[tuple[str, float]]:
-        """Return the predicted classes, each with its probability; empty without touch."""
-        chances = self.chances | self.agreeing
-        pairs = [
-            (OPPOSITE.get(name, ""), 1 - chances[name])
-            if yes is False
-            else (name if yes else f"{name}?", chances[name])
-            for name, yes in self.known.items()
-        ]
-        return [(word, chance) for word, chance in pairs if word]
+from skin.hardware.live.verdict import LASTING, Note, Verdict, order_notes
+from skin.hardware.wire.channels import EXPECTED, FROZEN, UnitConversion, fails_in_contact
+from skin.touch.labels import RELEASE, Task
 
 
 @checked("live.patience")
@@ -161,6 +79,8 @@ class Debounce:
 Classify = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """Readings (B, T, S), float32, N, and valid (B, T, S), bool, of windows -> probabilities (B, L)."""
 
+_OVERLAP = 0.02  # of the reading of a pressed sensor: another that reads more shows the touch, too
+_DISTINCT = 10  # different frames of a block that is repeated
 _GAP = 0.5  # s without a frame after which the history of the window is lost
 _CHANGING = 0.3  # share of changes at the tare from which a channel must change within FROZEN
 _ROUNDING = 1e-6  # s
@@ -218,8 +138,7 @@ class _Decision(NamedTuple):
         gap: frames are missing in the window.
         masked: sensors without a valid reading now.
         unknown: sensors at which a dangerous touch could not be felt.
-        below: sensors that read below their rest.
-        pause: s without a frame before the latest; 0 if it was short.
+        notes: on what may be wrong.
         last: the stream is interrupted behind it.
     """
 
@@ -233,8 +152,7 @@ class _Decision(NamedTuple):
     gap: bool
     masked: tuple[int, ...]
     unknown: tuple[int, ...]
-    below: tuple[int, ...]
-    pause: float
+    notes: tuple[Note, ...]
     last: bool
 
 
@@ -278,12 +196,15 @@ class Engine:
         self.task = task
         self._classify, self._detection = classify, detection
         self._patience = patience or DebounceSettings()
-        self._contact = ContactDetector(sensors, rate, detection.threshold, detection.drift)
+        overlap = None if presses is None else presses >= _OVERLAP * np.diagonal(presses)[:, None]
+        if overlap is not None:
+            np.fill_diagonal(overlap, False)
+        self._contact = ContactDetector(sensors, rate, detection.threshold, detection.drift, overlap)
         self._held = held_frames(detection.longest, rate, frames)
         self._shown = longest_shown(self._held, ceil(RELEASE * rate - 1e-9), frames)
         self._above = 0.5 if self._patience.above is None else self._patience.above
         self._responds = np.eye(sensors, dtype=bool) if presses is None else presses >= detection.threshold
-        self._clock, self._freshness = StreamClock(), _Freshness(sensors)
+        self._clock, self._freshness, self._losses = StreamClock(), _Freshness(sensors), _Losses()
         self._latest: tuple[Frame, float, float] | None = None  # with its time, and that since the one before
         self._tick = -1
         self._decided = True
@@ -300,13 +221,23 @@ class Engine:
         return self._contact.baseline
 
     @property
-    def frozen(self) -> bool:
-        """Whether no reading has changed for so long that the device cannot be working."""
+    def frozen(self) -> "Frozen":
+        """Why the device cannot be working; empty if it may be."""
         return self._freshness.frozen
 
-    def reset(self) -> None:
-        """Reset alarm and contact, after a tare of the untouched skin."""
-        self._contact.reset()
+    def reset(self, raised: np.ndarray | None = None) -> None:
+        """Reset alarm and contact, after a tare of the untouched skin.
+
+        Args:
+            raised: (S,), N, baseline of the tare above the rest that is stored for the device: something may
+                have touched it. None: no rest is stored.
+        """
+        void = (
+            np.zeros(self.window.sensors, dtype=bool)
+            if raised is None
+            else raised >= self._detection.threshold
+        )
+        self._contact.reset(void)
         shape = self.window.frames, self.window.sensors
         self._idle = np.zeros(shape, dtype=np.float32), np.ones(shape, dtype=bool)
         self.alarm, self._peak_probability = False, 0.0
@@ -314,7 +245,7 @@ class Engine:
         self._touch = Debounce(*slow)
         self._labels = {name: Debounce(*slow) for name in self.task.gated}
         self._labels |= {"dangerous": Debounce(self._patience.alarm, self._patience.calm)}
-        self._agreeing = dict[str, float]()
+        self._agreeing, self._doubts = dict[str, float](), dict[str, Note]()
 
     def push(self, frames: Sequence[Frame], conversion: UnitConversion | None) -> list[Verdict]:
         """Return the verdicts that are due with these frames, the latest one last.
@@ -339,9 +270,12 @@ class Engine:
             # What came last before the interruption would be forgotten undecided.
             due += self._decide(conversion, last=True)
             self.window.clear()
+            if frame.after in ("reset", "reconnect"):
+                self._contact.restart()
         self._latest, self._decided = (frame, time, pause), False
         self.window.add(frame._replace(t=time, segment=0))
         self._freshness.add(frame, time, conversion)
+        self._losses.add(frame.lost + (not frame.valid.all()), time, self.contact)
         tick = floor((time + _ROUNDING) * DECISIONS)
         if tick != self._tick:
             self._tick = tick
@@ -371,7 +305,7 @@ class Engine:
         contact = self._contact.update(readings, valid, time)
         risen = bool(self._contact.rises(readings, valid).any())
         # To the model a sensor below its rest is as one without a reading.
-        valid = valid & ~below
+        valid = valid & ~below & ~self._contact.lost
         readings = np.where(valid, readings, 0.0).astype(np.float32)
         # Unknown history counts as the rest of the sensors that are valid now.
         readings[: seen.before] = self._contact.baseline
@@ -379,7 +313,9 @@ class Engine:
         if not contact and not risen:
             self._idle = readings, valid
         lasted = None if self._contact.since is None else time - self._contact.since
-        unknown = ~self._responds[:, valid[-1]].any(axis=1) | (pause > 0)
+        responding = self._responds[:, valid[-1] & ~self._contact.void]
+        unknown = np.asarray(~responding.any(axis=1) | (pause > 0))
+        notes = self._find_notes(unknown, below[-1], pause)
         readings, presented = self._cut_window(readings, valid, lasted or 0.0)
         return [
             _Decision(
@@ -393,11 +329,24 @@ class Engine:
                 gap=seen.gap,
                 masked=_numbers(~valid[-1]),
                 unknown=_numbers(unknown),
-                below=_numbers(below[-1]),
-                pause=pause,
+                notes=notes,
                 last=last,
             )
         ]
+
+    def _find_notes(self, unknown: np.ndarray, below: np.ndarray, pause: float) -> tuple[Note, ...]:
+        """Return the notes on a decision.
+
+        Args:
+            unknown, below: (S,), bool, sensors at which a touch could not be felt, and that are below rest.
+            pause: s without a frame before the latest; 0 if it was short.
+        """
+        void, beyond, lost = self._contact.void, self._contact.beyond, self._contact.lost
+        masked = unknown & ~(void | below | beyond | lost | (pause > 0))
+        sensors = {"below": below, "void": void, "over_range": beyond, "lost_wire": lost, "masked": masked}
+        notes = [Note(code, _numbers(which)) for code, which in sensors.items() if which.any()]
+        notes += [Note("unreadable")] * self._losses.excessive + [Note("pause", seconds=pause)] * (pause > 0)
+        return tuple(notes)
 
     def _cut_window(
         self, readings: np.ndarray, valid: np.ndarray, lasted: float
@@ -425,8 +374,13 @@ class Engine:
         period = max(self.window.period, 1 / DECISIONS)
         self._update_alarm(decision, chances, learned, period)
         touched = self._debounce_touch(decision, learned, period)
+        notes = self._doubts | {note.code: note for note in decision.notes}
+        # What makes a touch doubtful holds until it ends.
+        self._doubts = {code: note for code, note in notes.items() if code in LASTING and touched}
+        if 0.5 < chances.get("dangerous", 0.0) <= self._above and touched:
+            notes["near_threshold"] = Note("near_threshold")
         labels = self._debounce_labels(decision, chances, period)
-        return self._pack(decision, chances, touched, labels)
+        return self._pack(decision._replace(notes=order_notes(notes.values())), chances, touched, labels)
 
     def _update_alarm(
         self, decision: _Decision, chances: dict[str, float], learned: bool, period: float
@@ -483,8 +437,7 @@ class Engine:
             masked=decision.masked,
             contact=decision.lasted,
             unknown=decision.unknown,
-            below=decision.below,
-            pause=decision.pause,
+            notes=decision.notes,
             agreeing=dict(self._agreeing),
         )
 
@@ -494,18 +447,53 @@ def _numbers(which: np.ndarray | np.bool) -> tuple[int, ...]:
     return tuple(np.flatnonzero(which).tolist())
 
 
+class _Losses:
+    """Compares the frames lost in a contact, or without a value of some sensor, with those lost at rest.
+
+    Attributes:
+        excessive: since half a second before the present contact, so many frames were lost or unreadable that
+            it is no accident: values beyond the range may make them unreadable.
+    """
+
+    def __init__(self) -> None:
+        self.excessive = False
+        self._recent = deque[tuple[float, int]]()
+        self._rest, self._touched = np.zeros((2, 2), dtype=int)  # frames, and those that were lost
+
+    def add(self, lost: int, time: float, contact: bool) -> None:
+        """Add a frame, with which ``lost`` frames were lost."""
+        self._recent.append((time, lost))
+        if not contact:
+            self._touched[:] = 0.0
+        while time - self._recent[0][0] > _GAP:
+            earlier = self._recent.popleft()[1]
+            (self._touched if contact else self._rest)[:] += 1, earlier
+        if not contact:
+            self.excessive = False
+        elif lost:
+            failed = self._touched[1] + sum(before for _, before in self._recent)
+            frames = self._touched[0] + len(self._recent) + failed
+            self.excessive |= fails_in_contact(failed, frames, self._rest[1], self._rest.sum())
+
+
+Frozen = Literal["", "still", "repeated"]
+"""Why readings count as frozen: they do not; none has changed; a block of frames is sent again and again."""
+
+
 class _Freshness:
     """Finds readings that do not change, though they did while the baseline was taken.
 
     Attributes:
-        frozen: none of the readings has changed for :data:`FROZEN` s.
+        frozen: none of the readings has changed for :data:`FROZEN` s, or frames repeat those before.
         stuck: (S,), bool, sensors whose readings have not changed for so long, unless they are at a limit.
     """
 
     def __init__(self, sensors: int) -> None:
-        self.frozen, self.stuck = False, np.zeros(sensors, dtype=bool)
+        self.frozen: Frozen = ""
+        self.stuck = np.zeros(sensors, dtype=bool)
         self._values: np.ndarray | None = None
         self._changed_at, self._unchanged, self._time, self._clock = np.zeros(sensors), 0, 0.0, 0.0
+        self._rows, self._equal = np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
 
     def add(self, frame: Frame, time: float, conversion: UnitConversion | None) -> None:
         """Compare a frame with the one before; nothing is known of a time without frames."""
@@ -517,11 +505,29 @@ class _Freshness:
         self._changed_at[changed] = self._clock
         self._unchanged = 0 if changed.any() else self._unchanged + 1
         self._values = frame.values
-        changing = None if conversion is None else conversion.changing
-        if changing is None:
+        if conversion is None or conversion.changing is None:
             return
         silent = self._clock - self._changed_at >= FROZEN - _ROUNDING
         limited = np.zeros_like(silent) if frame.saturated is None else frame.saturated
-        self.stuck = silent & (changing >= _CHANGING) & ~limited
+        self.stuck = silent & (conversion.changing >= _CHANGING) & ~limited
         # Noise alone would have changed some reading so many times.
-        self.frozen = bool(silent.all() and self._unchanged * changing.sum() >= EXPECTED)
+        still = silent.all() and self._unchanged * conversion.changing.sum() >= EXPECTED
+        self.frozen = "still" if still else "repeated" if self._repeats(frame, conversion.equal) else ""
+
+    def _repeats(self, frame: Frame, equal: np.ndarray) -> bool:
+        """Return whether the latest frames are, one after the other, those before them.
+
+        Args:
+            frame: the latest.
+            equal: (L,), probability that a frame at rest equals that 1, 2, ... frames before.
+        """
+        if len(equal) != len(self._rows):
+            self._rows, self._equal = (np.zeros(len(equal), dtype=np.int64) for _ in range(2))
+        row = hash(frame.values.tobytes())
+        self._equal = np.where(self._rows == row, self._equal + 1, 0)
+        self._rows = np.concatenate([[row], self._rows[:-1]])
+        likely = -self._equal * np.log(equal) < EXPECTED
+        if likely.all():
+            return False
+        # Sensors at their limit, all but one, may repeat a few values.
+        return len(np.unique(self._rows[: self._equal[~likely].max()])) >= _DISTINCT

@@ -18,7 +18,8 @@ from skin.device.resampling import Frame
 from skin.errors import InputError
 from skin.evaluation.decisions import DRIFT
 from skin.hardware.live.contacts import LiveContacts, Mechanics
-from skin.hardware.live.engine import DebounceSettings, Detection, EngineSettings, sensor_list
+from skin.hardware.live.engine import DebounceSettings, Detection, EngineSettings
+from skin.hardware.live.verdict import sensor_list
 from skin.hardware.wire.channels import RawRange, UnitConversion, unit_conversion
 from skin.hardware.wire.reader import PortSettings, SkinDisconnected, SkinTimeout
 from skin.hardware.wire.skin import SerialSource, Skin, Source

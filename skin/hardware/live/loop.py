@@ -2,10 +2,11 @@
 
 import logging
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from math import inf
-from threading import Event, Lock
+from threading import Event, Lock, Thread
 from time import monotonic
 from typing import Any, Literal
 
@@ -14,7 +15,8 @@ import numpy as np
 from skin.device.resampling import Frame
 from skin.errors import InputError
 from skin.hardware.live.contacts import LiveContacts, unknown_contacts
-from skin.hardware.live.engine import Engine, Verdict, sensor_list
+from skin.hardware.live.engine import Engine, Frozen
+from skin.hardware.live.verdict import Note, Verdict, order_notes, sensor_list, summarize_notes
 from skin.hardware.wire.channels import Tare, UnitConversion
 from skin.hardware.wire.reader import SkinDisconnected, SkinTimeout
 from skin.hardware.wire.skin import Skin
@@ -29,8 +31,22 @@ TareRequest = Literal["", "tare", "forced"]
 
 _KEPT = 8192  # frames that are kept for slow views
 _ONSET = 10  # frames of a touch before its contact is decided
+_AGE = 0.5  # s after which a decision is old where the next is not overdue
+_TOGETHER = 0.02  # s: decisions of one delivery
+_USUAL = 5.0  # s over which the usual interval between decisions is taken
+_OFTEN = 0.1  # s between two looks at the age of a verdict
 _CONFIRM = 60.0  # s after a refusal in which a tare may be forced
 REFUSED = "tare refused: something touches the skin; if nothing does, confirm it (terminal: force and Enter)"
+
+
+STALE = 1.5
+"""s without frames after which nothing is known of the skin."""
+OLD_READINGS = f"the latest readings are over {STALE:g} s old"
+LATE = "no decision for longer than usual"
+FROZEN_READINGS: dict[Frozen, str] = {
+    "still": "readings are frozen: no channel has changed for 5 s",
+    "repeated": "readings are frozen: the same frames come again and again",
+}
 
 
 @dataclass(frozen=True)
@@ -70,6 +86,7 @@ class DisplayState:
         line: text with rate, lost frames and latency.
         peak: (S,), N, the largest of each sensor in the touch that the verdict is about; 0 without touch.
         contacts: what is known of them, as in :func:`skin.hardware.live.contacts.contact_message`.
+        notes: on what may be wrong, the gravest first.
     """
 
     number: int
@@ -82,6 +99,12 @@ class DisplayState:
     alarm: bool
     peak: np.ndarray
     contacts: dict[str, Any]
+    notes: tuple[Note, ...]
+
+    @property
+    def reason(self) -> str:
+        """The gravest note in words, and the number of the others."""
+        return summarize_notes(self.notes)
 
     @property
     def held(self) -> bool:
@@ -98,19 +121,30 @@ class DisplayState:
 class Display:
     """The latest frames, verdict and status, shared by one writing thread and any number of views.
 
+    A verdict that is older than half a second and the usual interval between decisions, or than
+    :data:`STALE`, counts as none, whatever the reason. An alarm is shown for ``calm`` s at least, even if it
+    was raised for frames that came late.
+
+    Args:
+        info: constant information.
+        contacts: tells what is known of them.
+        calm: s.
+
     Attributes:
         info: as given.
+        notes: on the whole session.
         contacts: the latest estimate of them.
         closed: event, set at the end.
         observers: called with each verdict, in the thread that classifies.
         listeners: called with the name of each event of the operator, such as ``tare``.
     """
 
-    def __init__(self, info: DisplayInfo, contacts: LiveContacts | None = None) -> None:
+    def __init__(self, info: DisplayInfo, contacts: LiveContacts | None = None, calm: float = 2.0) -> None:
         self.info, self.closed, self.contacts = info, Event(), contacts or LiveContacts()
+        self.notes: tuple[Note, ...] = ()
         self.observers: list[Observer] = []
         self.listeners: list[Callable[[str], None]] = []
-        self._lock = Lock()
+        self._lock, self._telling = Lock(), Lock()
         sensors = len(info.positions)
         first = np.zeros(sensors), np.zeros(sensors, dtype=bool)
         self._frames: deque[tuple[np.ndarray, np.ndarray]] = deque([first], maxlen=_KEPT)
@@ -118,6 +152,8 @@ class Display:
         self._peak, self._contact = np.zeros(sensors), False
         self._number = 0
         self._verdict: Verdict | None = None
+        self._calm, self._alarm_at, self._decided = calm, -inf, deque([-inf])
+        self._told: tuple[Verdict | None, str, bool] | None = None
         self._trouble, self._line, self._note = "waiting for the first frame", "", ""
         self._request: TareRequest = ""
         self._noted_at = -np.inf
@@ -132,11 +168,29 @@ class Display:
             self._valid = valid
             self._peak = np.maximum(self._peak, np.where(valid, values, 0.0))
 
-    def set_verdict(self, verdict: Verdict | None, trouble: str = "", alarm: bool = False) -> None:
-        """Set the verdict; or None with the reason and whether an alarm continues."""
+    def set_verdict(
+        self, verdict: Verdict | None, trouble: str = "", alarm: bool = False, now: float | None = None
+    ) -> None:
+        """Set the verdict; or None with the reason and whether an alarm continues.
+
+        Args:
+            verdict: made at ``now``.
+            trouble: why there is none.
+            alarm: whether one continues without a verdict.
+            now: s, the host's monotonic clock; None: that of the call.
+        """
+        now = monotonic() if now is None else now
         with self._lock:
             self._verdict, self._trouble = verdict, trouble
-            self._alarm = alarm if verdict is None else verdict.dangerous
+            if verdict is not None:
+                if now - self._decided[-1] < _TOGETHER:
+                    self._decided.pop()
+                self._decided.append(now)
+                while now - self._decided[0] > _USUAL:
+                    self._decided.popleft()
+            alarm = alarm if verdict is None else verdict.dangerous
+            self._alarm_at = now if alarm and not self._alarm else self._alarm_at
+            self._alarm = alarm
             contact = verdict is not None and verdict.contact is not None
             touched = contact or (verdict is not None and verdict.touched)
             if not self._alarm and (not touched or (contact and not self._contact)):
@@ -144,8 +198,36 @@ class Display:
                 recent = [values for values, _ in list(self._frames)[-_ONSET:]]
                 self._peak = np.max(recent, axis=0) if contact else np.zeros_like(self._peak)
             self._contact = contact
-        for observer in self.observers:
-            observer(verdict, trouble, alarm)
+        self._tell(now)
+
+    def refresh(self, now: float) -> None:
+        """Tell the observers if the latest verdict has become too old, or a late alarm ends."""
+        with self._lock:
+            changed = self._current(now) != self._told
+        if changed:
+            self._tell(now)
+
+    def _tell(self, now: float) -> None:
+        with self._telling:
+            with self._lock:
+                self._told = self._current(now)
+            for observer in self.observers:
+                observer(*self._told)
+
+    def _current(self, now: float) -> tuple[Verdict | None, str, bool]:
+        """Return the verdict, why there is none, and the alarm, as they are shown at ``now``, s."""
+        alarm = self._alarm or now - self._alarm_at < self._calm
+        # A single pause is not usual.
+        gaps = sorted(np.diff(self._decided))
+        usual = gaps[-2] if len(gaps) > 2 else 0.0
+        if self._verdict is None or now - self._decided[-1] > min(_AGE + usual, STALE):
+            return None, self._trouble or LATE, alarm
+        return self._verdict.in_alarm if alarm and not self._verdict.dangerous else self._verdict, "", alarm
+
+    def add_note(self, note: Note) -> None:
+        """Add a note on the whole session."""
+        with self._lock:
+            self.notes = (*(other for other in self.notes if other.code != note.code), note)
 
     def set_status(self, line: str) -> None:
         """Set the text with rate, lost frames and latency."""
@@ -181,30 +263,51 @@ class Display:
             request, self._request = self._request, ""
         return request
 
-    def state(self, since: int = 0) -> DisplayState:
-        """Return the state, with the largest values after the first ``since`` frames."""
+    def state(self, since: int = 0, now: float | None = None) -> DisplayState:
+        """Return the state at ``now``, s, with the largest values after the first ``since`` frames."""
+        now = monotonic() if now is None else now
         with self._lock:
             fresh = min(max(1, self._number - since), len(self._frames))
             latest = [self._frames[-1 - back] for back in range(fresh)]
-            note = self._note if monotonic() - self._noted_at <= _CONFIRM else ""
+            note = self._note if now - self._noted_at <= _CONFIRM else ""
             line = ", ".join(text for text in (note, self._line) if text)
-            state = self._verdict, self._trouble, line, self._alarm, self._peak
-            number, valid = self._number, self._valid
-        contacts = unknown_contacts(state[1]) if state[0] is None else self.contacts.state()
+            verdict, trouble, alarm = self._current(now)
+            peak, number, valid = self._peak, self._number, self._valid
+        contacts = unknown_contacts(trouble) if verdict is None else self.contacts.state()
         values, saturated = (np.max(part, axis=0) for part in zip(*latest, strict=True))
-        return DisplayState(number, np.where(valid, values, 0.0), valid, saturated & valid, *state, contacts)
+        readings = np.where(valid, values, 0.0), valid, saturated & valid
+        notes = self.list_notes(verdict, trouble)
+        return DisplayState(number, *readings, verdict, trouble, line, alarm, peak, contacts, notes)
+
+    def list_notes(self, verdict: Verdict | None, trouble: str) -> tuple[Note, ...]:
+        """Return the notes on a verdict, or on its absence, and on the session, the gravest first."""
+        present = (Note("stale", detail=trouble),) if verdict is None else verdict.notes
+        return order_notes((*present, *self.notes))
 
 
-STALE = 1.5
-"""s without frames after which nothing is known of the skin."""
-OLD_READINGS = f"the latest readings are over {STALE:g} s old"
-FROZEN_READINGS = "readings are frozen: no channel has changed for 5 s"
 _PATIENCE = 0.3  # s for which one read waits
 _PROVED = 10.0  # s after the self-test in which sensors may prove dead
 _AT_ONCE = 1024  # frames
 _STATUS = 0.5  # s between two updates of the status
 _ENOUGH = 10  # frames for each one of the model: with n, a tap of one frame reads 1/n too low at worst
 _DELAYS = 2000  # verdicts for the percentile of the delay
+
+
+@contextmanager
+def watch_age(display: Display) -> Iterator[None]:
+    """Tell the observers of a display while the block runs when its verdict becomes too old."""
+
+    def watch() -> None:
+        while not display.closed.wait(_OFTEN):
+            display.refresh(monotonic())
+
+    thread = Thread(target=watch, name="skin-age", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        display.closed.set()
+        thread.join()
 
 
 class LiveLoop:
@@ -259,10 +362,16 @@ class LiveLoop:
             except SkinDisconnected:
                 return
             else:
-                self._take(frames + self._waiting())
-            if (now := monotonic()) - self._updated_at >= _STATUS:
-                self._updated_at = now
-                self._display.set_status(self.line)
+                self.take(frames + self._waiting(), monotonic())
+            self.update_status(monotonic())
+
+    def update_status(self, now: float) -> None:
+        """Show the state of the stream, if it was not shown within half a second before ``now``, s."""
+        if now - self._updated_at >= _STATUS:
+            self._updated_at = now
+            self._display.set_status(self.line)
+            if not self._skin.stats.clock_trusted:
+                self._display.add_note(Note("clock", detail=self._skin.stats.clock))
 
     def _wait(self, reason: str) -> None:
         """Show why no frames come, once they are overdue: those of a bridge come in bursts."""
@@ -276,8 +385,9 @@ class LiveLoop:
         except (SkinTimeout, SkinDisconnected) as few:
             return few.frames
 
-    def _take(self, frames: list[Frame]) -> None:
-        self._heard_at = monotonic()
+    def take(self, frames: list[Frame], now: float) -> None:
+        """Take frames that have arrived at ``now``, s, and show what follows from them."""
+        self._heard_at = now
         if request := self._display.take_tare():
             self._tare.restart(force=request == "forced")
         taken = self._tare.count
@@ -286,35 +396,36 @@ class LiveLoop:
         conversion = self._tare.conversion
         if conversion is None:
             self._engine.push(frames, None)
-            self._display.set_verdict(None, self._tare.status, self._engine.alarm)
+            self._display.set_verdict(None, self._tare.status, self._engine.alarm, now)
             return
         if self._tare.count > taken:
             self._engine.reset()
-        self._test(conversion)
+        self._test(conversion, now)
         for frame in frames:
             self._display.add_frame(frame, conversion)
         verdicts = self._engine.push(frames, conversion)
         if self._engine.frozen:
-            self._display.set_verdict(None, FROZEN_READINGS, self._engine.alarm)
+            reason = FROZEN_READINGS[self._engine.frozen]
+            self._display.set_verdict(None, reason, self._engine.alarm, now)
             return
         for verdict in verdicts:
             self.verdicts += 1
-            if monotonic() - verdict.t_host < STALE:
-                self._display.set_verdict(verdict)
+            if now - verdict.t_host < STALE:
+                self._display.set_verdict(verdict, now=now)
             else:
-                self._display.set_verdict(None, OLD_READINGS, verdict.dangerous)
+                self._display.set_verdict(None, OLD_READINGS, verdict.dangerous, now)
         if verdicts:
             self._delays.append(monotonic() - verdicts[-1].t_host)
         # After the verdict is shown: it waits for nothing.
         self._display.contacts.look(frames, conversion, verdicts, self._engine.baseline)
 
-    def _test(self, conversion: UnitConversion) -> None:
+    def _test(self, conversion: UnitConversion, now: float) -> None:
         """Test the alarm before the first decision; refuse a skin of which much proves dead soon after."""
         if self._before is not None:
             self._most_dead, self._before = self._before(conversion), None
-            self._tested_at = monotonic()
+            self._tested_at = now
         dead = [number for number, state in enumerate(self._skin.channels) if state == "dead"]
-        if len(dead) > self._most_dead and monotonic() - self._tested_at < _PROVED:
+        if len(dead) > self._most_dead and now - self._tested_at < _PROVED:
             raise InputError(
                 f"self-test: {sensor_list(dead)} have never changed and are dead, more than "
                 f"{self._most_dead} of {len(self._skin.channels)}: check their wires; live.selftest=false "

@@ -157,11 +157,9 @@ def print_changes(display: Display, console: Console) -> None:
 def _sentence(state: DisplayState) -> str:
     verdict, alarm = state.verdict, "DANGEROUS: " if state.alarm else ""
     if verdict is None:
-        return f"{alarm}unknown: {state.trouble.split(':')[0]}"
-    if not verdict.touched:
-        return verdict.reason or verdict.state
-    words = " ".join(word for word, _ in verdict.words())
-    return "; ".join(text for text in (alarm + words, verdict.reason) if text)
+        return f"{alarm}unknown: {state.reason}"
+    words = " ".join(word for word, _ in verdict.words()) or verdict.state
+    return "; ".join(text for text in (alarm + words, state.reason) if text)
 
 
 def screen(display: Display, state: DisplayState, picture: SkinPicture) -> RenderableType:
@@ -186,13 +184,13 @@ def _map(image: Any) -> Text:
 
 def _verdict(state: DisplayState) -> RenderableType:
     verdict, alarm = state.verdict, Text("DANGEROUS", "bold white on red")
-    if verdict is None:
-        trouble = Text(f"unknown: {state.trouble or 'waiting'}", style="yellow")
+    if verdict is None or not verdict.touched:
+        shown = "unknown" if verdict is None else verdict.state
+        text = ": ".join(filter(None, (shown, state.reason)))
+        trouble = Text(text, style="dim" if shown == "no touch" else "yellow")
         return Group(alarm, Text(), trouble) if state.alarm else trouble
-    if not verdict.touched:
-        return Text(verdict.reason or verdict.state, style="yellow" if verdict.unknown else "dim")
-    head, notes = alarm if verdict.dangerous else Text("touch", "bold"), [contact_text(verdict.contact)]
-    notes += [verdict.reason] * bool(verdict.unknown) + ["the touch has ended"] * (verdict.contact is None)
+    head, notes = alarm if state.alarm else Text("touch", "bold"), [contact_text(verdict.contact)]
+    notes += [state.reason] + ["the touch has ended"] * (verdict.contact is None)
     notes += [f"{count} sensors at their limit"] if (count := int(state.saturated.sum())) else []
     notes += ["frames are missing"] * verdict.gap
     bars = Table.grid(padding=(0, 1))

@@ -14,35 +14,40 @@ from typing import Any, Literal, TextIO
 
 from skin.core.files import json_line, unwritable
 from skin.errors import InputError
-from skin.hardware.live.contacts import LiveContacts, unknown_contacts
-from skin.hardware.live.engine import Verdict
+from skin.hardware.live.contacts import unknown_contacts
 from skin.hardware.live.loop import Display
+from skin.hardware.live.verdict import Verdict, summarize_notes
 
 SCHEMA = 1
 """Version of the messages. A field may be added without a new version; a reader ignores unknown ones."""
 
 
-def verdict_message(
-    verdict: Verdict | None, reason: str, alarm: bool, contacts: dict[str, Any]
-) -> dict[str, Any]:
+def verdict_message(display: Display, verdict: Verdict | None, reason: str, alarm: bool) -> dict[str, Any]:
     """Return a verdict, or the reason why there is none, as JSON data.
 
     Args:
+        display: that tells it.
         verdict: the present one; None if there is none.
         reason: why there is none.
         alarm: an alarm that continues without a verdict.
-        contacts: what is known of them beside a verdict.
 
     Returns:
         The fields of ``docs/export.md`` but ``number`` and ``event``.
     """
+    notes = display.list_notes(verdict, reason)
+    shared = {
+        "schema": SCHEMA,
+        "stale": verdict is None,
+        "reason": summarize_notes(notes),
+        "state": "unknown" if verdict is None else verdict.state,
+        "alarm": alarm,
+        "dangerous": True if alarm else None if verdict is None else verdict.danger,
+        "notes": [note.message for note in notes],
+    }
     if verdict is None:
-        shared = {"schema": SCHEMA, "stale": True, "reason": reason, "state": "unknown"}
-        return shared | {"time": _utc(0.0), "alarm": alarm, "contacts": unknown_contacts(reason)}
-    shared = {"schema": SCHEMA, "stale": False, "reason": verdict.reason, "state": verdict.state}
+        return shared | {"time": _utc(0.0), "contacts": unknown_contacts(reason)}
     return shared | {
         "time": _utc(monotonic() - verdict.t_host),
-        "alarm": verdict.dangerous,
         "device_time": verdict.t,
         "touched": verdict.touched,
         "labels": verdict.known,
@@ -55,7 +60,7 @@ def verdict_message(
         "gap": verdict.gap,
         "masked": list(verdict.masked),
         "unknown": list(verdict.unknown),
-        "contacts": contacts,
+        "contacts": display.contacts.state(),
     }
 
 
@@ -81,39 +86,35 @@ class VerdictStream:
     seconds, with ``stale`` true.
 
     Args:
-        contacts: tells what is known of them.
+        display: that tells verdicts.
     """
 
-    def __init__(self, contacts: LiveContacts) -> None:
-        self._contacts = contacts
+    def __init__(self, display: Display) -> None:
+        self._display = display
         self._lock, self._number, self._readers = Lock(), 0, list[Lines]()
-        self._state: tuple[Verdict | None, str, bool] = None, "waiting for the first frame", False
-        self._sent = self._seen = monotonic()
+        state = display.state()
+        self._state = state.verdict, state.trouble, state.alarm
+        self._sent = monotonic()
 
     def observe(self, verdict: Verdict | None, reason: str, alarm: bool) -> None:
         """Send a verdict, or a new reason for its absence."""
         with self._lock:
             before, self._state = self._state, (verdict, reason, alarm)
-            self._seen = monotonic()
             if verdict is not None or before != self._state:
                 self._send("verdict" if verdict is not None else "change")
 
     def beat(self) -> None:
-        """Repeat the state if nothing was sent for a while; a verdict of that age is stale."""
+        """Repeat the state if nothing was sent for a while."""
         with self._lock:
-            if monotonic() - self._sent < HEARTBEAT:
-                return
-            verdict = self._state[0]
-            if verdict is not None and monotonic() - self._seen >= HEARTBEAT:
-                self._state = None, "no frames", verdict.dangerous
-            self._send("heartbeat")
+            if monotonic() - self._sent >= HEARTBEAT:
+                self._send("heartbeat")
 
     def _send(self, event: str) -> None:
         self._number, self._sent = self._number + 1, monotonic()
         message = {
             "number": self._number,
             "event": event,
-            **verdict_message(*self._state, self._contacts.state()),
+            **verdict_message(self._display, *self._state),
         }
         line = (json_line(message) + "\n").encode()
         for lines in self._readers:
@@ -163,7 +164,7 @@ def stream_verdicts(display: Display, where: Literal["stdout"] | int) -> Iterato
     Raises:
         InputError: the port is in use or not allowed.
     """
-    stream, over = VerdictStream(display.contacts), Event()
+    stream, over = VerdictStream(display), Event()
     display.observers.append(stream.observe)
     beats = Thread(target=_beat, args=(stream, over), name="skin-heartbeat", daemon=True)
     beats.start()
@@ -219,19 +220,19 @@ class AlarmLog:
 
     Args:
         file: open for writing. If it becomes unwritable, a message says so once, and the live view continues.
-        contacts: tells what is known of them.
+        display: that tells verdicts.
     """
 
-    def __init__(self, file: TextIO, contacts: LiveContacts) -> None:
+    def __init__(self, file: TextIO, display: Display) -> None:
         self._file: TextIO | None = file
-        self._contacts = contacts
+        self._display = display
         self._alarm, self._stale, self._unknown = False, True, False
         self._state: tuple[Verdict | None, str, bool] = None, "", False
 
     def observe(self, verdict: Verdict | None, reason: str, alarm: bool) -> None:
         """Write what has changed since the last call."""
         self._state = verdict, reason, alarm
-        now, stale = (alarm, True) if verdict is None else (verdict.dangerous, False)
+        now, stale = alarm, verdict is None
         if stale != self._stale:
             self.write("stale" if stale else "resumed")
         if now != self._alarm:
@@ -247,7 +248,7 @@ class AlarmLog:
         if self._file is None:
             return
         try:
-            message = verdict_message(*self._state, self._contacts.state())
+            message = verdict_message(self._display, *self._state)
             self._file.write(json_line({"event": event, **message}) + "\n")
             self._file.flush()
         except OSError as error:
@@ -268,7 +269,7 @@ def log_alarms(display: Display, path: Path) -> Iterator[None]:
     except OSError as error:
         raise unwritable(path, error, "live.log=FILE.jsonl") from error
     with file:
-        log = AlarmLog(file, display.contacts)
+        log = AlarmLog(file, display)
         log.write("started")
         display.observers.append(log.observe)
         display.listeners.append(log.write)

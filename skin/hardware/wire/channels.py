@@ -2,11 +2,12 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from math import inf
 from typing import Literal, get_args
 
 import numpy as np
+from scipy.special import betainc
 
 from skin.device.calibration import Calibration
 from skin.device.curves import Curves
@@ -135,6 +136,7 @@ class UnitConversion:
         noise: (S,), N, standard deviation of a frame of the untouched skin; None: unknown.
         changing: (S,), share of the frames of the untouched skin that differed from the one before; None:
             unknown.
+        equal: (L,), probability that a frame of the untouched skin equals that 1, 2, ... frames before.
         curves: of the sensors, for gain 1; None: all are linear.
         rest: (S,), N, mean of the frames of the untouched skin: below 0, because the zero is that of the
             largest values of intervals; None: unknown.
@@ -145,6 +147,7 @@ class UnitConversion:
     broken: np.ndarray
     noise: np.ndarray | None = None
     changing: np.ndarray | None = None
+    equal: np.ndarray = field(default_factory=lambda: np.zeros(0))
     curves: Curves | None = None
     rest: np.ndarray | None = None
 
@@ -308,6 +311,7 @@ _UNTOUCHED = "taking the baseline: do not touch the skin"
 _AT_LIMIT = 0.5  # share of the time at its limit from which a channel cannot be tared
 FROZEN = 5.0
 """s without a change after which readings are frozen."""
+_LAGS = 1000  # frames of the longest block that is recognised when it is sent again and again
 EXPECTED = 20
 """Changes of any channel that noise would have caused in that time: without one, readings are frozen."""
 
@@ -450,7 +454,9 @@ class Tare:
         newtons = fresh.newtons(frames)
         noise, rest = np.diff(newtons, axis=0).std(axis=0) / np.sqrt(2), newtons.mean(axis=0)
         changing = (steps != 0).mean(axis=0)
-        self.conversion = replace(fresh, noise=noise, changing=changing, rest=rest)
+        self.conversion = replace(
+            fresh, noise=noise, changing=changing, rest=rest, equal=_equal_chance(frames)
+        )
         lacks = (
             [f"{_channels(untared)} at the limit or without a value: no baseline"] if untared.any() else []
         )
@@ -460,6 +466,27 @@ class Tare:
         self.warning = "; ".join(lacks)
         self.count, self.status, self._deadline, self._forced = self.count + 1, "", None, False
         self._quiet.clear()
+
+
+_FRAMES, _FEW = 100, 3  # frames at rest with one failure, to begin with; failures that are an accident
+_TIMES, _ACCIDENT = 2.0, 1e-4  # times the failures at rest; least probability of an accident
+
+
+def fails_in_contact(failed: int, frames: int, failed_at_rest: int, frames_at_rest: int) -> bool:
+    """Return whether so many frames fail in a contact that it is no accident, given those at rest.
+
+    Values beyond the range may make frames, or values in them, unreadable.
+    """
+    usual = min(_TIMES * (failed_at_rest + 1) / (frames_at_rest + _FRAMES), 1.0)
+    # The probability of so many or more.
+    return failed >= _FEW and bool(betainc(failed, frames - failed + 1, usual) < _ACCIDENT)
+
+
+def _equal_chance(frames: np.ndarray) -> np.ndarray:
+    """Return the probability (L,) that one of the frames (F, S) equals that 1, 2, ... frames before."""
+    rows = np.array([hash(frame.tobytes()) for frame in frames])
+    lags = range(1, min(len(rows) // 2, _LAGS) + 1)
+    return np.array([((rows[lag:] == rows[:-lag]).sum() + 1) / (len(rows) - lag + 2) for lag in lags])
 
 
 def _channels(which: np.ndarray) -> str:

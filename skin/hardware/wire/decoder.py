@@ -365,6 +365,7 @@ class Stats:
         format: ``text`` or ``binary``; empty if not known yet, or if the source sends no bytes.
         check: ``crc16``, ``xor`` or ``none``; empty likewise.
         clock: what the device's clock and its counter were found to count; empty: as they should, or unknown.
+        clock_trusted: False: the host's clock is used instead.
         trouble: a message about the current problem; empty if there is none.
     """
 
@@ -384,6 +385,7 @@ class Stats:
     format: str = ""
     check: str = ""
     clock: str = ""
+    clock_trusted: bool = True
     trouble: str = ""
 
     @property
@@ -457,7 +459,7 @@ class Decoder:
             FrameClock(),
         )
         self._unit = ClockUnit(self._order.unit, False)
-        self._watch, self._trusted, self._clocked = ClockWatch(), True, False
+        self._watch, self._clocked = ClockWatch(), False
         self._latest = np.zeros(sensors or 0)
         self._channels = np.array(channels) if len(channels) else None
         self._polarity = np.array(polarity, dtype=float) if min(polarity, default=1) < 0 else None
@@ -481,7 +483,7 @@ class Decoder:
         self._counted.restart()
         self._unit.restart()
         self._watch.restart()
-        self._trusted = True
+        self.stats.clock_trusted = True
 
     def feed(self, data: bytes, now: float = 0.0) -> list[Frame]:
         """Return the frames that end in ``data``.
@@ -503,7 +505,7 @@ class Decoder:
         pieces, self._buffer = self.frame_format.split(self._buffer)
         good, bad = self.stats.frames, self.stats.bad_frames
         frames = [frame for piece in pieces if (frame := self._frame(piece, now))]
-        if frames and self._trusted:
+        if frames and self.stats.clock_trusted:
             self._judge_clock(frames, now)
         if len(self._buffer) > _LONGEST:
             self._buffer, self._overlong = b"", True
@@ -604,7 +606,7 @@ class Decoder:
 
     def _place_frame(self, raw: RawFrame, now: float) -> Frame:
         ticks, rate = raw.ticks, None if self.header is None else self.header.rate
-        self._clocked = ticks is not None and self._trusted
+        self._clocked = ticks is not None and self.stats.clock_trusted
         frames = self._order.ahead(raw.seq, self._missing)
         if ticks is None or not self._clocked:
             ticks = self._counted(now, frames, rate) / self._order.unit
@@ -612,7 +614,7 @@ class Decoder:
             self._order.unit = self._unit.unit
             self._order.cut("reset")
         t, segment, lost, after = self._order.place(raw.seq, ticks, self._missing, self._clocked)
-        if self._unit.summary and self._trusted:
+        if self._unit.summary and self.stats.clock_trusted:
             modulus = f", its counter wraps at {self._order.modulus}" if self._order.modulus else ""
             self.stats.clock = self._unit.summary + modulus
         stats = self.stats
@@ -647,7 +649,7 @@ class Decoder:
             self._watch.restart()
         speed = (self.header and self.header.speed) or 1.0
         if self._clocked and not self._watch.trust([frame.t for frame in frames], now, speed):
-            self._trusted = False
+            self.stats.clock_trusted = False
             self._order.cut("reset")
             self.stats.clock = "the device's clock cannot be trusted: the host's is used"
 

@@ -135,7 +135,7 @@ class TextFormat:
         line = piece.strip(b"\r\n")
         if not line or line.startswith(b"#"):
             return line
-        read = self.parse(line)
+        read = self._parse(line)
         if read.check != self.check:
             raise FrameError("checksum")
         if (missing := self.roles.count - len(read.fields)) == 0:
@@ -144,6 +144,15 @@ class TextFormat:
             extra = self.roles.count - len(self.roles.values)
             raise FrameError("fields", len(read.fields) - extra)
         return Line([*read.fields, nan], read.check, False)
+
+    def _parse(self, line: bytes) -> Line:
+        """Return the fields of a line; a word in place of a value, such as for over-range, costs only it."""
+        try:
+            return self.parse(line)
+        except FrameError as bad:
+            if 2 * sum(map(isfinite, bad.numbers)) <= self.roles.count:
+                raise
+            return Line(bad.numbers, self.check, False)
 
     def read(self, piece: bytes) -> RawFrame | bytes:
         """Return the frame in a line, or the line where it is empty or a comment; else raise FrameError."""

@@ -146,7 +146,11 @@ def parse_words(words: Sequence[bytes], check: Check = "none", invalid: Collecti
         fields = [nan]
     finite = all(map(isfinite, fields))
     if not finite:
-        fields = [_field(word, invalid) for word in words]
+        values = [_field(word) for word in words]
+        fields = [value if value is not None and isfinite(value) else nan for value in values]
+        for word, value in zip(words, values, strict=True):
+            if value is None and word.strip().lower() not in invalid:
+                raise FrameError("number", word=word.strip().decode("ascii", "replace"), numbers=fields)
     if any(b"_" in word for word in words):  # valid in Python's grammar only
         raise FrameError("number")
     return Line(fields, check, finite)
@@ -157,16 +161,12 @@ def ends_with_separator(line: bytes) -> bool:
     return line.rpartition(b"*")[0 if b"*" in line else 2].rstrip(b" \r")[-1:] in _SEPARATORS
 
 
-def _field(word: bytes, invalid: Collection[bytes]) -> float:
-    """Return the number of a field; NaN where it says that there is none."""
-    word = word.strip()
-    if word.lower() in invalid:
-        return nan
+def _field(word: bytes) -> float | None:
+    """Return the number of a field; None if it is no number."""
     try:
-        value = float(word)
+        return float(word)
     except ValueError:
-        raise FrameError("number", word=word.decode("ascii", "replace")) from None
-    return value if isfinite(value) else nan
+        return None
 
 
 def parse_header(line: bytes) -> Header | None:

@@ -377,12 +377,8 @@ class WireFeed:
             self._heard_at = now
         elif now - self._heard_at >= self._silence:
             raise TimeoutError(f"nothing received for {self._silence:g} s")
-        frames = self._decoder.feed(data, now) if data else []
+        frames = self.decode(data, now) if data else []
         self._prompter.answer(bool(data), bool(frames))
-        if data and (error := self._decoder.error()):
-            raise error
-        if frames:
-            self._prepare()
         stats = self._decoder.stats
         if now - self._reported_at >= 1:
             fresh, self._reported, self._reported_at = stats.bad - self._reported, Counter(stats.bad), now
@@ -390,6 +386,19 @@ class WireFeed:
                 reasons = ", ".join(f"{count} {reason}" for reason, count in fresh.most_common())
                 trouble = f"; {stats.trouble}" if stats.trouble else ""
                 _log.warning("%d bad frames (%s)%s", fresh.total(), reasons, trouble)
+        return frames
+
+    def decode(self, data: bytes, now: float) -> list[Frame]:
+        """Return the frames that end in bytes received at ``now``, s, with checked channels.
+
+        Raises:
+            InputError: no format is detected, or another device is connected.
+        """
+        frames = self._decoder.feed(data, now)
+        if error := self._decoder.error():
+            raise error
+        if frames:
+            self._prepare()
         return [self._judge(frame) for frame in frames]
 
     def states(self) -> tuple[ChannelState, ...]:
@@ -411,7 +420,7 @@ class WireFeed:
         """Warn once of a weak checksum; set limits from the header as soon as it arrives."""
         check, header, clock = self._decoder.stats.check, self._decoder.header, self._decoder.stats.clock
         if clock != self._clock_told:
-            _log.info("%s", clock)
+            (_log.info if self._decoder.stats.clock_trusted else _log.warning)("%s", clock)
             self._clock_told = clock
         if not self._warned and check in _WEAK:
             _log.warning("frames carry %s; let the firmware send *HHHH", _WEAK[check])

@@ -15,6 +15,7 @@ from time import monotonic
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from scipy.ndimage import maximum_filter1d
 
 from skin.device.calibration import read_calibration
 from skin.device.resampling import Frame, check_rate
@@ -29,6 +30,7 @@ from skin.hardware.wire.channels import (
     Tare,
     UnitConversion,
     check_scale,
+    fails_in_contact,
     take_baseline,
     unit_conversion,
 )
@@ -281,6 +283,7 @@ class Skin:
 
 
 _KEPT = 10_000  # frames for the statistics of channels
+_FAR, _NEAR = 10.0, 0.5  # times the noise; s: a touch
 _SPREAD = 1.4826  # median absolute deviation -> standard deviation of normal noise
 
 
@@ -411,6 +414,7 @@ class PortMonitor:
         values = np.stack([frame.values for frame in self._frames])
         valid = np.stack([frame.valid for frame in self._frames])
         states = self._skin.channels or ("ok",) * values.shape[1]
+        touched = self._find_contact(values, valid)
         # Of a channel that is never valid, the values that it repeats.
         rows = [row[mask] if mask.any() else row for row, mask in zip(values.T, valid.T, strict=True)]
         lines = [f"header: {self._skin.header or 'none'}", "channel     least    median   largest     noise"]
@@ -420,9 +424,28 @@ class PortMonitor:
             text = state if share == 1 else f"{state}, invalid in {1 - share:.0%}"
             if share == 0 and state == "ok":
                 text = "no value"
+            elif _fails_under_touch(~valid[:, channel], touched):
+                text += ", more often in contact than at rest: beyond its range?"
             numbers = f"{channel:7d}{row.min():10.5g}{middle:10.5g}{row.max():10.5g}{noise:10.3g}"
             lines.append(f"{numbers}  {text}")
+        if _fails_under_touch(np.array([frame.lost > 0 for frame in self._frames]), touched):
+            lines.append(
+                "more frames are unreadable or lost in contact than at rest: values beyond the range?"
+            )
         return "\n".join(lines)
+
+    def _find_contact(self, values: np.ndarray, valid: np.ndarray) -> np.ndarray:
+        """Return the frames (F,), bool, within half a second of which a channel is far from its median."""
+        away, noise = np.abs(values - np.median(values, axis=0)), np.abs(np.diff(values, axis=0)).mean(axis=0)
+        touched = ((away > _FAR * noise) & valid).any(axis=1)
+        near = 2 * round(_NEAR * self._skin.stats.rate_hz) + 1
+        return np.asarray(maximum_filter1d(touched, near))
+
+
+def _fails_under_touch(failed: np.ndarray, touched: np.ndarray) -> bool:
+    """Return whether frames (F,) fail more often while the skin is touched, (F,)."""
+    counts = (int(part.sum()) for part in (failed & touched, touched, failed & ~touched, ~touched))
+    return fails_in_contact(*counts)
 
 
 _LEAST = 1.0  # s over which the rate is measured

@@ -8,14 +8,13 @@ import numpy as np
 import pytest
 
 from skin.errors import InputError
-from skin.hardware.live.contacts import LiveContacts
-from skin.hardware.live.engine import Verdict
 from skin.hardware.live.loop import Display, DisplayInfo
+from skin.hardware.live.verdict import Verdict
 from skin.hardware.live.verdicts import AlarmLog, log_alarms
 
 
 def display():
-    return Display(DisplayInfo("run", "port", np.zeros((4, 3)), (0.1, 0.1), 4.0))
+    return Display(DisplayInfo("run", "port", np.zeros((4, 3)), (0.1, 0.1), 4.0), calm=0.0)
 
 
 def verdict(dangerous):
@@ -64,7 +63,7 @@ def test_a_full_disk_ends_the_log_and_not_the_view(capsys):
         def write(self, text):
             raise OSError("No space left on device")
 
-    log = AlarmLog(Full(), LiveContacts())
+    log = AlarmLog(Full(), display())
     log.observe(verdict(True), "", False)
     log.observe(verdict(False), "", False)
     assert capsys.readouterr().err == "the alarm log ends here: No space left on device\n"

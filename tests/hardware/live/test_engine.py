@@ -169,7 +169,7 @@ def test_a_place_is_known_where_another_sensor_responds():
     frames = [frame(n / 100, np.zeros(4), valid=np.array([True, False, True, False])) for n in range(60)]
     verdict = subject.push(frames, PLAIN)[-1]
     assert (verdict.masked, verdict.unknown, verdict.state) == ((1, 3), (3,), "unknown")
-    assert "unknown near sensor 3" in verdict.reason
+    assert [(note.code, note.sensors) for note in verdict.notes] == [("masked", (3,))]
 
 
 @pytest.mark.parametrize("force", [0.0, 5.0])
@@ -203,7 +203,7 @@ def test_a_stream_that_becomes_slow_is_unknown_as_taps_fall_between_its_frames(r
     assert {verdict.state for verdict in said} == {"no touch"}
     slow = subject.push([frame(5 + n / rate, np.zeros(4), lost=40, after="gap") for n in range(9)], PLAIN)
     assert {verdict.state for verdict in slow[1:]} == {"unknown"}
-    assert f"no frame for {1 / rate:.2f} s" in slow[-1].reason
+    assert f"no frame for {1 / rate:.2f} s" in slow[-1].notes[0].text
     end = 5 + 8 / rate
     fast = subject.push([frame(end + n / 4.1, np.zeros(4)) for n in range(1, 9)], PLAIN)
     assert {verdict.state for verdict in fast} == {"no touch"}
@@ -241,7 +241,7 @@ def test_frozen_readings_are_seen_where_noise_was():
         subject.push([frame(3 + n / 100, noise[-1]) for n in range(480)], conversion)
         assert not subject.frozen
         subject.push([frame(7.8 + n / 100, noise[-1]) for n in range(30)], conversion)
-        assert subject.frozen == frozen
+        assert subject.frozen == ("still" if frozen else "")
         subject.push([frame(8.1, noise[0])], conversion)
         assert not subject.frozen
 
@@ -263,8 +263,9 @@ def test_a_value_that_is_the_same_behind_a_silence_is_not_stuck():
     behind = np.array([noise[-1, 0], noise[-1, 1], 0.01, 0.01])
     said = subject.push([frame(12 + n / 100, behind, after="gap" * (n == 0)) for n in range(30)], conversion)
     # The last decision before the silence, and the first behind it.
-    assert [verdict.pause > 8 for verdict in said[:3]] == [False, True, False]
-    assert all(verdict.unknown == () for verdict in said if not verdict.pause)
+    paused = [any(note.code == "pause" and note.seconds > 8 for note in verdict.notes) for verdict in said]
+    assert paused[:3] == [False, True, False]
+    assert all(verdict.unknown == () for verdict, after in zip(said, paused, strict=True) if not after)
 
 
 def test_a_safe_touch_beside_a_dead_sensor_may_hide_a_dangerous_one():
@@ -306,9 +307,9 @@ def test_values_that_fall_with_force_are_told():
     values = np.zeros((300, 4))
     values[200:, :2] = -4.0
     verdict = engine().push([frame(n / 100, row) for n, row in enumerate(values)], PLAIN)[-1]
-    assert (verdict.state, verdict.below) == ("unknown", (0, 1))
-    assert "below rest" in verdict.reason
-    assert "device.scale" in verdict.reason
+    assert verdict.state == "unknown"
+    assert [(note.code, note.sensors) for note in verdict.notes] == [("below", (0, 1)), ("void", (0, 1))]
+    assert "device.scale" in verdict.notes[0].text
 
 
 def test_a_word_does_not_stand_beside_the_probability_of_its_opposite():

@@ -2,12 +2,12 @@
 
 import json
 import struct
-from time import sleep
 
 import numpy as np
 import pytest
 
-from tests.hardware.live.test_safety import LATE, RATE, SCALE, SENSORS, Watching, force
+from tests.hardware.live.memory_view import MemoryView
+from tests.hardware.live.test_safety import LATE, RATE, SCALE, SENSORS, arriving, force, settings
 
 WORD, NUMBER = "off", -999
 JSON = {"kind": "json", "invalid": [NUMBER]}
@@ -32,8 +32,8 @@ def to_rows(n, row):
     return "".join(" ".join(words[place : place + 3]) + "\n" for place in (0, 3, 6)).encode() + b"\n"
 
 
-BOARDS = {"json": (JSON, to_json, 8), "binary": (BINARY, to_binary, 8), "rows": (ROWS, to_rows, 1)}
-"""Adapter, encoder of a frame, and how many times faster than the device's clock a stream is sent."""
+BOARDS = {"json": (JSON, to_json), "binary": (BINARY, to_binary), "rows": (ROWS, to_rows)}
+"""Adapter, and encoder of a frame."""
 
 
 def counts(newtons):
@@ -42,7 +42,7 @@ def counts(newtons):
 
 def frames(name, values, restart=None):
     """Yield the bytes of counts (F, S); the device restarts every ``restart`` s, with a banner."""
-    _, encode, _ = BOARDS[name]
+    encode = BOARDS[name][1]
     every = len(values) if restart is None else round(restart * RATE)
     for number, row in enumerate(values.tolist()):
         banner = b"" if number % every or restart is None else b"\r\nBooting...\r\nok\r\n"
@@ -50,11 +50,10 @@ def frames(name, values, restart=None):
 
 
 def watch(name, stream):
-    adapter, _, speed = BOARDS[name]
-    return Watching(stream, speed=speed, adapter=adapter, scale=SCALE)
+    return MemoryView(arriving(stream), settings(), adapter=BOARDS[name][0], scale=SCALE)
 
 
-@pytest.fixture(params=["json", "binary", pytest.param("rows", marks=pytest.mark.slow)])
+@pytest.fixture(params=["json", "binary", "rows"])
 def board(request):
     return request.param
 
@@ -102,14 +101,9 @@ def test_a_cut_wire_is_unknown(board, cut):
 
 
 def test_silence_is_unknown(board):
-    def stream():
-        yield from frames(board, counts(force(5)))
-        sleep(3)
-        yield from frames(board, counts(force(1)))
-
-    silent = [verdict for _, verdict, reason, _ in watch(board, stream()).said if "stopped sending" in reason]
-    assert silent
-    assert all(verdict is None for verdict in silent)
+    seen = watch(board, [*frames(board, counts(force(5))), 3.0, *frames(board, counts(force(1)))])
+    assert seen.states(3, 5) == {"no touch"}
+    assert seen.states(5.7, 8) == {"unknown"}
 
 
 def test_damaged_frames_hide_no_press(board):

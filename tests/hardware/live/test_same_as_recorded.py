@@ -147,8 +147,8 @@ def live(learner, stream):
                 found[round(verdict.t * RATE)] = asked.windows[-1], verdict
 
     class Turning(LiveLoop):
-        def _take(self, frames):
-            super()._take(frames)
+        def take(self, frames, now):
+            super().take(frames, now)
             turn.set()
 
         def _wait(self, reason):

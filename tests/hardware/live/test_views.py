@@ -18,9 +18,9 @@ from scipy.interpolate import LinearNDInterpolator
 from skin.device.resampling import Frame
 from skin.errors import InputError
 from skin.hardware.live import loop, terminal, web
-from skin.hardware.live.engine import Verdict
 from skin.hardware.live.loop import Display, DisplayInfo
 from skin.hardware.live.terminal import SkinPicture
+from skin.hardware.live.verdict import Note, Verdict
 from skin.hardware.wire.channels import UnitConversion
 
 PLACES = np.array([[0.02, 0.02, 0], [0.14, 0.03, 0], [0.03, 0.1, 0], [0.13, 0.11, 0], [0.08, 0.06, 0]])
@@ -108,9 +108,9 @@ def test_where_output_is_no_terminal_a_line_tells_each_change(tmp_path):
     ):
         for verdict in (None, None, PRESSED, PRESSED):
             subject.set_verdict(verdict, "" if verdict else "taking the baseline: do not touch")
-            sleep(0.3)
+            sleep(0.2)
     said = (tmp_path / "said").read_text().splitlines()
-    assert said[-2:] == ["unknown: taking the baseline", "DANGEROUS: small dangerous"]
+    assert said[-2:] == ["unknown: taking the baseline: do not touch", "DANGEROUS: small dangerous"]
 
 
 def test_the_terminal_shows_the_alarm_and_the_probability():
@@ -129,13 +129,13 @@ def test_the_terminal_shows_the_alarm_and_the_probability():
 def test_the_page_gets_pictures_and_needs_nothing_from_elsewhere():
     subject = display()
     subject.add_frame(frame([0, 0, 2.0, 0, 0], np.array([True, True, True, True, False])), PLAIN)
-    subject.set_verdict(PRESSED)
     with web.serve_page(subject, 0) as address:
         code, page = fetch(address)
         assert code == 200
         assert not re.search(r"(src|href)\s*=|https?://|@import|url\(", page)
         info = json.loads(fetch(f"{address}/skin.json")[1])
         assert info["positions"] == PLACES.tolist()
+        subject.set_verdict(PRESSED)
         with urllib.request.urlopen(f"{address}/pictures", timeout=30) as answer:
             line = answer.readline().decode()
         picture = json.loads(line.removeprefix("data: "))
@@ -311,12 +311,13 @@ def test_the_map_of_an_alarm_is_held_and_goes_with_the_touch():
 
 def test_an_unknown_place_is_not_shown_as_no_touch():
     subject = display()
-    verdict = replace(PRESSED, touched=False, dangerous=False, unknown=(2,), masked=(2,))
-    subject.set_verdict(verdict)
+    masked = {"unknown": (2,), "masked": (2,), "notes": (Note("masked", (2,)), Note("pause", seconds=0.7))}
+    subject.set_verdict(replace(PRESSED, touched=False, labels={}, dangerous=False, **masked))
     sent = web.message(subject.state(), SkinPicture(PLACES, SIZE, 8, 4.0))
     assert (sent["verdict"]["state"], sent["unknown"]) == ("unknown", [2])
     assert "no touch" not in terminal._sentence(subject.state())
-    assert "unknown near sensor 2" in terminal._sentence(subject.state())
+    assert "near sensor 2 could not be felt" in terminal._sentence(subject.state())
+    assert terminal._sentence(subject.state()).endswith("(and 1 more note)")
     subject.set_verdict(None, "readings are frozen")
     assert web.message(subject.state(), SkinPicture(PLACES, SIZE, 8, 4.0))["unknown"] == [0, 1, 2, 3, 4]
     assert terminal._sentence(subject.state()) == "unknown: readings are frozen"

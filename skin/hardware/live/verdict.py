@@ -1,0 +1,144 @@
+"""The verdict of a live view: state, labels, alarm, and notes on what may be wrong with them."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from math import isfinite, nan
+from typing import Any, Literal, NamedTuple
+
+from skin.touch.labels import OPPOSITE
+
+State = Literal["touch", "no touch", "unknown"]
+_NAMED = 3  # sensors
+
+NOTES = {
+    "stale": "{text}",
+    "below": "{sensors} below rest: a broken wire, device.scale of the wrong sign, or a tare under load",
+    "void": "the baseline of {sensors} is void, as readings fell below it: tare the untouched skin",
+    "over_range": "no value of {sensors} since the force rose: beyond its range, or a broken wire",
+    "unreadable": "more frames are unreadable in this contact than at rest: values beyond the range?",
+    "lost_wire": "{sensors} fell to rest while its neighbours stay pressed: a broken wire",
+    "masked": "a touch near {sensors} could not be felt: no valid reading",
+    "pause": "no frame for {seconds:.2f} s, in which a touch may have come and gone",
+    "near_threshold": "probably dangerous, but below the threshold of the alarm",
+    "unverified": "{text}",
+    "clock": "{text}",
+}
+"""Code of each note -> its sentence, the gravest first."""
+
+LASTING = frozenset(("over_range", "unreadable", "lost_wire"))
+"""Notes with which no touch is safe, until it ends."""
+
+
+def sensor_list(sensors: Sequence[int]) -> str:
+    """Return the numbers of sensors in words."""
+    omitted = f" and {len(sensors) - _NAMED} more" if len(sensors) > _NAMED else ""
+    numbers = ", ".join(map(str, sensors[:_NAMED]))
+    return f"sensor{'s' * (len(sensors) > 1)} {numbers}{omitted}"
+
+
+class Note(NamedTuple):
+    """What may be wrong with a verdict.
+
+    Attributes:
+        code: one of :data:`NOTES`.
+        sensors: that it is about.
+        seconds: that it is about.
+        detail: text of a note on the whole session.
+    """
+
+    code: str
+    sensors: tuple[int, ...] = ()
+    seconds: float = 0.0
+    detail: str = ""
+
+    @property
+    def text(self) -> str:
+        """The note in words."""
+        return NOTES[self.code].format(
+            sensors=sensor_list(self.sensors), seconds=self.seconds, text=self.detail
+        )
+
+    @property
+    def message(self) -> dict[str, Any]:
+        """The note as JSON data."""
+        return {"code": self.code, "text": self.text, "sensors": list(self.sensors)}
+
+
+def order_notes(notes: Iterable[Note]) -> tuple[Note, ...]:
+    """Return notes, the gravest first."""
+    return tuple(sorted(notes, key=lambda note: list(NOTES).index(note.code)))
+
+
+def summarize_notes(notes: Sequence[Note]) -> str:
+    """Return the gravest of ordered notes in full, and the number of the others; empty without notes."""
+    more = len(notes) - 1
+    return "" if not notes else notes[0].text + (f" (and {more} more note{'s' * (more > 1)})" if more else "")
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Classification of a window.
+
+    Attributes:
+        t: s, the device's clock at the latest frame.
+        t_host: s, the host's clock at that frame.
+        chances: label -> its probability in this window; of ``dangerous`` the largest since the alarm was
+            raised, while it lasts.
+        touched: debounced; if False, nothing touches the skin and the labels are meaningless.
+        labels: label -> debounced prediction; empty without touch.
+        dangerous: the alarm, which lasts until the contact ends.
+        gap: whether frames are missing in the window.
+        masked: sensors without a valid reading.
+        contact: duration of the contact, s; None without contact.
+        unknown: sensors at which a dangerous touch could not be felt, because no valid sensor would respond.
+        notes: on what may be wrong, the gravest first.
+        agreeing: label -> its probability in the latest window that agreed with the debounced label; where it
+            is missing, that of this window.
+    """
+
+    t: float
+    t_host: float
+    chances: dict[str, float]
+    touched: bool
+    labels: dict[str, bool]
+    dangerous: bool
+    gap: bool
+    masked: tuple[int, ...] = ()
+    contact: float | None = None
+    unknown: tuple[int, ...] = ()
+    notes: tuple[Note, ...] = ()
+    agreeing: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def state(self) -> State:
+        """``touch``; ``unknown``, where a dangerous touch on a sensor could not be felt; or ``no touch``."""
+        touching = self.touched or self.contact is not None
+        return "touch" if touching else "unknown" if self.unknown else "no touch"
+
+    @property
+    def danger(self) -> bool | None:
+        """Whether the touch is dangerous; None where that can be neither said nor excluded."""
+        doubtful = self.unknown or any(note.code in {*LASTING, "near_threshold"} for note in self.notes)
+        return True if self.dangerous else None if doubtful else False
+
+    @property
+    def known(self) -> dict[str, bool | None]:
+        """The labels, with :attr:`danger` for ``dangerous``."""
+        return self.labels | ({"dangerous": self.danger} if "dangerous" in self.labels else {})
+
+    def words(self) -> list[tuple[str, float]]:
+        """Return the predicted classes, each with its probability; empty without touch."""
+        chances = self.chances | self.agreeing
+        pairs = [
+            (OPPOSITE.get(name, ""), 1 - chances[name])
+            if yes is False
+            else (name if yes else f"{name}?", chances[name])
+            for name, yes in self.known.items()
+        ]
+        return [(word, chance) for word, chance in pairs if word and isfinite(chance)]
+
+    @property
+    def in_alarm(self) -> "Verdict":
+        """This verdict during an alarm that has begun before it, whose probability it does not know."""
+        labels = self.labels | ({"dangerous": True} if "dangerous" in self.labels else {})
+        return replace(self, dangerous=True, labels=labels, chances=self.chances | {"dangerous": nan})

@@ -73,7 +73,7 @@ def contact_message(estimate: "FrameEstimate", time: float) -> dict[str, Any]:
         "large": round(estimate.large, 6),
     }
     if not (estimate.fingertip or none):
-        # The strongest of the fingertips that fit best: where a hard touch is must be known, as well as it is.
+        # The strongest of the fingertips that fit best: a reader must find where a hard touch is.
         best = {"state": "not a fingertip", "contacts": list(map(_contact, estimate.contacts[:1]))}
         return unknown_contacts("") | base | best
     return {

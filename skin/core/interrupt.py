@@ -6,13 +6,11 @@ import socket
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from threading import Thread
-from time import monotonic, sleep
+from threading import Event, Thread
 from types import FrameType, TracebackType
 
 _PATIENCE = _LAST = 1.0  # s
 _CLOSING = 10.0  # s in which everything must be closed; containers and clusters wait as long or longer
-_TURN = 0.01  # s
 _usual = sys.excepthook
 
 
@@ -33,7 +31,7 @@ def leave(code: int) -> None:
 
 
 @contextmanager
-def ends_on_signal(last: Callable[[], object] | None = None) -> Iterator[None]:
+def ends_on_signal(last: Callable[[], object] = bool) -> Iterator[None]:
     """Turn SIGTERM into SystemExit, so that resources are closed; only in the main thread.
 
     Python handles a signal between two of its own steps, and a solve or a batch of a network is one step that
@@ -41,7 +39,7 @@ def ends_on_signal(last: Callable[[], object] | None = None) -> Iterator[None]:
     likewise where the block has not ended ten seconds later. Further signals do not interrupt its cleanup.
 
     Args:
-        last: called in another thread before such an end; it has a second.
+        last: called in another thread before such an end; it has a second. By default nothing is.
     """
     # No Event: a signal that interrupts its handler would wait for the lock that this handler holds.
     answered = list[int]()
@@ -64,38 +62,34 @@ def ends_on_signal(last: Callable[[], object] | None = None) -> Iterator[None]:
 
 
 @contextmanager
-def _watched(answered: list[int], last: Callable[[], object] | None) -> Iterator[None]:
+def _watched(answered: list[int], last: Callable[[], object]) -> Iterator[None]:
     """End the process where a signal does not end the block."""
     # A pair of sockets, because Windows has no pipes that do not block before Python 3.12.
     receiver, sender = socket.socketpair()
     sender.setblocking(False)
+    ended = Event()
     # The interpreter writes the numbers of signals at once, whatever the main thread does.
     before = signal.set_wakeup_fd(sender.fileno(), warn_on_full_buffer=False)
-    watch = Thread(target=_watch, args=(receiver, answered, last), name="skin-signals", daemon=True)
+    watch = Thread(target=_watch, args=(receiver, answered, ended, last), name="skin-signals", daemon=True)
     watch.start()
     try:
         yield
     finally:
         signal.set_wakeup_fd(before)
         sender.close()
+        ended.set()
 
 
-def _watch(receiver: socket.socket, answered: list[int], last: Callable[[], object] | None) -> None:
+def _watch(receiver: socket.socket, answered: list[int], ended: Event, last: Callable[[], object]) -> None:
     with receiver:
         while signal.SIGTERM not in (numbers := receiver.recv(64)):
             if not numbers:
                 return
-        begin = monotonic()
-        receiver.setblocking(False)
-        while monotonic() - begin < (_CLOSING if answered else _PATIENCE):
-            sleep(_TURN)
-            with suppress(BlockingIOError):
-                if not receiver.recv(64):
-                    return
-    if last is not None:
-        ending = Thread(target=_try, args=(last,), daemon=True)
-        ending.start()
-        ending.join(_LAST)
+        if ended.wait(_PATIENCE) or (answered and ended.wait(_CLOSING)):
+            return
+    ending = Thread(target=_try, args=(last,), daemon=True)
+    ending.start()
+    ending.join(_LAST)
     os._exit(128 + signal.SIGTERM)
 
 

@@ -74,8 +74,11 @@ def contact_message(estimate: "FrameEstimate", time: float) -> dict[str, Any]:
     }
     if not (estimate.fingertip or none):
         # The strongest of the fingertips that fit best: a reader must find where a hard touch is.
-        best = {"state": "not a fingertip", "contacts": list(map(_contact, estimate.contacts[:1]))}
-        return unknown_contacts("") | base | best
+        return (
+            unknown_contacts("")
+            | base
+            | {"state": "not a fingertip", "contacts": [*map(_contact, estimate.contacts[:1])]}
+        )
     return {
         "state": "no contact" if none else "contacts",
         **base,

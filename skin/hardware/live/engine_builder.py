@@ -91,10 +91,12 @@ class SelfTest:
         above = [settings.patience.above or 0.5 for settings in (self.used, self.nominal)]
         if above[0] <= above[1]:
             return
-        plausible = self._plausible
         used, nominal = (
             self.find(
-                replace(plausible, patience=replace(plausible.patience, above=value)), unit, RawRange(), _WEAK
+                replace(self._plausible, patience=replace(self.nominal.patience, above=value)),
+                unit,
+                RawRange(),
+                _WEAK,
             ).sum()
             for value in above
         )

@@ -14,7 +14,6 @@ from skin.hardware.wire.protocol import Line, ends_with_separator, parse_words, 
 _SEPARATORS = (b",", b";", b"\t")
 _TIME = re.compile(rb"(?:\d{4}-\d\d-\d\d[T ])?(\d{1,2}):(\d\d):(\d\d(?:\.\d+)?)")  # of the day
 _DEEP = 8  # levels of JSON
-_SHOWN = 80  # bytes of a word, in a message
 
 
 class LineReader(Protocol):
@@ -123,7 +122,7 @@ class NumberReader:
             elif line[place] in b" \t,;":
                 place += 1
             else:  # not searched for further on: it would take as long as the square of the line's length
-                raise FrameError("number", word=line[place : place + _SHOWN].decode("ascii", "replace"))
+                raise FrameError("number", word=line[place:][:80].decode("ascii", "replace"))
         if self.split.decimal == ",":
             words = [word.replace(b",", b".") for word in words]
         return parse_words(words, "none", self.split.invalid)
@@ -192,8 +191,11 @@ class LabelReader:
         """Return the reader of lines with the commonest names."""
         mark = re.escape(label.encode())
         # Each blank is matched in one way, or blanks would take a time as the square of their number.
-        name = rb"([^\s,;\d.+-](?:[^\s,;=:]|[^\S\t]++(?![\s,;=:]))*?)"
-        field = re.compile(rb"\s*" + name + rb"\s*" + mark + rb"\s*([^\s,;]+)\s*[,;\t ]?\s*")
+        field = re.compile(
+            rb"\s*([^\s,;\d.+-](?:[^\s,;=:]|[^\S\t]++(?![\s,;=:]))*?)\s*"
+            + mark
+            + rb"\s*([^\s,;]+)\s*[,;\t ]?\s*"
+        )
         seen = Counter(names for line in lines if (names := _names_of(field, line)))
         labels = seen.most_common(1)[0][0] if seen else ()
         parts = [re.escape(name) + rb"\s*" + mark + rb"\s*+([^\s,;]*)" for name in labels]

@@ -10,6 +10,7 @@ from threading import Event, Thread
 from types import FrameType, TracebackType
 
 _PATIENCE = _LAST = 1.0  # s
+_CLOSING = 10.0  # s in which everything must be closed; containers and clusters wait as long or longer
 _usual = sys.excepthook
 
 
@@ -30,20 +31,23 @@ def leave(code: int) -> None:
 
 
 @contextmanager
-def ends_on_signal(last: Callable[[], object] | None = None) -> Iterator[None]:
+def ends_on_signal(last: Callable[[], object] = bool) -> Iterator[None]:
     """Turn SIGTERM into SystemExit, so that resources are closed; only in the main thread.
 
     Python handles a signal between two of its own steps, and a solve or a batch of a network is one step that
-    may take ten seconds. If it takes longer than a second, the process ends at once, as if it were killed.
+    may take ten seconds. If it takes longer than a second, the process ends at once, as if it were killed;
+    likewise where the block has not ended ten seconds later. Further signals do not interrupt its cleanup.
 
     Args:
-        last: called in another thread before such an end; it has a second.
+        last: called in another thread before such an end; it has a second. By default nothing is.
     """
-    answered = Event()
+    # No Event: a signal that interrupts its handler would wait for the lock that this handler holds.
+    answered = list[int]()
 
     def end(number: int, frame: FrameType | None) -> None:
-        answered.set()
-        raise SystemExit(128 + number)
+        if not answered:
+            answered.append(number)
+            raise SystemExit(128 + number)
 
     try:
         before = signal.signal(signal.SIGTERM, end)
@@ -58,31 +62,35 @@ def ends_on_signal(last: Callable[[], object] | None = None) -> Iterator[None]:
 
 
 @contextmanager
-def _watched(answered: Event, last: Callable[[], object] | None) -> Iterator[None]:
-    """End the process where a signal is not answered while the block runs."""
+def _watched(answered: list[int], last: Callable[[], object]) -> Iterator[None]:
+    """End the process where a signal does not end the block."""
     # A pair of sockets, because Windows has no pipes that do not block before Python 3.12.
     receiver, sender = socket.socketpair()
     sender.setblocking(False)
+    ended = Event()
     # The interpreter writes the numbers of signals at once, whatever the main thread does.
     before = signal.set_wakeup_fd(sender.fileno(), warn_on_full_buffer=False)
-    watch = Thread(target=_watch, args=(receiver, answered, last), name="skin-signals", daemon=True)
+    watch = Thread(target=_watch, args=(receiver, answered, ended, last), name="skin-signals", daemon=True)
     watch.start()
     try:
         yield
     finally:
         signal.set_wakeup_fd(before)
         sender.close()
+        ended.set()
 
 
-def _watch(receiver: socket.socket, answered: Event, last: Callable[[], object] | None) -> None:
+def _watch(receiver: socket.socket, answered: list[int], ended: Event, last: Callable[[], object]) -> None:
     with receiver:
-        while numbers := receiver.recv(64):
-            if signal.SIGTERM in numbers and not answered.wait(_PATIENCE):
-                if last is not None:
-                    ending = Thread(target=_try, args=(last,), daemon=True)
-                    ending.start()
-                    ending.join(_LAST)
-                os._exit(128 + signal.SIGTERM)
+        while signal.SIGTERM not in (numbers := receiver.recv(64)):
+            if not numbers:
+                return
+        if ended.wait(_PATIENCE) or (answered and ended.wait(_CLOSING)):
+            return
+    ending = Thread(target=_try, args=(last,), daemon=True)
+    ending.start()
+    ending.join(_LAST)
+    os._exit(128 + signal.SIGTERM)
 
 
 def _try(last: Callable[[], object]) -> None:

@@ -183,24 +183,25 @@ class Store:
             for key, value in (tags | {PROCESS: _identify_process()}).items():
                 self.client.set_tag(run.info.run_id, key, value)
         status = "KILLED"
-        try:
-            with ends_on_signal(lambda: self._end(run, status)), _patience():
-                yield run
-                self.client.set_terminated(run.info.run_id, "FINISHED")
-            status = "FINISHED"
-        except Exception as error:
-            if self._lost(error):
-                raise InputError(
-                    f"the tracking server {self.uri} does not answer, and run {run.info.run_id} is not "
-                    "complete: repeat the command when it does; a training continues after its last epoch"
-                ) from error
-            status = "FAILED"
-            if answers(self.uri):
-                self.client.set_tag(run.info.run_id, "error", f"{type(error).__name__}: {error}"[:500])
-            raise
-        finally:
-            if status != "FINISHED":
-                self._end(run, status)
+        with ends_on_signal(lambda: self._end(run, status)):
+            try:
+                with _patience():
+                    yield run
+                    self.client.set_terminated(run.info.run_id, "FINISHED")
+                status = "FINISHED"
+            except Exception as error:
+                if self._lost(error):
+                    raise InputError(
+                        f"the tracking server {self.uri} does not answer, and run {run.info.run_id} is not "
+                        "complete: repeat the command when it does; a training continues after its last epoch"
+                    ) from error
+                status = "FAILED"
+                if answers(self.uri):
+                    self.client.set_tag(run.info.run_id, "error", f"{type(error).__name__}: {error}"[:500])
+                raise
+            finally:
+                if status != "FINISHED":
+                    self._end(run, status)
 
     def _lost(self, error: Exception) -> bool:
         """Return whether an error means that the server gives no answer; what it answers is another one."""

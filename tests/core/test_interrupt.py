@@ -1,8 +1,10 @@
 """Ctrl-C while a command is still importing: no traceback, and the exit code of a signal."""
 
+import os
 import signal
 import subprocess
 import sys
+from collections import Counter
 from time import monotonic, sleep
 
 import pytest
@@ -73,4 +75,78 @@ def test_sigterm_is_answered_within_seconds_whatever_the_process_does(step, line
         process.wait()
     assert process.returncode == 128 + signal.SIGTERM
     assert ["busy", *said] == lines
+    assert monotonic() - start < 10
+
+
+DOUBLED = """
+import os, random, signal, sys, time
+from skin.core.interrupt import ends_on_signal
+
+def wait():
+    try:
+        with ends_on_signal():
+            try:
+                os.write(sender, b"open")
+                while True:
+                    time.sleep(0.001)
+            finally:
+                time.sleep(0.005)  # the second signal arrives
+                os.write(sender, b"closed")
+    except SystemExit as end:
+        os._exit(end.code)
+    finally:
+        os._exit(1)
+
+pauses = random.Random(0)
+for _ in range(int(sys.argv[1])):
+    receiver, sender = os.pipe()
+    child = os.fork() or wait()
+    os.close(sender)
+    os.read(receiver, 4)
+    os.kill(child, signal.SIGTERM)
+    time.sleep(pauses.uniform(0, 3e-4))
+    os.kill(child, signal.SIGTERM)
+    late = time.monotonic() + 5
+    while not (ended := os.waitpid(child, os.WNOHANG))[0] and time.monotonic() < late:
+        time.sleep(0.001)
+    if not ended[0]:
+        os.kill(child, signal.SIGKILL)
+    status = ended[1] if ended[0] else os.waitpid(child, 0)[1]
+    print(os.waitstatus_to_exitcode(status), os.read(receiver, 6).decode())
+    os.close(receiver)
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork")
+@pytest.mark.parametrize("times", [20, pytest.param(1000, marks=pytest.mark.slow)])
+def test_two_signals_end_a_process_once_everything_is_closed(times):
+    """A second one interrupted the first, in its handler, which could hang, or what closes resources."""
+    line = [sys.executable, "-c", DOUBLED, str(times)]
+    done = subprocess.run(line, capture_output=True, text=True, cwd=ROOT, check=True)
+    assert Counter(done.stdout.splitlines()) == {"143 closed": times}
+
+
+HANGING = """
+import time
+from skin.core import interrupt
+interrupt._CLOSING = 1.5
+with interrupt.ends_on_signal(lambda: print("last", flush=True)):
+    try:
+        print("open", flush=True)
+        time.sleep(60)
+    finally:
+        time.sleep(60)
+"""
+
+
+def test_a_signal_ends_a_process_that_hangs_while_it_closes():
+    line = [sys.executable, "-c", HANGING]
+    with subprocess.Popen(line, stdout=subprocess.PIPE, text=True, cwd=ROOT) as process:
+        assert process.stdout.readline() == "open\n"
+        process.terminate()
+        sleep(0.2)
+        process.terminate()
+        start = monotonic()
+        assert process.stdout.read() == "last\n"
+        assert process.wait() == 128 + signal.SIGTERM
     assert monotonic() - start < 10

@@ -88,6 +88,24 @@ def test_a_signal_leaves_no_finished_run(begin, tmp_path, settings, store, numbe
     assert Store.open(settings).find(fingerprint="f")[0].info.status == "KILLED"
 
 
+def test_a_second_signal_does_not_interrupt_the_end_of_a_run(store, monkeypatch):
+    before, ended = signal.getsignal(signal.SIGTERM), []
+
+    def end(store, run, status):
+        signal.raise_signal(signal.SIGTERM)
+        ended.append(status)
+
+    monkeypatch.setattr(Store, "_end", end)
+    # Else a signal that is not expected would end the tests.
+    signal.signal(signal.SIGTERM, lambda *_: pytest.fail("a signal was not expected"))
+    try:
+        with pytest.raises(SystemExit, match="143"), store.run("stopped twice", {}):
+            signal.raise_signal(signal.SIGTERM)
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    assert ended == ["KILLED"]
+
+
 def test_a_run_whose_process_is_gone_is_called_killed(settings, store):
     here, number, started = json.loads(tracking._identify_process())
     with subprocess.Popen([sys.executable, "-c", ""]) as ended:

@@ -73,8 +73,12 @@ def contact_message(estimate: "FrameEstimate", time: float) -> dict[str, Any]:
         "large": round(estimate.large, 6),
     }
     if not (estimate.fingertip or none):
-        # The best fingertips are none of those that press: a reader must not find them.
-        return unknown_contacts("") | base | {"state": "not a fingertip"}
+        # The strongest of the fingertips that fit best: a reader must find where a hard touch is.
+        return (
+            unknown_contacts("")
+            | base
+            | {"state": "not a fingertip", "contacts": [*map(_contact, estimate.contacts[:1])]}
+        )
     return {
         "state": "no contact" if none else "contacts",
         **base,
@@ -115,7 +119,8 @@ def contact_text_lines(message: dict[str, Any]) -> list[str]:
     if state == "unknown":
         return [f"contacts unknown: {message['reason']}"]
     if state == "not a fingertip":
-        return [state]
+        head = f"{state} (fit {message['fit']:.2g}, a larger contact {100 * message['large']:.0f} %)"
+        return [head, *(f"best: {_words(contact)}" for contact in message["contacts"])]
     head = f"{number or 'no'} contact{'s' * (number > 1)} ({100 * message['probability']:.0f} %)"
     return [head, *map(_words, message["contacts"])]
 

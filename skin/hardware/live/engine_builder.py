@@ -30,6 +30,7 @@ from skin.runs.trained_model import TrainedModel
 STRENGTH = 1.5
 """Pressure of the touches as a multiple of the limit of ``dangerous``."""
 
+_WEAK = 1.2  # the same of weaker ones: a network is surer of strong touches than of those that a limit hides
 _LEAST = 0.5  # of the presses that must raise the alarm with nominal settings
 _SHARE = 0.9  # of what the model finds with nominal settings that the settings in use must find
 _MASKED = 0.25  # share of the sensors that may be without a valid reading
@@ -67,7 +68,8 @@ class SelfTest:
 
         Raises:
             InputError: fewer touches raise the alarm than with nominal settings, a valid sensor cannot raise
-                it that does with those, or with those less than half of the presses do.
+                it that does with those, or with those less than half of the presses do; or the threshold
+                hides weaker ones.
         """
         unit = unit_conversion(len(self.presses), None, 1.0, None, None)
         expected = self.find(self._plausible, unit, RawRange())
@@ -83,6 +85,28 @@ class SelfTest:
         few = raised[valid].sum() < _SHARE * expected[valid].sum()
         if expected.mean() < _LEAST or len(missed) or few or conversion.broken.mean() > _MASKED:
             raise InputError(self._refusal(raised, expected, missed, conversion, device))
+        self._check_threshold(unit)
+
+    def _check_threshold(self, unit: UnitConversion) -> None:
+        """Raise InputError if a threshold above the nominal one hides weak touches, which it alone could."""
+        above = [settings.patience.above or 0.5 for settings in (self.used, self.nominal)]
+        if above[0] <= above[1]:
+            return
+        used, nominal = (
+            self.find(
+                replace(self._plausible, patience=replace(self.nominal.patience, above=value)),
+                unit,
+                RawRange(),
+                _WEAK,
+            ).sum()
+            for value in above
+        )
+        if used < _SHARE * nominal:
+            raise InputError(
+                f"self-test: {used} of {len(self._sensors)} presses at {_WEAK:g} times the limit raise the "
+                f"alarm, {nominal} with nominal settings: live.patience.above={above[0]:g} is most likely "
+                f"wrong; {_OVERRIDE}"
+            )
 
     @property
     def _sensors(self) -> np.ndarray:
@@ -97,7 +121,13 @@ class SelfTest:
         threshold = min(detection.threshold, _PLAUSIBLE)
         return replace(self.nominal, detection=replace(detection, threshold=threshold))
 
-    def find(self, settings: EngineSettings, conversion: UnitConversion, device: RawRange) -> np.ndarray:
+    def find(
+        self,
+        settings: EngineSettings,
+        conversion: UnitConversion,
+        device: RawRange,
+        strength: float = STRENGTH,
+    ) -> np.ndarray:
         """Return which presses raise the alarm, (P,), bool: a fast one on each sensor, and some slow ones."""
         engine, raised = settings.build(), list[bool]()
         # Without noise: the frozen frames of a test are no fault of the device.
@@ -105,7 +135,7 @@ class SelfTest:
         for number, sensor in enumerate(self._sensors):
             engine.reset()
             rise = _FAST if number < len(self.presses) else _SLOW
-            frames = list(_frames(number, rise, STRENGTH * self.presses[sensor], conversion, device))
+            frames = list(_frames(number, rise, strength * self.presses[sensor], conversion, device))
             settling = round(_REST * _RATE)
             engine.push(frames[:settling], None)  # nothing to decide yet
             pieces = (frames[first : first + _PIECE] for first in range(settling, len(frames), _PIECE))

@@ -268,14 +268,15 @@ def log_alarms(display: Display, path: Path) -> Iterator[None]:
         file = path.open("a", encoding="utf-8")
     except OSError as error:
         raise unwritable(path, error, "live.log=FILE.jsonl") from error
-    with file:
-        log = AlarmLog(file, display)
-        log.write("started")
-        display.observers.append(log.observe)
-        display.listeners.append(log.write)
-        try:
-            yield
-        finally:
-            display.observers.remove(log.observe)
-            display.listeners.remove(log.write)
-            log.write("ended")
+    log = AlarmLog(file, display)
+    log.write("started")
+    display.observers.append(log.observe)
+    display.listeners.append(log.write)
+    try:
+        yield
+    finally:
+        display.observers.remove(log.observe)
+        display.listeners.remove(log.write)
+        log.write("ended")
+        with suppress(OSError):  # of a full disk: the log has told of it
+            file.close()

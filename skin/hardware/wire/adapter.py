@@ -296,6 +296,8 @@ class Adapter:
 
     def _detect_struct(self, data: bytes, sensors: int | None) -> DetectedFormat:
         head, tail, seen = self._mark(self.head), self._mark(self.tail), None
+        if data.count(head or tail) < _RUN:
+            return DetectedFormat()
         for repeat in [self.repeat] if self.repeat else range(1, _MOST_REPEATS):
             size = repeat * self._record.itemsize
             length = len(head) + size + len(tail)

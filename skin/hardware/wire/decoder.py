@@ -408,6 +408,7 @@ _LONGEST = 65536  # bytes of a line
 _ENOUGH = 4096  # bytes in which the format must show
 _PATIENCE = 2.0  # s of receiving in which it must
 _MANY, _LONG = 65536, 4.0  # the same of an adapter, which may need a dozen frames of many lines
+_NEWS = 1 / 16  # share of the first bytes that must be new before the format is looked for again
 _PAUSE = 0.2  # s that a silence counts for at most, because a board may take seconds to start
 _PER_FIELD = 12  # bytes
 _SPAN = 2.0  # s over which good frames are compared with bad ones
@@ -470,7 +471,7 @@ class Decoder:
         self.stats.format = self.stats.check = ""
         self._buffer = b""
         self._count_seen: int | None = None
-        self._receiving, self._fed_at = 0.0, float("nan")
+        self._receiving, self._fed_at, self._unseen = 0.0, float("nan"), 0
         self._whole = self._overlong = self._synchronous = False
         self._missing = 0
 
@@ -539,8 +540,11 @@ class Decoder:
 
     def _recognise(self, data: bytes) -> bool:
         """Buffer the first bytes until they show the format; they are then decoded from the first one on."""
-        if not self.adapter.may_end(data):
+        self._unseen += len(data)
+        # What is left unread grows with what was read, or the time to read it all would grow as its square.
+        if not self.adapter.may_end(data) or self._unseen < _NEWS * len(self._buffer):
             return False
+        self._unseen = 0
         detected = self.adapter.detect(self._buffer, self.sensors)
         self.frame_format, self._count_seen = detected.frame_format, detected.count_seen
         if self.frame_format is None:

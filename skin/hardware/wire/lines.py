@@ -114,13 +114,15 @@ class NumberReader:
         """Return the fields of a line."""
         number = re.compile(self.number.encode())  # re caches it
         words, place = list[bytes](), 0
-        for match in number.finditer(line):
-            if line[place : match.start()].strip(b" \t,;") or match.end() == match.start():
-                raise FrameError("number", word=line[place : match.end()].decode("ascii", "replace"))
-            words.append(match[0])
-            place = match.end()
-        if line[place:].strip(b" \t,;"):
-            raise FrameError("number", word=line[place:].decode("ascii", "replace"))
+        while place < len(line):
+            match = number.match(line, place)
+            if match is not None and match.end() > place:
+                words.append(match[0])
+                place = match.end()
+            elif line[place] in b" \t,;":
+                place += 1
+            else:  # not searched for further on: it would take as long as the square of the line's length
+                raise FrameError("number", word=line[place:][:80].decode("ascii", "replace"))
         if self.split.decimal == ",":
             words = [word.replace(b",", b".") for word in words]
         return parse_words(words, "none", self.split.invalid)
@@ -188,11 +190,17 @@ class LabelReader:
     def learn(cls, lines: Sequence[bytes], label: str, split: SeparatedReader) -> "LabelReader":
         """Return the reader of lines with the commonest names."""
         mark = re.escape(label.encode())
-        field = re.compile(rb"\s*([^\s,;\d.+-][^,;\t=:]*?)\s*" + mark + rb"\s*([^\s,;]+)\s*[,;\t ]?\s*")
+        # Each blank is matched in one way, or blanks would take a time as the square of their number.
+        field = re.compile(
+            rb"\s*([^\s,;\d.+-](?:[^\s,;=:]|[^\S\t]++(?![\s,;=:]))*?)\s*"
+            + mark
+            + rb"\s*([^\s,;]+)\s*[,;\t ]?\s*"
+        )
         seen = Counter(names for line in lines if (names := _names_of(field, line)))
         labels = seen.most_common(1)[0][0] if seen else ()
-        parts = [re.escape(name) + rb"\s*" + mark + rb"\s*([^\s,;]*)" for name in labels]
-        pattern = re.compile(rb"\s*" + rb"\s*[,;\t ]\s*".join(parts) + rb"\s*[,;]?\s*")
+        parts = [re.escape(name) + rb"\s*" + mark + rb"\s*+([^\s,;]*)" for name in labels]
+        separator = rb"(?:\s*+[,;]\s*+|\s++|(?<=\s))"  # the last one: behind an empty field
+        pattern = re.compile(rb"\s*+" + separator.join(parts) + rb"\s*+[,;]?\s*+")
         return cls(pattern, labels, split)
 
     def __call__(self, line: bytes) -> Line:

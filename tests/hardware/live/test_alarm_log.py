@@ -2,6 +2,7 @@
 
 import json
 from datetime import UTC, datetime, timedelta
+from pathlib import Path
 from time import monotonic
 
 import numpy as np
@@ -67,6 +68,15 @@ def test_a_full_disk_ends_the_log_and_not_the_view(capsys):
     log.observe(verdict(True), "", False)
     log.observe(verdict(False), "", False)
     assert capsys.readouterr().err == "the alarm log ends here: No space left on device\n"
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no such device")
+def test_a_full_disk_does_not_hide_how_the_view_ends(capsys):
+    """Closing the file raised an error of its own: SIGTERM ended with code 2."""
+    shown = display()
+    with pytest.raises(SystemExit, match="143"), log_alarms(shown, Path("/dev/full")):
+        raise SystemExit(143)
+    assert capsys.readouterr().err == "the alarm log ends here: [Errno 28] No space left on device\n"
 
 
 def test_the_log_is_valid_json_whatever_a_verdict_holds(tmp_path):

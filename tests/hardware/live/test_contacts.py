@@ -162,8 +162,22 @@ def test_few_sensors_that_feel_nothing_show_no_contact_but_a_light_touch():
 @pytest.mark.parametrize("values", [np.full(SENSORS, 3.0), [0, 0, 0, 0, -3.0, 0, 0, 0, 0]])
 def test_what_no_fingertip_gives_is_none_and_not_no_contact(posterior, values):
     message = estimate_contacts(posterior, NOISE, moment(values))
-    assert (message["state"], message["number"], message["contacts"]) == ("not a fingertip", None, [])
-    assert contact_text_lines(message) == ["not a fingertip"]
+    assert (message["state"], message["number"], message["probability"]) == ("not a fingertip", None, None)
+    assert contact_text_lines(message)[0].startswith("not a fingertip (fit ")
+
+
+def test_where_a_hard_touch_is_is_shown_though_no_fingertip_fits_it(posterior, felt):
+    """On many sensors, gains that differ by more than was assumed show only there, where they are large."""
+    estimate = replace(posterior.estimate(5 * felt), fingertip=False, fit=0.00213, large=0.3)
+    message = contact_message(estimate, 0.0)
+    assert (message["state"], message["number"], message["fit"]) == ("not a fingertip", None, 0.00213)
+    (best,) = message["contacts"]
+    assert np.hypot(best["x"] - TRUTH[0, 0], best["y"] - TRUTH[0, 1]) < 0.005
+    assert best["force"] == pytest.approx(25, rel=0.2)
+    head, line = contact_text_lines(message)
+    assert head == "not a fingertip (fit 0.0021, a larger contact 30 %)"
+    assert line.startswith("best: (")
+    assert " N, " in line
 
 
 def test_broken_sensors_do_not_look_like_no_contact(posterior, felt):

@@ -1,10 +1,12 @@
 """The live view of an exported model: in a process of its own, without torch."""
 
 import json
+import os
+import re
 import socket
 import subprocess
 import sys
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from threading import Event, Thread
 from time import monotonic, sleep
@@ -26,6 +28,7 @@ from skin.runs.onnx_writer import write_model
 pytest.importorskip("onnxruntime")
 RATE = 100.0  # Hz, of the device
 PATIENCE = 300  # s
+EXAMPLE = ROOT / "docs" / "examples" / "onnx_only.py"
 LIVE = LiveSettings(0, 4.0, None, 0.2, None, None, False, True, DebounceSettings())
 WATCH = """
 import sys
@@ -178,15 +181,13 @@ def test_the_command_replaces_settings_of_the_file(model, skin):
 
 @pytest.mark.slow
 def test_the_example_without_this_package(model, begin, tmp_path):
-    example = ROOT / "docs" / "examples" / "onnx_only.py"
-    assert len(example.read_text().splitlines()) <= 40
     sizes = ["layout=grid", "layout.rows=2", "layout.columns=3"]
     with begin(tmp_path, "emulate", "simulator=naive", *sizes, "link=skin", "emulate.idle=4") as emulator:
         while "device.scale=" not in emulator.out:
             assert emulator.poll() is None, emulator.err
         scale = emulator.out.partition("device.scale=")[2].split()[0]
         with subprocess.Popen(
-            [sys.executable, "-I", example, model, tmp_path / "skin", scale],
+            [sys.executable, "-I", EXAMPLE, model, tmp_path / "skin", scale],
             stdout=subprocess.PIPE,
             text=True,
             cwd=tmp_path,
@@ -196,3 +197,97 @@ def test_the_example_without_this_package(model, begin, tmp_path):
     assert {line["touched"] for line in lines} == {False, True}
     assert all(0 <= line[name] <= 1 for line in lines for name in ("big", "dynamic", "press", "dangerous"))
     assert all(line["alarm"] == (line["touched"] and line["dangerous"] > 0.25) for line in lines)
+
+
+@contextmanager
+def board(line):
+    """Yield the port of a board that sends ``line(number)`` without end."""
+    tty = pytest.importorskip("tty", reason="pseudo-terminals need a POSIX system")
+    controller, follower = os.openpty()
+    tty.setraw(controller)
+    stop = Event()
+
+    def send():
+        for number in range(10**6):
+            os.write(controller, line(number))
+            if stop.wait(0.002):
+                return
+
+    thread = Thread(target=send)
+    thread.start()
+    yield os.ttyname(follower)
+    stop.set()
+    thread.join(PATIENCE)
+    os.close(controller)
+    os.close(follower)
+
+
+@contextmanager
+def example(model, port, *files):
+    """Yield the example as a process that reads the port."""
+    line = [sys.executable, "-I", EXAMPLE, model, port, *files]
+    with subprocess.Popen(line, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as reader:
+        yield reader
+        reader.kill()
+
+
+ADAPTER = """
+kind: text
+separator: ;
+decimal: ","
+names: [ms, a, b, c, d, e, f, heat]
+drop: [heat]
+time: ms
+time_unit: ms
+invalid: ["off"]
+"""
+GAINS = """
+format: 1
+count: 6
+scale: 0.01
+polarity: -1
+channels: [1, 0, 2, 3, 4, 5]
+sensors: {gain: [0.05, 0.05, 0.05, 0.05, null, 0.05]}
+broken: {dead: [2]}
+"""
+
+
+def test_the_example_reads_an_adapter_and_a_calibration(model, tmp_path):
+    """A touch of 10 counts is 2 N, and 0.1 N without the gains; one of the broken sensor is none."""
+    (tmp_path / "board.yaml").write_text(ADAPTER)
+    (tmp_path / "gains.yaml").write_text(GAINS)
+
+    def line(number):
+        if number % 20 == 7:
+            return b"what is this\n"
+        phase = number % 1000
+        values = [500, 500, 500 - 500 * (250 <= phase < 500), 500, 500, 500 - 10 * (phase >= 500)]
+        words = [50 * number, *(f"{value},0" for value in values), "21,5"]
+        words[5] = "off" if number % 3 else words[5]
+        return ";".join(map(str, words)).encode() + b"\r\n"
+
+    with (
+        board(line) as port,
+        example(model, port, tmp_path / "gains.yaml", tmp_path / "board.yaml") as reader,
+    ):
+        said = [json.loads(reader.stdout.readline()) for _ in range(600)]
+        assert 250 < sum(one["touched"] for one in said) < 350
+        assert re.match(r"[1-9] of 50 lines cannot be read: ", reader.stderr.readline())
+
+
+@pytest.mark.parametrize(
+    ("setting", "said"),
+    [
+        ("kind: json", "device.adapter.kind=json: this example reads text; use skin live\n"),
+        ("kind: text\nlabel: ':'", "device.adapter.label: this example reads only"),
+        ("kind: text\ndecimal: ','", r"\d+ of 50 lines cannot be read: .*; give an adapter"),
+    ],
+)
+def test_what_the_example_cannot_read_it_refuses_in_a_sentence(model, tmp_path, setting, said):
+    (tmp_path / "board.yaml").write_text(setting)
+    with (
+        board(lambda number: b"%d,1,2,3,4,5,6\n" % number) as port,
+        example(model, port, "0.01", tmp_path / "board.yaml") as reader,
+    ):
+        assert re.match(said, reader.stderr.read())
+        assert reader.wait() == 2

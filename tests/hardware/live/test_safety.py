@@ -270,6 +270,21 @@ class TestSelfTest:
             with pytest.raises(InputError, match=rf"{named} is most likely wrong.*live\.selftest=false"):
                 self.run(used)
 
+    def test_a_threshold_that_only_strong_touches_exceed_is_named(self):
+        """A network is nearly certain of touches far above the limit, and less so of those just above it."""
+
+        class Soft(Loud):
+            def probabilities(self, touches):
+                danger = torch.sigmoid(8 * (touches.readings.flatten(1).amax(1) - 4))
+                return torch.stack([danger] * 4, dim=1)
+
+        classify = window_classifier(Soft(), torch.zeros(SENSORS, 3), 10.0)
+        nominal = replace(settings(), classify=classify)
+        for above in (0.1, 0.99):
+            self.run(replace_patience(nominal, above=above), nominal=nominal)
+        with pytest.raises(InputError, match=r"0 of 14 .* 14 with .* live\.patience\.above=0\.9999 is most"):
+            self.run(replace_patience(nominal, above=0.9999), nominal=nominal)
+
     def test_a_model_that_finds_less_than_half_of_the_presses_is_refused(self):
         felt = np.where(np.arange(SENSORS) < SENSORS // 3, 4.0, 1e-3)
         conversion = UnitConversion(np.full(SENSORS, SCALE), np.full(SENSORS, 200.0), np.zeros(SENSORS, bool))

@@ -3,6 +3,7 @@
 import json
 import struct
 from collections.abc import Callable
+from time import process_time
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ import pytest
 from skin.errors import InputError
 from skin.hardware.wire.adapter import Adapter, read_adapter
 from skin.hardware.wire.decoder import Decoder
+from skin.hardware.wire.formats import DetectedFormat
 from skin.hardware.wire.proposal import propose
 
 RATE = 50.0  # Hz
@@ -268,3 +270,43 @@ def test_fields_are_kept_dropped_and_marked_invalid():
     assert {frame.valid[1] for frame in frames if frame.seq % 5 == 0} == {False}
     frames = Decoder(adapter=Adapter(kind="text", values=(4, 1))).feed(lines)
     assert frames[-1].values.tolist() == [300, 514]
+
+
+SHIPPED = {
+    "arduino_plotter": b"a:%d,b:2\n",
+    "anyskin": b"25.00%d.00-1.250.17\n",
+    "csv": b"%d,2,3\n",
+    "json_lines": b'{"a":%d,"b":2}\n',
+    "matrix_rows": b"%d,2,3\n",
+    "protocol": b"%d,2,3\n",
+    "anyskin_binary": b"%d",
+}
+
+
+@pytest.mark.parametrize("adapter", SHIPPED)
+def test_the_time_for_a_long_line_grows_with_its_length(adapter):
+    """Regular expressions that match blanks or digits in several ways took 4 s, or an hour."""
+
+    def seconds(line):
+        decoder = Decoder(adapter=read_adapter(adapter))
+        decoder.feed(b"".join(SHIPPED[adapter] % (place % 9) for place in range(40)))
+        start = process_time()
+        for place in range(0, len(line), 1024):
+            decoder.feed(line[place : place + 1024])
+        return process_time() - start
+
+    for begin in (b"a", b"a:", b"a:1", b"a:1,b:2", b"1.25", b"25.0"):
+        for middle in (b" ", b"1", b"a"):
+            short, long = (seconds(begin + middle * length + b"x\n") for length in (7_500, 30_000))
+            assert long < 8 * short + 0.1, (begin, middle)  # as the square: 16 times
+
+
+def test_what_is_read_to_find_a_format_grows_with_what_is_received(monkeypatch):
+    """Each of many small pieces made the decoder read all of those before it."""
+    read, decoder = [], Decoder(adapter=read_adapter("csv"))
+    monkeypatch.setattr(
+        Adapter, "detect", lambda self, data, sensors: read.append(len(data)) or DetectedFormat()
+    )
+    for _ in range(3000):
+        decoder.feed(b"xyz 1 of\r\n")
+    assert sum(read) < 20 * 30_000

@@ -79,13 +79,20 @@ class FrameError(Exception):
         found: number of fields, for the reason ``fields``.
         word: the field, for the reason ``number``.
         numbers: the fields of a line, NaN where there is no number, for the same reason.
+        check: kind of its checksum.
     """
 
     def __init__(
-        self, reason: str, count: int | None = None, word: str = "", numbers: Sequence[float] = ()
+        self,
+        reason: str,
+        count: int | None = None,
+        word: str = "",
+        numbers: Sequence[float] = (),
+        check: Check = "none",
     ) -> None:
         super().__init__(reason)
-        self.reason, self.found, self.word, self.numbers = reason, count, word, list(numbers)
+        self.reason, self.found, self.word = reason, count, word
+        self.numbers, self.check = list(numbers), check
 
 
 _SLOWER = 1.05  # tolerance for the error of a ceramic resonator and for lost frames

@@ -479,7 +479,7 @@ def fails_in_contact(failed: int, frames: int, failed_at_rest: int, frames_at_re
     """
     usual = min(_TIMES * (failed_at_rest + 1) / (frames_at_rest + _FRAMES), 1.0)
     # The probability of so many or more.
-    return failed >= _FEW and bool(betainc(failed, frames - failed + 1, usual) < _ACCIDENT)
+    return bool(failed >= _FEW and betainc(failed, frames - failed + 1, usual) < _ACCIDENT)
 
 
 def _equal_chance(frames: np.ndarray) -> np.ndarray:

@@ -595,7 +595,8 @@ class Decoder:
             self._identity, self._changed_at = "changed", min(self._changed_at, self._fed_at)
         else:
             self._identity = "other"
-        self._other, self.stats.trouble = header, self._doubt
+        self._other = header
+        self.stats.trouble = self._doubt
 
     @property
     def _doubt(self) -> str:

@@ -152,7 +152,7 @@ class TextFormat:
         except FrameError as bad:
             if 2 * sum(map(isfinite, bad.numbers)) <= self.roles.count:
                 raise
-            return Line(bad.numbers, self.check, False)
+            return Line(bad.numbers, bad.check, False)
 
     def read(self, piece: bytes) -> RawFrame | bytes:
         """Return the frame in a line, or the line where it is empty or a comment; else raise FrameError."""

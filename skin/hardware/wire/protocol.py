@@ -150,7 +150,8 @@ def parse_words(words: Sequence[bytes], check: Check = "none", invalid: Collecti
         fields = [value if value is not None and isfinite(value) else nan for value in values]
         for word, value in zip(words, values, strict=True):
             if value is None and word.strip().lower() not in invalid:
-                raise FrameError("number", word=word.strip().decode("ascii", "replace"), numbers=fields)
+                text = word.strip().decode("ascii", "replace")
+                raise FrameError("number", word=text, numbers=fields, check=check)
     if any(b"_" in word for word in words):  # valid in Python's grammar only
         raise FrameError("number")
     return Line(fields, check, finite)

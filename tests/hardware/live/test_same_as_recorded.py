@@ -14,6 +14,7 @@ from skin.hardware.live.engine import Detection, Engine
 from skin.hardware.live.loop import Display, DisplayInfo, LiveLoop
 from skin.hardware.recorder import convert_session, record_session
 from skin.hardware.serial import Serial
+from skin.hardware.wire.decoder import ClockWatch
 from skin.hardware.wire.protocol import (
     Announcement,
     Header,
@@ -141,8 +142,8 @@ def live(learner, stream):
     skin, engine, asked, info, found = watched(learner, device)
 
     class Taking(Display):
-        def set_verdict(self, verdict, trouble="", alarm=False):
-            super().set_verdict(verdict, trouble, alarm)
+        def set_verdict(self, verdict, trouble="", alarm=False, now=None):
+            super().set_verdict(verdict, trouble, alarm, now)
             if verdict is not None:
                 found[round(verdict.t * RATE)] = asked.windows[-1], verdict
 
@@ -171,7 +172,8 @@ def recorded(learner, stream, path):
     return touches, learner.probabilities(touches)
 
 
-def test_live_and_recorded_are_the_same_to_the_last_bit(learner, tmp_path):
+def test_live_and_recorded_are_the_same_to_the_last_bit(learner, tmp_path, monkeypatch):
+    monkeypatch.setattr(ClockWatch, "_SPAN", np.inf)  # the stream comes as fast as it is read
     said = live(learner, pieces())
     touches, chances = recorded(learner, pieces(), tmp_path / "s.csv")
     assert len(touches) == GESTURES

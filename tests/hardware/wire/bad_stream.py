@@ -50,11 +50,11 @@ def fuzz(count: int, spoken: WireFormat, sensors: int, seed: int) -> dict[str, i
     )
     stream = _Stream(rng, spoken, sensors)
     oracle = _Oracle(stream)
-    for number in range(count):
+    for _ in range(count):
         chunk = stream.chunk(rng.randint(0, rng.choice(_LENGTHS)))
-        for frame in decoder.feed(chunk, number * 1e-3):
+        for frame in decoder.feed(chunk, stream.time):
             oracle.take(frame)
-    for frame in decoder.feed(stream.rest(), count * 1e-3):
+    for frame in decoder.feed(stream.rest(), stream.time):
         oracle.take(frame)
     missed = oracle.missed + len(stream.expected)
     return {
@@ -86,6 +86,11 @@ class _Stream:
             self._good()
         if spoken in ("xor", "none"):
             self.expected.popleft()  # without a CRC the first line may be half a line, and is left out
+
+    @property
+    def time(self) -> float:
+        """Of the latest frame by the device's clock, s."""
+        return self._count * _PERIOD * 1e-6
 
     def chunk(self, length: int) -> bytes:
         """Return the next bytes."""
@@ -168,7 +173,7 @@ class _Stream:
         elif kind < 0.5:
             noise = rng.randbytes(length)
         elif kind < 0.6:
-            noise = b"# skin proto=1 n=%d rate=50 unit=adc bits=99\n" % rng.randrange(99)
+            noise = b"# skin proto=1 n=%d rate=50 unit=adc bits=99\n" % self._sensors
         else:
             noise = bytes(rng.choices(_SOUP, k=length))
         self._put(noise + (self._end if rng.random() < 0.7 else b""))

@@ -130,7 +130,8 @@ def test_two_seconds_of_receiving_are_enough_but_a_slow_start_is_none():
     [
         (b"3,3000,1,2,3\n", "fields"),
         (b"3,3000,1,2,3,4,5\n", "fields"),
-        (b"3,3000,1,x,3,4\n", "number"),
+        (b"3,3000,x,y,z,4\n", "number"),
+        (b"3,x,1,2,3,4\n", "number"),
         (b"nan,3000,1,2,3,4\n", "number"),
         (b"-3,3000,1,2,3,4\n", "number"),
         (b"3.5,3000,1,2,3,4\n", "number"),
@@ -146,6 +147,14 @@ def test_a_bad_line_is_dropped_and_the_next_one_taken(spoilt, reason):
     assert (frames[2].after, frames[2].lost) == ("gap", 1)
     counters = decoder.stats
     assert (counters.bad, counters.resyncs, counters.gaps, counters.lost) == ({reason: 1}, 1, 1, 1)
+
+
+def test_a_word_in_place_of_a_value_costs_that_value():
+    decoder = Decoder(4)
+    frames = decoder.feed(b"".join(lines(3, check="none")) + b"3,3000,1,OL,3,4\n")
+    assert (frames[-1].seq, frames[-1].valid.tolist()) == (3, [True, False, True, True])
+    assert frames[-1].values.tolist() == [1, 102, 3, 4]  # its latest value, which does not count
+    assert (decoder.stats.bad_frames, decoder.stats.invalid) == (0, 1)
 
 
 def test_a_weaker_checksum_than_the_first_lines_had_is_refused():

@@ -88,7 +88,7 @@ def test_what_comes_when_a_port_is_opened_is_skipped_and_counted(plug):
     ("spoilt", "reason"),
     [
         (b"5,50000,1,2,3\n", "fields"),
-        (b"5,50000,1,2,three,4\n", "number"),
+        (b"5,50000,one,two,three,4\n", "number"),
         (b"5,nan,1,2,3,4\n", "number"),
         (line(5).replace(b"501", b"511"), "checksum"),
         (b"9" * 70_000 + b"\n", "long"),

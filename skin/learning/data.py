@@ -117,6 +117,7 @@ class TouchData(pl.LightningDataModule):
         device: as given.
         task: the labels.
         window: number of frames per touch.
+        passes: counts the passes over training batches without a Trainer.
     """
 
     def __init__(
@@ -141,7 +142,7 @@ class TouchData(pl.LightningDataModule):
         self._known: tuple[Tensor, AbstractRepresentation] | None = None
         self._drawn: dict[str, Touches] = {}
         self._ahead: dict[int, Future[Touches]] = {}
-        self._passes = itertools.count()
+        self.passes = itertools.count()
 
     @property
     def task(self) -> Task:
@@ -255,10 +256,6 @@ class TouchData(pl.LightningDataModule):
         make: Any = getattr(self._make, "func", self._make)
         return bool(make.layout_free)
 
-    def next_epoch(self) -> int:
-        """Return the epoch of the pass that begins: the Trainer's, or the number of passes before it."""
-        return self.trainer.current_epoch if self.trainer else next(self._passes)
-
     def teardown(self, stage: str) -> None:
         """Forget the Trainer, which has ended."""
         self.trainer = None
@@ -289,10 +286,8 @@ class _Batches:
         data = self.data
         if self.split == "train" and data.alongside:
             yield from one_ahead(data.frames, self._touches())
-        elif data.trainer is None:
-            yield from map(data.frames, self._touches())
         else:
-            yield from self._touches()
+            yield from self._touches() if data.trainer else map(data.frames, self._touches())
 
     def _touches(self) -> Iterator[Touches]:
         data = self.data
@@ -301,7 +296,7 @@ class _Batches:
                 for start in range(0, len(touches), data.batch_size):
                     yield touches[start : start + data.batch_size]
             return
-        epoch = data.next_epoch()
+        epoch = data.trainer.current_epoch if data.trainer else next(data.passes)
         data.draw_ahead(epoch + 1)
         # one stream per (seed, epoch); a mere sum would give seed 1 the orders of seed 0, an epoch late
         generator = torch.Generator().manual_seed(data.seed * 1_000_003 + epoch)

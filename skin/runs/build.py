@@ -7,7 +7,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from hydra import compose, initialize_config_dir
-from hydra.errors import InstantiationException
+from hydra.errors import HydraException
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
@@ -113,12 +113,9 @@ def training_data(settings: Mapping[str, Any] | None = None, /, **groups: Any) -
     try:
         with initialize_config_dir(str(CONF), version_base="1.3"):
             config = validate_config(compose("train", words))
-    except Exception as error:  # Hydra raises any on a value such as data=None
-        raise to_input_error(error) or InputError(f"skin.data: {one_line(error)}") from error
-    try:
         return build_data(config, build_device(config))
-    except InstantiationException as error:
-        raise to_input_error(error) or error from error
+    except (HydraException, ValueError) as error:  # ValueError: of a group that is None
+        raise to_input_error(error) or InputError(one_line(error)) from error
 
 
 def _geometry(config: Config) -> "Tensor":

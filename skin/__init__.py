@@ -19,11 +19,12 @@ if TYPE_CHECKING:
     from skin.inference.posterior import Posterior as Posterior
     from skin.mechanics.simulator.fem import PlatesAndBeams as PlatesAndBeams
     from skin.mechanics.simulator.solid import Solid as Solid
+    from skin.runs.build import training_data as data
     from skin.runs.model_of_run import load_run as load_run
 
 __version__ = "0.2.0"
 __all__ = ["Arm", "Grid", "InputError", "LayoutFile", "PlatesAndBeams", "Sheet", "Solid"]
-__all__ += ["FingertipPrior", "Noise", "Posterior", "load_run", "open_skin", "read_recording"]
+__all__ += ["FingertipPrior", "Noise", "Posterior", "data", "load_run", "open_skin", "read_recording"]
 
 _PLACES = {
     "FingertipPrior": "skin.inference.candidates",
@@ -36,6 +37,7 @@ _PLACES = {
     "PlatesAndBeams": "skin.mechanics.simulator.fem",
     "Sheet": "skin.body.base",
     "Solid": "skin.mechanics.simulator.solid",
+    "data": "skin.runs.build:training_data",
     "load_run": "skin.runs.model_of_run",
     "open_skin": "skin.hardware.wire.skin",
     "read_recording": "skin.device.files",

@@ -2,6 +2,7 @@
 
 import ast
 import re
+import runpy
 import subprocess
 import sys
 
@@ -21,8 +22,8 @@ pytestmark = pytest.mark.filterwarnings("ignore:The ``noload`` loader strategy")
 HEAVY = {"hydra", "numpy", "torch", "mlflow", "pytorch_lightning"}
 
 
-def test_there_are_thirteen_names_and_they_cost_nothing_yet():
-    assert len(skin.__all__) == 13
+def test_there_are_fourteen_names_and_they_cost_nothing_yet():
+    assert len(skin.__all__) == 14
     assert all(getattr(skin, name).__module__.startswith("skin.") for name in skin.__all__)
     assert set(skin.__all__) <= set(dir(skin))
     with pytest.raises(AttributeError, match="no attribute 'shin'"):
@@ -90,6 +91,38 @@ def test_the_simulator_is_differentiable_as_documented():
     made = run_example("docs/mechanics.md")
     assert made["readings"].shape == (20,)
     assert made["pressure"].grad.abs().max() > 0
+
+
+def test_a_loop_of_ones_own_trains(capsys):
+    made = runpy.run_path(str(ROOT / "docs/tutorials/tutorial_6_own_loop.py"))
+    assert made["loss"] < 0.65  # ln 2 at the start
+    assert "dangerous" in capsys.readouterr().out
+
+
+def test_settings_of_data_are_those_of_a_training():
+    data = skin.data(
+        {"data.gestures": 40, "seed": 3}, simulator="naive", representation="readings", data={"batch_size": 9}
+    )
+    frames, labels = next(iter(data.train_dataloader()))
+    assert (frames.x.shape[0], labels.shape, data.seed) == (9, (9, 4), 3)
+    assert sum(data.count("train")) == 32
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"simulater": "naive"}, "Could not override 'simulater'"),
+        ({"simulator": "x"}, "Could not find 'simulator/x'"),
+        ({"data": {"gesturs": 3}}, "Could not override 'data.gesturs'"),
+        ({"data": {"gestures": "few"}}, "Value 'few' of type 'str' could not be converted to Integer"),
+        ({"data": None}, "must be a string or a list"),
+        ({"device": {"offset": -1}}, "device.offset=-1 must be greater than or equal to 0"),
+        ({"layout": {"path": "none.csv"}}, "no layout file none.csv"),
+    ],
+)
+def test_data_that_cannot_be_made_are_refused(settings, message):
+    with pytest.raises(skin.InputError, match=message):
+        skin.data(**settings)
 
 
 @pytest.fixture(scope="module")

@@ -31,7 +31,14 @@ from hydra.types import RunMode
 
 from skin.core.messages import JobInputError, one_line, to_input_error
 from skin.errors import InputError
-from skin.runs.configuration import Config, check_server, overrides, refuse_null_groups, validate_config
+from skin.runs.configuration import (
+    Config,
+    check_server,
+    hide_password,
+    overrides,
+    refuse_null_groups,
+    validate_config,
+)
 from skin.runs.sweep import left_out
 
 # What a person may have meant by an override that Hydra refuses.
@@ -40,6 +47,12 @@ from skin.runs.sweep import left_out
 _UNKNOWN = re.compile(r"Could not override '([^']+)'")
 _NO_OPTION = re.compile(r"Could not find '(\S+)/([^/']+)'")
 _OPTIONS = re.compile(r"Available options in '[^']+':((?:\s+\S+)+)")
+_EXTRAS = {
+    "'hydra/launcher/joblib'": "parallel",
+    "'hydra/launcher/submitit_local'": "slurm",
+    "'hydra/launcher/submitit_slurm'": "slurm",
+    "'hydra/sweeper/optuna'": "optuna",
+}  # options of Hydra's plugins -> extra of this package
 _AMBIGUOUS = re.compile(r"Ambiguous value for argument '(.+?)'\n")
 
 
@@ -60,13 +73,22 @@ def suggest(error: Exception, name: str, words: Sequence[str]) -> str | None:
         quoted = quote_value(override)
         return None if quoted is None else f"{override} cannot be read: quote the value, as in {quoted}"
     if unknown := _UNKNOWN.search(text):
-        near = get_close_matches(unknown[1], _names(name, words, unknown[1]), 1, 0.8)
-        return f"there is no setting or group {unknown[1]}: did you mean {near[0]}?" if near else None
+        names, group = _names(name, words, unknown[1]), unknown[1].partition(".")[0]
+        others = {
+            f"{group}.{key}": path.stem
+            for path in sorted((CONF / group).glob("*.yaml"), reverse=True)
+            for key in map(str, OmegaConf.load(path))
+        }
+        near = get_close_matches(unknown[1], [*names, *others], 1, 0.8)
+        of = f", which {group}={others[near[0]]} has" if near and near[0] not in names else ""
+        return f"there is no setting or group {unknown[1]}: did you mean {near[0]}{of}?" if near else None
     option, options = _NO_OPTION.search(text), _OPTIONS.search(text)
     if option and options:
         names = options[1].split()
         near = get_close_matches(option[2], names, 1)
         meant = f"did you mean {near[0]}? There are" if near else "there are"
+        if extra := _EXTRAS.get(option[0].removeprefix("Could not find ")):
+            meant = f'pip install "tactile-skin[{extra}]" adds it; there are'
         return f"there is no {option[1]}={option[2]}: {meant} {', '.join(names)}"
     return None
 
@@ -192,7 +214,10 @@ def command(name: str = "train") -> Callable[[Callable[[Config], Any]], Callable
         def main(words: Sequence[str] | None = None) -> None:
             _log_to_stderr()
             started.clear()  # where this process ran the command before
-            arguments = sys.argv[1:] if words is None else words
+            arguments = [
+                hide_password(word) if "tracking.uri=" in word else word
+                for word in (sys.argv[1:] if words is None else words)
+            ]
             try:
                 _run(job, name, arguments)
             except Exception as error:

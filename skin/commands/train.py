@@ -11,8 +11,8 @@ from skin.runs.configuration import Config
 
 
 @command()
-def main(config: Config) -> bool:
-    """Train and evaluate one configuration; return False if a finished run has the results."""
+def main(config: Config) -> float:
+    """Train and evaluate one configuration; return ``tracking.objective``, for a sweeper that needs it."""
     from skin.runs.train import train
 
     return train(config)

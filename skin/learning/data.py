@@ -1,5 +1,6 @@
 """The LightningDataModule: touches as batches of frames."""
 
+import itertools
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from dataclasses import dataclass, replace
@@ -100,6 +101,9 @@ class TouchData(pl.LightningDataModule):
     parts, each epoch has the parts in another order, and shuffles the touches of each. Processes that train
     together share each training batch; each of them validates on all gestures.
 
+    Without a Trainer, each pass over the training batches is the next epoch, and the loaders yield frames and
+    labels on the CPU.
+
     Args:
         device: source of touches.
         representation: partial; takes positions (S, 3), m, and size (x, y), m.
@@ -113,6 +117,7 @@ class TouchData(pl.LightningDataModule):
         device: as given.
         task: the labels.
         window: number of frames per touch.
+        passes: counts the passes over training batches without a Trainer.
     """
 
     def __init__(
@@ -137,6 +142,7 @@ class TouchData(pl.LightningDataModule):
         self._known: tuple[Tensor, AbstractRepresentation] | None = None
         self._drawn: dict[str, Touches] = {}
         self._ahead: dict[int, Future[Touches]] = {}
+        self.passes = itertools.count()
 
     @property
     def task(self) -> Task:
@@ -250,6 +256,10 @@ class TouchData(pl.LightningDataModule):
         make: Any = getattr(self._make, "func", self._make)
         return bool(make.layout_free)
 
+    def teardown(self, stage: str) -> None:
+        """Forget the Trainer, which has ended."""
+        self.trainer = None
+
     def train_dataloader(self) -> "_Batches":
         """Return the batches of the training split, in another order each epoch."""
         return _Batches(self, "train")
@@ -277,7 +287,7 @@ class _Batches:
         if self.split == "train" and data.alongside:
             yield from one_ahead(data.frames, self._touches())
         else:
-            yield from self._touches()
+            yield from self._touches() if data.trainer else map(data.frames, self._touches())
 
     def _touches(self) -> Iterator[Touches]:
         data = self.data
@@ -286,7 +296,7 @@ class _Batches:
                 for start in range(0, len(touches), data.batch_size):
                     yield touches[start : start + data.batch_size]
             return
-        epoch = data.trainer.current_epoch if data.trainer else 0
+        epoch = data.trainer.current_epoch if data.trainer else next(data.passes)
         data.draw_ahead(epoch + 1)
         # one stream per (seed, epoch); a mere sum would give seed 1 the orders of seed 0, an epoch late
         generator = torch.Generator().manual_seed(data.seed * 1_000_003 + epoch)

@@ -1,22 +1,26 @@
 """Build the objects that a configuration names, group by group, and find the settings of a skin's objects."""
 
-from collections.abc import Callable
+import json
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
+from hydra import compose, initialize_config_dir
+from hydra.errors import HydraException
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
 from skin.body.base import AbstractBody, Sensors, check_plausibility, warn_of_surface
 from skin.body.layout import AbstractLayout, Listed
 from skin.core.files import CONF
+from skin.core.messages import one_line, to_input_error
 from skin.core.settings import check_groups, configured
 from skin.device.base import AbstractDevice
 from skin.errors import InputError
 from skin.learning.learner import AbstractLearner
 from skin.mechanics.simulator.base import AbstractSimulator
-from skin.runs.configuration import Config
+from skin.runs.configuration import Config, iterate_leaves, validate_config
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -86,6 +90,32 @@ def build_data(config: Config, device: AbstractDevice) -> "TouchData":
     representation = instantiate(config.representation)
     geometry = partial(_geometry, config) if device.configured else None
     return TouchData(device, representation, config.data.batch_size, config.seed, augmentation, geometry)
+
+
+def training_data(settings: Mapping[str, Any] | None = None, /, **groups: Any) -> "TouchData":
+    """Return the data of a training, for a loop of your own or a Trainer; nothing is simulated yet.
+
+    A pass over ``train_dataloader()`` is an epoch, and yields (:class:`skin.learning.representation.Frames`,
+    labels (B, L)). Passes of equal number are equal where the seeds are.
+
+    Args:
+        settings: as on the command line of ``skin train``, such as ``{"data.gestures": 400}``.
+        groups: the option of a group by its name, as in ``simulator="solid"``, or settings of a group, as in
+            ``data={"fresh": True}``.
+
+    Raises:
+        InputError: there is no such group, option or setting, or it has another value.
+    """
+    words = [
+        f"{'.'.join(path)}={json.dumps(value, default=str)}"
+        for path, value in iterate_leaves({**(settings or {}), **groups})
+    ]
+    try:
+        with initialize_config_dir(str(CONF), version_base="1.3"):
+            config = validate_config(compose("train", words))
+        return build_data(config, build_device(config))
+    except (HydraException, ValueError) as error:  # ValueError: of a group that is None
+        raise to_input_error(error) or InputError(one_line(error)) from error
 
 
 def _geometry(config: Config) -> "Tensor":

@@ -5,6 +5,7 @@ Only Hydra is imported here: ``--help`` and a mistyped key must not import torch
 
 import hashlib
 import json
+import os
 import platform
 import re
 import socket
@@ -148,6 +149,9 @@ _TOO_LARGE = 2**63
 _COUNTED = (("seconds",), ("gestures",), ("n",))  # settings of commands
 _PATIENCE = 5.0  # s until a server that accepts no connection counts as away
 
+# Of an address: what is before its password, which is not the port of a server, and what is after it.
+_PASSWORD = re.compile(r"""([a-z][\w+.-]*://[^/@:\s]*:)(?!\d+/|\*\*\*@)(\S*)(@[^\s'"]*)""")
+_PORTS = {"http": 80, "https": 443, "postgresql": 5432, "mysql": 3306, "mssql": 1433}
 # Settings without effect on results.
 _STEERING = ("shard", "tracking", "trust")
 
@@ -175,6 +179,10 @@ class Tracking:
     experiment: str = "skin"
     resume: bool = True
     threads: int | None = None
+    objective: str | None = None
+
+    def __post_init__(self) -> None:
+        self.uri = self.uri and hide_password(self.uri)
 
 
 @dataclass(frozen=True)
@@ -250,14 +258,37 @@ def is_server(uri: str | None) -> bool:
     return uri is not None and uri.startswith(("http://", "https://"))
 
 
+def hide_password(text: str) -> str:
+    """Return a tracking URI or an override with it, with ``***`` for the password.
+
+    The environment keeps the password for :func:`reveal_password`. So no message, log or stored configuration
+    can tell it, and commands that this one starts can connect.
+    """
+    for address in _PASSWORD.finditer(text):
+        hidden = f"{address[1]}***{address[3]}"
+        os.environ[_variable(hidden)] = address[2]
+        text = text.replace(address[0], hidden)
+    return text
+
+
+def reveal_password(uri: str) -> str:
+    """Return a tracking URI with the password that :func:`hide_password` replaced, to connect to it."""
+    return uri.replace(":***@", f":{os.environ.get(_variable(uri), '***')}@", 1)
+
+
+def _variable(hidden: str) -> str:
+    """Return the environment variable of the password of a URI."""
+    return f"SKIN_PASSWORD_{hashlib.sha256(hidden.encode()).hexdigest()[:8]}"
+
+
 def answers(uri: str | None) -> bool:
-    """Return whether the server of a tracking URI accepts connections; True for a database."""
-    if uri is None or not is_server(uri):
+    """Return whether the server of a tracking URI accepts connections; True for a file."""
+    place = urlsplit(uri or "")
+    port = place.port or _PORTS.get(place.scheme.partition("+")[0])
+    if not place.hostname or port is None:
         return True
-    place = urlsplit(uri)
-    port = place.port or (443 if place.scheme == "https" else 80)
     try:
-        socket.create_connection((place.hostname or "", port), timeout=_PATIENCE).close()
+        socket.create_connection((place.hostname, port), timeout=_PATIENCE).close()
     except OSError:
         return False
     return True
@@ -267,8 +298,18 @@ def check_server(uri: str | None) -> None:
     """Check that the server of a tracking URI answers, before anything heavy is imported.
 
     Raises:
-        InputError: it does not.
+        InputError: it does not, or it is a database whose driver is not installed.
     """
+    if uri is not None and uri.startswith(("mssql", "mysql", "postgresql")):
+        from sqlalchemy import exc, make_url  # only where a database is named
+
+        try:
+            make_url(uri).get_dialect().import_dbapi()
+        except (ImportError, exc.SQLAlchemyError) as error:
+            raise InputError(
+                f"tracking.uri={uri} needs a driver that is not installed ({one_line(error)}): install it, "
+                'or give postgresql+pg8000://... after pip install "tactile-skin[server]"'
+            ) from error
     if not answers(uri):
         raise InputError(
             f"the tracking server {uri} does not answer: start it, open the tunnel to it, or correct "

@@ -32,7 +32,7 @@ from skin.errors import InputError
 from skin.evaluation.operating_point import OperatingPoint, parse_operating_point
 from skin.learning.data import TouchData
 from skin.learning.learner import AbstractLearner
-from skin.runs.configuration import Config, apply_overrides, validate_config
+from skin.runs.configuration import Config, apply_overrides, reveal_password, validate_config
 from skin.runs.store import Store
 
 TAG = "operating_point"
@@ -180,7 +180,9 @@ class FinishedRun:
         try:
             _check_regular(place, name)
             # Not by its id: a pretrained model is not in the database.
-            return Path(download_artifacts(f"{place}/{name}", dst_path=folder, tracking_uri=self.store.uri))
+            return Path(
+                download_artifacts(f"{place}/{name}", None, None, folder, reveal_password(self.store.uri))
+            )
         except (MlflowException, OSError, ValueError) as error:
             reason = " ".join(str(error).split())
             raise InputError(f"run {self.identity} has no {name} in {place}: {reason}") from error

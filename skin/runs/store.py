@@ -14,6 +14,7 @@ os.environ.setdefault("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "3")
 os.environ.setdefault("MLFLOW_HTTP_REQUEST_BACKOFF_FACTOR", "1")
 
 import atexit
+import hashlib
 import json
 import logging
 import platform
@@ -40,7 +41,14 @@ from sqlalchemy.exc import SQLAlchemyError
 from skin.core.files import whole
 from skin.core.interrupt import ends_on_signal
 from skin.errors import InputError
-from skin.runs.configuration import Tracking, answers, check_server, is_server, source_tags
+from skin.runs.configuration import (
+    Tracking,
+    answers,
+    check_server,
+    is_server,
+    reveal_password,
+    source_tags,
+)
 
 _log = logging.getLogger(__name__)
 
@@ -50,6 +58,7 @@ PROCESS = "process"
 _QUICK = {"MLFLOW_HTTP_REQUEST_MAX_RETRIES": "3", "MLFLOW_HTTP_REQUEST_BACKOFF_FACTOR": "1"}
 # During a run: waits of 0, 20, 40, 80 and five times 120 s, together 12 minutes. MLflow takes no more than 9.
 _PATIENT = {"MLFLOW_HTTP_REQUEST_MAX_RETRIES": "9", "MLFLOW_HTTP_REQUEST_BACKOFF_FACTOR": "10"}
+_NAME_LENGTH = 80  # characters that the table of runs and legends of charts show
 _SET_CLOCK = 60  # s by which the clock of a machine may be set without a process looking like another one
 
 # The table of runs in the UI of MLflow: the shared view of a link, with widths of its columns in pixels.
@@ -80,7 +89,7 @@ class Store:
 
     Attributes:
         client: of the tracking store.
-        uri: of the tracking store.
+        uri: of the tracking store, without its password.
         experiment: id of the experiment.
     """
 
@@ -101,7 +110,7 @@ class Store:
         check_server(uri)
         try:
             with _lock_creation(uri, artifacts):
-                client = MlflowClient(tracking_uri=uri)
+                client = MlflowClient(tracking_uri=reveal_password(uri))
                 # A server keeps the artifacts of its runs, unless a folder is given.
                 served = is_server(uri) and settings.artifacts is None
                 location = None if served else (artifacts / settings.experiment).resolve().as_uri()
@@ -109,8 +118,8 @@ class Store:
         except (MlflowException, SQLAlchemyError, CommandError, sqlite3.Error, OSError) as error:
             reason = next(iter(str(error.__cause__ or error).splitlines()), type(error).__name__)
             raise InputError(
-                f"cannot use the runs in {uri}: {reason}: give another place, as in "
-                "tracking.uri=sqlite:////FOLDER/runs.db"
+                f"cannot use the runs in {uri}: {reason.replace(reveal_password(uri), uri)}: give another "
+                "place, as in tracking.uri=sqlite:////FOLDER/runs.db"
             ) from error
         store = cls(client, uri, identity)
         store._close_abandoned()
@@ -147,7 +156,7 @@ class Store:
     def create(self, name: str, tags: dict[str, str]) -> Run:
         """Return a new run, tagged with this process; the caller must end it."""
         return self.client.create_run(
-            self.experiment, tags=tags | {PROCESS: _identify_process()}, run_name=name
+            self.experiment, tags=tags | {PROCESS: _identify_process()}, run_name=shorten(name)
         )
 
     def _close_abandoned(self) -> None:
@@ -197,7 +206,8 @@ class Store:
                     ) from error
                 status = "FAILED"
                 if answers(self.uri):
-                    self.client.set_tag(run.info.run_id, "error", f"{type(error).__name__}: {error}"[:500])
+                    text = f"{type(error).__name__}: {error}".replace(reveal_password(self.uri), self.uri)
+                    self.client.set_tag(run.info.run_id, "error", text[:500])
                 raise
             finally:
                 if status != "FINISHED":
@@ -223,6 +233,12 @@ class Store:
         metrics = [Metric(name, value, now, 0) for name, value in values.items() if value == value]
         for start in range(0, len(metrics), 1000):
             self.client.log_batch(run.info.run_id, metrics[start : start + 1000], synchronous=True)
+
+
+def shorten(name: str, end: str = "") -> str:
+    """Return the name of a run with its end, in at most 80 characters; other names stay other ones."""
+    other = f" {hashlib.sha256(name.encode()).hexdigest()[:8]}{end}"
+    return name + end if len(name + end) <= _NAME_LENGTH else name[: _NAME_LENGTH - len(other)] + other
 
 
 @contextmanager

@@ -75,13 +75,17 @@ class Shard:
         return set(sorted(set(names))[self.number - 1 :: self.count])
 
 
+class Reused(float):
+    """The objective of a job whose results a finished run has."""
+
+
 def left_out() -> bool:
     """Return whether the running job of a multirun belongs to another shard."""
     return str(HydraConfig.get().job.num) in os.environ.get(LEFT_OUT, "").split()
 
 
 def sweep_jobs(overrides: list[str], parameters: Mapping[str, str]) -> list[dict[str, str]]:
-    """Return the overrides of each job of a multirun, in the order of Hydra's sweeper.
+    """Return the overrides of each job of a multirun, in the order of Hydra's own sweeper.
 
     Args:
         overrides: of the command line; of equal keys the last one counts.
@@ -94,12 +98,12 @@ def sweep_jobs(overrides: list[str], parameters: Mapping[str, str]) -> list[dict
     loader = GlobalHydra.instance().config_loader() if GlobalHydra.instance().is_initialized() else None
     lines = [f"{key}={value}" for key, value in parameters.items()] + overrides
     parsed = OverridesParser.create(loader).parse_overrides(lines)
-    for override in parsed:
-        if override.is_sweep_override() and not override.is_discrete_sweep():
-            key = override.get_key_element()
-            raise InputError(
-                f"{override.input_line} names no values to try: give {key}=1,2 or {key}=range(1,9,2)"
-            )
+    swept = [override for override in parsed if override.is_sweep_override()]
+    if drawn := [override for override in swept if not override.is_discrete_sweep()]:
+        raise InputError(
+            f"{drawn[0].input_line} names no values to try: give {drawn[0].get_key_element()}=1,2 or a "
+            "sweeper that draws them, as hydra/sweeper=optuna"
+        )
     (jobs,) = BasicSweeper.split_arguments(parsed, None)
     return [_parse_choices(job) for job in jobs]
 
@@ -107,8 +111,7 @@ def sweep_jobs(overrides: list[str], parameters: Mapping[str, str]) -> list[dict
 def sweep_title(jobs: Sequence[Mapping[str, str]], swept: Sequence[str]) -> str:
     """Return the swept settings, such as ``model.norm=none,layer × seed=0,1``, for the name of a run."""
     values = {key: dict.fromkeys(job[key] for job in jobs) for key in swept}
-    text = " × ".join(f"{key.lstrip('+')}={','.join(tried)}" for key, tried in values.items())
-    return text if len(text) <= 250 else f"{text[:249]}…"
+    return " × ".join(f"{key.lstrip('+')}={','.join(tried)}" for key, tried in values.items())
 
 
 def _parse_choices(overrides: Iterable[str]) -> dict[str, str]:
@@ -185,7 +188,9 @@ class SweepCallback(Callback):
     The parent exists before the first job, and with it database and experiment: jobs that start at once must
     not race to make them. Hydra does not call ``on_multirun_end`` when a job has failed, so the parent is
     closed at exit. A parent that has no children by then, because each job was finished before or refused, is
-    deleted.
+    deleted. A job that is refused is noted in the tag ``refused_<number>`` of the parent.
+
+    Only Hydra's own sweeper has a list of jobs. Others choose each by the objectives of those before it.
 
     Args:
         parent: whether the jobs are runs; a command whose jobs run sweeps of their own has no parent run.
@@ -224,24 +229,35 @@ class SweepCallback(Callback):
     def _open(self, config: DictConfig) -> None:
         """Choose the jobs, and make the folder that Hydra writes to, and the parent run."""
         # Swept or not, Hydra lists only what belongs to jobs here.
-        self._jobs = sweep_jobs(_words(config), config.hydra.sweeper.params or {})
-        self._swept = [key for key in self._jobs[0] if len({job[key] for job in self._jobs}) > 1]
+        if config.hydra.sweeper._target_.endswith(f".{BasicSweeper.__name__}"):
+            self._jobs = sweep_jobs(_words(config), config.hydra.sweeper.params or {})
+            self._swept = [key for key in self._jobs[0] if len({job[key] for job in self._jobs}) > 1]
+        elif config.get("shard") is not None:
+            raise InputError(f"shard={config.shard} divides a list of jobs, which this sweeper does not have")
+        else:
+            self._swept = [
+                override.get_key_element()
+                for override in OverridesParser.create().parse_overrides(_words(config))
+                if override.is_sweep_override()
+            ]
         if "tracking" not in config:
             self._choose(config, [""] * len(self._jobs))
             return
         settings = validate_config(_without_hydra(config)).tracking
         check_server(settings.uri)
+        config.tracking.uri = settings.uri  # without its password, for the file that Hydra writes
         composed = [_compose_job(config, job) for job in self._jobs]
         Path(config.hydra.sweep.dir).mkdir(parents=True, exist_ok=True)
 
-        from skin.runs.store import Store
+        from skin.runs.store import Store, shorten
         from skin.runs.train import tags
 
         identities = [tags(job) if job else {} for job in composed]
         self._fingerprints = [identity.get("fingerprint", "") for identity in identities]
         self._choose(config, self._fingerprints)
         self._store = store = Store.open(settings)
-        name = config.hydra.runtime.choices.get("sweep") or sweep_title(self._jobs, self._swept) or "sweep"
+        swept = sweep_title(self._jobs or [_parse_choices(_words(config))], self._swept)
+        name = shorten(config.hydra.runtime.choices.get("sweep") or swept or "sweep")
         self._parent, self._resume = store.create(name, {"sweep": name}), settings.resume
         atexit.register(self._close)
         os.environ[PARENT] = self._parent.info.run_id
@@ -269,7 +285,7 @@ class SweepCallback(Callback):
         chosen = shard.part(names) if self._runs is None else self._runs
         self._own = [number for number, name in enumerate(names) if name in chosen]
         os.environ[LEFT_OUT] = " ".join(str(number) for number in set(range(len(names))) - {*self._own})
-        if not self._own:
+        if self._jobs and not self._own:
             if self._runs is None:
                 print(f"shard {config.shard} has no job: the sweep has only {len(set(names))}")
             sys.exit(0)
@@ -277,59 +293,76 @@ class SweepCallback(Callback):
     def on_job_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Print which job begins."""
         self._began = time.monotonic()
-        if self._parent and config.hydra.job.num in self._own:
+        if self._has(config):
             left = self._progress.left()
             remainder = "" if left is None else f" about {format_duration(left)} left"
             print(f"{self._label(config)} …{remainder}", flush=True)
 
     def on_job_end(self, config: DictConfig, job_return: JobReturn, **kwargs: Any) -> None:
         """Print how a job ended."""
-        if not self._parent or config.hydra.job.num not in self._own:
+        if not self._has(config):
             return
-        took, skipped = time.monotonic() - self._began, job_return._return_value is False
+        took, value, label = time.monotonic() - self._began, job_return._return_value, self._label(config)
         if job_return.status == JobStatus.FAILED:
-            print(f"{self._label(config)} failed: {job_return._return_value}", file=sys.stderr, flush=True)
-        elif skipped:
-            print(f"{self._label(config)} was finished before", flush=True)
+            print(f"{label} failed: {value}", file=sys.stderr, flush=True)
+            if isinstance(value, InputError) and self._store and self._parent:
+                self._store.client.set_tag(
+                    self._parent.info.run_id, f"refused_{config.hydra.job.num}", f"{label}: {value}"[:500]
+                )
+        elif isinstance(value, Reused):
+            print(f"{label} was finished before", flush=True)
         else:
-            print(f"{self._label(config)} took {format_duration(took)}", flush=True)
-        self._progress.finish(self._own.index(config.hydra.job.num), took, skipped)
+            print(f"{label} took {format_duration(took)}", flush=True)
+        if self._jobs:
+            self._progress.finish(self._own.index(config.hydra.job.num), took, isinstance(value, Reused))
 
     def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
         """Close the parent run."""
-        self._close()
+        self._close(ended=True)
 
-    def _close(self) -> None:
-        """End the parent run, once: FINISHED only if every job of the shard came to its end."""
+    def _has(self, config: DictConfig) -> bool:
+        """Return whether a job belongs to the parent run and the shard."""
+        return self._parent is not None and (not self._jobs or config.hydra.job.num in self._own)
+
+    def _close(self, ended: bool = False) -> None:
+        """End the parent run, once: FINISHED only if every job of the shard ended or was refused."""
         store, self._store = self._store, None
         if store is None or self._parent is None:
             return
         # Errors of the database were reported before; the next start closes the run.
         with suppress(Exception):
-            self._conclude(store, self._parent)
+            self._conclude(store, self._parent, ended)
 
-    def _conclude(self, store: "Store", parent: "Run") -> None:
-        """End the parent: FAILED if a job of this shard has no finished run; delete one without children."""
+    def _conclude(self, store: "Store", parent: "Run", ended: bool) -> None:
+        """End the parent: FAILED if a job that was not refused, or every job, has no finished run.
+
+        One without children is deleted. Without a list of jobs, the sweeper must have ended by itself.
+        """
         from mlflow.utils.mlflow_tags import MLFLOW_PARENT_RUN_ID
 
         from skin.runs.store import note_reuse
 
         children = {MLFLOW_PARENT_RUN_ID: parent.info.run_id}
-        missing = False
-        for identity in {self._fingerprints[number] for number in self._own}:
+        notes = store.client.get_run(parent.info.run_id).data.tags
+        valid = {self._fingerprints[number] for number in self._own if f"refused_{number}" not in notes}
+        results = [
             # One that was finished before counts, unless it was to be repeated.
-            runs = store.find("FINISHED", fingerprint=identity, **{} if self._resume else children)
-            missing |= not runs
-            for run in runs[:1]:
-                note_reuse(run)  # jobs in other processes warn of nothing
-        store.client.set_terminated(parent.info.run_id, "FAILED" if missing else "FINISHED")
+            store.find("FINISHED", fingerprint=identity, **{} if self._resume else children)
+            for identity in valid
+        ]
+        for run, *_ in filter(None, results):
+            note_reuse(run)  # jobs in other processes warn of nothing
+        if not self._jobs:
+            results = [store.find("FINISHED", **children)] if ended else []
+        store.client.set_terminated(parent.info.run_id, "FINISHED" if results and all(results) else "FAILED")
         if not store.find(**children):
             store.client.delete_run(parent.info.run_id)
 
     def _label(self, config: DictConfig) -> str:
         job = _parse_choices(_words(config))
         chosen = " ".join(f"{key}={job[key]}" for key in self._swept or job)
-        return f"[{self._own.index(config.hydra.job.num) + 1}/{len(self._own)}] {chosen}"
+        number, count = config.hydra.job.num, f"/{len(self._own)}" if self._jobs else ""
+        return f"[{(self._own.index(number) if self._jobs else number) + 1}{count}] {chosen}"
 
 
 def _refuse(error: InputError) -> NoReturn:

@@ -1,6 +1,5 @@
 """One run: build, train, evaluate, log; and evaluate it again on other touches."""
 
-import hashlib
 import json
 import logging
 import math
@@ -26,13 +25,14 @@ from omegaconf import OmegaConf
 from pytorch_lightning.loggers import MLFlowLogger
 from pytorch_lightning.utilities import rank_zero_only
 from rich.console import Console
+from torch import Tensor
 
 from skin.core.files import results, unwritable
 from skin.core.messages import PARENT, Steps, quiet
 from skin.core.settings import import_target, option_name
 from skin.device.balance import report_balance
 from skin.errors import InputError
-from skin.evaluation.metrics import OUTCOMES
+from skin.evaluation.metrics import OUTCOMES, compute_metrics
 from skin.evaluation.operating_point import choose_operating_point
 from skin.evaluation.report import Report, evaluate, metrics_table, publish_evaluation, write_chances
 from skin.evaluation.report import print_report as show
@@ -46,28 +46,35 @@ from skin.runs.configuration import (
     Config,
     Tracking,
     fingerprint,
+    iterate_leaves,
     overrides,
+    reveal_password,
     settings_of,
     source_tags,
 )
 from skin.runs.finished_run import TAG, FinishedRun
 from skin.runs.model_of_run import load_model, threshold_device
-from skin.runs.store import Store, note_reuse
+from skin.runs.store import Store, note_reuse, shorten
+from skin.runs.sweep import Reused
 from skin.touch.labels import Task
 
 _log = logging.getLogger(__name__)
 
 _STEERING = ("hydra", "shard", "tracking", "trust", "sweep")  # no result depends on them
 _NETWORK = ("representation", "model", "fusion", "optimizer", "trainer")  # a network consists of these
+_VALIDATION = "best_val_"  # begins the names of metrics of what was learned on the validation split
 # A run's name has the first ones in any case; the others choose the machine.
 _NAMED = ("experiment", "row", "seed", "simulator", *(f"trainer.{name}" for name in MACHINE))
 
 
-def train(config: Config) -> bool:
-    """Train and evaluate a configuration; return False if a finished run has the results.
+def train(config: Config) -> float:
+    """Train and evaluate a configuration; return the objective on the validation split.
 
     A run that finished with the same fingerprint is not repeated, and one that was killed is continued,
-    unless ``tracking.resume=false``.
+    unless ``tracking.resume=false``. The objective of the former is a :class:`skin.runs.sweep.Reused`.
+
+    Raises:
+        InputError: a setting cannot be used, or ``tracking.objective`` is not among the metrics.
     """
     quiet()
     if (threads := config.tracking.threads) is not None:
@@ -76,22 +83,24 @@ def train(config: Config) -> bool:
         torch.set_num_threads(threads)
     if getattr(rank_zero_only, "rank", 0):
         _join(config)
-        return True
+        return math.nan
     store, identity = Store.existing(config.tracking), tags(config)
     identity["threads"] = str(torch.get_num_threads())
-    if _is_finished(store, config, identity):
-        return False
+    if finished := _find_finished(store, config, identity):
+        return Reused(_objective(config.tracking, finished.data.metrics))
     settings = check_evaluation(config.evaluation)
     device = build_device(config)
     judged = device if settings.profile is None else threshold_device(config, config)
     data, learner = build_data(config, device), build_learner(config)
     learner.check(data)
+    # refuses the name of no metric
+    _objective(config.tracking, _score(data.task, data.example.known_labels, data.example.known_labels))
     report_balance(device, shown=PARENT not in os.environ)
     name = _name(config, identity)
     store = Store.open(config.tracking)
     with alone(config.tracking, identity["fingerprint"]):
-        if _is_finished(store, config, identity):  # by a process that began earlier
-            return False
+        if finished := _find_finished(store, config, identity):  # by a process that began earlier
+            return Reused(_objective(config.tracking, finished.data.metrics))
         again = find_unfinished(store, config.tracking, identity["fingerprint"])
         with store.run(name, identity, os.environ.get(PARENT), again) as run:
             learner.unfinished = _unfinished(config.tracking) / run.info.run_id
@@ -100,13 +109,41 @@ def train(config: Config) -> bool:
             learner.fit(data, RunLogger(store, run.info.run_id, learner.unfinished))
             point = choose_operating_point(learner, judged, settings)
             report = evaluate(learner, device, settings, point)
+            parts = [(learner.probabilities(p), p.known_labels) for p in data.parts("validation") if len(p)]
+            scores = _score(data.task, *map(torch.cat, zip(*parts, strict=True))) if parts else {}
             values = {"seconds_per_epoch": learner.seconds_per_epoch, "parameters": learner.parameters}
             log_learner(store, run, learner)
-            log_report(store, run, report, device.task, values)
+            log_report(store, run, report, device.task, values | scores)
         shutil.rmtree(learner.unfinished, ignore_errors=True)
     if PARENT not in os.environ:
         show(report, f"{name}, run {run.info.run_id}")
-    return True
+    return _objective(config.tracking, scores)
+
+
+def _score(task: Task, probabilities: Tensor, labels: Tensor) -> dict[str, float]:
+    """Return the metrics on the validation split, ``best_val_<metric>`` over all labels and of each."""
+    return {
+        f"{_VALIDATION}{'_'.join(reversed(name.split('/')))}".removesuffix("_overall"): value
+        for name, value in compute_metrics(probabilities, labels, task).items()
+    }
+
+
+def _objective(settings: Tracking, metrics: Mapping[str, float]) -> float:
+    """Return ``tracking.objective``: by default the accuracy; of a regression the share of the variance.
+
+    Raises:
+        InputError: a metric is named that is missing.
+    """
+    scores = {name: value for name, value in metrics.items() if name.startswith(_VALIDATION)}
+    if settings.objective and settings.objective not in scores:
+        raise InputError(
+            f"tracking.objective={settings.objective} is no metric of the validation data: give one of "
+            f"{', '.join(scores) or 'those that another run logs'}"
+        )
+    # Runs of earlier versions have none.
+    return scores.get(
+        settings.objective or f"{_VALIDATION}accuracy", scores.get(f"{_VALIDATION}r2", math.nan)
+    )
 
 
 class RunLogger(MLFlowLogger):
@@ -122,7 +159,7 @@ class RunLogger(MLFlowLogger):
     """
 
     def __init__(self, store: Store, run: str, folder: Path) -> None:
-        super().__init__(tracking_uri=store.uri, run_id=run)
+        super().__init__(tracking_uri=reveal_password(store.uri), run_id=run)
         self._left = folder / "metrics.json"
         if self._left.is_file():
             super().log_metrics(**json.loads(self._left.read_text()))
@@ -196,15 +233,15 @@ def _unfinished(settings: Tracking) -> Path:
     return Path(settings.artifacts or "mlartifacts").expanduser() / "unfinished"
 
 
-def _is_finished(store: Store, config: Config, identity: dict[str, str]) -> bool:
-    """Return whether a run did a training before and may replace it; print its metrics."""
+def _find_finished(store: Store, config: Config, identity: dict[str, str]) -> Run | None:
+    """Return the run that did a training before and may replace it; print its metrics."""
     finished = store.find("FINISHED", fingerprint=identity["fingerprint"]) if config.tracking.resume else []
     for run in finished[:1]:
         note_reuse(run)
         if PARENT not in os.environ:  # a sweep prints the metrics of all its runs
             _log.info("run %s did this before: tracking.resume=false repeats it", run.info.run_id)
             Console().print(metrics_table(run.data.metrics, run.info.run_name))
-    return bool(finished)
+    return finished[0] if finished else None
 
 
 def log_learner(store: Store, run: Run, learner: AbstractLearner) -> None:
@@ -261,39 +298,41 @@ def log_configuration(store: Store, run: str, config: Config, data_hash: str) ->
     unused = _unused(config)
     used = [group for group in groups if group in chosen and group not in unused]
     choices = {group: _option(chosen[group], group) for group in used}
-    scalars = {"seed": config.seed, "row": config.row}
-    if "simulator" in config.device:
-        scalars |= {name: chosen["data"][name] for name in ("gestures", "fresh", "stream", "direction")}
-    else:
+    parts = {part: chosen.get(part, {}) for part in ("data", *_NETWORK, "learner") if part not in unused}
+    if "simulator" not in config.device:
         choices.pop("simulator", None)
-    params = relevant_overrides(config) | choices | scalars
+        parts["data"] = {"batch_size": chosen["data"]["batch_size"], "augment": chosen["data"]["augment"]}
+    settings = {
+        ".".join(path): value
+        for path, value in iterate_leaves(parts)
+        if not path[-1].startswith("_") and not {"body", *_NETWORK, *MACHINE}.intersection(path[1:])
+    }
+    params = settings | relevant_overrides(config) | choices | {"seed": config.seed, "row": config.row}
     store.client.log_batch(run, params=[Param(name, str(value)) for name, value in params.items()])
 
 
 def _name(config: Config, identity: Mapping[str, str]) -> str:
     """Return the name of a run, which tells it from those of other changes."""
-    changes = {key: value for key, value in relevant_overrides(config).items() if key not in _NAMED}
-    text = " ".join(f"{key.split('.')[-1]}={value}" for key, value in changes.items())
-    # A server's names have 250 characters.
-    short = text if len(text) <= 200 else f"{text[:191]} {hashlib.sha256(text.encode()).hexdigest()[:8]}"
-    return " ".join(filter(None, (identity["row"], identity["simulator"], short, f"seed {config.seed}")))
+    changes = [
+        f"{key.split('.')[-1]}={value}"
+        for key, value in relevant_overrides(config).items()
+        if key not in _NAMED
+    ]
+    name = " ".join(filter(None, (identity["row"], identity["simulator"], *changes)))
+    return shorten(name, f" seed {config.seed}")
 
 
 def relevant_overrides(config: Config) -> dict[str, str]:
     """Return the overrides of the running command that affect its result; empty without a command."""
     if not HydraConfig.initialized():
         return {}
-    parsed = OverridesParser.create().parse_overrides(overrides())
-    changes = {
-        override.key_or_group: override.get_value_element_as_str()
-        for override in parsed
-        if not override.is_delete()
-    }
     unused = _unused(config)
     return {
-        key: value
-        for key, value in changes.items()
-        if not key.startswith(_STEERING) and key.split(".")[0] not in unused
+        override.key_or_group: override.get_value_element_as_str()
+        for override in OverridesParser.create().parse_overrides(overrides())
+        if not override.is_delete()
+        and not override.key_or_group.startswith(_STEERING)
+        and override.key_or_group.split(".")[0] not in unused
     }
 
 
@@ -320,8 +359,7 @@ def log_report(store: Store, run: Run, report: Report, task: Task, values: dict[
             _log.warning("warning: %s", point.warning())
     store.client.set_tag(run.info.run_id, TAG, "null" if point is None else point.text())
     store.client.set_tag(run.info.run_id, "split", report.split)
-    defined = {name: value for name, value in report.metrics.items() if not math.isnan(value)}
-    store.log_metrics(run, defined | values)
+    store.log_metrics(run, report.metrics | values)
     with tempfile.TemporaryDirectory() as folder:
         _write(report, task, Path(folder))
         store.client.log_artifacts(run.info.run_id, folder)

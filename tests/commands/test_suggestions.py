@@ -1,6 +1,7 @@
 """A mistyped override is answered with what to type."""
 
 import shlex
+from importlib.util import find_spec
 
 import pytest
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -15,6 +16,8 @@ from skin.commands.train import main
         ("simulater=solid", "there is no setting or group simulater: did you mean simulator?"),
         ("device.nois=3", "there is no setting or group device.nois: did you mean device.noise?"),
         ("touch.rat=3", "there is no setting or group touch.rat: did you mean touch.rate?"),
+        ("model.widht=3", "group model.widht: did you mean model.width, which model=pyg has?"),
+        ("model.widths=[3]", "group model.widths: did you mean model.widths, which model=gcn has?"),
         ("simulator=solit", "there is no simulator=solit: did you mean solid? There are fem, naive, solid"),
         ("simulator=xyz", "there is no simulator=xyz: there are fem, naive, solid\n"),
         (
@@ -32,6 +35,33 @@ def test_the_answer_names_what_was_meant(word, answer, capsys, monkeypatch):
     assert ended.value.code == 2
     error = capsys.readouterr().err
     assert answer in error
+    assert len(error.splitlines()) == 1
+
+
+@pytest.mark.skipif(find_spec("hydra_plugins.hydra_optuna_sweeper") is not None, reason="it is installed")
+def test_an_option_of_a_plugin_is_told_how_to_install(capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(["-m", "hydra/sweeper=optuna"])
+    assert ended.value.code == 2
+    assert 'pip install "tactile-skin[optuna]" adds it' in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("shown", ["job", "hydra"])
+def test_a_password_is_not_in_the_configuration(shown, capsys):
+    main(["tracking.uri='postgresql+pg8000://me:ge/heim@h/runs'", "--cfg", shown])
+    text = capsys.readouterr().out
+    assert "postgresql+pg8000://me:***@h/runs" in text
+    assert "heim" not in text
+
+
+@pytest.mark.parametrize("scheme", ["postgresql+none", "mysql+none"])
+def test_a_database_without_its_driver_is_refused_at_once(scheme, capsys):
+    with pytest.raises(SystemExit) as ended:
+        main([f"tracking.uri={scheme}://me:geheim@127.0.0.1:1/runs"])
+    assert ended.value.code == 2
+    error = capsys.readouterr().err
+    assert f"tracking.uri={scheme}://me:***@127.0.0.1:1/runs needs a driver that is not installed" in error
+    assert "give postgresql+pg8000://" in error
     assert len(error.splitlines()) == 1
 
 

@@ -13,6 +13,7 @@ from omegaconf import OmegaConf
 from experiments.studies.study import chosen_studies
 from skin.core.files import CONF, ROOT
 from skin.runs.configuration import validate_config
+from skin.runs.store import shorten
 from skin.runs.sweep import sweep_jobs
 
 # MLflow's own business with SQLAlchemy.
@@ -57,9 +58,9 @@ def test_a_killed_command_goes_on_where_it_was(run, begin, tmp_path):
     assert done.returncode == 0, done.stderr
     assert done.stdout.count("== [") == 3
     assert "about 3.0 h left" in done.stdout
+    small = "gestures=160 test_gestures=64 devices=0 layouts=0 safe_gestures=64"
     assert sorted(name for name, status in runs(tmp_path) if status == "FINISHED") == [
-        f"rules naive gestures=160 test_gestures=64 devices=0 layouts=0 safe_gestures=64 seed {seed}"
-        for seed in range(4)
+        shorten(f"rules naive {small}", f" seed {seed}") for seed in range(4)
     ]
     assert {"study_table.csv", "study_ensemble.csv"} <= {path.name for path in (tmp_path / "docs").iterdir()}
     again = run(tmp_path, "results", *PARTS, *SMALL)

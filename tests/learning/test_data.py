@@ -6,12 +6,14 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from pytorch_lightning import LightningModule
+from pytorch_lightning import Trainer as Fit
 
 from skin.device.base import AbstractDevice
 from skin.device.touches import Part, Recording, Touches
 from skin.errors import InputError
 from skin.learning.data import Augmentation, TouchData
-from skin.learning.representation import Readings
+from skin.learning.representation import Frames, Readings
 from skin.runs.build import build_data, build_device
 from skin.touch.labels import TOUCH_SLIDING
 
@@ -199,6 +201,45 @@ def test_a_layout_is_represented_once(make):
     positions = torch.rand(2, 3)
     assert data.representation_for(positions) is data.representation_for(positions.clone())
     assert data.representation_for(positions) is not data.representation_for(positions + 0.01)
+
+
+@pytest.mark.parametrize("fresh", [False, True])
+def test_without_a_trainer_each_pass_is_the_next_epoch(make, fresh):
+    """A loop of one's own gets the frames and labels that a Trainer's network gets."""
+    alone, other = make(fresh=fresh), make(fresh=fresh)
+    alone.trainer = None
+    held = alone.train_dataloader()
+    for epoch in range(3):
+        other.trainer.current_epoch = epoch
+        expected = [other.frames(batch) for batch in other.train_dataloader()]
+        loader = held if epoch else alone.train_dataloader()  # it may be kept, or made anew
+        for (frames, labels), (x, y) in zip(loader, expected, strict=True):
+            assert torch.equal(frames.x, x.x)
+            assert torch.equal(labels, y)
+        assert len(list(alone.val_dataloader())) == 5
+    assert all(frames.x.shape[1:] == (6, 2) for frames, _ in alone.val_dataloader())
+
+
+@pytest.mark.filterwarnings("ignore")  # Lightning's advice
+def test_a_loop_after_a_trainer_has_its_own_epochs(make, tmp_path):
+    class Constant(LightningModule):
+        def __init__(self):
+            super().__init__()
+            self.weight = torch.nn.Parameter(torch.zeros(1))
+            self.automatic_optimization = False
+
+        def training_step(self, batch, index):
+            assert isinstance(batch[0], Frames)
+
+        def configure_optimizers(self):
+            return torch.optim.SGD(self.parameters())
+
+    data = make(fresh=True)
+    quiet = {"logger": False, "enable_progress_bar": False, "enable_checkpointing": False}
+    quiet |= {"enable_model_summary": False, "accelerator": "cpu", "default_root_dir": tmp_path}
+    Fit(max_epochs=2, limit_val_batches=0, **quiet).fit(Constant(), datamodule=data)
+    firsts = [next(iter(data.train_dataloader()))[0].x.max() // 1000 for _ in range(2)]
+    assert firsts == [0, 1]
 
 
 def test_what_cannot_be_batched_is_refused(make):

@@ -5,13 +5,17 @@ import signal
 import sqlite3
 import subprocess
 import sys
+from base64 import b64encode
 from concurrent.futures import ThreadPoolExecutor
+from http.server import BaseHTTPRequestHandler, HTTPServer
+from threading import Thread
 
 import pytest
 
 from skin.core.files import ROOT
+from skin.errors import InputError
 from skin.runs import store as tracking
-from skin.runs.configuration import Tracking, source_tags
+from skin.runs.configuration import Tracking, hide_password, reveal_password, source_tags
 from skin.runs.finished_run import FinishedRun
 from skin.runs.model_of_run import load_run
 from skin.runs.store import TAGS, Store, print_table_link
@@ -226,6 +230,48 @@ def test_a_refused_command_leaves_no_database(words, run, tmp_path):
     done = run(tmp_path, *words, store=False)
     assert done.returncode == 2, done.stderr
     assert not list(tmp_path.glob("mlflow.db*"))
+
+
+@pytest.mark.parametrize(
+    ("uri", "hidden"),
+    [
+        ("http://me:geheim@h:5000", "http://me:***@h:5000"),
+        ("postgresql+pg8000://me:a/b@c@h/runs?x=y", "postgresql+pg8000://me:***@h/runs?x=y"),
+        ("https://me@h/x", None),
+        ("http://h:5000/a@b", None),
+        ("sqlite:////tmp/a:b@c/m.db", None),
+    ],
+)
+def test_a_password_is_hidden_and_found_again(uri, hidden):
+    assert Tracking(uri).uri == (hidden or uri)
+    assert Tracking(hidden or uri).uri == (hidden or uri)
+    assert hide_password(f"tracking.uri='{uri}'") == f"tracking.uri='{hidden or uri}'"
+    assert reveal_password(hidden or uri) == uri
+
+
+def test_a_server_gets_the_password_and_messages_do_not(monkeypatch):
+    """The store is of a server that refuses everything."""
+    monkeypatch.setenv("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "0")
+    sent = []
+
+    class Refusing(BaseHTTPRequestHandler):
+        def do_GET(self):
+            sent.append(self.headers["Authorization"])
+            self.send_error(401)
+
+        def log_message(self, *arguments):
+            pass
+
+    with HTTPServer(("127.0.0.1", 0), Refusing) as server:
+        thread = Thread(target=server.serve_forever)
+        thread.start()
+        address = f"127.0.0.1:{server.server_port}"
+        with pytest.raises(InputError, match=rf"the runs in http://me:\*\*\*@{address}: ") as refused:
+            Store.open(Tracking(f"http://me:geheim@{address}"))
+        server.shutdown()
+        thread.join()
+    assert "geheim" not in str(refused.value)
+    assert sent[0] == f"Basic {b64encode(b'me:geheim').decode()}"
 
 
 def test_a_pretrained_model_needs_no_database(tmp_path, monkeypatch):

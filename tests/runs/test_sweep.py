@@ -1,5 +1,6 @@
 """A sweep counts its jobs as Hydra does, goes on after a failure, resumes, and tells what it found."""
 
+import os
 import socket
 import sqlite3
 import subprocess
@@ -7,12 +8,13 @@ import sys
 
 import pytest
 from hydra import initialize_config_dir
+from omegaconf import OmegaConf
 
 from skin.core.files import CONF
 from skin.errors import InputError
 from skin.runs.configuration import Tracking
-from skin.runs.store import Store
-from skin.runs.sweep import sweep_jobs, sweep_title
+from skin.runs.store import Store, shorten
+from skin.runs.sweep import SweepCallback, sweep_jobs, sweep_title
 
 # MLflow's own business with SQLAlchemy.
 pytestmark = pytest.mark.filterwarnings("ignore:The ``noload`` loader strategy")
@@ -26,7 +28,12 @@ SMALL = [
     "evaluation.layouts=1",
     "evaluation.safe_gestures=64",
 ]
-NAME = "rules naive gestures=64 test_gestures=32 devices=1 layouts=1 safe_gestures=64"
+
+
+def named(seed, more=""):
+    """Return the name of a run of ``SMALL``."""
+    name = f"rules naive gestures=64 test_gestures=32 devices=1 layouts=1 safe_gestures=64{more}"
+    return shorten(name, f" seed {seed}")
 
 
 def test_jobs_come_in_hydras_order():
@@ -60,7 +67,7 @@ def test_every_way_to_write_values_is_hydras(override, values):
 
 
 def test_an_interval_is_refused():
-    with pytest.raises(InputError, match=r"^optimizer.lr=interval\(0.1,1\) names no values to try: give opt"):
+    with pytest.raises(InputError, match=r"^optimizer.lr=interval\(0.1,1\) names .* hydra/sweeper=optuna$"):
         sweep_jobs(["optimizer.lr=interval(0.1,1)"], {})
 
 
@@ -94,7 +101,7 @@ def test_a_sweep_that_was_killed_goes_on_where_it_was(run, begin, tmp_path):
         next(line for line in first.lines() if line.startswith("[2/3]"))
     assert [one[:2] for one in runs(tmp_path)][:2] == [
         ("seed=0,1,2", "RUNNING"),
-        (f"{NAME} seed 0", "FINISHED"),
+        (named(0), "FINISHED"),
     ]
     again = run(tmp_path, *sweep(tmp_path, "seed=0,1,2"), store=False)
     assert again.returncode == 0, again.stderr
@@ -102,7 +109,7 @@ def test_a_sweep_that_was_killed_goes_on_where_it_was(run, begin, tmp_path):
         line for line in again.stdout.splitlines() if line.startswith("[1/3]") and "…" not in line
     ]
     finished = [name for name, status, parent in runs(tmp_path) if status == "FINISHED" and parent]
-    assert finished == [f"{NAME} seed 0", f"{NAME} seed 1", f"{NAME} seed 2"]
+    assert finished == [named(0), named(1), named(2)]
 
 
 @pytest.mark.slow
@@ -115,7 +122,8 @@ def test_a_run_is_named_by_its_changes_and_logs_them_and_a_skipped_one_prints_it
         params = dict(database.execute("select key, value from params"))
     database.close()
     assert name.startswith("rules naive ")
-    assert name.endswith(" offset=0.2 layout=grid seed 0")
+    assert name == named(0, " offset=0.2 layout=grid")
+    assert len(name) == 80
     assert (params["device.offset"], params["layout"], params["seed"]) == ("0.2", "grid", "0")
     assert params["learner"] == "rules"
     assert not {"representation", "model", "fusion"} & set(params)  # rules use none of them
@@ -132,8 +140,11 @@ def test_a_bad_job_fails_and_the_others_run(run, tmp_path):
     done = run(tmp_path, *sweep(tmp_path, "device.offset=-1,0.1"), store=False)
     assert done.returncode == 1
     assert "offset" in done.stderr
-    assert [one[:2] for one in runs(tmp_path) if one[2]] == [(f"{NAME} offset=0.1 seed 0", "FINISHED")]
-    assert [status for name, status, parent in runs(tmp_path) if not parent] == ["FAILED"]
+    assert [one[:2] for one in runs(tmp_path) if one[2]] == [(named(0, " offset=0.1"), "FINISHED")]
+    (parent,) = parents(tmp_path)
+    assert parent.info.status == "FINISHED"
+    assert "device.offset=-1 must be" in parent.data.tags["refused_0"]
+    assert "refused_1" not in parent.data.tags
 
 
 def parents(folder):
@@ -148,10 +159,80 @@ def test_a_title_tells_what_is_swept():
     assert sweep_title(jobs, []) == ""
 
 
-def test_a_title_fits_into_the_database():
-    found = sweep_title([{"seed": str(seed)} for seed in range(1000)], ["seed"])
-    assert len(found) == 250
-    assert found.endswith("…")
+@pytest.mark.slow
+@pytest.mark.parametrize("sweeper", ["ask", "optuna"])
+def test_a_sweeper_gets_the_objective_and_draws_from_an_interval(sweeper, tmp_path):
+    if sweeper == "optuna":
+        pytest.importorskip("hydra_plugins.hydra_optuna_sweeper")
+    (tmp_path / "hydra_plugins").mkdir()
+    (tmp_path / "hydra_plugins/ask.py").write_text(ASK)
+    given = ["train", "-m", *SMALL, "device.noise=interval(0.05,0.3)", f"tracking.artifacts={tmp_path}/a"]
+    given += [f"hydra/sweeper={sweeper}", "hydra.sweeper.n_trials=6", f"hydra.sweep.dir={tmp_path}/out"]
+    given += ["hydra.sweeper.n_jobs=1"] * (sweeper == "optuna")
+    paths = os.pathsep.join([str(tmp_path), *os.environ.get("PYTHONPATH", "").split(os.pathsep)])
+    done = subprocess.run(
+        [sys.executable, "-m", "skin", *given, f"tracking.uri=sqlite:///{tmp_path}/m.db"],
+        capture_output=True, text=True, timeout=300, cwd=tmp_path, env=os.environ | {"PYTHONPATH": paths},
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert [line for line in done.stdout.splitlines() if line.startswith("[6] device.noise=0.")]
+    (parent,) = parents(tmp_path)
+    assert (parent.info.run_name, parent.info.status) == ("device.noise=interval(0.05,0.3)", "FINISHED")
+    store = Store.open(Tracking(f"sqlite:///{tmp_path}/m.db"))
+    trials = [run.data for run in store.find(**{"mlflow.parentRunId": parent.info.run_id})]
+    assert len(trials) == 6
+    assert all(0.05 <= float(trial.params["device.noise"]) <= 0.3 for trial in trials)
+    best = max(trial.metrics["best_val_accuracy"] for trial in trials)
+    (result,) = (tmp_path / "out").glob("optimization_results.yaml")
+    assert OmegaConf.load(result).best_value == pytest.approx(best)
+
+
+ASK = """
+from hydra.core.config_store import ConfigStore
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.plugins import Plugins
+from hydra.plugins.sweeper import Sweeper
+from omegaconf import OmegaConf
+
+
+class Ask(Sweeper):
+    # Narrows an interval around the best value so far.
+
+    def __init__(self, n_trials):
+        self.n_trials = n_trials
+
+    def setup(self, *, hydra_context, task_function, config):
+        self.folder, plugins = config.hydra.sweep.dir, Plugins.instance()
+        self.launcher = plugins.instantiate_launcher(
+            hydra_context=hydra_context, task_function=task_function, config=config
+        )
+
+    def sweep(self, arguments):
+        parsed = OverridesParser.create().parse_overrides(arguments)
+        (drawn,) = [override for override in parsed if override.is_sweep_override()]
+        others = [override.input_line for override in parsed if override is not drawn]
+        low, high = drawn.value().start, drawn.value().end
+        told = {}
+        for number in range(self.n_trials):
+            value = (low + high) / 2 if told else low
+            job = [*others, f"{drawn.get_key_element()}={value}"]
+            (result,) = self.launcher.launch([job], initial_job_idx=number)
+            told[value] = float(result.return_value)
+            low, high = (low, value) if max(told, key=told.get) < value else (value, high)
+        OmegaConf.save({"best_value": max(told.values())}, f"{self.folder}/optimization_results.yaml")
+
+
+ConfigStore.instance().store(
+    group="hydra/sweeper", name="ask", node={"_target_": "hydra_plugins.ask.Ask", "n_trials": 1}
+)
+"""
+
+
+def test_a_shard_of_a_search_is_refused(tmp_path, monkeypatch):
+    sweeper = {"_target_": "hydra_plugins.x.Search"}
+    hydra = {"sweeper": sweeper, "overrides": {"task": ["seed=interval(0,3)"]}}
+    with pytest.raises(InputError, match=r"^shard=1/2 divides a list of jobs, which this sweeper does not"):
+        SweepCallback()._open(OmegaConf.create({"shard": "1/2", "hydra": hydra}))
 
 
 @pytest.mark.slow
@@ -165,9 +246,9 @@ def test_a_run_is_nested_under_the_sweep_that_trained_it(run, tmp_path):
     assert (first.info.run_name, first.info.status) == ("seed=0,1", "FINISHED")
     children = {one[0]: one[2] for one in runs(tmp_path) if one[2]}
     assert children == {
-        f"{NAME} seed 0": first.info.run_id,
-        f"{NAME} seed 1": first.info.run_id,
-        f"{NAME} seed 2": second.info.run_id,
+        named(0): first.info.run_id,
+        named(1): first.info.run_id,
+        named(2): second.info.run_id,
     }
 
 
@@ -218,7 +299,7 @@ def test_shards_train_every_job_once(run, tmp_path):
         said.append(done.stdout)
     assert "shard 3/3 has no job: the sweep has only 2" in said[2]
     children = [(name, status) for name, status, parent in runs(tmp_path) if parent]
-    assert sorted(children) == [(f"{NAME} seed {seed}", "FINISHED") for seed in (0, 1)]
+    assert sorted(children) == sorted((named(seed), "FINISHED") for seed in (0, 1))
     assert [parent.info.status for parent in parents(tmp_path)] == ["FINISHED", "FINISHED"]
 
 

@@ -11,8 +11,9 @@ from omegaconf import OmegaConf
 import skin.runs.train
 from skin.core.files import CONF, ROOT
 from skin.errors import InputError
-from skin.runs.configuration import validate_config
+from skin.runs.configuration import Tracking, validate_config
 from skin.runs.store import Store
+from skin.runs.sweep import Reused
 
 # MLflow's own business with SQLAlchemy.
 pytestmark = pytest.mark.filterwarnings("ignore:The ``noload`` loader strategy")
@@ -57,7 +58,50 @@ def test_runs_of_other_settings_have_other_names():
     many = [f"+touch.setting_{number}={number}.123456" for number in range(10)]
     names = {name_of(*many, f"data.gestures={count}") for count in (64, 65)}
     assert len(names) == 2
-    assert max(map(len, names)) < 250
+    assert max(map(len, names)) == 80
+    # Of one variant, the names differ in the seed alone.
+    same = {name_of(*many, f"seed={seed}").removesuffix(f" seed {seed}") for seed in (3, 4)}
+    assert len(same) == 1
+
+
+@pytest.mark.parametrize(
+    ("chosen", "expected"),
+    [
+        (
+            "model=cnn",
+            {
+                "optimizer.lr": "0.001",
+                "model.channels": "[8, 16]",
+                "fusion.hidden": "64",
+                "learner.dropout": "0.0",
+            },
+        ),
+        ("experiment=features", {"learner.rounds": "500", "learner.learning_rate": "0.1"}),
+    ],
+)
+def test_settings_are_parameters_at_their_defaults(chosen, expected, configured, tmp_path):
+    store = Store.open(Tracking(f"sqlite:///{tmp_path}/m.db", str(tmp_path)))
+    config = validate_config(configured(chosen, "tracking.uri=http://me:geheim@h"))
+    with store.run("x", {}) as run:
+        skin.runs.train.log_configuration(store, run.info.run_id, config, "")
+    params = store.client.get_run(run.info.run_id).data.params
+    expected |= {"data.batch_size": "64", "data.gestures": "4038", "seed": "0", "simulator": "fem"}
+    assert expected.items() <= params.items()
+    assert ("optimizer.lr" in params) == (chosen == "model=cnn")
+    assert not [name for name in params if name.split(".")[1:2] == ["model"] or "_target_" in name]
+    (text,) = (path.read_text() for path in tmp_path.rglob("config.yaml"))
+    assert "http://me:***@h" in text
+    assert "geheim" not in text
+
+
+@pytest.mark.parametrize("objective", ["same/overall/accuracy", "best_val_acuracy"])
+def test_an_objective_that_is_no_metric_of_the_validation_is_refused(objective, configured, tmp_path):
+    """Before anything is trained; the gestures of the test must not choose settings."""
+    given = ["experiment=rules", *SMALL[1:3], f"tracking.uri=sqlite:///{tmp_path}/m.db"]
+    config = configured(*given, f"tracking.objective={objective}")
+    with pytest.raises(InputError, match=rf"^tracking.objective={objective} is no .* best_val_ece_big, "):
+        skin.runs.train.train(config)
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.slow
@@ -71,19 +115,26 @@ def test_a_run_stays_open_until_its_results_are_logged(config, monkeypatch):
         return evaluate(*arguments)
 
     monkeypatch.setattr(skin.runs.train, "evaluate", looking)
-    assert skin.runs.train.train(config) is True
+    objective = skin.runs.train.train(config)
     assert seen == ["RUNNING"]
     (run,) = Store.open(config.tracking).find("FINISHED")
     assert run.data.metrics["parameters"] == 196
     choices = {group: run.data.params[group] for group in ("representation", "model", "fusion", "learner")}
     assert choices == {"representation": "graph", "model": "gcn", "fusion": "linked", "learner": "network"}
     assert {"same/overall/accuracy", "train_loss", "val_loss", "seconds_per_epoch"} <= set(run.data.metrics)
-    assert skin.runs.train.train(config) is False
+    assert type(objective) is float
+    # Of the weights that are kept, not of the last epoch; here there is one.
+    assert objective == run.data.metrics["best_val_accuracy"]
+    assert objective == pytest.approx(run.data.metrics["val_accuracy"], abs=1e-6)
+    config.tracking.objective = "best_val_ece_big"
+    reused = skin.runs.train.train(config)
+    assert isinstance(reused, Reused)
+    assert reused == run.data.metrics["best_val_ece_big"]
     page = (ROOT / "docs" / "runs.md").read_text()
     for name in run.data.metrics:
         # train_accuracy_press is told of as train_accuracy
         parts = name.split("/") if f"`{name}`" not in page else [name]
-        parts = [re.sub("(_accuracy)_[a-z]+$", r"\1", part) for part in parts]
+        parts = [re.sub("(_accuracy|_ece)_[a-z]+$", r"\1", part) for part in parts]
         assert all(f"`{part}`" in page for part in parts), name
 
 

@@ -26,7 +26,6 @@ def main(config: Config) -> None:
         measure_ratios,
         require_agreement,
         store_check,
-        suggest_sensors,
     )
     from skin.hardware.known_loads import KnownLoad, base_readings
     from skin.hardware.serial import require_port
@@ -39,18 +38,17 @@ def main(config: Config) -> None:
     if config.base is None or not config.seconds or config.seconds < 3:
         raise InputError(f"seconds={config.seconds}: each load must lie for at least 3 s, as in seconds=10")
     expected = load.force * base_readings(build_skin(config), config.base)
-    positions = device.sensors.positions
-    numbers = suggest_sensors(positions, device.size)
-    places = [f"{n} ({1e3 * positions[n, 0]:.0f}, {1e3 * positions[n, 1]:.0f} mm)" for n in numbers]
     try:
         with device.wire.open()[0] as skin:
             first, conversion = device.wire.warm_up(skin, _notify)
             _notify(
-                f"put {load.weight:g} kg on {len(places)} sensors in turn, for {config.seconds:g} s each: "
-                f"{', '.join(places)}, or others"
+                f"put {load.weight:g} kg on three sensors in turn, for {config.seconds:g} s each: far from "
+                "each other, and from the rim"
             )
             ratios = measure_ratios(skin, first, conversion, expected, config.seconds, _notify)
-            setup = describe_setup(device.wire, skin.header, conversion, positions, device.size)
+            setup = describe_setup(
+                device.wire, skin.header, conversion, device.sensors.positions, device.size
+            )
     except (SkinTimeout, SkinDisconnected) as error:
         raise InputError(f"{config.device['port']}: {error}") from error
     require_agreement(ratios)

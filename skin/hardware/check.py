@@ -23,9 +23,9 @@ from skin.core.safe_loading import TEXT, parse_json, read_file
 from skin.core.settings import configured
 from skin.device.resampling import Frame, StreamClock
 from skin.errors import InputError
-from skin.hardware.wire.channels import UnitConversion
+from skin.hardware.wire.channels import AGREES, UnitConversion
 from skin.hardware.wire.protocol import EMULATED, Header
-from skin.hardware.wire.skin import AGREES, SerialSource, Source
+from skin.hardware.wire.skin import SerialSource, Source
 
 # What was checked, and what is in use.
 
@@ -55,7 +55,7 @@ class Setup:
         return tuple(
             entry.name
             for entry in fields(Setup)
-            if not _same(getattr(self, entry.name), getattr(other, entry.name))
+            if json_text(getattr(self, entry.name)) != json_text(getattr(other, entry.name))
             and not (entry.name == "materials" and "" in (self.materials, other.materials))
         )
 
@@ -102,13 +102,6 @@ class Verification:
             "declared": "scale agrees with device.sensitivity",
             "unverified": f"unverified: {unverified}; run skin check, or give device.sensitivity",
         }[self.state]
-
-
-def _same(first: Any, second: Any) -> bool:
-    """Return whether two values are the same, numbers to four digits."""
-    if isinstance(first, list) and isinstance(second, list) and len(first) == len(second):
-        return bool(np.allclose(first, second, rtol=1e-4, atol=0))
-    return bool(json_text(first) == json_text(second))
 
 
 def describe_setup(
@@ -346,19 +339,3 @@ def require_agreement(ratios: dict[str, float]) -> None:
         f"the readings are those of the load times {text}, not within {AGREES:.0%} of 1: most likely "
         f"{' or '.join(causes or ['a wrong device.scale or calibration'])}; nothing was stored"
     )
-
-
-def suggest_sensors(positions: np.ndarray, size: Sequence[float]) -> list[int]:
-    """Return up to three sensors, from 0, that are far from each other and from the rim.
-
-    Args:
-        positions: (S, 2 or 3), m.
-        size: of the body, m.
-    """
-    flat = positions[:, :2]
-    margin = np.minimum(flat, np.array(size) - flat).min(axis=1).round(6)
-    chosen = [int(margin.argmax())]
-    while len(chosen) < min(3, len(flat)):
-        apart = np.linalg.norm(flat[:, None] - flat[chosen], axis=2).min(axis=1)
-        chosen.append(int(np.minimum(apart, 4 * margin).round(6).argmax()))
-    return chosen

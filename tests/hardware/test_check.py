@@ -15,7 +15,6 @@ from skin.hardware.check import (
     measure_ratios,
     require_agreement,
     store_check,
-    suggest_sensors,
     verify_source,
 )
 from skin.hardware.wire.channels import UnitConversion
@@ -92,11 +91,6 @@ def test_a_device_that_follows_its_own_baseline_is_refused(follows, shown):
 def test_a_load_that_is_lifted_too_early_is_put_down_again():
     with pytest.raises(InputError, match="no load within 120 s"):
         measured(loads=[4], hold=4.0)
-
-
-def test_sensors_far_from_each_other_and_from_the_rim_are_suggested():
-    assert suggest_sensors(POSITIONS, SIZE) == [3, 5, 4]
-    assert suggest_sensors(POSITIONS[:2], SIZE) == [0, 1]
 
 
 class Opened:

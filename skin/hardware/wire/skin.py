@@ -29,6 +29,7 @@ from skin.hardware.wire.channels import (
     Tare,
     UnitConversion,
     check_scale,
+    check_sensitivity,
     take_baseline,
     unit_conversion,
 )
@@ -427,8 +428,6 @@ class PortMonitor:
 
 
 _LEAST = 1.0  # s over which the rate is measured
-AGREES = 0.25
-"""Relative difference up to which two references agree: a finger on a kitchen scale is no better."""
 
 
 @dataclass(frozen=True)
@@ -539,14 +538,7 @@ class SerialSource:
             InputError: the scale is unknown, or contradicts ``device.sensitivity``.
         """
         conversion = unit_conversion(self._sensors, baseline, self.settings.scale, self._calibration, header)
-        scale = float(np.median(np.abs(conversion.scale[~conversion.broken])))
-        declared = self.settings.sensitivity
-        if declared is not None and abs(scale / declared - 1) > AGREES:
-            raise InputError(
-                f"device.scale or device.calibration converts by {scale:.4g} N per unit, "
-                f"device.sensitivity={declared:g} says otherwise: give the scale that the data sheet "
-                f"confirms within {AGREES:.0%}, or leave out the wrong one"
-            )
+        check_sensitivity(conversion, self.settings.sensitivity)
         return conversion
 
     def warm_up(self, skin: Skin, notify: Callable[[str], None]) -> tuple[list[Frame], UnitConversion]:

@@ -114,9 +114,10 @@ def files_are_parsed_once():
 
 @pytest.fixture(scope="session", autouse=True)
 def own_cache(shared):
-    """Keep operators of tests apart from the user's; commands that tests start inherit the variable."""
+    """Keep operators and checks of tests apart from the user's: commands inherit the variables."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("SKIN_CACHE", str(shared / "cache"))
+        patch.setenv("SKIN_DATA", str(shared / "data"))
         yield
 
 

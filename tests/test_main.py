@@ -35,8 +35,8 @@ def test_a_verb_shows_its_own_groups_and_settings(verb, capsys):
     assert f"skin {verb}" in text
     trained = ("adapt", "compare", "evaluate", "export", "live", "train")
     assert ("fusion" in text) == (verb in trained)
-    assert ("[serial]" in text) == (verb in ("listen", "record"))
-    assert ("[simulated]" in text) == (verb not in ("listen", "record"))
+    assert ("[serial]" in text) == (verb in ("check", "listen", "record"))
+    assert ("[simulated]" in text) == (verb not in ("check", "listen", "record"))
     assert "hydra" not in text
 
 

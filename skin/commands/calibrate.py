@@ -82,6 +82,7 @@ def _calibrate_by_gauge(config: Config, path: str) -> None:
         fit_calibration,
         print_calibration,
     )
+    from skin.hardware.gauge_drift import check_gauge
     from skin.hardware.wiring import Confirmed, check_usable, device_channels, wired_bench
     from skin.runs.build import build_device
 
@@ -96,6 +97,7 @@ def _calibrate_by_gauge(config: Config, path: str) -> None:
     rows = None if config.presses is None else read_gauge(config.presses, *shape, settings["delay"], units)
     with Console(stderr=True).status("fitting"):
         bench = wired_bench(device, session, rows, confirmed)
+        check_gauge(bench)
         calibration = fit_calibration(bench)
         check_usable(calibration)
         if units.force_scale is None:

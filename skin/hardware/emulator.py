@@ -25,6 +25,7 @@ from skin.device.resampling import Check
 from skin.errors import InputError
 from skin.hardware.wire.contact_lines import contact_lines, encode_contact_line
 from skin.hardware.wire.protocol import (
+    EMULATED,
     Announcement,
     Header,
     encode_announcement,
@@ -397,7 +398,7 @@ class EmulatorSettings:
         gap: between two windows, s.
         announce: send an announcement before each gesture, with its contacts, in the text format.
         seed: of the gestures and of the faults; the device's own noise follows ``device.seed``.
-        id: its name.
+        id: its name; begins with ``emulated``, else that is put before it.
     """
 
     rate: PositiveFloat = 100.0
@@ -541,7 +542,8 @@ class Emulator:
     def _header(self) -> None:
         settings, unit = self.settings, "N" if self.settings.bits is None else "adc"
         speed = None if settings.speed == 1 else settings.speed
-        header = Header(1, len(self.device.sensors), settings.rate, unit, settings.bits, settings.id, speed)
+        name = settings.id if settings.id.startswith(EMULATED) else f"{EMULATED}-{settings.id}"
+        header = Header(1, len(self.device.sensors), settings.rate, unit, settings.bits, name, speed)
         if self.binary:
             self._send(encode_comment(encode_header(header, "none").rstrip()))
         else:

@@ -7,7 +7,7 @@ below it, and a board not at all.
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -21,6 +21,9 @@ from skin.hardware.bench import BenchSession, Gauge, per_newton
 from skin.hardware.bench_protocol import Protocol, sent_session
 from skin.hardware.placements import Placements, find_placements
 from skin.hardware.wiring import find_quantum, list_numbers, measure_idle
+
+if TYPE_CHECKING:
+    from skin.runs.build import SkinModel
 
 GRAVITY = 9.80665  # m/s2
 _HEAVIEST = 50.0  # kg: nobody puts more on a skin by hand
@@ -121,7 +124,7 @@ def fit_known_load(device: AbstractSimulated, session: BenchSession, load: Known
     return _build(session, placements, load, gains, counts, differ, float(device.constants.noise.median()))
 
 
-def base_readings(device: AbstractSimulated, base: float) -> np.ndarray:
+def base_readings(device: "AbstractSimulated | SkinModel", base: float) -> np.ndarray:
     """Return the readings (S, S), N, under 1 N on a round base over each sensor.
 
     Near the rim the base is as far inside as it needs to be to lie on the skin.

@@ -53,7 +53,7 @@ def require_port(device: AbstractDevice) -> "Serial":
         InputError: it is another device.
     """
     if not isinstance(device, Serial):
-        raise InputError("only a skin at a port can be recorded: leave out device=")
+        raise InputError("only a skin at a port can be recorded or checked: leave out device=")
     return device
 
 
@@ -108,7 +108,7 @@ class Serial(PortSettings, AbstractDevice):
         self.sensors = self.layout.sensors(self.body)
         self._positions = torch.from_numpy(self.sensors.positions).float()
         self._recording: Recording | None = None
-        self.wire = SerialSource(self, len(self.sensors), self.model_rate)
+        self.wire = SerialSource(self, len(self.sensors), self.model_rate, self.body.layers)
 
     def touches(self, split: Split, epoch: int = 0) -> Touches:
         """Return the gestures, read at the first call; labels are None if unknown."""

@@ -100,7 +100,7 @@ def _spread(values: np.ndarray, step: float) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Responses:
-    """Responses of all channels, mean over the steps of a press while its force rises.
+    """Responses of all channels, medians over the steps of a press while its force rises.
 
     Attributes:
         measured: (F, S), change against the rest before the press, in the session's unit.
@@ -149,7 +149,7 @@ def collect_responses(bench: BenchData) -> Responses:
         rests.append(level)
         for step in np.array_split(frames, min(_STEPS, len(frames))):
             rows.append(find_medians(raw[step]) - level)
-            forces.append(force[step].mean())
+            forces.append(np.median(force[step]))  # as the readings: a part may hold two levels
             numbers.append(number)
             counts.append(len(step))
     measured = np.nan_to_num(np.array(rows))

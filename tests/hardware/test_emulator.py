@@ -3,8 +3,10 @@
 import socket
 import time
 from threading import Thread
+from types import SimpleNamespace
 
 import pytest
+import torch
 
 from skin.body.base import Sheet
 from skin.body.layout import Grid
@@ -36,3 +38,13 @@ def test_it_stops_wherever_it_waits(waits_for):
         thread.join(20)
         port.unplug()
     assert not thread.is_alive()
+
+
+@pytest.mark.parametrize(("name", "sent"), [("emulated-2", "emulated-2"), ("arm-L", "emulated-arm-L")])
+def test_its_header_says_that_it_is_emulated(name, sent):
+    """Nobody must check its scale, and no id may hide that."""
+    written = []
+    port = SimpleNamespace(write=written.append)
+    device = SimpleNamespace(sensors=[0], seed=0, constants=SimpleNamespace(clip=torch.ones(1)))
+    Emulator(device, port, EmulatorSettings(id=name), Faults())._header()
+    assert f"id={sent}" in written[0].decode().partition("*")[0].split()

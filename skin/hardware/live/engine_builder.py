@@ -17,6 +17,7 @@ from skin.core.settings import configured
 from skin.device.resampling import Frame
 from skin.errors import InputError
 from skin.evaluation.decisions import DRIFT
+from skin.hardware.check import Verification, verify_source
 from skin.hardware.live.contacts import LiveContacts, Mechanics
 from skin.hardware.live.engine import DebounceSettings, Detection, EngineSettings
 from skin.hardware.live.verdict import sensor_list
@@ -81,7 +82,9 @@ class SelfTest:
         text += f"{expected.sum()} with nominal settings"
         if not raised.all():
             text += f"; not on {sensor_list(np.unique(self._sensors[~raised]).tolist())}"
-        say(text if device.known else f"{text}; the device declares no range, so its scale is not checked")
+        untested = "only its range tests the scale" if device.known else "so its scale is not checked"
+        declared = "" if device.known else "the device declares no range, "
+        say(f"{text}; {declared}{untested}")
         few = raised[valid].sum() < _SHARE * expected[valid].sum()
         if expected.mean() < _LEAST or len(missed) or few or conversion.broken.mean() > _MASKED:
             raise InputError(self._refusal(raised, expected, missed, conversion, device))
@@ -283,8 +286,12 @@ class Watched:
     settings: EngineSettings
     nominal: EngineSettings
 
+    def verify(self, conversion: UnitConversion) -> Verification:
+        """Return whether a second reference confirms the conversion in use; its ``text`` is for the user."""
+        return verify_source(self.source, conversion, self.model.positions, self.model.size)
+
     def check(self, test: bool, say: Callable[[str], None], conversion: UnitConversion) -> int:
-        """Run the self-test with the conversion that is in use.
+        """Say whether the scale is verified, and run the self-test with the conversion that is in use.
 
         Args:
             test: ``live.selftest``.
@@ -298,6 +305,8 @@ class Watched:
             InputError: the settings in use hide dangerous touches.
         """
         sensors = len(self.model.positions)
+        if text := self.verify(conversion).text:
+            say(text)
         if not test:
             say("no self-test: live.selftest=false")
         elif self.nominal.presses is None or not self.model.alarms:

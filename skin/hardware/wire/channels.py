@@ -235,6 +235,21 @@ def check_scale(scale: float | None, calibration: Calibration | None) -> None:
         )
 
 
+AGREES = 0.25
+"""Relative difference up to which two references agree: a finger on a kitchen scale is no better."""
+
+
+def check_sensitivity(conversion: UnitConversion, declared: float | None) -> None:
+    """Raise InputError if the median scale of a conversion contradicts that of a data sheet, N per unit."""
+    scale = float(np.median(np.abs(conversion.scale[~conversion.broken])))
+    if declared is not None and abs(scale / declared - 1) > AGREES:
+        raise InputError(
+            f"device.scale or device.calibration converts by {scale:.4g} N per unit, "
+            f"device.sensitivity={declared:g} says otherwise: give the scale that the data sheet confirms "
+            f"within {AGREES:.0%}, or leave out the wrong one"
+        )
+
+
 FEWEST = 10
 """Frames that a baseline needs."""
 

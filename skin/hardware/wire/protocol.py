@@ -64,6 +64,10 @@ class Line(NamedTuple):
     finite: bool = True
 
 
+EMULATED = "emulated"
+"""How the id of an emulated device begins, and of no other: nobody is hurt by its scale."""
+
+
 @dataclass(frozen=True)
 class Header:
     """Description of a device, sent in a comment line.

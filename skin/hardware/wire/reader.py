@@ -55,6 +55,7 @@ class PortSettings:
         tare: duration of the tare, s.
         scale: N per unit of the device; negative if values fall with force.
         calibration: calibration file.
+        sensitivity: N per unit of a sensor by its data sheet; the conversion to N must agree with it.
 
     Raises:
         InputError: a setting is invalid.
@@ -71,6 +72,7 @@ class PortSettings:
     tare: float = 2.0
     scale: float | None = None
     calibration: str | None = None
+    sensitivity: PositiveFloat | None = None
 
     def __post_init__(self) -> None:
         # To open the port shows whether it is one.

@@ -30,6 +30,7 @@ from skin.hardware.wire.channels import (
     Tare,
     UnitConversion,
     check_scale,
+    check_sensitivity,
     fails_in_contact,
     take_baseline,
     unit_conversion,
@@ -48,6 +49,7 @@ from skin.hardware.wire.reader import (
 from skin.hardware.wire.segmentation import AnnouncementListener
 
 if TYPE_CHECKING:
+    from skin.body.base import Layer
     from skin.device.base import AbstractDevice
     from skin.device.touches import Touches
 
@@ -460,12 +462,14 @@ class Source:
         skin: open.
         tare: gives the conversion of values to N.
         limits: smallest and largest value of a channel, as given by the user.
+        port: that the frames come from; None: a recording or the simulator.
     """
 
     name: str
     skin: Skin
     tare: Tare
     limits: Limits | None = None
+    port: "SerialSource | None" = None
 
     @property
     def raw_range(self) -> RawRange:
@@ -491,13 +495,17 @@ class SerialSource:
         settings: of the port.
         sensors: S.
         rate: of the model, Hz.
+        layers: of the body; empty: unknown.
 
     Raises:
-        InputError: an invalid setting, or a calibration of another number of sensors.
+        InputError: an invalid setting, a calibration of another number of sensors, or a conversion that
+            contradicts ``device.sensitivity``.
     """
 
-    def __init__(self, settings: PortSettings, sensors: int, rate: float) -> None:
-        self._settings, self._sensors, self._rate = settings, sensors, rate
+    def __init__(
+        self, settings: PortSettings, sensors: int, rate: float, layers: "Sequence[Layer]" = ()
+    ) -> None:
+        self.settings, self._sensors, self._rate, self.layers = settings, sensors, rate, layers
         path = settings.calibration
         self._calibration = None if path is None else read_calibration(path)
         check_scale(settings.scale, self._calibration)
@@ -505,27 +513,34 @@ class SerialSource:
             self._calibration.fits(sensors)
             if self._calibration.values()["dead"].all():
                 raise InputError(f"every sensor is broken in device.calibration={path}")
+        if settings.scale is not None or self._calibration is not None:
+            self.convert(None, None)
+
+    @property
+    def channels(self) -> Sequence[int]:
+        """The device's channel of every sensor; empty: the same order."""
+        return self._calibration.channels if self._calibration else ()
 
     @property
     def polarity(self) -> Sequence[int]:
         """1 or -1 per sensor, -1 where the value falls with force; empty: 1 for all."""
         if self._calibration is not None:
             return self._calibration.polarity
-        scale = self._settings.scale
+        scale = self.settings.scale
         return [-1] * self._sensors if scale is not None and scale < 0 else ()
 
     def open(self, reconnect: bool = False) -> tuple[Skin, AnnouncementListener]:
         """Open the port and collect its announcements; ``reconnect`` waits for an unplugged skin."""
-        port = self._settings.port
+        port = self.settings.port
         if port is None:
             raise InputError("device=serial needs a port, device.port=/dev/ttyACM0; skin emulate makes one")
-        listener = AnnouncementListener(partial(open_stream, port, self._settings.baudrate))
+        listener = AnnouncementListener(partial(open_stream, port, self.settings.baudrate))
         skin = open_skin(
-            self._settings,
+            self.settings,
             range(self._sensors),
             opener=listener,
             reconnect=reconnect,
-            channels=self._calibration.channels if self._calibration else (),
+            channels=self.channels,
             polarity=self.polarity,
         )
         return skin, listener
@@ -533,19 +548,21 @@ class SerialSource:
     def open_source(self) -> Source:
         """Open the port as a stream of frames; wait for an unplugged skin."""
         skin, _ = self.open(reconnect=True)
-        return Source(str(self._settings.port), skin, self.tare(skin), self._settings.limits)
+        return Source(str(self.settings.port), skin, self.tare(skin), self.settings.limits, self)
 
     def tare(self, skin: Skin) -> Tare:
         """Return the tare of an open skin."""
-        return Tare(self.convert, self._settings.tare, self._rate, lambda: skin.header)
+        return Tare(self.convert, self.settings.tare, self._rate, lambda: skin.header)
 
     def convert(self, baseline: np.ndarray | None, header: Header | None) -> UnitConversion:
         """Return the conversion of values to N, given a baseline (S,) and the header of the device.
 
         Raises:
-            InputError: the scale is unknown.
+            InputError: the scale is unknown, or contradicts ``device.sensitivity``.
         """
-        return unit_conversion(self._sensors, baseline, self._settings.scale, self._calibration, header)
+        conversion = unit_conversion(self._sensors, baseline, self.settings.scale, self._calibration, header)
+        check_sensitivity(conversion, self.settings.sensitivity)
+        return conversion
 
     def warm_up(self, skin: Skin, notify: Callable[[str], None]) -> tuple[list[Frame], UnitConversion]:
         """Read frames until rate, conversion and device are known; return all of them, and the conversion.
@@ -555,16 +572,16 @@ class SerialSource:
             SkinTouched: the skin was still touched after a minute.
         """
         try:
-            frames, conversion = warm_up(skin, self.tare(skin), self._rate, self._settings.tare, notify)
+            frames, conversion = warm_up(skin, self.tare(skin), self._rate, self.settings.tare, notify)
             while (
                 skin.header is None
-                and self._settings.frames.kind == "protocol"  # other formats have no header
+                and self.settings.frames.kind == "protocol"  # other formats have no header
                 and frames[-1].t_host - frames[0].t_host < HEADER
             ):
                 frames += skin.read(1)
             return frames, conversion
         except (SkinTimeout, SkinDisconnected) as error:
-            raise InputError(f"{self._settings.port}: {error}") from error
+            raise InputError(f"{self.settings.port}: {error}") from error
 
 
 def warm_up(

@@ -250,7 +250,8 @@ class TestSelfTest:
 
     def test_nominal_settings_pass(self):
         assert self.run() == [
-            "self-test: 14 of 14 dangerous presses raise the alarm, 14 with nominal settings"
+            "self-test: 14 of 14 dangerous presses raise the alarm, 14 with nominal settings; only its range "
+            "tests the scale"
         ]
         assert "its scale is not checked" in self.run(device=RawRange())[0]
 

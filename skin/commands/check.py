@@ -52,8 +52,9 @@ def main(config: Config) -> None:
     except (SkinTimeout, SkinDisconnected) as error:
         raise InputError(f"{config.device['port']}: {error}") from error
     require_agreement(ratios)
+    rest = conversion.zero if conversion.rest is None else conversion.raw(conversion.rest)
     date = datetime.now(UTC).isoformat(timespec="seconds")
-    path = store_check(Check(**asdict(setup), date=date, ratios=ratios, rest=conversion.zero.tolist()))
+    path = store_check(Check(**asdict(setup), date=date, ratios=ratios, rest=rest.tolist()))
     print(f"{path}: the scale agrees, times {', '.join(f'{ratio:.3g}' for ratio in ratios.values())}")
 
 

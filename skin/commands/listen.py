@@ -32,8 +32,9 @@ def main(config: Config) -> None:
         )
 
     from skin.hardware.wire.formats import SensorCountError
+    from skin.hardware.wire.monitor import PortMonitor
     from skin.hardware.wire.reader import PortSettings, SkinDisconnected, SkinTimeout
-    from skin.hardware.wire.skin import PortMonitor, open_skin
+    from skin.hardware.wire.skin import open_skin
 
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     settings = PortSettings.select(device)

@@ -171,7 +171,11 @@ def show(config: Config, changes: Sequence[str], own_mechanics: bool = False) ->
                 opened.enter_context(show_in_terminal(display, Console()))
             source, engine = watched.source, watched.settings.build()
             session = LiveLoop(
-                source.skin, source.tare, engine, display, partial(watched.check, live.selftest, say)
+                source.skin,
+                source.tare,
+                engine,
+                display,
+                partial(watched.check, live.selftest, say, display.add_note),
             )
             opened.callback(lambda: say(f"{session.verdicts} verdicts, {session.line}"))
             # A search for garbage among all that is loaded would stop the loop for 0.3 s, every few seconds.

@@ -66,6 +66,11 @@ _LIFT = 0.1
 shows, with friction of 0.5."""
 
 
+def least_visible(noise: np.ndarray, threshold: float) -> np.ndarray:
+    """Return the readings (S,), N, from which sensors show a touch beside them, given their noise (S,), N."""
+    return np.maximum(_NOISE * noise, _FAINT * threshold)
+
+
 class ContactDetector:
     """Detects contact in a stream of tared readings.
 
@@ -201,7 +206,7 @@ class ContactDetector:
         self.lost &= ~risen
         before, now = np.where(valid, readings - self.rest, np.nan)[-2:]
         self.beyond = ~valid[-1] & (self.beyond | self._touched | (before >= _BEGUN * self._threshold))
-        change, visible = np.abs(now - before), np.maximum(_NOISE * self.noise, _FAINT * self._threshold)
+        change, visible = np.abs(now - before), least_visible(self.noise, self._threshold)
         steady = change <= _STEADY * np.maximum(before, visible)
         pressed = self._overlap & (steady & (before >= visible))
         moved = self._overlap & ~(steady | (change < visible))

@@ -1,10 +1,12 @@
 """Find in a bench session whether its force gauge drifts."""
 
 import numpy as np
+import pandas as pd
+from scipy.stats import theilslopes
 
 from skin.errors import InputError
 from skin.hardware.bench import BenchData
-from skin.hardware.wiring import _MEDIAN, collect_responses
+from skin.hardware.wiring import collect_responses
 
 _BELOW = 0.8  # of the channel's largest response: above, it may be at its limit
 _REACHED = 0.5  # of the sensor's strongest press: weaker ones depend on where it lies
@@ -13,7 +15,7 @@ _LIMITS = {"sensitivity": 0.2, "zero": 0.1}
 """Largest changes. Sensors misplaced by 2 mm look like a sensitivity that changes by 12 %, as the protocol
 presses them first where the response should be highest."""
 _SENSORS = 3  # that were pressed again: fewer may all be misplaced alike
-_SURE = 3.0  # standard errors of the change, which misplaced sensors cause, too
+_SURE = 0.95  # probability of the interval of a change: misplaced sensors cause one, too
 
 
 def check_gauge(bench: BenchData) -> None:
@@ -31,8 +33,8 @@ def check_gauge(bench: BenchData) -> None:
     time, sensor, slope, zero = _fit_lines(bench).T
     # Sensors have gains of their own, but the gauge has one zero.
     for what, group, values in (("sensitivity", sensor, slope), ("zero", 0 * sensor, zero)):
-        change, error = _fit_change(time, group, values)
-        if abs(change) > max(_LIMITS[what], _SURE * error):
+        change, low, high = _fit_change(time, group, values)
+        if abs(change) > _LIMITS[what] and low * high > 0:
             raise InputError(
                 f"the {what} of the gauge, against the sensors, changes by {change:+.0%} during the session: "
                 "let it warm up, zero it between presses, and record again"
@@ -57,21 +59,15 @@ def _fit_lines(bench: BenchData) -> np.ndarray:
     return np.array(rows).reshape(-1, 4)
 
 
-def _fit_change(time: np.ndarray, group: np.ndarray, values: np.ndarray) -> tuple[float, float]:
-    """Return how values change from time 0 to 1 within groups, and the standard error; infinite if unknown.
+def _fit_change(time: np.ndarray, group: np.ndarray, values: np.ndarray) -> tuple[float, float, float]:
+    """Return how values change from time 0 to 1 within groups, and its interval of 95 %; 0 if unknown.
 
-    The line has the least absolute error, so that some misplaced sensors do not bend it.
+    By the slopes between pairs (Theil and Sen), so that some misplaced sensors do not bend the line.
     """
-    number = np.unique(group, return_inverse=True)[1]
-    count = np.bincount(number)
-    time, values = (part - (np.bincount(number, part) / count)[number] for part in (time, values))
-    lever, spare = float((time**2).sum()), len(time) - len(count)
-    if spare < _SENSORS or lever < 1e-6:
-        return 0.0, np.inf
-    moved = np.abs(time) > 1e-6
-    ratios, weights = values[moved] / time[moved], np.abs(time[moved])
-    order = np.argsort(ratios)
-    weight = np.cumsum(weights[order])
-    change = float(ratios[order][np.searchsorted(weight, weight[-1] / 2)])
-    spread = _MEDIAN * float(np.abs(values - change * time).mean()) * np.sqrt(len(time) / spare)
-    return change, float(_MEDIAN * spread / np.sqrt(lever))
+    frame = pd.DataFrame({"time": time, "values": values})
+    within = frame - frame.groupby(group).transform("mean")
+    moved = within[within["time"].abs() > 1e-6]
+    if len(moved) - len(np.unique(group)) < _SENSORS:
+        return 0.0, 0.0, 0.0
+    change, _, low, high = theilslopes(moved["values"], moved["time"], _SURE)
+    return float(change), float(low), float(high)

@@ -61,23 +61,13 @@ def test_three_loads_confirm_a_scale_and_guide_the_user():
     ]
 
 
-@pytest.mark.parametrize(
-    ("scale", "cause"),
-    [
-        (1e-9, "wrong device.scale"),
-        (0.1, "a decimal place"),
-        (0.5, "half a scale"),
-        (2.0, "another weight"),
-        (9.80665, "given in kg"),
-        (1 / 4.448, "lbf"),
-        (0.001, "g in place of kg"),
-        (-1.0, "the sign of device.scale"),
-    ],
-)
-def test_a_wrong_scale_is_refused_with_its_cause(scale, cause):
+@pytest.mark.parametrize("scale", [1e-9, 0.1, 0.5, 2.0, 1 / 4.448, -1.0])
+def test_a_wrong_scale_is_refused_with_its_ratio(scale):
     ratios, _ = measured(scale)
-    with pytest.raises(InputError, match=f"the load times .*{cause}.*nothing was stored"):
+    with pytest.raises(InputError, match=r"the load times .*nothing was stored.*4\.45 lbf") as refused:
         require_agreement(ratios)
+    shown = float(str(refused.value).split("times ")[1].split(" ")[0])
+    assert shown == pytest.approx(scale, rel=0.03)
 
 
 @pytest.mark.parametrize(

@@ -232,12 +232,8 @@ class Engine:
             raised: (S,), N, baseline of the tare above the rest that is stored for the device: something may
                 have touched it. None: no rest is stored.
         """
-        void = (
-            np.zeros(self.window.sensors, dtype=bool)
-            if raised is None
-            else raised >= self._detection.threshold
-        )
-        self._contact.reset(void)
+        raised = np.zeros(self.window.sensors) if raised is None else raised
+        self._contact.reset(raised >= self._detection.threshold)
         shape = self.window.frames, self.window.sensors
         self._idle = np.zeros(shape, dtype=np.float32), np.ones(shape, dtype=bool)
         self.alarm, self._peak_probability = False, 0.0

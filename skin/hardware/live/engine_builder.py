@@ -16,11 +16,11 @@ from hydra import compose
 from skin.core.settings import configured
 from skin.device.resampling import Frame
 from skin.errors import InputError
-from skin.evaluation.decisions import DRIFT
-from skin.hardware.check import Verification, verify_source
+from skin.evaluation.decisions import DRIFT, least_visible
+from skin.hardware.check import verify_source
 from skin.hardware.live.contacts import LiveContacts, Mechanics
 from skin.hardware.live.engine import DebounceSettings, Detection, EngineSettings
-from skin.hardware.live.verdict import sensor_list
+from skin.hardware.live.verdict import Note, sensor_list
 from skin.hardware.wire.channels import RawRange, UnitConversion, unit_conversion
 from skin.hardware.wire.reader import PortSettings, SkinDisconnected, SkinTimeout
 from skin.hardware.wire.skin import SerialSource, Skin, Source
@@ -286,27 +286,38 @@ class Watched:
     settings: EngineSettings
     nominal: EngineSettings
 
-    def verify(self, conversion: UnitConversion) -> Verification:
-        """Return whether a second reference confirms the conversion in use; its ``text`` is for the user."""
-        return verify_source(self.source, conversion, self.model.positions, self.model.size)
-
-    def check(self, test: bool, say: Callable[[str], None], conversion: UnitConversion) -> int:
-        """Say whether the scale is verified, and run the self-test with the conversion that is in use.
+    def check(
+        self,
+        test: bool,
+        say: Callable[[str], None],
+        add_note: Callable[[Note], None],
+        conversion: UnitConversion,
+    ) -> tuple[int, np.ndarray | None]:
+        """Compare the conversion in use with what is stored of the device, and run the self-test with it.
 
         Args:
             test: ``live.selftest``.
             say: called with each message for the user.
+            add_note: called with a note on the whole session.
             conversion: of the device's values to N.
 
         Returns:
-            The largest number of sensors that may prove dead afterwards.
+            The largest number of sensors that may prove dead afterwards; and the baseline above the stored
+            rest of the device, (S,), N, None if none is stored.
 
         Raises:
             InputError: the settings in use hide dangerous touches.
         """
         sensors = len(self.model.positions)
-        if text := self.verify(conversion).text:
-            say(text)
+        found = verify_source(self.source, conversion, self.model.positions, self.model.size)
+        if found.text:
+            say(found.text)
+        if found.state == "unverified":
+            add_note(Note("unverified", detail=found.text))
+        rest = found.check.rest if found.state == "checked" and found.check else self.source.calibrated_rest
+        raised = None
+        if rest is not None and conversion.rest is not None:
+            raised = conversion.rest - conversion.newtons(np.asarray(rest))
         if not test:
             say("no self-test: live.selftest=false")
         elif self.nominal.presses is None or not self.model.alarms:
@@ -314,8 +325,12 @@ class Watched:
         else:
             selftest = SelfTest(self.nominal.presses, self.settings, self.nominal)
             selftest.run(conversion, self.source.raw_range, say)
-            return int(_MASKED * sensors)
-        return sensors
+            sensors = int(_MASKED * sensors)
+        if self.nominal.presses is not None and conversion.noise is not None:
+            felt = self.nominal.presses >= least_visible(conversion.noise, self.settings.detection.threshold)
+            if alone := np.flatnonzero(felt.sum(axis=1) < 2).tolist():
+                say(f"no neighbour would show that the wire of {sensor_list(alone)} breaks to its rest value")
+        return sensors, raised
 
 
 Loaded = Callable[[TrainedModel, str], None]

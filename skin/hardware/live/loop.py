@@ -322,7 +322,8 @@ class LiveLoop:
         engine: gives verdicts.
         display: shows them.
         before: called once with the conversion, before the first decision; returns the largest number of
-            sensors that may prove dead soon after. It may raise InputError.
+            sensors that may prove dead soon after, and the baseline above the stored rest of the device,
+            (S,), N, or None. It may raise InputError.
 
     Attributes:
         verdicts: number of verdicts so far.
@@ -334,7 +335,7 @@ class LiveLoop:
         tare: Tare,
         engine: Engine,
         display: Display,
-        before: Callable[[UnitConversion], int] | None = None,
+        before: Callable[[UnitConversion], tuple[int, np.ndarray | None]] | None = None,
     ) -> None:
         self._skin, self._tare, self._engine, self._display = skin, tare, engine, display
         self._before, self._heard_at = before, monotonic()
@@ -422,7 +423,8 @@ class LiveLoop:
     def _test(self, conversion: UnitConversion, now: float) -> None:
         """Test the alarm before the first decision; refuse a skin of which much proves dead soon after."""
         if self._before is not None:
-            self._most_dead, self._before = self._before(conversion), None
+            (self._most_dead, raised), self._before = self._before(conversion), None
+            self._engine.reset(raised)
             self._tested_at = now
         dead = [number for number, state in enumerate(self._skin.channels) if state == "dead"]
         if len(dead) > self._most_dead and now - self._tested_at < _PROVED:

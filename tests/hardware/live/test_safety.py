@@ -224,13 +224,13 @@ def test_sensors_that_prove_dead_after_the_self_test_are_counted(dead):
     values[:, :dead] = 0.0
     refused = pytest.raises(InputError, match=r"sensors 0, 1, 2 .* dead, more than 2 of 9.*selftest=false")
     with refused if dead > 2 else nullcontext():
-        watch(lines(values), before=lambda conversion: 2)
+        watch(lines(values), before=lambda conversion: (2, None))
 
 
 def test_sensors_that_break_later_end_no_live_view():
     values = force(15)
     values[700:, :6] = values[700, :6]
-    seen = watch(lines(values), before=lambda conversion: 2)
+    seen = watch(lines(values), before=lambda conversion: (2, None))
     assert seen.states(13, 15) == {"unknown"}
 
 

@@ -14,7 +14,7 @@ from skin.hardware.live.engine import Detection, Engine
 from skin.hardware.live.loop import Display, DisplayInfo, LiveLoop
 from skin.hardware.recorder import convert_session, record_session
 from skin.hardware.serial import Serial
-from skin.hardware.wire.decoder import ClockWatch
+from skin.hardware.wire.clocks import ClockWatch
 from skin.hardware.wire.protocol import (
     Announcement,
     Header,

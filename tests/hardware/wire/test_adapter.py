@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 from skin.core.files import CONF
 from skin.errors import InputError
 from skin.hardware.wire.adapter import Adapter, read_adapter
-from skin.hardware.wire.decoder import ClockUnit, Decoder, SequenceTracker
+from skin.hardware.wire.clocks import ClockUnit, ClockWatch, SequenceTracker
+from skin.hardware.wire.decoder import Decoder
 from skin.hardware.wire.proposal import propose
 from skin.hardware.wire.reader import PortSettings, SkinTimeout
 from skin.hardware.wire.skin import open_skin
@@ -91,19 +92,20 @@ def test_the_unit_of_a_clock_follows_from_the_host_or_the_header(frames, rate, s
     unit = ClockUnit(1e-6, False)
     changed = [unit.add(10 * n, n / 100, 1, rate) for n in range(frames)]
     assert sum(changed) == 1
-    assert (unit.unit, said in unit.summary, unit.error) == (1e-3, True, None)
+    assert (unit.unit, said in unit.summary) == (1e-3, True)
 
 
-def test_contradicting_clocks_are_refused():
-    fixed = ClockUnit(1e-6, True)
-    for n in range(200):
-        fixed.add(10 * n, n / 100, 1, None)
-    assert "counts ms by the host's clock, not us" in str(fixed.error)
-    # The header says 100 Hz, but the host sees 0.1 Hz of the same clock.
-    between = ClockUnit(1e-6, False)
-    for n in range(200):
-        between.add(10 * n, 10.0 * n, 1, 100.0)
-    assert "not ms" in str(between.error)
+@pytest.mark.parametrize(("fixed", "arrival", "rate"), [(True, 0.01, None), (False, 10.0, 100.0)])
+def test_where_the_unit_contradicts_the_hosts_clock_that_rules(fixed, arrival, rate):
+    """The user set the unit; or the header says 100 Hz, but the host sees 0.1 Hz of the same clock."""
+    unit, watch = ClockUnit(1e-6, fixed), ClockWatch()
+    trusted = []
+    for n in range(400):
+        unit.add(10 * n, arrival * n, 1, rate)
+        trusted.append(watch.trust([10 * n * unit.unit], arrival * n, 1.0))
+    assert unit.unit == (1e-6 if fixed else 1e-3)
+    assert trusted[0]
+    assert not trusted[-1]
 
 
 @pytest.mark.parametrize("modulus", [37, 100, 256, 1000, 4096])

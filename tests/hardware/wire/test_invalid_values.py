@@ -7,8 +7,9 @@ import pytest
 
 from skin.device.resampling import FrameError
 from skin.hardware.wire.decoder import Decoder
+from skin.hardware.wire.monitor import PortMonitor
 from skin.hardware.wire.protocol import crc16, encode_frame, parse_line
-from skin.hardware.wire.skin import PortMonitor, open_skin
+from skin.hardware.wire.skin import open_skin
 
 WORDS = [
     *(b"nan", b"NaN", b"-nan", b"inf", b"-INF", b"1e400", b"-1e999", b"ovf", b"OVF", b"err", b"ERROR"),

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from skin.device.resampling import FrameError
-from skin.hardware.wire.decoder import FrameClock, HostClock, SequenceTracker
+from skin.hardware.wire.clocks import FrameClock, HostClock, SequenceTracker
 from skin.hardware.wire.protocol import frames_ahead
 
 

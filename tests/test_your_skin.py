@@ -103,7 +103,7 @@ def test_the_commands_of_the_page_put_sensors_on_an_arm(home, line):
     assert leaning.all() == leaning.any() == ("tilted" in line)
 
 
-@pytest.mark.slow
+@pytest.mark.slow("trains as the page does")
 def test_the_training_of_the_page_runs(home, run, monkeypatch):
     monkeypatch.setenv("HOME", str(home))
 

@@ -123,7 +123,7 @@ def test_a_session_that_is_being_recorded_is_left_alone(record, tmp_path):
     assert not (tmp_path / "s.csv").exists()
 
 
-@pytest.mark.slow
+@pytest.mark.slow("two processes that record")
 def test_two_recordings_at_once_do_not_mix_and_kill_9_unlocks(record, begin, tmp_path):
     with skin({}) as port, begin(tmp_path, "record.py", "out=s.csv", *FREE, port) as first:
         next(line for line in first.lines(errors=True) if line.startswith("2 of"))

@@ -132,7 +132,7 @@ def _moments(weight, values):
     return average, np.sqrt(weight @ (values - average) ** 2 / weight.sum())
 
 
-@pytest.mark.slow
+@pytest.mark.slow("integrates over all contacts by brute force")
 @pytest.mark.parametrize(
     ("thin", "noise"),
     [(False, NOISE), (True, NOISE), (False, Noise(0.05, 10, gain=0.02)), (True, Noise(0.05, clip=1.0))],

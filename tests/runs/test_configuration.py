@@ -309,7 +309,7 @@ def test_settings_that_nobody_means_cost_one_sentence(word, capsys, monkeypatch,
     assert "Traceback" not in message
 
 
-@pytest.mark.slow
+@pytest.mark.slow("builds hundreds of configurations")
 def test_every_setting_works_or_is_refused_whatever_it_is_set_to(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with initialize_config_dir(str(CONF), version_base="1.3"):

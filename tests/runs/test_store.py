@@ -71,7 +71,7 @@ def test_an_interrupted_run_is_killed(store):
     assert status(store, run) == "KILLED"
 
 
-@pytest.mark.slow
+@pytest.mark.slow("trains until a signal")
 @pytest.mark.parametrize(
     ("number", "expected"),
     [(signal.SIGTERM, "KILLED"), (signal.SIGINT, "KILLED"), (signal.SIGKILL, "RUNNING")],
@@ -135,7 +135,7 @@ def test_readers_and_writers_work_side_by_side(settings, store):
     database.close()
 
 
-@pytest.mark.slow
+@pytest.mark.slow("imports MLflow in several processes")
 def test_processes_that_start_at_once_share_one_new_database(tmp_path):
     command = [sys.executable, "-c", BEGIN + "print(store.experiment)"]
     command += [f"sqlite:///{tmp_path}/m.db", str(tmp_path / "a")]

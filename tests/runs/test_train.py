@@ -60,7 +60,7 @@ def test_runs_of_other_settings_have_other_names():
     assert max(map(len, names)) < 250
 
 
-@pytest.mark.slow
+@pytest.mark.slow("trains a network")
 def test_a_run_stays_open_until_its_results_are_logged(config, monkeypatch):
     seen = []
     evaluate = skin.runs.train.evaluate
@@ -117,7 +117,7 @@ def logged(folder):
     return [(name, status, [float(loss) for loss in losses.split(",")]) for name, status, losses in found]
 
 
-@pytest.mark.slow
+@pytest.mark.slow("trains in two processes that import anew")
 def test_two_processes_make_one_run(run, tmp_path):
     """The second one, which Lightning starts as the command again, neither logs nor prints."""
     given = [*SMALL, "data.gestures=80", "trainer.max_epochs=2"]  # 64 to train on: two equal parts
@@ -138,7 +138,7 @@ def test_two_processes_make_one_run(run, tmp_path):
     assert len(losses) == 2
 
 
-@pytest.mark.slow
+@pytest.mark.slow("trains in two processes that import anew")
 def test_a_sweep_trains_each_job_in_two_processes(run, tmp_path):
     two = ["trainer.devices=2", "trainer.strategy=ddp_spawn", f"hydra.sweep.dir={tmp_path}/out"]
     done = run(tmp_path, "train", "-m", *SMALL, "seed=0", *two, apart=True)
@@ -147,7 +147,7 @@ def test_a_sweep_trains_each_job_in_two_processes(run, tmp_path):
     assert (status, len(losses)) == ("FINISHED", 1)
 
 
-@pytest.mark.slow
+@pytest.mark.slow("starts processes that import anew")
 @pytest.mark.parametrize(
     ("given", "said"),
     [

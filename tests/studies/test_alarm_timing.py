@@ -40,7 +40,7 @@ def engine(request, trained):
     return engine_settings(of, DebounceSettings(), request.param).build(), device
 
 
-@pytest.mark.slow
+@pytest.mark.slow("plays long courses through an engine")
 @pytest.mark.parametrize("course", COURSES)
 def test_an_alarm_stays_until_the_touch_ends(engine, course):
     subject, device = engine

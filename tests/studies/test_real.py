@@ -70,7 +70,7 @@ def test_the_choice_and_the_prediction_do_not_depend_on_the_targets_of_the_test(
     assert lines[1]["value"] > 1e5
 
 
-@pytest.mark.slow
+@pytest.mark.slow("fits hundreds of presses")
 def test_an_alarm_on_unseen_places_has_intervals_over_presses_and_places(tmp_path):
     write_pad(tmp_path / "sdu_fsi")
     lines = run(tmp_path, "rows=sdu alarm")
@@ -126,7 +126,7 @@ def test_wrong_settings_are_one_sentence(tmp_path, words):
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.slow
+@pytest.mark.slow("fits a tenth of the real recordings")
 @pytest.mark.skipif(not REAL.is_dir(), reason="the recordings are not part of the repository")
 def test_a_tenth_of_the_real_recordings(tmp_path):
     """With 360 presses of two sessions the force of the third errs by 0.55 N, of 34 N at most."""
@@ -195,7 +195,7 @@ def test_presses_are_read_above_what_was_before_them(tmp_path):
         real_barometers.read_frames(tmp_path / "b.csv")
 
 
-@pytest.mark.slow
+@pytest.mark.slow("fits the place of a strip")
 def test_a_strip_is_found_from_a_third_of_its_presses_and_places_the_others(tmp_path):
     """The skin is simulated with other gains, and 8 mm beside the robot."""
     about = real_barometers.OmegaConf.load(

@@ -88,7 +88,7 @@ def skin():
         thread.join(PATIENCE)
 
 
-@pytest.mark.slow
+@pytest.mark.slow("starts a process that imports anew")
 def test_it_runs_without_torch_and_writes_json_lines(model, skin, tmp_path):
     words = [f"run={model}", "device=serial", f"device.port={skin}", "device.tare=1", "live.verdicts=stdout"]
     words += ["seconds=15", "live.log=alarms.jsonl", "live.selftest=false"]  # untrained
@@ -176,7 +176,7 @@ def test_the_command_replaces_settings_of_the_file(model, skin):
     assert (watched.settings.detection.threshold, watched.nominal.detection.threshold) == (0.5, 0.3)
 
 
-@pytest.mark.slow
+@pytest.mark.slow("starts a process that imports anew")
 def test_the_example_without_this_package(model, begin, tmp_path):
     example = ROOT / "docs" / "examples" / "onnx_only.py"
     assert len(example.read_text().splitlines()) <= 40

@@ -54,7 +54,9 @@ def watch(name, stream):
     return Watching(stream, speed=speed, adapter=adapter, scale=SCALE)
 
 
-@pytest.fixture(params=["json", "binary", pytest.param("rows", marks=pytest.mark.slow)])
+@pytest.fixture(
+    params=["json", "binary", pytest.param("rows", marks=pytest.mark.slow("plays text at a low rate"))]
+)
 def board(request):
     return request.param
 

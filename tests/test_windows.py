@@ -39,6 +39,7 @@ def test_a_run_is_trained(windows):
     assert "overall/accuracy" in done.stdout
 
 
+@pytest.mark.slow("imports all libraries anew")
 def test_the_emulator_asks_for_a_socket(windows):
     done = windows("emulate", "simulator=naive")
     assert done.returncode == 2

@@ -17,7 +17,14 @@ from skin.runs.build import build_device
 from skin.runs.configuration import validate_config
 from skin.runs.generation import generate_data_set, generate_file
 
-SMALL = ["simulator=naive", "n=80", "touch.leak=0.95"]  # few gestures may have few shapes
+SMALL = [
+    "simulator=naive",
+    "layout=grid",
+    "layout.rows=3",
+    "layout.columns=3",
+    "n=80",
+    "touch.leak=0.95",
+]  # few gestures may have few shapes
 
 
 def composed(*overrides):

@@ -143,14 +143,14 @@ def test_an_untouched_skin_has_no_contact(posterior):
 
 def test_few_sensors_that_feel_nothing_show_no_contact_but_a_light_touch():
     """They cannot rule out a contact between them, which is no reason to show one."""
-    body, count = Sheet((0.2, 0.2), (32, 32), BODY.layers), 12
+    body, count = Sheet((0.2, 0.2), (20, 20), BODY.layers), 12
     mechanics = Mechanics(Naive, body, Grid(3, 4).sensors(body), NOISE)
     posterior, rng = mechanics.posterior(), np.random.default_rng(0)
     # 0.3 N at the first sensor, which reads 0.1 N.
     place = np.array([[0.028, 0.033, 0.008]])
     light = 0.3 * disc_readings(Naive(body, mechanics.sensors), body, place, 0.0015)[0]
     works = {"valid": np.ones(count, dtype=bool), "saturated": np.zeros(count, dtype=bool)}
-    for _ in range(6):
+    for _ in range(3):
         noise = rng.normal(scale=NOISE.frame / 10**0.5, size=count)
         idle, touched = (
             estimate_contacts(posterior, NOISE, moment(noise + felt, **works)) for felt in (0.0, light)
@@ -262,6 +262,7 @@ def test_looking_never_waits_and_only_the_newest_counts(running, felt):
     assert len([t for t in times if t > 1e6]) <= 3
 
 
+@pytest.mark.slow("starts a process that imports anew")
 def test_a_process_that_dies_is_said_and_stops_nothing(felt):
     with started() as contacts:
         state_of(contacts, "contacts", felt)

@@ -53,22 +53,21 @@ def slowness() -> float:
     return max(1.0, (process_time() - begin) / REFERENCE)
 
 
-def unexplained(items: list[pytest.Item]) -> list[str]:
-    """Return the slow cases that do not say why they are: ``@pytest.mark.slow("trains three models")``."""
-    marks = [(item.nodeid, mark) for item in items for mark in item.iter_markers("slow")]
-    return [name for name, mark in marks if not any((*mark.args, *mark.kwargs.values()))]
-
-
 class Budget:
     """Fail a case that is not marked slow and takes more than ``limit`` seconds of processor time.
 
     The call and the fixtures of one function count, with all processes that they wait for. What others
     share does not count: fixtures of modules and of the session, and the import of modules. On a slower or
     busier machine the limit grows.
+
+    Attributes:
+        limit: s of processor time.
+        unexplained: names of slow cases that do not say why they are.
     """
 
     def __init__(self, limit: float = LIMIT) -> None:
         self.limit = limit
+        self.unexplained: list[str] = []
         self._begin = 0.0
 
     def pytest_sessionstart(self) -> None:
@@ -82,9 +81,9 @@ class Budget:
         SourceFileLoader.exec_module = exec_module  # type: ignore[method-assign]
 
     def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
-        """Refuse slow cases without a reason."""
-        if missing := unexplained(items):
-            raise pytest.UsageError(f"slow without a reason: {', '.join(missing)}")
+        """Note the slow cases that do not say why: ``@pytest.mark.slow("trains three models")``."""
+        marks = [(item.nodeid, mark) for item in items for mark in item.iter_markers("slow")]
+        self.unexplained = [name for name, mark in marks if not any((*mark.args, *mark.kwargs.values()))]
 
     @pytest.hookimpl(wrapper=True)
     def pytest_fixture_setup(self, fixturedef):

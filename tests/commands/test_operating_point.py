@@ -157,6 +157,7 @@ def tapped():
 LIVE = ["live.touch=0.3", "live.selftest=false", "seconds=1.2"]  # a training of seconds finds little
 
 
+@pytest.mark.slow("starts a live view that waits for a tap")
 @pytest.mark.parametrize(("above", "alarm"), [("0.00001", True), ("0.9999", False)])
 def test_live_raises_the_alarm_where_it_is_told(run, folder, above, alarm):
     with tapped() as port:

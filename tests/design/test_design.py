@@ -35,7 +35,7 @@ def test_the_expected_posterior_of_nine_sensors(run, tmp_path):
 
 
 def test_a_skin_without_mechanics_has_a_posterior_too(run, tmp_path):
-    done = run(tmp_path, *SMALL, "simulator=naive", "out=x", store=False)
+    done = run(tmp_path, *SMALL, "simulator=naive", "design.touches=32", "out=x", store=False)
     assert done.returncode == 0, done.stderr
     weak, _, strong = json.loads((tmp_path / "x" / "design.json").read_text())["expected"]
     # A touch beside every sensor's cell raises none, however hard it is.

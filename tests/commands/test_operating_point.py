@@ -13,6 +13,7 @@ import pytest
 SKIN = ["layout=grid", "layout.rows=2", "layout.columns=2", "simulator=naive"]
 SMALL = ["data.gestures=400", "device.test_gestures=96", "evaluation.devices=1", "evaluation.layouts=0"]
 SMALL += ["evaluation.safe_gestures=200"]
+FEW = "evaluation.devices=0"
 
 
 @pytest.fixture(scope="module")
@@ -69,7 +70,7 @@ def test_a_training_stores_what_it_chose_and_says_what_it_reaches(folder):
 
 def test_evaluate_raises_the_alarm_where_the_run_does(run, folder):
     with changed(folder, threshold=1e-9):
-        done = run(folder, "evaluate", f"out={folder}/found")
+        done = run(folder, "evaluate", FEW, f"out={folder}/found")
     assert done.returncode == 0, done.stderr
     assert "false alarms: 48 of 48 safe gestures, 100.0 %" in done.stdout
     assert "alarm above 0.0000, chosen on 200 fresh safe gestures" in done.stdout
@@ -81,14 +82,14 @@ def test_evaluate_raises_the_alarm_where_the_run_does(run, folder):
 def test_a_run_of_old_gets_its_threshold_now_and_that_is_said(run, folder):
     """It is the one that its training would have stored."""
     with changed(folder):
-        done = run(folder, "evaluate", "device.seed=3", f"out={folder}/old")
+        done = run(folder, "evaluate", FEW, "device.seed=3", f"out={folder}/old")
     assert done.returncode == 0, done.stderr
     assert "stores no alarm threshold for 2 % false alarms, it is chosen now" in done.stderr
     assert f"alarm above {stored(folder)['threshold']:.4f}" in done.stdout
 
 
 def test_another_rate_gets_another_threshold(run, folder):
-    done = run(folder, "evaluate", "evaluation.false_alarm_rate=0.2", f"out={folder}/rate")
+    done = run(folder, "evaluate", FEW, "evaluation.false_alarm_rate=0.2", f"out={folder}/rate")
     assert "stores no alarm threshold for 20 % false alarms" in done.stderr
     level = float(re.search(r"alarm above (0\.\d+), chosen on 200 fresh", done.stdout)[1])
     assert level < stored(folder)["threshold"]
@@ -101,7 +102,7 @@ def threshold(text):
 @pytest.fixture(scope="module")
 def found(run, folder):
     """The threshold that an evaluation finds for a profile."""
-    done = run(folder, "evaluate", "evaluation.profile=rough", f"out={folder}/profile")
+    done = run(folder, "evaluate", FEW, "evaluation.profile=rough", f"out={folder}/profile")
     assert done.returncode == 0, done.stderr
     return threshold(done.stdout)
 
@@ -110,6 +111,7 @@ def test_a_profile_gets_a_threshold_of_its_own(folder, found):
     assert abs(found - stored(folder)["threshold"]) > 1e-3
 
 
+@pytest.mark.slow("trains and evaluates once more")
 def test_a_training_stores_the_threshold_of_a_profile(run, found, tmp_path):
     words = ["experiment=rules", *SKIN, *SMALL, "evaluation.profile=rough"]
     done = run(tmp_path, "train", *words)
@@ -169,6 +171,7 @@ def test_live_raises_the_alarm_where_it_is_told(run, folder, above, alarm):
     assert f"alarm above {float(above):g}" in done.stderr
 
 
+@pytest.mark.slow("draws and plays touches for three live views")
 def test_live_chooses_a_threshold_per_touch_for_the_profile_and_keeps_it(run, folder, tmp_path, monkeypatch):
     monkeypatch.setenv("SKIN_CACHE", str(tmp_path))
     levels, few = [], "evaluation.safe_gestures=50"  # the time goes with their number

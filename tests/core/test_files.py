@@ -102,7 +102,6 @@ def test_an_animation_is_whole(tmp_path, configured):
     from skin.runs.build import build_device
 
     small = ["data.gestures=10", "simulator=naive", "layout=grid", "layout.rows=2", "layout.columns=2"]
-    small += ["touch.rate=5"]
     scene = simulate_scene(build_device(configured(*small)), [], None, 0, False)
     with full(500), pytest.raises(InputError, match=r"^cannot write .*x\.gif"):
         animation.write_animation(scene, "flat", tmp_path / "x.gif")

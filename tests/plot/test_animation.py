@@ -116,12 +116,12 @@ def test_a_touch_of_another_device_is_taken_by_its_number(made_up_device, tmp_pa
 
 @pytest.mark.parametrize("view", ["sensors3d", "skin3d"])
 def test_a_slide_on_the_arm_is_drawn_in_space(view, configured, tmp_path):
-    device = build_device(configured("body=arm", "body.cells=[12,12]", "simulator=naive", "touch.rate=5"))
+    device = build_device(configured("body=arm", "body.cells=[12,12]", "simulator=naive"))
     scene = simulate_scene(device, ["press", "dynamic"], "bar", 5, field=True)
     assert scene.body == device.body
     assert scene.moved is None
     shown, _ = frames_of(write_animation(scene, view, tmp_path / "x.gif"))
-    assert len(shown) == 15
+    assert len(shown) == 30
 
 
 def test_a_recording_of_an_arm_is_drawn_on_the_arm(configured, tmp_path):

@@ -1,6 +1,7 @@
 """What all tests share."""
 
 import gc
+import hashlib
 import json
 import logging
 import os
@@ -24,24 +25,22 @@ from collections.abc import Callable, Iterator
 from contextlib import redirect_stderr, redirect_stdout, suppress
 from copy import deepcopy
 from functools import partial
+from importlib.metadata import version
 from io import StringIO
 from itertools import count
 from pathlib import Path
 from tempfile import mkdtemp
 from time import monotonic, sleep
-from typing import TextIO
+from typing import Any, TextIO
 
 import pytest
-import torch
 from filelock import FileLock
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 from skin.core.files import ROOT
-from skin.device.base import AbstractDevice
-from skin.device.touches import Touches
 from skin.runs.configuration import Config, validate_config
-from skin.touch.labels import TOUCH
+from tests.budget import Budget, charge, free
 from tests.starter import copying, remembering
 
 # The imports of all tests make a million objects that live to the end. To search them for garbage again and
@@ -49,12 +48,18 @@ from tests.starter import copying, remembering
 gc.disable()
 
 CONF = ROOT / "conf"
+OPERATORS = ("body", "touch", "mechanics")  # rooms that operators depend on
 PATIENCE = 600  # s: machines are busy at times
 
 
+def pytest_configure(config: pytest.Config) -> None:
+    """Limit the processor time of each case."""
+    config.pluginmanager.register(Budget(), "budget")
+
+
 def pytest_xdist_auto_num_workers() -> int:
-    """Use one process more than there are cores: who tests a port mostly waits."""
-    return (os.cpu_count() or 1) + 1
+    """Use as many processes as there are cores: each further one imports and collects for 20 s."""
+    return os.cpu_count() or 1
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -77,19 +82,27 @@ def shared(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def empty_database(shared) -> Callable[[], Path]:
+def kept(request, shared) -> Path:
+    """Return the folder that outlives this run, or the shared one if pytest keeps no cache."""
+    cache = getattr(request.config, "cache", None)
+    return cache.mkdir("skin") if cache else shared
+
+
+@pytest.fixture(scope="session")
+def empty_database(kept) -> Callable[[], Path]:
     """Return a function that returns an empty database, which takes MLflow seconds to make.
 
-    It does not exist if its disk is full, as some tests let it be.
+    It is kept for as long as the version of MLflow is. It does not exist if its disk is full, as some tests
+    let it be.
     """
-    path = shared / "empty.db"
+    path = kept / f"empty-{version('mlflow')}.db"
 
     def made() -> Path:
-        with FileLock(f"{path}.lock"):
+        with FileLock(f"{path}.lock"), free():
             if not path.exists():
                 create = f"import mlflow; mlflow.MlflowClient('sqlite:///{path}.new').search_experiments()"
                 if not subprocess.run([sys.executable, "-c", create], capture_output=True).returncode:
-                    path.with_name("empty.db.new").rename(path)
+                    path.with_name(f"{path.name}.new").rename(path)
         return path
 
     return made
@@ -113,12 +126,21 @@ def files_are_parsed_once():
 
 
 @pytest.fixture(scope="session", autouse=True)
-def own_cache(shared):
-    """Keep operators and checks of tests apart from the user's: commands inherit the variables."""
+def own_cache(kept, shared):
+    """Keep operators of tests, until their sources change, and checks apart from the user's; commands, too."""
+    path = kept / f"cache-{hash_of_sources()}"
+    for old in set(kept.glob("cache-*")) - {path}:
+        shutil.rmtree(old, ignore_errors=True)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("SKIN_CACHE", str(shared / "cache"))
+        patch.setenv("SKIN_CACHE", str(path))
         patch.setenv("SKIN_DATA", str(shared / "data"))
         yield
+
+
+def hash_of_sources() -> str:
+    """Return a hash of all that operators depend on; what else is kept has a key of its own sources."""
+    sources = [path for room in OPERATORS for path in sorted((ROOT / "skin" / room).rglob("*.py"))]
+    return hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()[:16]
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -291,12 +313,18 @@ def named(command: str | Path) -> list[str]:
 def forked(starter: TextIO, job: dict) -> tuple[int, Callable[[], int | None]]:
     """Begin a command as a fork of the starter; return its process's number and what gives its exit code."""
 
-    def ask(what: dict) -> int | None:
+    def ask(what: dict) -> Any:
         print(json.dumps(what), file=starter, flush=True)
         return json.loads(starter.readline())
 
+    def ended() -> int | None:
+        if answer := ask({"ended": number}):
+            charge(answer[1])
+            return answer[0]
+        return None
+
     number = ask(job)
-    return number, lambda: ask({"ended": number})
+    return number, ended
 
 
 def started(job: dict) -> tuple[int, Callable[[], int | None]]:
@@ -359,6 +387,7 @@ def _print_warning(message, category, filename, lineno, file=None, line=None) ->
 
 def run_here(folder: Path, words: list[str]) -> subprocess.CompletedProcess:
     """Run ``skin`` with these words in this process; leave its state as it was."""
+    import torch
     from hydra.core.global_hydra import GlobalHydra
     from hydra.core.singleton import Singleton
 
@@ -405,39 +434,9 @@ def run_here(folder: Path, words: list[str]) -> subprocess.CompletedProcess:
     return subprocess.CompletedProcess(words, code, out.getvalue(), err.getvalue())
 
 
-class MadeUpDevice(AbstractDevice):
-    """Yields random touches of 12 sensors and 10 frames whose labels a simple network can learn."""
-
-    task, size, rate = TOUCH, (0.16, 0.12), 10.0
-
-    def touches(self, split: str, epoch: int = 0) -> Touches:
-        """Return 160 touches to train on, 40 else."""
-        generator = torch.Generator().manual_seed(hash_of(split))
-        count = 160 if split == "train" else 40
-        labels = torch.rand(count, 4, generator=generator).round()
-        readings = 0.05 * torch.randn(count, 10, 12, generator=generator)
-        big, dynamic, press, dangerous = labels.T
-        for sensor in range(12):
-            # a press lasts 6 frames, a tap 2; a dynamic touch comes later to every further sensor
-            first = 1 + (dynamic * (sensor % 3)).long()
-            last = first + 2 + (4 * press).long()
-            now = torch.arange(10)
-            during = (now >= first[:, None]) & (now < last[:, None])
-            reached = (sensor < 4) | (big == 1)
-            force = reached * (1 + 4 * dangerous)
-            readings[:, :, sensor] += force[:, None] * during
-        grid = torch.cartesian_prod(torch.tensor([0.02, 0.06, 0.1]), torch.tensor([0.02, 0.06, 0.1, 0.14]))
-        places = grid.flip(1) + 0.004 * torch.rand(12, 2, generator=torch.Generator().manual_seed(0))
-        positions = torch.cat([places, torch.full((12, 1), 0.005)], dim=1)
-        return Touches(readings, torch.ones_like(readings, dtype=torch.bool), positions, labels, self.rate)
-
-
-def hash_of(split: str) -> int:
-    """Return a seed that does not change from one process to the next."""
-    return sum(map(ord, split))
-
-
 @pytest.fixture
-def made_up_device() -> MadeUpDevice:
+def made_up_device():
     """Return a device that needs no simulator."""
+    from tests.made_up import MadeUpDevice
+
     return MadeUpDevice()

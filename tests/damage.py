@@ -1,6 +1,7 @@
 """Damaged and hostile copies of files, for property tests."""
 
 import copy
+import os
 import re
 from collections.abc import Callable
 from typing import Any, TypeVar
@@ -13,9 +14,13 @@ from skin.errors import InputError
 Content = TypeVar("Content")
 
 DAMAGED_FILES = settings(
-    max_examples=500, derandomize=True, deadline=None, database=None, suppress_health_check=list(HealthCheck)
+    max_examples=int(os.environ.get("DAMAGED", "100")),
+    derandomize=True,
+    deadline=None,
+    database=None,
+    suppress_health_check=list(HealthCheck),
 )
-"""The same 500 files in every run of the tests."""
+"""The same files in every run of the tests: 100, or as many as ``make slow`` says."""
 
 _NUMBER = re.compile(rb"-?\d+(\.\d+)?(e-?\d+)?")
 _ODD_NUMBERS = (

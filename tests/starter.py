@@ -1,9 +1,9 @@
 """Runs commands, each in a fork of a process that has imported the heavy libraries once.
 
 Processes that run tests connect to a socket. A line is a job, and its process's number the answer; or it asks
-for the exit code of such a process. A job has a process of its own, with its own folder, environment, files
-and end, as one that a shell starts; only imports are shared, and an empty database. It ends when nobody is
-connected any more.
+for the exit code and the processor time of such a process. A job has a process of its own, with its own
+folder, environment, files and end, as one that a shell starts; only imports are shared, and an empty
+database. It ends when nobody is connected any more.
 """
 
 import atexit
@@ -87,10 +87,10 @@ def _accept(server: socket.socket, clients: dict[socket.socket, TextIO]) -> None
     print("ready", file=clients[client], flush=True)
 
 
-def _ended(number: int) -> int | None:
-    """Return the exit code of a process, None while it runs."""
-    ended, status = os.waitpid(number, os.WNOHANG)
-    return os.waitstatus_to_exitcode(status) if ended else None
+def _ended(number: int) -> tuple[int, float] | None:
+    """Return the exit code of a process and its processor time, s; None while it runs."""
+    ended, status, used = os.wait4(number, os.WNOHANG)
+    return (os.waitstatus_to_exitcode(status), used.ru_utime + used.ru_stime) if ended else None
 
 
 def _warm() -> dict[str, str]:

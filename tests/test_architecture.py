@@ -38,6 +38,12 @@ sys.modules["house"] = house
 _spec.loader.exec_module(house)
 
 
+@pytest.fixture(scope="module", autouse=True)
+def parsed():
+    """Parse all modules once."""
+    house.trees()
+
+
 def modules(folder: Path) -> dict[str, Path]:
     """Return every module under a folder by its dotted name."""
     paths = {}

@@ -35,7 +35,7 @@ def test_one_option_of_each_of_four_groups_is_shown():
     assert (len(TRAINING), len(EVALUATION)) == (4, 1)
 
 
-@pytest.mark.slow
+@pytest.mark.slow("trains and evaluates an option of every kind")
 @pytest.mark.parametrize("overrides", TRAINING, ids=lambda words: words[-1])
 def test_an_option_of_ones_own_is_trained_and_evaluated(run, own, overrides):
     simulator = [] if any(one.startswith("simulator=") for one in overrides) else ["simulator=naive"]

@@ -5,6 +5,8 @@ import re
 import runpy
 import subprocess
 import sys
+from contextlib import redirect_stdout
+from io import StringIO
 
 import numpy as np
 import pytest
@@ -55,8 +57,8 @@ def test_a_skin_is_described_simulated_and_differentiated():
 
 def test_a_run_is_loaded_and_predicts_a_recording(run, tmp_path):
     for arguments in (
-        ["train.py", "experiment=rules", *SMALL],
-        ["generate.py", *SMALL[:1], "n=20", "out=x.csv"],
+        ["train", "experiment=rules", *SMALL],
+        ["generate", *SMALL[:1], "n=20", "out=x.csv"],
     ):
         done = run(tmp_path, *arguments, store="train" in arguments[0])
         assert done.returncode == 0, done.stderr
@@ -78,13 +80,20 @@ def run_example(page):
     return variables
 
 
-def test_the_example_of_the_readme_runs(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    made = run_example("README.md")
+@pytest.fixture(scope="module")
+def readme(tmp_path_factory):
+    """Return the variables of the example of the README, and what it says."""
+    with pytest.MonkeyPatch.context() as patch, redirect_stdout(StringIO()) as said:
+        patch.chdir(tmp_path_factory.mktemp("readme"))
+        return run_example("README.md"), said.getvalue()
+
+
+def test_the_example_of_the_readme_runs(readme):
+    made, said = readme
     assert len(made["run"].labels) == 4
     chances = dict(zip(made["run"].labels, made["run"].predict(made["readings"])[0], strict=True))
     assert chances["press"] > 0.5 > chances["big"]
-    assert "dangerous" in capsys.readouterr().out
+    assert "dangerous" in said
 
 
 def test_the_simulator_is_differentiable_as_documented():

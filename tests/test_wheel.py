@@ -81,7 +81,7 @@ def test_verbs_show_their_help(installed):
     assert "port: pty" in installed("-m", "skin", "emulate", "--help")
 
 
-@pytest.mark.slow
+@pytest.mark.slow("trains from an installed wheel")
 def test_a_training_leaves_its_results_in_the_current_folder(installed, unpacked, tmp_path):
     before = {path for path in unpacked.rglob("*") if path.suffix not in (".pyc", "")}
     said = installed("-m", "skin", "train", "experiment=rules", "simulator=naive", *SMALL)

@@ -22,7 +22,7 @@ def windows(tmp_path):
     return run
 
 
-@pytest.mark.slow
+@pytest.mark.slow("imports all libraries anew")
 def test_every_module_is_imported_and_every_verb_shows_its_help(windows):
     done = windows()
     assert done.returncode == 0, done.stderr
@@ -30,7 +30,7 @@ def test_every_module_is_imported_and_every_verb_shows_its_help(windows):
         assert f"    skin {verb}" in done.stdout
 
 
-@pytest.mark.slow
+@pytest.mark.slow("trains a run with all libraries imported anew")
 def test_a_run_is_trained(windows):
     small = ["data.gestures=48", "device.test_gestures=48", "evaluation.safe_gestures=64"]
     small += ["evaluation.devices=0", "evaluation.layouts=0"]
@@ -39,6 +39,7 @@ def test_a_run_is_trained(windows):
     assert "overall/accuracy" in done.stdout
 
 
+@pytest.mark.slow("imports all libraries anew")
 def test_the_emulator_asks_for_a_socket(windows):
     done = windows("emulate", "simulator=naive")
     assert done.returncode == 2

@@ -68,7 +68,7 @@ def adapted(run, folder):
     return parent, runs(folder)[-1], done.stdout
 
 
-@pytest.mark.slow
+@pytest.mark.slow("trains and adapts a run")
 def test_a_simulated_skin_is_adapted_to(folder, adapted):
     parent, made, said = adapted
     found, about = metrics(folder, made), tags(folder, made)
@@ -81,7 +81,7 @@ def test_a_simulated_skin_is_adapted_to(folder, adapted):
     assert "chosen: layers=all lr=0.001" in said
 
 
-@pytest.mark.slow
+@pytest.mark.slow("trains and adapts a run")
 def test_the_new_run_is_evaluated_on_its_skin_with_its_weights(run, folder, adapted):
     _, made, _ = adapted
     done = run(folder, "evaluate", f"run={made}")
@@ -90,14 +90,14 @@ def test_the_new_run_is_evaluated_on_its_skin_with_its_weights(run, folder, adap
     assert metrics(folder, runs(folder)[-1])[name] == pytest.approx(metrics(folder, made)[name], abs=1e-6)
 
 
-@pytest.mark.slow
+@pytest.mark.slow("trains and adapts a run")
 def test_the_new_run_is_shown_live(run, folder, adapted):
     done = run(folder, "live", f"run={adapted[1]}", "live.touch=0.3", "live.patience.above=0.5", "seconds=2")
     assert done.returncode == 0, done.stderr
     assert "verdicts" in done.stderr
 
 
-@pytest.mark.slow
+@pytest.mark.slow("trains and adapts a run")
 def test_the_same_adaptation_is_not_repeated(run, folder, adapted):
     parent, made, _ = adapted
     before = runs(folder)
@@ -106,7 +106,7 @@ def test_the_same_adaptation_is_not_repeated(run, folder, adapted):
     assert runs(folder) == before
 
 
-@pytest.mark.slow
+@pytest.mark.slow("trains and adapts a run")
 def test_a_recording_is_adapted_to_and_the_rest_of_it_is_reported(run, folder, session, adapted):
     recorded = ["device=recording", f"device.path={session}"]
     done = run(folder, "adapt", f"run={adapted[0]}", *recorded, "adapt.gestures=48", *QUICK)
@@ -122,7 +122,7 @@ def test_a_recording_is_adapted_to_and_the_rest_of_it_is_reported(run, folder, s
     assert again.returncode == 0, again.stderr
 
 
-@pytest.mark.slow
+@pytest.mark.slow("trains and adapts a run")
 def test_what_is_not_better_keeps_the_weights(run, folder, adapted):
     parent = adapted[0]
     line = ["adapt.gestures=16", "adapt.lr=[1000]", "adapt.layers=[all]", "adapt.epochs=2", TEST, *SMALL]
@@ -135,7 +135,7 @@ def test_what_is_not_better_keeps_the_weights(run, folder, adapted):
     assert found["validation/overall/accuracy"] == found["validation_before/overall/accuracy"]
 
 
-@pytest.mark.slow
+@pytest.mark.slow("trains and adapts a run")
 def test_a_learner_from_scratch_is_kept_where_it_is_better(run, folder, adapted, session):
     """The readings of the other skin are reversed: what the network knows does not help there."""
     known = read_recording(session)
@@ -190,7 +190,7 @@ def bad(run, folder, session):
         (None, ["learner.dropout=0.5"], "learner.dropout was fixed when the run was trained"),
     ],
 )
-@pytest.mark.slow
+@pytest.mark.slow("trains and adapts a run")
 def test_bad_input_ends_with_2_and_one_sentence(run, folder, adapted, bad, row, given, reason):
     before = query(folder, "select count(*) from runs")
     words = [one.format(**bad) for one in given]
@@ -209,7 +209,7 @@ def emulated(begin, folder, seed):
         yield [f"device.port={port}", "device.scale=0.0390625", "device.labels=announced"]
 
 
-@pytest.mark.slow
+@pytest.mark.slow("trains, records and adapts a run")
 def test_gestures_recorded_at_a_port_make_the_run_better_on_others(run, begin, folder, adapted):
     for name, seed, count in (("few", 0, 48), ("others", 1, 96)):
         with emulated(begin, folder, seed) as port:

@@ -9,7 +9,7 @@ from skin.runs.build import build_device
 NAIVE = ("animate", "simulator=naive")
 
 
-@pytest.mark.slow
+@pytest.mark.slow("draws every frame of two touches")
 def test_a_drawn_touch_and_a_recorded_one(run, tmp_path, configured):
     done = run(tmp_path, *NAIVE, "out=hand.gif", "labels=[big,dynamic]", "shape=hand", "seed=3", store=False)
     assert done.returncode == 0, done.stderr
@@ -34,7 +34,7 @@ def test_fingertips_are_shown_without_asking_for_labels(run, tmp_path):
     assert done.stdout == "tips.png: disc: dynamic, press, 30 frames at 10 Hz\n"
 
 
-@pytest.mark.slow
+@pytest.mark.slow("draws the arm in 3D")
 def test_a_still_of_the_arm(run, tmp_path):
     arm = ["body=arm", "out=arm.png", "view=skin3d", "labels=[press]", "shape=disc"]
     done = run(tmp_path, *NAIVE, *arm, store=False)

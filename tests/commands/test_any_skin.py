@@ -30,7 +30,7 @@ def folder(run, tmp_path_factory):
     return folder
 
 
-@pytest.mark.slow
+@pytest.mark.slow("trains and evaluates a run")
 def test_it_is_evaluated_on_a_layout_from_a_file_and_says_what_is_new_to_it(run, folder):
     done = run(folder, "evaluate", "device=simulated", "device.test_gestures=200", *OWN)
     assert done.returncode == 0, done.stderr
@@ -38,7 +38,7 @@ def test_it_is_evaluated_on_a_layout_from_a_file_and_says_what_is_new_to_it(run,
     assert re.search(r"longer side 0\.16 m \(0\.08 to 0\.12 m\)", " ".join(done.stderr.split()))
 
 
-@pytest.mark.slow
+@pytest.mark.slow("trains and evaluates a run")
 def test_a_recording_gets_the_geometry_of_the_configured_skin(run, folder):
     done = run(folder, "generate", "n=200", "out=own.parquet", *OWN, store=False)
     assert done.returncode == 0, done.stderr
@@ -48,7 +48,7 @@ def test_a_recording_gets_the_geometry_of_the_configured_skin(run, folder):
     assert 0 < metrics(folder)[-1]["same/overall/accuracy"] < 1
 
 
-@pytest.mark.slow
+@pytest.mark.slow("trains and evaluates a run")
 def test_a_recording_with_one_of_the_labels_is_judged_by_it(run, folder):
     done = run(folder, "generate", "n=40", "out=four.parquet", *OWN, store=False)
     assert done.returncode == 0, done.stderr
@@ -67,7 +67,7 @@ def test_a_recording_with_one_of_the_labels_is_judged_by_it(run, folder):
     assert "has the labels firm, and the run learned big, dynamic, press, dangerous" in done.stderr
 
 
-@pytest.mark.slow
+@pytest.mark.slow("trains a run and starts a live view")
 def test_it_watches_nine_sensors_at_a_port(begin, folder):
     link = folder / "skin"
     with ExitStack() as both:
@@ -88,7 +88,7 @@ def test_it_watches_nine_sensors_at_a_port(begin, folder):
     assert re.search(r"[1-9]\d* verdicts", live.err), live.err
 
 
-@pytest.mark.slow
+@pytest.mark.slow("trains and exports a run")
 def test_it_is_exported_for_a_layout_from_a_file(run, folder):
     onnxruntime = pytest.importorskip("onnxruntime")
     done = run(folder, "export", "out=nine.onnx", "export.touches=100", *OWN)
@@ -98,7 +98,7 @@ def test_it_is_exported_for_a_layout_from_a_file(run, folder):
     assert shapes == {"readings": [30, 9], "valid": [30, 9], "probabilities": [4]}
 
 
-@pytest.mark.slow
+@pytest.mark.slow("trains and adapts a run")
 def test_it_is_adapted_to_a_skin_that_must_be_named(run, folder):
     quick = ["adapt.gestures=8", "adapt.layers=[head]", "adapt.lr=[0.001]", "adapt.epochs=2"]
     quick += ["evaluation.safe_gestures=64"]

@@ -7,7 +7,7 @@ from skin.device.calibration import read_calibration
 SMALL = ["layout=grid", "layout.rows=2", "layout.columns=2", "calibrate.protocol.rest=1.5"]
 
 
-@pytest.mark.slow
+@pytest.mark.slow("fits and generates a data set")
 def test_from_a_bench_to_touches_of_the_calibrated_device(run, tmp_path):
     session, out = tmp_path / "bench.parquet", tmp_path / "mine.yaml"
     done = run(
@@ -40,7 +40,7 @@ def test_from_a_bench_to_touches_of_the_calibrated_device(run, tmp_path):
     assert touches.is_file()
 
 
-@pytest.mark.slow
+@pytest.mark.slow("fits the noise of a data set")
 def test_a_calibration_that_does_not_help_ends_with_1_and_writes_nothing(run, tmp_path):
     """A skin that is what the simulation says cannot gain from a fit to its noise."""
     perfect = ["device.gain_spread=0", "device.offset=0", "device.clip=1000"]
@@ -66,7 +66,7 @@ def test_bad_input_ends_with_2_and_one_sentence(run, tmp_path, arguments, reason
     assert "Traceback" not in done.stderr
 
 
-@pytest.mark.slow
+@pytest.mark.slow("fits a bench")
 def test_a_session_with_other_axes_is_refused_until_that_is_confirmed(run, tmp_path):
     session, out = tmp_path / "bench.csv", tmp_path / "mine.yaml"
     files, demo = (f"session={session}", f"out={out}"), "calibrate.demo=true"

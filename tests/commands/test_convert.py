@@ -8,6 +8,7 @@ import pytest
 import yaml
 
 from skin.device.files import read_recording
+from tests.budget import free
 
 MAPPING = {
     "files": "*/*.csv",
@@ -46,32 +47,47 @@ def write(folder, persons=6, touches=24):
     (folder / "map.yaml").write_text(yaml.safe_dump(MAPPING, sort_keys=False))
 
 
-def test_a_folder_is_converted_and_trained_on_by_person(run, tmp_path):
-    write(tmp_path)
-    done = run(tmp_path, "convert", "from=map.yaml", "out=x.parquet", store=False)
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.startswith(
-        "x.parquet: 144 touches of 12 frames at 10 Hz, 3 readings, press in 48 of 96, "
-    )
-    assert done.stdout.endswith("6 of person, positions unknown\n")
-    recording = read_recording(tmp_path / "x.parquet")
+@pytest.fixture(scope="module")
+def converted(run, tmp_path_factory):
+    """Return a function that converts touches once, with classes or without, and returns the file."""
+    known = {}
+
+    def convert(**more):
+        if (key := tuple(more)) not in known:
+            with free():
+                folder = tmp_path_factory.mktemp("converted")
+                write(folder)
+                (folder / "map.yaml").write_text(yaml.safe_dump(MAPPING | more, sort_keys=False))
+                done = run(folder, "convert", "from=map.yaml", "out=x.parquet", store=False)
+                assert done.returncode == 0, done.stderr
+                known[key] = folder / "x.parquet", done.stdout
+        return known[key]
+
+    return convert
+
+
+TREES = ["experiment=features", "learner.rounds=5"]
+NETWORK = ["representation=readings", "model=mlp", "trainer.max_epochs=2"]
+
+
+@pytest.mark.parametrize("settings", [TREES, NETWORK], ids=["trees", "network"])
+def test_a_folder_is_converted_and_trained_on_by_person(run, converted, tmp_path, settings):
+    path, said = converted()
+    assert said.startswith("x.parquet: 144 touches of 12 frames at 10 Hz, 3 readings, press in 48 of 96, ")
+    assert said.endswith("6 of person, positions unknown\n")
+    recording = read_recording(path)
     assert recording.touches.labels[:, 0].isnan().sum() == 48
     assert recording.touches.labels[:, 1].isnan().sum() == 36
-    for settings in (
-        ["experiment=features", "learner.rounds=5"],
-        ["representation=readings", "model=mlp", "trainer.max_epochs=2"],
-    ):
-        train = ["device=recording", "device.path=x.parquet", "device.test_groups=[p1]", *settings]
-        done = run(tmp_path, "train.py", *train)
-        assert done.returncode == 0, done.stderr
-        assert "split: by person: 4 to train (1 for validation), 1 to test (p1)\n" in done.stdout
+    train = ["device=recording", f"device.path={path}", "device.test_groups=[p1]", *settings]
+    done = run(tmp_path, "train", *train)
+    assert done.returncode == 0, done.stderr
+    assert "split: by person: 4 to train (1 for validation), 1 to test (p1)\n" in done.stdout
     database = sqlite3.connect(tmp_path / "m.db")
-    splits = database.execute("select value from tags where key = 'split'").fetchall()
-    losses = database.execute("select value, is_nan from latest_metrics where key = 'val_loss'").fetchall()
+    ((split,),) = database.execute("select value from tags where key = 'split'").fetchall()
+    losses = database.execute("select is_nan from latest_metrics where key = 'val_loss'").fetchall()
     database.close()
-    assert len(splits) == 2
-    assert all(split.startswith("by person: ") for (split,) in splits)
-    assert [is_nan for _, is_nan in losses] == [0]
+    assert split.startswith("by person: ")
+    assert losses == [(0,)] * (settings is NETWORK)
 
 
 @pytest.mark.parametrize(
@@ -94,25 +110,34 @@ def test_bad_input_ends_with_a_sentence(run, tmp_path, words, message):
     assert not list(tmp_path.glob("x.*"))
 
 
-def test_classes_and_targets_are_learned_instead_of_labels(run, tmp_path):
-    write(tmp_path)
-    mapping = MAPPING | {"classes": {"column": "gesture"}}
-    (tmp_path / "map.yaml").write_text(yaml.safe_dump(mapping, sort_keys=False))
-    done = run(tmp_path, "convert", "from=map.yaml", "out=x.parquet", store=False)
+@pytest.mark.parametrize("settings", [TREES, NETWORK], ids=["trees", "network"])
+@pytest.mark.parametrize(("task", "figure"), [("classes", "overall/accuracy"), ("regression", "force/rms_N")])
+def test_classes_and_targets_are_learned_instead_of_labels(run, converted, tmp_path, task, figure, settings):
+    path, said = converted(classes={"column": "gesture"})
+    assert "classes pat, press, tap" in said
+    words = ["device=recording", f"device.path={path}", f"task={task}", *settings]
+    done = run(tmp_path, "train", *words)
     assert done.returncode == 0, done.stderr
-    assert "classes pat, press, tap" in done.stdout
-    trees = ["experiment=features", "learner.rounds=20"]
-    network = ["representation=readings", "model=mlp", "trainer.max_epochs=2"]
-    for task, figure in (("classes", "overall/accuracy"), ("regression", "force/rms_N")):
-        for settings in (trees, network):
-            words = ["device=recording", "device.path=x.parquet", f"task={task}", *settings]
-            done = run(tmp_path, "train.py", *words)
-            assert done.returncode == 0, done.stderr
-            assert figure in done.stdout
-            assert "press/accuracy" not in done.stdout
-    done = run(tmp_path, "evaluate.py", "run=latest")
+    assert figure in done.stdout
+    assert "press/accuracy" not in done.stdout
+    if (task, settings) == ("regression", TREES):
+        done = run(tmp_path, "evaluate", "run=latest")
+        assert done.returncode == 0, done.stderr
+        assert figure in done.stdout
+
+
+@pytest.fixture(scope="module")
+def two(run, tmp_path_factory):
+    """Return a recording of two persons, of whom only the second one presses."""
+    folder = tmp_path_factory.mktemp("two")
+    write(folder, persons=2, touches=12)
+    for path in (folder / "p0").glob("press*"):
+        path.unlink()
+    done = run(folder, "convert", "from=map.yaml", "out=x.csv", store=False)
     assert done.returncode == 0, done.stderr
-    assert "force/rms_N" in done.stdout
+    groups = json.loads((folder / "x.csv.json").read_text())["metadata"]["groups"]
+    assert groups == {"person": ["p0", "p1"]}
+    return f"device.path={folder}/x.csv"
 
 
 @pytest.mark.parametrize(
@@ -126,13 +151,9 @@ def test_classes_and_targets_are_learned_instead_of_labels(run, tmp_path):
         (["task=regression", "device=simulated"], "task=regression needs device=recording"),
     ],
 )
-def test_what_is_not_in_a_recording_is_not_learned(run, tmp_path, words, message):
-    write(tmp_path, persons=2, touches=12)
-    done = run(tmp_path, "convert", "from=map.yaml", "out=x.csv", store=False)
-    assert done.returncode == 0, done.stderr
-    words = ["device=recording", "device.path=x.csv", "experiment=features", *words]
-    words = [word for word in words if "device=simulated" not in words or not word.startswith("device.path")]
-    done = run(tmp_path, "train.py", *(words[1:] if "device=simulated" in words else words))
+def test_what_is_not_in_a_recording_is_not_learned(run, two, tmp_path, words, message):
+    recording = [] if "device=simulated" in words else ["device=recording", two]
+    done = run(tmp_path, "train", *recording, "experiment=features", *words)
     assert done.returncode == 2, done.stderr
     assert message in done.stderr
     assert done.stderr.count("\n") == 1
@@ -147,15 +168,8 @@ def test_what_is_not_in_a_recording_is_not_learned(run, tmp_path, words, message
         (["device.test_groups=[p1]"], "press lacks a class in the touches to train on"),
     ],
 )
-def test_a_split_that_leaves_nothing_to_learn_is_refused(run, tmp_path, words, message):
-    """Only the second person presses."""
-    write(tmp_path, persons=2, touches=12)
-    for path in (tmp_path / "p0").glob("press*"):
-        path.unlink()
-    done = run(tmp_path, "convert", "from=map.yaml", "out=x.csv", store=False)
-    assert done.returncode == 0, done.stderr
-    assert json.loads((tmp_path / "x.csv.json").read_text())["metadata"]["groups"] == {"person": ["p0", "p1"]}
-    done = run(tmp_path, "train.py", "device=recording", "device.path=x.csv", "experiment=features", *words)
+def test_a_split_that_leaves_nothing_to_learn_is_refused(run, two, tmp_path, words, message):
+    done = run(tmp_path, "train", "device=recording", two, "experiment=features", *words)
     assert done.returncode == 2, done.stderr
     assert message in done.stderr
     assert done.stderr.count("\n") == 1

@@ -42,7 +42,7 @@ def refuses(address):
     return True
 
 
-@pytest.mark.slow
+@pytest.mark.slow("starts the demo, with two processes")
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 0), (signal.SIGTERM, 143)])
 def test_the_page_shows_an_emulated_skin_until_a_signal_ends_both(begin, tmp_path, number, code):
     store = f"tracking.uri=sqlite:///{tmp_path}/m.db"
@@ -87,7 +87,7 @@ def test_a_device_is_refused(run, tmp_path):
     assert done.stderr == "demo=true emulates a skin at a port: leave out device=serial, or demo=true\n"
 
 
-@pytest.mark.slow
+@pytest.mark.slow("chooses a threshold anew")
 def test_the_page_is_there_while_the_threshold_is_chosen(begin, tmp_path, monkeypatch):
     monkeypatch.setenv("SKIN_CACHE", str(tmp_path))
     with begin(tmp_path, "live", "demo=true", "live.web_port=0") as demo:
@@ -99,7 +99,7 @@ def test_the_page_is_there_while_the_threshold_is_chosen(begin, tmp_path, monkey
         assert demo.wait(PATIENCE) == 0, demo.err
 
 
-@pytest.mark.slow
+@pytest.mark.slow("generates thousands of touches")
 def test_the_alarm_of_the_shipped_model_is_chosen_for_the_emulated_device(run, tmp_path):
     """With the threshold for the devices of its training, dangerous touches were hidden, and it ended."""
     done = run(tmp_path, "live", "demo=true", "live.web_port=0", "live.contacts=false", "seconds=2")
@@ -107,7 +107,7 @@ def test_the_alarm_of_the_shipped_model_is_chosen_for_the_emulated_device(run, t
     assert "100.0 Hz" in done.stdout + done.stderr
 
 
-@pytest.mark.slow
+@pytest.mark.slow("starts the demo, with two processes")
 def test_what_is_killed_leaves_no_process_and_no_port(begin, tmp_path):
     with begin(
         tmp_path, "live", "demo=true", "live.web_port=0", "live.patience.above=0.97", "web=true"
@@ -119,7 +119,7 @@ def test_what_is_killed_leaves_no_process_and_no_port(begin, tmp_path):
     assert refuses(page)
 
 
-@pytest.mark.slow
+@pytest.mark.slow("trains a run and starts the demo")
 def test_a_run_of_equation_10_says_why_it_estimates_no_contacts(begin, tmp_path):
     words = ["run=default_skin", "live.web_port=0", "live.patience.above=0.95", "seconds=6"]
     with begin(tmp_path, "live", "demo=true", *words) as demo:

@@ -48,7 +48,7 @@ def folder(run, tmp_path_factory):
     return folder
 
 
-@pytest.mark.slow
+@pytest.mark.slow("trains and evaluates a run")
 def test_the_same_device_gives_the_same_figures(run, folder):
     done = run(folder, "evaluate.py")
     assert done.returncode == 0, done.stderr
@@ -58,14 +58,14 @@ def test_the_same_device_gives_the_same_figures(run, folder):
     assert f"{100 * trained['same/overall/accuracy']:.1f}" in done.stdout
 
 
-@pytest.mark.slow
+@pytest.mark.slow("trains a run")
 def test_bad_input_is_one_sentence(run, folder):
     done = run(folder, "evaluate.py", "device=recording")
     assert (done.returncode, done.stderr.count("\n")) == (2, 1), done.stderr
     assert "device.path=" in done.stderr
 
 
-@pytest.mark.slow
+@pytest.mark.slow("trains and evaluates a run")
 def test_touches_without_labels_get_verdicts(run, folder, tmp_path):
     done = run(tmp_path, "generate", "simulator=naive", "n=12", "out=x.parquet", store=False)
     assert done.returncode == 0, done.stderr

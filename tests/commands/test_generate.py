@@ -4,11 +4,11 @@ import pytest
 
 from skin.device.files import read_recording
 
-NAIVE = ("generate.py", "simulator=naive")
+NAIVE = ("generate", "simulator=naive")
 
 
 def test_writes_a_recording(run, tmp_path):
-    done = run(tmp_path, *NAIVE, "n=32", "out=x.csv", store=False, fresh=True)
+    done = run(tmp_path, *NAIVE, "n=32", "out=x.csv", store=False, apart=True)
     assert done.returncode == 0, done.stderr
     assert "x.csv: 32 gestures" in done.stdout
     recording = read_recording(tmp_path / "x.csv")
@@ -18,18 +18,18 @@ def test_writes_a_recording(run, tmp_path):
 
 
 def test_a_folder_becomes_a_data_set_to_train_on(run, tmp_path):
-    done = run(tmp_path, *NAIVE, "n=64", "out=touches", store=False)
+    done = run(tmp_path, *NAIVE, "n=48", "out=touches", store=False)
     assert done.returncode == 0, done.stderr
-    assert "touches: 64 gestures in 1 shards, " in done.stdout
+    assert "touches: 48 gestures in 1 shards, " in done.stdout
     train = ["device=recording", "device.path=touches", "representation=readings", "model=mlp"]
-    done = run(tmp_path, "train.py", *train, "trainer.max_epochs=2")
+    done = run(tmp_path, "train", *train, "trainer.max_epochs=1")
     assert done.returncode == 0, done.stderr
     assert "holdout" in done.stdout
     shard = tmp_path / "touches" / "shards" / "00000.parquet"
     shard.write_bytes(shard.read_bytes()[:-100])
     for done in (
-        run(tmp_path, "train.py", *train, "trainer.max_epochs=3"),
-        run(tmp_path, *NAIVE, "n=64", "out=touches", store=False),
+        run(tmp_path, "train", *train, "trainer.max_epochs=3"),
+        run(tmp_path, *NAIVE, "n=48", "out=touches", store=False),
     ):
         assert done.returncode == 2
         assert "00000.parquet is damaged" in done.stderr

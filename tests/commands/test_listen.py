@@ -119,22 +119,31 @@ def test_ctrl_c_ends_it_well(address):
     assert (process.returncode, "saturated" in out) == (0, True), said
 
 
-def test_it_proposes_an_adapter_and_reads_with_it(played, tmp_path):
+@pytest.fixture
+def foreign(played):
+    """Return the address of a board of two sensors with a format of its own."""
+
     def say(reader, stop):
         for number in range(100_000):
             reader.sendall(b"<%d|%d|%d>\r" % (20_000 + 10 * number, 500 + number % 3, 700 - number % 2))
             if stop.wait(0.01):
                 return
 
-    address = played(say)
-    done = listen(f"device.port={address}", "adapter=auto", "seconds=1.5")
+    return played(say)
+
+
+def test_it_proposes_an_adapter_and_reads_with_it(foreign, tmp_path):
+    done = listen(f"device.port={foreign}", "adapter=auto", "seconds=1.5")
     assert done.returncode == 0, done.stderr
     path = tmp_path / "board.yaml"
     path.write_text(done.stdout)
-    done = listen(f"device.port={address}", f"device.adapter={path}", "seconds=1.5")
+    done = listen(f"device.port={foreign}", f"device.adapter={path}", "seconds=1.5")
     assert done.returncode == 0, done.stderr
     assert "text, NO CHECKSUM, 2 sensors" in done.stdout
     assert "the device's clock counts ms" in done.stderr
-    done = listen(f"device.port={address}", "adapter=json_lines", "seconds=1.5", "device.timeout=1.5")
+
+
+def test_lines_of_another_shape_are_no_frames(foreign):
+    done = listen(f"device.port={foreign}", "adapter=json_lines", "seconds=1.5", "device.timeout=1.5")
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr.count("(its shape is another)") == 3

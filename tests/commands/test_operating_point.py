@@ -13,13 +13,14 @@ import pytest
 SKIN = ["layout=grid", "layout.rows=2", "layout.columns=2", "simulator=naive"]
 SMALL = ["data.gestures=400", "device.test_gestures=96", "evaluation.devices=1", "evaluation.layouts=0"]
 SMALL += ["evaluation.safe_gestures=200"]
+FEW = "evaluation.devices=0"
 
 
 @pytest.fixture(scope="module")
 def folder(run, tmp_path_factory):
     """A folder with one finished run of rules, and what its training said."""
     folder = tmp_path_factory.mktemp("runs")
-    done = run(folder, "train.py", "experiment=rules", *SKIN, *SMALL)
+    done = run(folder, "train", "experiment=rules", *SKIN, *SMALL)
     assert done.returncode == 0, done.stderr
     (folder / "said").write_text(done.stdout)
     (folder / "warned").write_text(done.stderr)
@@ -69,7 +70,7 @@ def test_a_training_stores_what_it_chose_and_says_what_it_reaches(folder):
 
 def test_evaluate_raises_the_alarm_where_the_run_does(run, folder):
     with changed(folder, threshold=1e-9):
-        done = run(folder, "evaluate.py", f"out={folder}/found")
+        done = run(folder, "evaluate", FEW, f"out={folder}/found")
     assert done.returncode == 0, done.stderr
     assert "false alarms: 48 of 48 safe gestures, 100.0 %" in done.stdout
     assert "alarm above 0.0000, chosen on 200 fresh safe gestures" in done.stdout
@@ -81,14 +82,14 @@ def test_evaluate_raises_the_alarm_where_the_run_does(run, folder):
 def test_a_run_of_old_gets_its_threshold_now_and_that_is_said(run, folder):
     """It is the one that its training would have stored."""
     with changed(folder):
-        done = run(folder, "evaluate.py", "device.seed=3", f"out={folder}/old")
+        done = run(folder, "evaluate", FEW, "device.seed=3", f"out={folder}/old")
     assert done.returncode == 0, done.stderr
     assert "stores no alarm threshold for 2 % false alarms, it is chosen now" in done.stderr
     assert f"alarm above {stored(folder)['threshold']:.4f}" in done.stdout
 
 
 def test_another_rate_gets_another_threshold(run, folder):
-    done = run(folder, "evaluate.py", "evaluation.false_alarm_rate=0.2", f"out={folder}/rate")
+    done = run(folder, "evaluate", FEW, "evaluation.false_alarm_rate=0.2", f"out={folder}/rate")
     assert "stores no alarm threshold for 20 % false alarms" in done.stderr
     level = float(re.search(r"alarm above (0\.\d+), chosen on 200 fresh", done.stdout)[1])
     assert level < stored(folder)["threshold"]
@@ -101,7 +102,7 @@ def threshold(text):
 @pytest.fixture(scope="module")
 def found(run, folder):
     """The threshold that an evaluation finds for a profile."""
-    done = run(folder, "evaluate.py", "evaluation.profile=rough", f"out={folder}/profile")
+    done = run(folder, "evaluate", FEW, "evaluation.profile=rough", f"out={folder}/profile")
     assert done.returncode == 0, done.stderr
     return threshold(done.stdout)
 
@@ -110,17 +111,18 @@ def test_a_profile_gets_a_threshold_of_its_own(folder, found):
     assert abs(found - stored(folder)["threshold"]) > 1e-3
 
 
+@pytest.mark.slow("trains and evaluates once more")
 def test_a_training_stores_the_threshold_of_a_profile(run, found, tmp_path):
     words = ["experiment=rules", *SKIN, *SMALL, "evaluation.profile=rough"]
-    done = run(tmp_path, "train.py", *words)
+    done = run(tmp_path, "train", *words)
     assert done.returncode == 0, done.stderr
     assert threshold(" ".join(done.stdout.split())) == found
-    done = run(tmp_path, "evaluate.py", f"out={tmp_path}/again")
+    done = run(tmp_path, "evaluate", f"out={tmp_path}/again")
     assert threshold(done.stdout) == found
 
 
 def test_an_unknown_profile_is_refused_before_anything_is_trained(run, folder, tmp_path):
-    for where, words in ((folder, ["evaluate.py"]), (tmp_path, ["train.py", "experiment=rules", *SKIN])):
+    for where, words in ((folder, ["evaluate"]), (tmp_path, ["train", "experiment=rules", *SKIN])):
         done = run(where, *words, "evaluation.profile=none_such")
         assert (done.returncode, done.stderr.count("\n")) == (2, 1), done.stderr
         assert "calibrated, drawn, harsh, mild, rough" in done.stderr
@@ -157,6 +159,7 @@ def tapped():
 LIVE = ["live.touch=0.3", "live.selftest=false", "seconds=1.2"]  # a training of seconds finds little
 
 
+@pytest.mark.slow("starts a live view that waits for a tap")
 @pytest.mark.parametrize(("above", "alarm"), [("0.00001", True), ("0.9999", False)])
 def test_live_raises_the_alarm_where_it_is_told(run, folder, above, alarm):
     with tapped() as port:
@@ -168,6 +171,7 @@ def test_live_raises_the_alarm_where_it_is_told(run, folder, above, alarm):
     assert f"alarm above {float(above):g}" in done.stderr
 
 
+@pytest.mark.slow("draws and plays touches for three live views")
 def test_live_chooses_a_threshold_per_touch_for_the_profile_and_keeps_it(run, folder, tmp_path, monkeypatch):
     monkeypatch.setenv("SKIN_CACHE", str(tmp_path))
     levels, few = [], "evaluation.safe_gestures=50"  # the time goes with their number

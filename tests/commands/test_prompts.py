@@ -78,7 +78,7 @@ def ended(person):
     return code, person.process.out
 
 
-@pytest.mark.slow
+@pytest.mark.slow("waits for prompts and recordings")
 def test_recording_with_enter_s_q_and_going_on_after_a_kill(person_at, address, tmp_path):
     command = ["record.py", *SKIN, "out=s.csv", f"device.port={address}", "device.gestures=6"]
     asked = re.compile(r"next: (big|small), (dynamic|static), (press|tap), (dangerous|safe) - press Enter")
@@ -115,7 +115,7 @@ def test_recording_with_enter_s_q_and_going_on_after_a_kill(person_at, address, 
     assert stored.touches.labels.int().tolist() == [[int(yes[n] == w[n]) for n in range(4)] for w in words]
 
 
-@pytest.mark.slow
+@pytest.mark.slow("waits for prompts and recordings")
 def test_ctrl_c_at_a_prompt_keeps_what_there_is(person_at, address, tmp_path):
     with person_at(tmp_path, "record.py", *SKIN, "out=s.csv", f"device.port={address}") as person:
         person.until("next: ")
@@ -126,7 +126,7 @@ def test_ctrl_c_at_a_prompt_keeps_what_there_is(person_at, address, tmp_path):
         assert ended(person) == (0, "s.parquet: 1 gestures\n")
 
 
-@pytest.mark.slow
+@pytest.mark.slow("waits for prompts and recordings")
 def test_free_recording_asks_for_nothing_and_goes_on_after_a_kill(person_at, address, tmp_path):
     command = ["record.py", *SKIN, "out=f.csv", f"device.port={address}", "record.free=true"]
     with person_at(tmp_path, *command) as person:
@@ -142,7 +142,7 @@ def test_free_recording_asks_for_nothing_and_goes_on_after_a_kill(person_at, add
     assert stored.touches.labels is None
 
 
-@pytest.mark.slow
+@pytest.mark.slow("trains a run and waits for prompts")
 def test_evaluating_a_person(run, person_at, address, tmp_path):
     own = [f"tracking.uri=sqlite:///{tmp_path}/m.db", f"tracking.artifacts={tmp_path}/a"]
     small = ["data.gestures=1000", "device.test_gestures=96", "evaluation.devices=1"]

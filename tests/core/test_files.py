@@ -125,7 +125,7 @@ def test_room_for_a_mapped_file_is_claimed_before_it_is_filled(tmp_path):
     assert path.stat().st_blocks * 512 >= 1 << 20
 
 
-@pytest.mark.slow
+@pytest.mark.slow("imports MLflow anew on a full disk")
 def test_a_database_on_a_full_disk_is_told_of_and_goes_on(tmp_path):
     settings = Tracking(f"sqlite:///{tmp_path}/m.db", f"{tmp_path}/a", "skin", True, None)
     with full(200_000), pytest.raises(InputError, match=r"^cannot (use the runs in sqlite|write)"):

@@ -15,7 +15,7 @@ from skin.core.files import ROOT
 MOMENTS = ["skin.core.interrupt", "torch._C"]
 
 
-@pytest.mark.slow
+@pytest.mark.slow("imports anew up to every moment")
 @pytest.mark.parametrize("moment", MOMENTS)
 @pytest.mark.parametrize(
     "command", [["emulate"], ["train"], ["record", "out=x.csv"], ["evaluate"]], ids=lambda c: c[0]

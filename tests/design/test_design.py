@@ -11,7 +11,7 @@ SMALL = (
 )  # fmt: skip
 
 
-@pytest.mark.slow
+@pytest.mark.slow("solves for the posteriors of nine sensors")
 def test_the_expected_posterior_of_nine_sensors(run, tmp_path):
     done = run(tmp_path, *SMALL, "simulator=solid", "simulator.divisions=2", "out=x", store=False)
     assert done.returncode == 0, done.stderr
@@ -35,14 +35,14 @@ def test_the_expected_posterior_of_nine_sensors(run, tmp_path):
 
 
 def test_a_skin_without_mechanics_has_a_posterior_too(run, tmp_path):
-    done = run(tmp_path, *SMALL, "simulator=naive", "out=x", store=False)
+    done = run(tmp_path, *SMALL, "simulator=naive", "design.touches=32", "out=x", store=False)
     assert done.returncode == 0, done.stderr
     weak, _, strong = json.loads((tmp_path / "x" / "design.json").read_text())["expected"]
     # A touch beside every sensor's cell raises none, however hard it is.
     assert 0.5 < strong["blind_share"] <= weak["blind_share"] < 1
 
 
-@pytest.mark.slow
+@pytest.mark.slow("solves a sweep of thicknesses and grids")
 def test_a_sweep_has_a_line_for_each_thickness_and_grid(run, tmp_path):
     given = (
         "design=sweep",

@@ -122,7 +122,7 @@ def estimate(simulator, fingertip, readings, start, noise, centre, priors):
     return found
 
 
-@pytest.mark.slow
+@pytest.mark.slow("200 touches with four noises each")
 def test_the_most_probable_place_has_the_local_precision():
     """200 touches that raise three sensors above five standard deviations, four noises each."""
     body, force, draws = sheet(THICK), 20.0, 4

@@ -318,7 +318,7 @@ def test_an_encoding_that_does_not_fit_is_named(tmp_path):
     assert len(convert_files(read_format(str(tmp_path / "map.yaml")), tmp_path)) == 1
 
 
-@pytest.mark.slow
+@pytest.mark.slow("converts recordings that are large")
 @pytest.mark.skipif(not REAL.is_dir(), reason="needs the real recordings")
 @pytest.mark.parametrize(
     ("name", "folder", "shape", "known"),

@@ -283,7 +283,7 @@ def test_rules_say_that_they_know_other_labels(configured, report):
         build_learner(config).fit(build_data(config, build_device(config)))
 
 
-@pytest.mark.slow
+@pytest.mark.slow("trains a network on a data set")
 def test_the_command_trains_a_network_on_it(run, report, tmp_path, monkeypatch):
     settings = ["experiment=temporal_graph", "trainer.max_epochs=6", "data.batch_size=32"]
     monkeypatch.setenv("HOME", str(report.parent))
@@ -305,7 +305,7 @@ def test_the_command_trains_a_network_on_it(run, report, tmp_path, monkeypatch):
     assert f"{100 * metrics['same/overall/accuracy']:.1f}" in done.stdout
 
 
-@pytest.mark.slow
+@pytest.mark.slow("imports all libraries anew")
 def test_without_the_file_a_command_says_where_it_is(run, tmp_path):
     done = run(tmp_path, "generate.py", "device=cost", f"out={tmp_path}/x.parquet", store=False)
     assert done.returncode == 2, done.stderr

@@ -63,8 +63,8 @@ def test_a_slow_ramp_does_not_become_the_baseline():
 
 def test_the_baseline_follows_drift_up_to_the_bound_and_no_faster():
     slow, fast = (ContactDetector(1, RATE, THRESHOLD) for _ in range(2))
-    frames = int(1800 * RATE)
-    drift = DRIFT * np.arange(frames)[:, None] / RATE  # 0.6 N in half an hour
+    frames = int(900 * RATE)
+    drift = DRIFT * np.arange(frames)[:, None] / RATE  # 0.3 N in a quarter of an hour
     assert not any(follow(slow, 0.95 * drift, noise=0.02))
     assert any(follow(fast, 2.5 * drift, noise=0.02))
 

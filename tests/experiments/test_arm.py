@@ -21,7 +21,7 @@ SOLID = (
 )
 
 
-@pytest.mark.slow
+@pytest.mark.slow("generates and trains on an arm")
 def test_generated_touches_train_and_are_evaluated(run, tmp_path):
     arm = "body=arm", "body.angle=2.5", "layout=grid"
     made = run(tmp_path, "generate.py", *arm, "simulator=naive", "n=48", "out=arm.parquet", store=False)

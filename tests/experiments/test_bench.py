@@ -10,7 +10,7 @@ from skin.core.files import ROOT
 from skin.errors import InputError
 
 
-@pytest.mark.slow
+@pytest.mark.slow("measures the generation of data")
 def test_generation_and_operators_are_timed_with_an_empty_cache(tmp_path, monkeypatch):
     monkeypatch.setenv("SKIN_CACHE", str(tmp_path))
     # A warm operator is there in a hundredth of that.
@@ -19,7 +19,7 @@ def test_generation_and_operators_are_timed_with_an_empty_cache(tmp_path, monkey
     assert run_alone("measure_generation", ["fem", 1])["gestures_per_second"] > 100
 
 
-@pytest.mark.slow
+@pytest.mark.slow("measures times of verdicts")
 @pytest.mark.parametrize(
     ("function", "row"),
     [
@@ -36,7 +36,7 @@ def test_a_verdict_is_timed_by_the_wall_and_by_the_core(function, row):
     assert 0 < figures["core_share"] < 1
 
 
-@pytest.mark.slow
+@pytest.mark.slow("measures a second checkout")
 def test_another_checkout_is_measured_in_the_same_run(tmp_path, capsys):
     other = tmp_path / "other"
     other.mkdir()
@@ -52,7 +52,7 @@ def test_another_checkout_is_measured_in_the_same_run(tmp_path, capsys):
     )
 
 
-@pytest.mark.slow
+@pytest.mark.slow("measures epochs of training")
 def test_the_epochs_of_a_row_are_timed():
     assert run_alone("measure_training", ["temporal_graph", 1])["seconds_per_epoch"] > 0
 

@@ -41,7 +41,7 @@ def answers(folder, said):
     return pq.read_table(files[-1]).to_pydict()
 
 
-@pytest.mark.slow
+@pytest.mark.slow("trains a run and starts a live view")
 def test_a_skin_at_a_port_and_its_recording_are_judged_alike(run, begin, played, tmp_path):
     def tell(script, *overrides):
         done = run(tmp_path, script, *overrides, store=script != "record.py")

@@ -28,7 +28,7 @@ def emulated(begin, tmp_path):
     return emulated
 
 
-@pytest.mark.slow
+@pytest.mark.slow("starts an emulator and waits for a signal")
 def test_ctrl_c_ends_the_emulator_well(emulated, tmp_path):
     link = tmp_path / "skin"
     with emulated(f"link={link}") as (port, lines, process):
@@ -39,7 +39,7 @@ def test_ctrl_c_ends_the_emulator_well(emulated, tmp_path):
     assert not link.is_symlink()
 
 
-@pytest.mark.slow
+@pytest.mark.slow("records twice from an emulator")
 def test_a_session_that_was_killed_goes_on_and_is_played_back(run, begin, emulated, tmp_path):
     path = tmp_path / "s.csv"
     with emulated("emulate.speed=5", "touch.window=3") as (port, _, _):
@@ -76,7 +76,7 @@ def test_a_session_that_was_killed_goes_on_and_is_played_back(run, begin, emulat
         (("compare",), "which session?"),
     ],
 )
-@pytest.mark.slow
+@pytest.mark.slow("a process for each command")
 def test_bad_input_ends_with_2_and_one_sentence(run, tmp_path, command, reason):
     done = run(tmp_path, *command, store=False)
     assert done.returncode == 2, done.stderr

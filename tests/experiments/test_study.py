@@ -78,7 +78,7 @@ def test_bad_input_ends_with_code_2_and_imports_nothing_heavy(arguments, named, 
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.slow
+@pytest.mark.slow("trains several rows")
 def test_what_is_missing_is_trained_and_what_failed_is_told(run, tmp_path):
     # graph convolutions know this pooling, the transformer does not
     few = ["smoke=true", "study.seeds=[0]", "simulator=naive", "+model.pooling=attention", "out=r"]
@@ -107,7 +107,7 @@ def trained(run, tmp_path_factory):
     return folder
 
 
-@pytest.mark.slow
+@pytest.mark.slow("evaluates trained rows")
 def test_finished_runs_are_tried_under_conditions_once(run, trained):
     words = ["study=robustness", "study.part=dead", "simulator=naive", "study.devices=2"]
     words += ["device.test_gestures=48", "out=dead"]
@@ -131,7 +131,7 @@ def test_finished_runs_are_tried_under_conditions_once(run, trained):
     assert "no finished run of gru" in refused.stderr
 
 
-@pytest.mark.slow
+@pytest.mark.slow("evaluates trained rows")
 def test_a_condition_changes_the_device_as_an_evaluation_does(run, trained):
     """Independent answer: skin evaluate with the same settings."""
     few = [
@@ -157,7 +157,7 @@ def test_a_condition_changes_the_device_as_an_evaluation_does(run, trained):
     assert found["5 mm"]["same/overall/accuracy"] != found["0 mm"]["same/overall/accuracy"]
 
 
-@pytest.mark.slow
+@pytest.mark.slow("evaluates trained rows")
 def test_verdicts_are_sorted_by_margins(run, trained):
     few = ["study.rows=[rules,temporal_graph]", "simulator=naive", "out=margins"]
     done = run(trained, "study", "study=margins", "study.measure.gestures=400", *few)
@@ -183,7 +183,7 @@ def test_verdicts_are_sorted_by_margins(run, trained):
     assert [{name: one[name] for name in head} for one in own] == lines(path)
 
 
-@pytest.mark.slow
+@pytest.mark.slow("evaluates trained rows")
 def test_every_course_is_played_and_no_alarm_ends_early(run, trained):
     few = ["study.rows=[rules]", "simulator=naive", "out=holds"]
     done = run(trained, "study", "study=holds", "study.measure.gestures=2", "study.measure.rate=10", *few)
@@ -196,7 +196,7 @@ def test_every_course_is_played_and_no_alarm_ends_early(run, trained):
     assert f"course {found[0]['course']}, touches 2" in done.stdout
 
 
-@pytest.mark.slow
+@pytest.mark.slow("evaluates trained rows")
 def test_a_run_is_probed_beside_graph_embeddings(run, trained):
     few = ["train=80", "test=40", "seeds=[0]", "epochs=2", "layouts=2", "attributes=[reading]"]
     words = ["study.rows=[temporal_graph]", "simulator=naive", *(f"study.measure.{one}" for one in few)]
@@ -212,7 +212,7 @@ def test_a_run_is_probed_beside_graph_embeddings(run, trained):
     assert text.count("**undecided**") == 3  # one seed decides nothing
 
 
-@pytest.mark.slow
+@pytest.mark.slow("trains with every simulator")
 def test_every_simulator_against_every_other(run, tmp_path):
     skin = ["body.cells=[8,8]", "layout=grid", "layout.rows=3", "layout.columns=3", "touch.redraws=100",
             "touch.small_area=[0.1,0.3]", "study.rows=[rules]", "study.seeds=[0]", "out=r"]  # fmt: skip
@@ -225,7 +225,7 @@ def test_every_simulator_against_every_other(run, tmp_path):
     assert "| variant | naive | fem, equation 10 |" in (tmp_path / "r" / "study_crosscheck.md").read_text()
 
 
-@pytest.mark.slow
+@pytest.mark.slow("trains several rows")
 def test_skins_of_one_study_feel_the_same_touches(run, tmp_path):
     few = ["study.seeds=[0]", "study.rows=[features]", "body.cells=[8,8]", "+simulator.divisions=1"]
     done = run(tmp_path, "study", "study=direction", *few, *SMALL)
@@ -245,7 +245,7 @@ def test_skins_of_one_study_feel_the_same_touches(run, tmp_path):
     assert "took" not in again.stdout
 
 
-@pytest.mark.slow
+@pytest.mark.slow("evaluates trained rows")
 def test_rows_decide_together(run, trained):
     words = ["study=ensemble", "study.rows=[rules,temporal_graph]", "study.seeds=[0]", "trainer.max_epochs=1"]
     done = run(trained, "study", *words, *NAIVE, "out=ensemble")
@@ -255,7 +255,7 @@ def test_rows_decide_together(run, trained):
     assert 0 < float(found["vote"]["same/any/disagreement"]) < 1
 
 
-@pytest.mark.slow
+@pytest.mark.slow("trains several rows")
 def test_a_study_of_ones_own_needs_a_file_only(run, tmp_path):
     (tmp_path / "own" / "study").mkdir(parents=True)
     (tmp_path / "own" / "experiment").mkdir()
@@ -273,7 +273,7 @@ def test_a_study_of_ones_own_needs_a_file_only(run, tmp_path):
     assert "| noise=0.5 |  | " in (tmp_path / "results" / "study_noise.md").read_text()
 
 
-@pytest.mark.slow
+@pytest.mark.slow("evaluates trained rows")
 def test_a_row_that_cannot_take_a_skin_is_named_so_also_where_thresholds_are_chosen(run, trained):
     (trained / "own" / "study").mkdir(parents=True)
     (trained / "own" / "study" / "four.yaml").write_text(
@@ -291,7 +291,7 @@ def test_a_row_that_cannot_take_a_skin_is_named_so_also_where_thresholds_are_cho
     assert "cannot" in (trained / "four" / "study_four.md").read_text()
 
 
-@pytest.mark.slow
+@pytest.mark.slow("evaluates trained rows")
 def test_a_multirun_of_studies_is_no_run_itself(run, trained):
     few = ["study=ensemble", "study.train=false", "study.seeds=[0]", "study.rows=[rules]", "out=one,two"]
     before = runs(trained)
@@ -301,7 +301,7 @@ def test_a_multirun_of_studies_is_no_run_itself(run, trained):
     assert {*runs(trained)} - {*before} <= {("study ensemble", "FINISHED")}
 
 
-@pytest.mark.slow
+@pytest.mark.slow("trains several rows")
 def test_a_simulator_that_selects_runs_keeps_their_settings(run, tmp_path):
     """Independent answer: skin evaluate, which changes nothing but the device."""
     done = run(tmp_path, "train", "experiment=rules", "simulator=fem", "simulator.reading=interface", *SMALL)
@@ -328,7 +328,7 @@ def test_a_simulator_that_selects_runs_keeps_their_settings(run, tmp_path):
     assert float(found["same/overall/accuracy"]) == pytest.approx(value)
 
 
-@pytest.mark.slow
+@pytest.mark.slow("trains several rows")
 def test_the_table_is_a_study_with_the_reports_numbers_and_its_figures(run, trained):
     """Rows that it does not train stand in it once they have finished; two trainings run at a time."""
     done = run(trained, "train", "experiment=best_fresh", "trainer.max_epochs=1", *NAIVE)

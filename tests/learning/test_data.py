@@ -259,11 +259,12 @@ def test_time_that_runs_backwards_is_refused_where_touches_have_a_direction(made
 
 
 def test_touches_without_geometry_get_that_of_the_configured_skin(configured):
-    config = configured("representation=sites", "simulator=solid", "simulator.divisions=1")
+    small = ["body.cells=[10,10]", "layout=grid", "device.test_gestures=16", "data.gestures=16"]
+    config = configured("representation=sites", "simulator=solid", "simulator.divisions=1", *small)
     device = build_device(config)
     touches, data = device.touches("test")[:8], build_data(config, device)
     unknown = replace(touches, geometry=None)
     torch.testing.assert_close(data.show(unknown).x, data.show(touches).x)
     torch.testing.assert_close(data.show(unknown).summary, data.show(touches).summary)
-    other = build_data(configured("representation=sites", "simulator=naive"), device)
+    other = build_data(configured("representation=sites", "simulator=naive", *small), device)
     assert not torch.allclose(other.show(unknown).x, data.show(touches).x)

@@ -63,7 +63,7 @@ def ran(run, tmp_path_factory):
     return folder, command("train", *train), command("study", *study)
 
 
-@pytest.mark.slow
+@pytest.mark.slow("trains a peer")
 def test_a_peer_is_a_run_that_the_table_finds(ran):
     folder, first, _ = ran
     assert first.returncode == 0, first.stderr
@@ -76,7 +76,7 @@ def test_a_peer_is_a_run_that_the_table_finds(ran):
     assert run.data.metrics["seconds_per_epoch"] > 0
 
 
-@pytest.mark.slow
+@pytest.mark.slow("trains a peer")
 def test_a_study_evaluates_a_finished_peer_under_its_conditions(ran):
     folder, _, study = ran
     assert study.returncode == 0, study.stderr
@@ -85,7 +85,7 @@ def test_a_study_evaluates_a_finished_peer_under_its_conditions(ran):
     assert all(line.startswith("ridge naive") for line in lines[1:])
 
 
-@pytest.mark.slow
+@pytest.mark.slow("trains each peer in its own environment")
 @pytest.mark.skipif(not peers.python().is_file(), reason="no .venv-peers: make peers builds it")
 @pytest.mark.parametrize("row", sorted({*peers.ROWS} - {"ridge"}))
 def test_peers_learn_in_their_own_environment(configured, made_up_device, row, tmp_path):

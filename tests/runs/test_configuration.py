@@ -85,11 +85,12 @@ def test_every_option_composes(configured, group, option):
     assert config[group]["_target_"] == target(group, option)
 
 
-@pytest.mark.parametrize("skin", ["naive", "fem", "solid", "solid body=arm"])
+@pytest.mark.parametrize("skin", ["naive", "fem", *(f"solid body={body}" for body in ("sheet", "arm"))])
 @pytest.mark.parametrize("kind", [path.stem for path in sorted((CONF / "touch").glob("*.yaml"))])
 def test_every_kind_of_touches_is_simulated(configured, kind, skin):
+    small = ["body.cells=[12,12]", "simulator.divisions=1"] if "solid" in skin else []
     skin = [f"simulator={skin.split()[0]}", *skin.split()[1:]]
-    device = build_device(configured(f"touch={kind}", *skin, "data.gestures=32"))
+    device = build_device(configured(f"touch={kind}", *skin, *small, "data.gestures=32"))
     touches = device.recording(complete=False).touches
     assert touches.readings.isfinite().all()
     assert touches.readings.max() > 1.0
@@ -309,7 +310,7 @@ def test_settings_that_nobody_means_cost_one_sentence(word, capsys, monkeypatch,
     assert "Traceback" not in message
 
 
-@pytest.mark.slow
+@pytest.mark.slow("builds hundreds of configurations")
 def test_every_setting_works_or_is_refused_whatever_it_is_set_to(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with initialize_config_dir(str(CONF), version_base="1.3"):

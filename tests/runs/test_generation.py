@@ -2,8 +2,6 @@
 
 import os
 import signal
-import subprocess
-import sys
 
 import pytest
 import torch
@@ -17,7 +15,14 @@ from skin.runs.build import build_device
 from skin.runs.configuration import validate_config
 from skin.runs.generation import generate_data_set, generate_file
 
-SMALL = ["simulator=naive", "n=80", "touch.leak=0.95"]  # few gestures may have few shapes
+SMALL = [
+    "simulator=naive",
+    "layout=grid",
+    "layout.rows=3",
+    "layout.columns=3",
+    "n=80",
+    "touch.leak=0.95",
+]  # few gestures may have few shapes
 
 
 def composed(*overrides):
@@ -105,10 +110,10 @@ generate(Path({folder!r}))
 """
 
 
-def test_a_killed_generation_goes_on(tmp_path):
-    folder, whole = tmp_path / "touches", tmp_path / "whole"
-    script = KILLED.format(tests=os.path.dirname(__file__), folder=str(folder))
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=600)
+def test_a_killed_generation_goes_on(begin, tmp_path):
+    folder, whole, script = tmp_path / "touches", tmp_path / "whole", tmp_path / "killed.py"
+    script.write_text(KILLED.format(tests=os.path.dirname(__file__), folder=str(folder)))
+    done = begin(tmp_path, script).completed()
     assert done.returncode == -signal.SIGKILL, done.stderr
     left = sorted(path.name for path in folder.glob("shards/*"))
     assert left[1:] == [f"0000{number}.parquet" for number in range(3)]

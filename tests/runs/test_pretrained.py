@@ -83,7 +83,7 @@ def test_a_model_names_no_folder_of_the_machine_of_its_training(name):
         assert str(ROOT).encode() not in path.read_bytes(), path
 
 
-@pytest.mark.slow
+@pytest.mark.slow("generates 400 touches for each shipped model")
 @pytest.mark.parametrize("name", NAMES)
 def test_the_weights_reproduce_the_card_on_400_touches(name, tmp_path):
     """At most a few predictions may differ: those closer to a threshold than processors round."""
@@ -182,7 +182,9 @@ def test_damage_never_passes_for_a_model(model, name):
     try_it()
 
 
-@pytest.mark.parametrize("name", [RECORD, pytest.param(CONFIG, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "name", [RECORD, pytest.param(CONFIG, marks=pytest.mark.slow("validates each configuration"))]
+)
 def test_a_model_of_somebody_else_works_or_is_refused(model, name):
     """Its checksums are right, whatever is in it."""
     content, store = load_yaml(model / name), None

@@ -64,7 +64,7 @@ def test_the_processor_has_a_name():
     assert len(tags()["processor"]) > 2
 
 
-@pytest.mark.slow
+@pytest.mark.slow("trains and evaluates again")
 def test_one_warning_counts_reused_results_of_other_code(run, tmp_path):
     from skin.runs.configuration import Tracking
     from skin.runs.store import Store

@@ -95,7 +95,7 @@ def runs(folder):
     return found
 
 
-@pytest.mark.slow
+@pytest.mark.slow("trains several runs")
 def test_a_sweep_that_was_killed_goes_on_where_it_was(run, begin, tmp_path):
     with begin(tmp_path, *sweep(tmp_path, "seed=0,1,2")) as first:
         next(line for line in first.lines() if line.startswith("[2/3]"))
@@ -112,7 +112,7 @@ def test_a_sweep_that_was_killed_goes_on_where_it_was(run, begin, tmp_path):
     assert finished == [named(0), named(1), named(2)]
 
 
-@pytest.mark.slow
+@pytest.mark.slow("trains several runs")
 def test_a_run_is_named_by_its_changes_and_logs_them_and_a_skipped_one_prints_its_scores(run, tmp_path):
     given = ["train", *SMALL, "device.offset=0.2", "layout=grid", "model=mlp"]
     first = run(tmp_path, *given)
@@ -135,7 +135,7 @@ def test_a_run_is_named_by_its_changes_and_logs_them_and_a_skipped_one_prints_it
     assert rows
 
 
-@pytest.mark.slow
+@pytest.mark.slow("trains several runs")
 def test_a_bad_job_fails_and_the_others_run(run, tmp_path):
     done = run(tmp_path, *sweep(tmp_path, "device.offset=-1,0.1"), store=False)
     assert done.returncode == 1
@@ -235,7 +235,7 @@ def test_a_shard_of_a_search_is_refused(tmp_path, monkeypatch):
         SweepCallback()._open(OmegaConf.create({"shard": "1/2", "hydra": hydra}))
 
 
-@pytest.mark.slow
+@pytest.mark.slow("trains several runs")
 def test_a_run_is_nested_under_the_sweep_that_trained_it(run, tmp_path):
     for seeds in ("0,1,0", "1,0", "shuffle(0,1,2)"):
         done = run(tmp_path, *sweep(tmp_path, f"seed={seeds}"), store=False)
@@ -252,7 +252,7 @@ def test_a_run_is_nested_under_the_sweep_that_trained_it(run, tmp_path):
     }
 
 
-@pytest.mark.slow
+@pytest.mark.slow("trains several runs in processes that import anew")
 def test_parallel_jobs_end_in_a_finished_parent(run, tmp_path):
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
     parallel = ["hydra/launcher=joblib", "hydra.launcher.n_jobs=2"]
@@ -262,7 +262,7 @@ def test_parallel_jobs_end_in_a_finished_parent(run, tmp_path):
     assert parent.info.status == "FINISHED"
 
 
-@pytest.mark.slow
+@pytest.mark.slow("composes several sweeps with trained runs")
 @pytest.mark.parametrize("given", [["device.offset=-1,-2"], ["seed=x,y"], ["model=cn", "seed=0,1"]])
 def test_a_sweep_that_trains_nothing_leaves_no_parent(run, tmp_path, given):
     done = run(tmp_path, *sweep(tmp_path, *given), store=False)
@@ -279,7 +279,7 @@ def test_what_no_job_could_accept_is_refused_once():
     assert "Traceback" not in done.stderr
 
 
-@pytest.mark.slow
+@pytest.mark.slow("trains several runs")
 def test_a_job_may_take_a_value_from_another_setting(run, tmp_path):
     words = [*SMALL, "device.noise=0.05,0.1", "device.offset=${device.noise}"]
     done = run(tmp_path, "train", "-m", *words, f"hydra.sweep.dir={tmp_path}/out")
@@ -290,7 +290,7 @@ def test_a_job_may_take_a_value_from_another_setting(run, tmp_path):
     assert found == [("device.noise=0.05,0.1", "FINISHED")]
 
 
-@pytest.mark.slow
+@pytest.mark.slow("trains several runs")
 def test_shards_train_every_job_once(run, tmp_path):
     said = []
     for shard in ("1/2", "2/2", "3/3"):

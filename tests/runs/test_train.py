@@ -104,7 +104,7 @@ def test_an_objective_that_is_no_metric_of_the_validation_is_refused(objective, 
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.slow
+@pytest.mark.slow("trains a network")
 def test_a_run_stays_open_until_its_results_are_logged(config, monkeypatch):
     seen = []
     evaluate = skin.runs.train.evaluate
@@ -168,7 +168,7 @@ def logged(folder):
     return [(name, status, [float(loss) for loss in losses.split(",")]) for name, status, losses in found]
 
 
-@pytest.mark.slow
+@pytest.mark.slow("trains in two processes that import anew")
 def test_two_processes_make_one_run(run, tmp_path):
     """The second one, which Lightning starts as the command again, neither logs nor prints."""
     given = [*SMALL, "data.gestures=80", "trainer.max_epochs=2"]  # 64 to train on: two equal parts
@@ -189,7 +189,7 @@ def test_two_processes_make_one_run(run, tmp_path):
     assert len(losses) == 2
 
 
-@pytest.mark.slow
+@pytest.mark.slow("trains in two processes that import anew")
 def test_a_sweep_trains_each_job_in_two_processes(run, tmp_path):
     two = ["trainer.devices=2", "trainer.strategy=ddp_spawn", f"hydra.sweep.dir={tmp_path}/out"]
     done = run(tmp_path, "train", "-m", *SMALL, "seed=0", *two, apart=True)
@@ -198,7 +198,7 @@ def test_a_sweep_trains_each_job_in_two_processes(run, tmp_path):
     assert (status, len(losses)) == ("FINISHED", 1)
 
 
-@pytest.mark.slow
+@pytest.mark.slow("starts processes that import anew")
 @pytest.mark.parametrize(
     ("given", "said"),
     [

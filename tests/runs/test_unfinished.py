@@ -63,7 +63,7 @@ def wait_for(epoch, folder, command, artifacts="a"):
     raise AssertionError("no checkpoint")
 
 
-@pytest.mark.slow
+@pytest.mark.slow("trains three times")
 def test_a_killed_training_ends_with_the_weights_of_one_that_was_not(run, begin, tmp_path):
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     for folder in (whole, killed):
@@ -85,7 +85,7 @@ def test_a_killed_training_ends_with_the_weights_of_one_that_was_not(run, begin,
     assert find_unfinished(store, settings, found.data.tags["fingerprint"]) is None
 
 
-@pytest.mark.slow
+@pytest.mark.slow("trains several times")
 def test_other_code_and_resume_false_begin_again_and_a_complete_training_is_evaluated(run, begin, tmp_path):
     own = [f"tracking.uri=sqlite:///{tmp_path}/m.db", f"tracking.artifacts={tmp_path}/a"]
     with begin(tmp_path, *TRAINING, *own) as first:
@@ -152,7 +152,7 @@ def on_server(server):
     return run, history
 
 
-@pytest.mark.slow
+@pytest.mark.slow("waits for a server")
 def test_a_training_waits_for_a_server_that_is_away(begin, tmp_path):
     server = Server(tmp_path)
     own = [f"tracking.uri={server.uri}"]
@@ -172,7 +172,7 @@ def test_a_training_waits_for_a_server_that_is_away(begin, tmp_path):
     assert all(len(steps) == 8 for steps in history.values())
 
 
-@pytest.mark.slow
+@pytest.mark.slow("trains twice and starts a server")
 def test_a_training_without_its_server_is_complete_when_repeated(begin, run, tmp_path, monkeypatch):
     monkeypatch.setenv("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "1")
     server = Server(tmp_path)
@@ -199,7 +199,7 @@ def test_a_training_without_its_server_is_complete_when_repeated(begin, run, tmp
     assert {name: len(set(steps)) for name, steps in history.items()} == {"train_loss": 8, "val_loss": 8}
 
 
-@pytest.mark.slow
+@pytest.mark.slow("trains and waits for a killed process")
 def test_a_training_in_progress_is_refused_and_a_killed_one_is_not(run, begin, tmp_path):
     own = [f"tracking.uri=sqlite:///{tmp_path}/m.db", f"tracking.artifacts={tmp_path}/a"]
     with begin(tmp_path, *TRAINING, *own) as first:

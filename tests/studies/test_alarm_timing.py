@@ -23,7 +23,10 @@ LEARNERS = {
 RATE = 10.0  # Hz, of the device
 
 
-@pytest.fixture(scope="module", params=LEARNERS)
+SLOW = {"ensemble": pytest.mark.slow("trains all members, and asks each of them at every frame")}
+
+
+@pytest.fixture(scope="module", params=[pytest.param(name, marks=SLOW.get(name, ())) for name in LEARNERS])
 def trained(request, configured):
     """Return a small run that has learned what touch is, and its device."""
     config = configured(*SMALL, *LEARNERS[request.param], "data.stream=true")
@@ -40,7 +43,7 @@ def engine(request, trained):
     return engine_settings(of, DebounceSettings(), request.param).build(), device
 
 
-@pytest.mark.slow
+@pytest.mark.slow("plays long courses through an engine")
 @pytest.mark.parametrize("course", COURSES)
 def test_an_alarm_stays_until_the_touch_ends(engine, course):
     subject, device = engine

@@ -14,6 +14,7 @@ from experiments.studies.study_page import read_reference
 from skin.core.files import CONF
 from skin.errors import InputError
 from skin.runs.configuration import fingerprint, validate_config
+from tests.budget import free
 
 FILES = {path.stem: OmegaConf.load(path) for path in sorted((CONF / "study").glob("*.yaml"))}
 NAMES = [(name, part) for name, file in FILES.items() for part in file.get("parts", {"": {}})]
@@ -34,7 +35,7 @@ def composed():
 
     def make(*words):
         if words not in made:
-            with composing(*words) as study:
+            with free(), composing(*words) as study:
                 made[words] = study, variants(study)
         return made[words]
 

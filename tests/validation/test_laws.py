@@ -9,12 +9,13 @@ from skin.core.files import ROOT
 from skin.errors import InputError
 from skin.mechanics.simulator._hexahedra import Hexahedra
 
-SLOW = {"boussinesq", "cerruti", "hertz", "punch"}  # seconds, of blocks that are solved
+SOLVED = {"boussinesq", "cerruti", "hertz", "punch"}
+SLOW = pytest.mark.slow("solves blocks for seconds")
 
 
 @pytest.mark.parametrize(
     "law",
-    [pytest.param(law, marks=pytest.mark.slow if law.name in SLOW else (), id=law.name) for law in LAWS],
+    [pytest.param(law, marks=SLOW if law.name in SOLVED else (), id=law.name) for law in LAWS],
 )
 def test_a_law_holds(law):
     outcome = law.check(True)

@@ -69,6 +69,9 @@ def felt(simulator):
     return 5 * disc_readings(simulator, BODY, TRUTH, 0.0015)[0]
 
 
+AGAIN = pytest.mark.slow("starts a process that imports anew, once more")
+
+
 @contextmanager
 def started():
     """Return contacts whose process is started."""
@@ -143,14 +146,14 @@ def test_an_untouched_skin_has_no_contact(posterior):
 
 def test_few_sensors_that_feel_nothing_show_no_contact_but_a_light_touch():
     """They cannot rule out a contact between them, which is no reason to show one."""
-    body, count = Sheet((0.2, 0.2), (32, 32), BODY.layers), 12
+    body, count = Sheet((0.15, 0.15), (24, 24), BODY.layers), 12
     mechanics = Mechanics(Naive, body, Grid(3, 4).sensors(body), NOISE)
     posterior, rng = mechanics.posterior(), np.random.default_rng(0)
     # 0.3 N at the first sensor, which reads 0.1 N.
-    place = np.array([[0.028, 0.033, 0.008]])
+    place = np.array([[0.0218, 0.025, 0.008]])
     light = 0.3 * disc_readings(Naive(body, mechanics.sensors), body, place, 0.0015)[0]
     works = {"valid": np.ones(count, dtype=bool), "saturated": np.zeros(count, dtype=bool)}
-    for _ in range(6):
+    for _ in range(3):
         noise = rng.normal(scale=NOISE.frame / 10**0.5, size=count)
         idle, touched = (
             estimate_contacts(posterior, NOISE, moment(noise + felt, **works)) for felt in (0.0, light)
@@ -276,6 +279,7 @@ def test_looking_never_waits_and_only_the_newest_counts(running, felt):
     assert len([t for t in times if t > 1e6]) <= 3
 
 
+@pytest.mark.slow("starts a process that imports anew")
 def test_a_process_that_dies_is_said_and_stops_nothing(felt):
     with started() as contacts:
         state_of(contacts, "contacts", felt)
@@ -288,7 +292,15 @@ def test_a_process_that_dies_is_said_and_stops_nothing(felt):
         assert contacts.state()["state"] == "unknown"
 
 
-def test_the_process_ends_with_the_command_however_it_ends(tmp_path):
+@pytest.mark.parametrize(
+    ("number", "wait"),
+    [
+        (signal.SIGKILL, 0.0),
+        pytest.param(signal.SIGTERM, 1.0, marks=AGAIN),
+        pytest.param(signal.SIGKILL, 4.0, marks=AGAIN),
+    ],
+)
+def test_the_process_ends_with_the_command_however_it_ends(tmp_path, number, wait):
     (tmp_path / "mechanics").write_bytes(pickle.dumps(MECHANICS))
     script = (
         "import pickle, time; from skin.hardware.live.contacts import LiveContacts;"
@@ -297,15 +309,12 @@ def test_the_process_ends_with_the_command_however_it_ends(tmp_path):
         "print(contacts._process.pid, flush=True); time.sleep(600)"
     )
     begin = [sys.executable, "-c", script]
-    commands = [subprocess.Popen(begin, cwd=tmp_path, stdout=subprocess.PIPE) for _ in range(3)]
-    children = [psutil.Process(int(command.stdout.readline())) for command in commands]
-    for number, wait in ((signal.SIGKILL, 0.0), (signal.SIGTERM, 1.0), (signal.SIGKILL, 4.0)):
+    with subprocess.Popen(begin, cwd=tmp_path, stdout=subprocess.PIPE) as command:
+        child = psutil.Process(int(command.stdout.readline()))
         sleep(wait)
-        command, child = commands.pop(0), children.pop(0)
         assert child.is_running()
-        with command:
-            command.send_signal(number)
-        child.wait(PATIENCE)
+        command.send_signal(number)
+    child.wait(PATIENCE)
 
 
 def test_the_process_does_not_hear_ctrl_c(running, felt):

@@ -164,7 +164,7 @@ def check(errors):
     assert np.median(force[right]) < 0.15
 
 
-@pytest.mark.slow
+@pytest.mark.slow("watches a live view for long")
 def test_page_and_json_lines_agree_with_what_is_announced(watched):
     tap, page, port = watched
     lines, pictures = [], []
@@ -199,7 +199,7 @@ def test_page_and_json_lines_agree_with_what_is_announced(watched):
     assert {contacts["number"] for contacts in lines} >= {0, 1, 2}
 
 
-@pytest.mark.slow
+@pytest.mark.slow("watches a live view in a browser")
 def test_the_browser_shows_them_in_newtons_and_kilopascals(watched, browser):
     tap, page, _ = watched
     browser.open(page)

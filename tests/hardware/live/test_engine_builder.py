@@ -91,7 +91,7 @@ def skin():
         thread.join(PATIENCE)
 
 
-@pytest.mark.slow
+@pytest.mark.slow("starts a process that imports anew")
 def test_it_runs_without_torch_and_writes_json_lines(model, skin, tmp_path):
     words = [f"run={model}", "device=serial", f"device.port={skin}", "device.tare=1", "live.verdicts=stdout"]
     words += ["seconds=15", "live.log=alarms.jsonl", "live.selftest=false"]  # untrained
@@ -121,13 +121,19 @@ def test_only_a_skin_at_a_port_is_watched(model):
         watch_exported(str(model), {"seed": 0}, LIVE, print, opened, lambda *_: None)
 
 
-@pytest.mark.parametrize(("rates", "threshold"), [(None, 0.25), ({"20": 0.3, "100": 0.35, "500": 0.4}, 0.35)])
-def test_the_settings_of_the_file_and_of_the_command(trained, skin, tmp_path, rates, threshold):
-    """The threshold is the one for the rate of the device, which sends 100 frames a second."""
+@pytest.fixture(scope="module", params=[None, {"20": 0.3, "100": 0.35, "500": 0.4}], ids=["one", "rates"])
+def with_thresholds(request, trained, tmp_path_factory):
+    """Return the file of a network with thresholds for rates or without, and the one at 100 Hz."""
     of, touches = trained
-    path, said = tmp_path / "skin.onnx", []
-    loaded = []  # what is said before the views open
-    write_model(of.learner.pipeline(of.places), of.describe(rates), touches, path)
+    path = tmp_path_factory.mktemp("thresholds") / "skin.onnx"
+    write_model(of.learner.pipeline(of.places), of.describe(request.param), touches, path)
+    return path, (request.param or {"100": 0.25})["100"]
+
+
+def test_the_settings_of_the_file_and_of_the_command(with_thresholds, skin):
+    """The threshold is the one for the rate of the device, which sends 100 frames a second."""
+    path, threshold = with_thresholds
+    said, loaded = [], []  # what is said before the views open
     with ExitStack() as opened:
         device = {"port": skin, "labels": "announced"}
         ready = lambda model, name: loaded.extend([model.title, name, *said])  # noqa: E731
@@ -136,7 +142,7 @@ def test_the_settings_of_the_file_and_of_the_command(trained, skin, tmp_path, ra
     assert loaded[:2] == ["untrained", watched.source.name]
     assert not any("alarm above" in text for text in loaded)
     assert said[-1] == f"alarm above {threshold:.4f}"
-    assert ("single windows" in said[-2]) == (rates is None)
+    assert ("single windows" in said[-2]) == (threshold == 0.25)
     assert watched.nominal.presses.shape == (6, 6)
     assert (watched.nominal.presses.argmax(axis=1) == np.arange(6)).all()
 
@@ -179,7 +185,7 @@ def test_the_command_replaces_settings_of_the_file(model, skin):
     assert (watched.settings.detection.threshold, watched.nominal.detection.threshold) == (0.5, 0.3)
 
 
-@pytest.mark.slow
+@pytest.mark.slow("starts a process that imports anew")
 def test_the_example_without_this_package(model, begin, tmp_path):
     sizes = ["layout=grid", "layout.rows=2", "layout.columns=3"]
     with begin(tmp_path, "emulate", "simulator=naive", *sizes, "link=skin", "emulate.idle=4") as emulator:

@@ -57,7 +57,7 @@ def store(run, tmp_path_factory):
     return own
 
 
-@pytest.mark.slow
+@pytest.mark.slow("starts a live view and a browser")
 def test_a_dangerous_press_turns_the_page_red_and_a_replugged_skin_heals_it(begin, store, browser, tmp_path):
     link = tmp_path / "skin"
     faults = ["faults.unplug=[10]", "faults.away=2"]
@@ -95,7 +95,7 @@ def test_a_dangerous_press_turns_the_page_red_and_a_replugged_skin_heals_it(begi
     assert re.search(r"gesture \d+: .*(?<!not )dangerous", emulator.out), emulator.out
 
 
-@pytest.mark.slow
+@pytest.mark.slow("starts a live view of the simulator")
 def test_the_simulator_is_watched_without_hardware(run, store, tmp_path):
     live = run(tmp_path, "live.py", "seconds=5", *store, store=False)
     assert live.returncode == 0, live.stderr
@@ -117,7 +117,7 @@ def test_bad_input_is_one_sentence(run, tmp_path, override, needed):
     assert done.stderr.count("\n") == 1
 
 
-@pytest.mark.slow
+@pytest.mark.slow("waits for a skin to come back")
 def test_a_skin_that_lost_its_power_is_found_again(begin, store, tmp_path):
     peers, stop = [], Event()
 
@@ -174,7 +174,7 @@ finally:
 """
 
 
-@pytest.mark.slow
+@pytest.mark.slow("imports all libraries anew and waits")
 def test_a_search_for_garbage_does_not_delay_a_verdict(tmp_path):
     """Among all that torch loads it takes 0.3 s, every few seconds."""
     settings = ["run=any_skin", "seconds=3", "live.patience.above=0.5", "live.contacts=false"]

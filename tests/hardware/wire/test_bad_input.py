@@ -26,7 +26,7 @@ SHEET = Sheet((0.16, 0.16), (32, 32), [{"material": "EcoFlex 00-30", "thickness"
 
 
 @pytest.mark.parametrize("verb", ["listen", "record"])
-@pytest.mark.slow
+@pytest.mark.slow("a process for each command")
 def test_a_port_in_use_ends_a_command_with_code_2(plug, tmp_path, verb):
     out = {"listen": [], "record": ["out=s.csv"]}[verb]
     with open_skin(plug.port):

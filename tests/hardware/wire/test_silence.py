@@ -162,7 +162,7 @@ with open_skin(port, range(4), reconnect=True, silence=float(sys.argv[1]), backo
 """
 
 
-@pytest.mark.slow
+@pytest.mark.slow("waits for silence to be noticed")
 @pytest.mark.parametrize(("silence", "reason"), [(0.5, "nothing received for 0.5 s"), (0, "timed out")])
 def test_a_cable_that_is_cut_in_between(silence, reason):
     # A network of its own whose only link goes down: no segment tells of it, as where a router fails.

@@ -7,7 +7,7 @@ import pytest
 from experiments.benchmarks import measure_decoder
 from tests.hardware.wire import faulty_wire
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.slow("streams for long")
 
 SECONDS, CHECK = float(os.environ.get("SOAK_SECONDS", 5)), os.environ.get("SOAK_CHECK", "crc16")
 

@@ -41,6 +41,9 @@ CHEAP = {
 pytestmark = pytest.mark.usefixtures("few_trees")
 
 
+SEVERAL = {"chosen", "ensemble"}
+
+
 @pytest.fixture(params=OPTIONS)
 def made(request, configured, made_up_device, tmp_path, monkeypatch):
     """Return a function that makes the learner, its data, and the device; in an empty folder."""
@@ -148,6 +151,14 @@ class Sliding(AbstractDevice):
         return Touches(readings, torch.ones_like(readings, dtype=torch.bool), positions, labels, self.rate)
 
 
+def by_option(slow: str):
+    """Choose the options of ``made``: those that train several learners are slow."""
+    marks = {name: pytest.mark.slow(slow) for name in SEVERAL}
+    options = [pytest.param(name, marks=marks.get(name, ())) for name in OPTIONS]
+    return pytest.mark.parametrize("made", options, indirect=True)
+
+
+@by_option("trains several learners, as the other cases of them do")
 def test_a_direction_is_learnt_or_refused_by_name(made, configured, tmp_path):
     device = Sliding()
     learner = made[0]()

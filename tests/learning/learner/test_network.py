@@ -21,7 +21,7 @@ def curve(folder):
     return ([float(row[name]) for row in rows if row[name]] for name in ("val_loss", "train_loss"))
 
 
-@pytest.mark.slow
+@pytest.mark.slow("trains until it has learned")
 def test_it_learns_touches_of_the_naive_skin_and_takes_another_layout(configured, tmp_path):
     config = configured(
         "experiment=temporal_graph", "simulator=naive", "data.gestures=600", "device.test_gestures=300",

@@ -215,7 +215,7 @@ def test_other_channels_are_refused(channels):
         EfficientNet("image", (channels, 64, 64), weights="random")
 
 
-@pytest.mark.slow
+@pytest.mark.slow("starts commands that build the network")
 def test_the_command_line_ends_with_code_2_and_the_sentence(run, tmp_path, monkeypatch):
     monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))
     few = ["simulator=naive", "data.gestures=20", "device.test_gestures=20"]

@@ -9,16 +9,17 @@ from skin.errors import InputError
 from skin.runs.build import build_device
 
 OPTIONS = sorted(path.stem for path in (CONF / "contact").glob("*.yaml"))
-SMALL = ("body.cells=[16,16]", "layout=grid", "data.gestures=40", "device.test_gestures=32")
+SMALL = ("body.cells=[12,12]", "layout=grid", "data.gestures=16", "device.test_gestures=16")
+SOLID = ("simulator=solid", "simulator.divisions=1")
 
 
 @pytest.fixture(scope="module", params=OPTIONS)
 def device(request, configured):
-    return build_device(configured(f"contact={request.param}", "simulator=solid", *SMALL))
+    return build_device(configured(f"contact={request.param}", *SOLID, *SMALL))
 
 
 def test_touches_are_made_of_pressures_that_carry_their_force(device):
-    movie = device.sampler.sample(32, np.random.default_rng(0))
+    movie = device.sampler.sample(16, np.random.default_rng(0))
     width, height = device.body.cell
     torch.testing.assert_close(
         movie.pressure().sum((2, 3)) * width * height, movie.force, rtol=1e-3, atol=1e-3
@@ -49,7 +50,7 @@ def test_the_command_line_says_so_too(run, tmp_path):
 
 def test_rigid_gestures_are_generated(run, tmp_path):
     out = tmp_path / "touches.parquet"
-    rigid = ["simulator=solid", "contact=rigid", "n=32", *SMALL[:2]]
+    rigid = [*SOLID, "contact=rigid", "n=16", *SMALL[:2]]
     done = run(tmp_path, "generate.py", *rigid, f"out={out}", store=False)
     assert done.returncode == 0, done.stderr
     assert "0 frames not solved" in done.stdout

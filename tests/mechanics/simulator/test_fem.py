@@ -193,7 +193,7 @@ def test_refinement_shrinks_the_differences():
     np.testing.assert_allclose(answers[:, 1], [3.19e-3, 3.56e-3, 3.89e-3], atol=0.005e-3)
 
 
-@pytest.mark.slow
+@pytest.mark.slow("solves for 128 x 128 cells")
 def test_64_cells_are_within_5_percent_of_128_and_the_default_is_as_its_docstring_says():
     default, fine, finer = (refined(cells) for cells in (32, 64, 128))
     np.testing.assert_allclose(fine, finer, rtol=0.05)

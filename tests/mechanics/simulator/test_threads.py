@@ -20,7 +20,7 @@ LAYERS = [
 ]
 
 
-@pytest.mark.slow
+@pytest.mark.slow("solves anew with each number of threads")
 def test_results_do_not_depend_on_the_number_of_threads(tmp_path):
     outputs = []
     for count in ("1", "2"):

@@ -9,7 +9,7 @@ from filelock import FileLock
 from skin.runs.build import build_data, build_device, build_learner
 from skin.runs.model_of_run import RunModel
 
-SMALL = ["simulator=naive", "layout=grid", "layout.rows=2", "layout.columns=3", "data.gestures=400"]
+SMALL = ["simulator=naive", "layout=grid", "layout.rows=2", "layout.columns=3", "data.gestures=96"]
 
 
 @pytest.fixture(scope="session")

@@ -21,7 +21,7 @@ def difference(of, path, readings, valid):
     return float(np.abs(found - expected.numpy()).max())
 
 
-@pytest.mark.slow
+@pytest.mark.slow("computes a thousand touches twice")
 def test_a_thousand_touches_have_the_probabilities_of_torch(exported):
     of, path = exported
     touches = of.device.replace(gestures=10_000).touches("validation")
@@ -51,7 +51,7 @@ def test_invalid_readings_idle_windows_and_single_sensors(exported):
     assert difference(of, path, readings, valid) <= TOLERANCE
 
 
-@pytest.mark.slow
+@pytest.mark.slow("exports a network for each set of options")
 @pytest.mark.parametrize(
     "overrides",
     [

@@ -127,7 +127,7 @@ def files_are_parsed_once():
 
 @pytest.fixture(scope="session", autouse=True)
 def own_cache(kept, shared):
-    """Keep operators of tests, until their sources change, and checks apart from the user's; commands, too."""
+    """Keep operators of tests, until their sources change, and checks apart from the user's; commands too."""
     path = kept / f"cache-{hash_of_sources()}"
     for old in set(kept.glob("cache-*")) - {path}:
         shutil.rmtree(old, ignore_errors=True)

@@ -51,10 +51,16 @@ def trees() -> dict[Path, ast.Module]:
 
 def count_statements(tree: ast.Module) -> int:
     """Return the number of statements without docstrings; imports count."""
-    scopes = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
-    nodes = list(ast.walk(tree))
-    docstrings = sum(isinstance(node, scopes) and ast.get_docstring(node) is not None for node in nodes)
-    return sum(isinstance(node, ast.stmt) for node in nodes) - docstrings
+    return sum(isinstance(node, ast.stmt) and not is_docstring(node) for node in ast.walk(tree))
+
+
+def is_docstring(node: ast.stmt) -> bool:
+    """Return whether a statement is a text alone, which documents what stands before or around it."""
+    return (
+        isinstance(node, ast.Expr)
+        and isinstance(node.value, ast.Constant)
+        and isinstance(node.value.value, str)
+    )
 
 
 def assigned_names(tree: ast.Module) -> list[str]:

@@ -108,7 +108,7 @@ def test_no_two_public_things_share_a_name():
 
 
 @pytest.mark.parametrize(
-    ("figure", "limit"), [("statements", 24_805), ("files", 205), ("words of documentation", 26_740)]
+    ("figure", "limit"), [("statements", 24_980), ("files", 205), ("words of documentation", 26_950)]
 )
 def test_the_house_stays_small(figure, limit):
     """Raise a limit only for a new capability, and say so in the change log."""

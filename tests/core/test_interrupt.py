@@ -118,7 +118,7 @@ for _ in range(int(sys.argv[1])):
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork")
-@pytest.mark.parametrize("times", [20, pytest.param(1000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("times", [20, pytest.param(1000, marks=pytest.mark.slow("starts 1,000 processes"))])
 def test_two_signals_end_a_process_once_everything_is_closed(times):
     """A second one interrupted the first, in its handler, which could hang, or what closes resources."""
     line = [sys.executable, "-c", DOUBLED, str(times)]

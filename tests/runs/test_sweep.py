@@ -159,7 +159,7 @@ def test_a_title_tells_what_is_swept():
     assert sweep_title(jobs, []) == ""
 
 
-@pytest.mark.slow
+@pytest.mark.slow("trains six networks in a process that shares nothing")
 @pytest.mark.parametrize("sweeper", ["ask", "optuna"])
 def test_a_sweeper_gets_the_objective_and_draws_from_an_interval(sweeper, tmp_path):
     if sweeper == "optuna":

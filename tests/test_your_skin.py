@@ -39,7 +39,7 @@ def follow(home, run, monkeypatch):
 
     def run_it(command: str, *more: str) -> subprocess.CompletedProcess:
         words = [os.path.expanduser(word) for word in shlex.split(command.replace("\\\n", " "))]
-        return run(home, f"{words[1]}.py", *words[2:], *more)
+        return run(home, f"{words[1]}.py", *words[2:], *more, store=words[1] != "animate")
 
     return run_it
 

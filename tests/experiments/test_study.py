@@ -47,6 +47,7 @@ def folder(tmp_path_factory, configured):
     return folder
 
 
+@pytest.mark.slow("composes nine runs twice and draws their page")
 def test_finished_runs_are_found_and_judged(run, folder):
     done = run(
         folder, "study", "study=graphs", "study.part=activation", "study.seeds=[0,1,2]", f"out={folder}/r"

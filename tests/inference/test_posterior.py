@@ -269,7 +269,7 @@ def test_the_order_of_sensors_does_not_matter():
     skin, other = (Solid(SMALL, where, divisions=1) for where in (sensors, shuffled))
     discs = np.array([(0.03, 0.05, 0.008), (0.05, 0.03, 0.006), (0.045, 0.045, 0.01)])
     readings = measure(5 * disc_readings(skin, SMALL, discs, FingertipPrior().rim), NOISE, 15)
-    ordered, mixed = (Posterior(one, NOISE, SMALL) for one in (skin, other))
+    ordered, mixed = (Posterior(one, NOISE, SMALL, contacts=2) for one in (skin, other))
     for row in readings:
         first, second = ordered.estimate(row), mixed.estimate(row[order])
         assert first.number == second.number

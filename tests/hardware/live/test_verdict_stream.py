@@ -85,6 +85,16 @@ def test_a_verdict_that_is_too_old_is_stale_and_keeps_its_alarm():
         assert "labels" not in old
 
 
+def test_the_first_line_tells_what_is_waited_for():
+    shown = display()
+    shown.set_verdict(None, "the threshold of the alarm is being chosen")
+    with stream_verdicts(shown, 0) as address:
+        host, port = address.removeprefix("tcp://").split(":")
+        with socket.create_connection((host, int(port)), timeout=PATIENCE) as client:
+            message = json.loads(client.makefile("rb").readline())
+    assert (message["reason"], message["state"]) == ("the threshold of the alarm is being chosen", "unknown")
+
+
 def test_a_reason_is_sent_once_and_then_with_each_heartbeat():
     shown = display()
     with connected(shown) as take:

@@ -6,8 +6,9 @@ import re
 import urllib.error
 import urllib.request
 from base64 import b64decode
+from contextlib import contextmanager
 from dataclasses import replace
-from threading import Thread
+from threading import Event, Thread
 from time import monotonic, sleep
 
 import numpy as np
@@ -358,12 +359,28 @@ def test_the_page_goes_when_the_watching_ends():
     assert subject.closed.is_set()
 
 
+@contextmanager
+def repeated(subject, verdict):
+    """Set a verdict again and again while the block runs, as decisions come: one alone becomes old."""
+    over = Event()
+
+    def repeat():
+        while not over.wait(0.1):
+            subject.set_verdict(verdict)
+
+    subject.set_verdict(verdict)
+    thread = Thread(target=repeat)
+    thread.start()
+    yield
+    over.set()
+    thread.join()
+
+
 def test_the_page_draws_what_it_is_sent(browser):
     subject = display()
     subject.add_frame(frame([0, 0, 2.0, 0, 0], np.array([True, True, True, True, False])), PLAIN)
-    subject.set_verdict(PRESSED)
     subject.set_status("99.9 Hz")
-    with web.serve_page(subject, 0) as address:
+    with web.serve_page(subject, 0) as address, repeated(subject, PRESSED):
         browser.open(address)
         deadline = monotonic() + 300
         while browser.run("return pictures") < 5:
@@ -430,8 +447,8 @@ def test_the_page_goes_on_after_a_restart_with_more_sensors(browser):
         shows(browser, CROSSED, "5 of 5 on /dev/skin")
     places = np.concatenate([PLACES, PLACES + np.array([0.01, 0.01, 0])])
     other = Display(DisplayInfo("any_skin", "/dev/other", places, SIZE, 4.0))
-    other.set_verdict(replace(PRESSED, touched=False, dangerous=False, unknown=(7, 9), masked=(7, 9)))
-    with web.serve_page(other, int(address.rsplit(":", 1)[1])):
+    verdict = replace(PRESSED, touched=False, dangerous=False, unknown=(7, 9), masked=(7, 9))
+    with web.serve_page(other, int(address.rsplit(":", 1)[1])), repeated(other, verdict):
         shows(browser, CROSSED, "10 of 10 on /dev/other")
         before = browser.run("return pictures")
         shows(browser, f"pictures > {before + 5} && {now}", True)
@@ -441,16 +458,53 @@ def test_the_page_goes_on_after_a_restart_with_more_sensors(browser):
 def test_the_map_of_a_program_that_has_ended_is_outdated(browser):
     subject = display()
     subject.add_frame(frame([0, 0, 2.0, 0, 0]), PLAIN)
-    subject.set_verdict(replace(PRESSED, touched=False, dangerous=False))
     subject.set_status("99.9 Hz")
     bright = "getComputedStyle($('map')).filter"
     with web.serve_page(subject, 0) as address:
         browser.open(address)
-        shows(browser, "$('time').textContent", "Map: now")
-        assert browser.run(f"return {bright}") == "none"
+        with repeated(subject, replace(PRESSED, touched=False, dangerous=False)):
+            shows(browser, "$('time').textContent", "Map: now")
+            assert browser.run(f"return {bright}") == "none"
+        shows(browser, "$('head').textContent", "unknown: no decision for longer than usual")
         subject.set_verdict(None, "the device has stopped sending")
         shows(browser, "$('time').textContent", "Map: last readings")
-    shows(browser, "$('time').textContent", "Map: outdated, the program has ended")
+    shows(browser, "$('time').textContent", "Map: outdated, no answer from the program")
     assert "grayscale" in browser.run(f"return {bright}")
     assert browser.run("return $('line').textContent") == ""
     assert browser.run("return document.body.dataset.state") == "unknown"
+
+
+def test_a_page_without_an_answer_says_unknown_and_keeps_the_alarm(browser, monkeypatch):
+    """The program hangs, though its connection stays open."""
+    subject, over = display(), Event()
+    subject.add_frame(frame([0, 0, 6.0, 0, 0]), PLAIN)
+    with web.serve_page(subject, 0) as address:
+        browser.open(address)
+        with repeated(subject, PRESSED):
+            shows(browser, "$('head').textContent", "⚠ DANGEROUS")
+        hangs = monkeypatch.context()
+        with hangs as patch:
+            patch.setattr(subject, "state", lambda *_: over.wait(60))
+            shows(
+                browser,
+                "$('head').textContent",
+                "⚠ DANGEROUS; unknown: no answer from the program for 1.5 s",
+            )
+        over.set()
+
+
+def test_the_page_shows_the_gravest_note_and_no_probability_beside_an_alarm_of_late_frames(browser):
+    subject = display()
+    subject.add_frame(frame([0, 0, 6.0, 0, 0]), PLAIN)
+    notes = (Note("over_range", (2,)), Note("masked", (4,)))
+    safe = replace(PRESSED, dangerous=False, labels={"big": False, "dangerous": False}, notes=notes)
+    with web.serve_page(subject, 0) as address:
+        browser.open(address)
+        with repeated(subject, safe):
+            shows(browser, "$('bars').innerText.includes('dangerous?')", True)
+            note = browser.run("return $('note').textContent")
+            assert "no value of sensor 2 since the force rose" in note
+            assert note.endswith("(and 1 more note)")
+            subject.set_verdict(PRESSED)
+            shows(browser, "document.body.dataset.state", "danger")
+            assert "safe" not in browser.run("return $('bars').innerText")

@@ -234,6 +234,11 @@ def command(name: str = "train") -> Callable[[Callable[[Config], Any]], Callable
     return decorate
 
 
+def notify(text: str) -> None:
+    """Write a message for the user to standard error; results go to standard output."""
+    print(text, file=sys.stderr, flush=True)
+
+
 def _log_to_stderr() -> None:
     """Write the messages of this package to standard error; results go to standard output."""
     logger = logging.getLogger("skin")

@@ -6,11 +6,10 @@ Prompts for each gesture. Ctrl-C stops; the same command resumes. Writes session
 record.finish=true writes only that.
 """
 
-import sys
 from contextlib import suppress
 from pathlib import Path
 
-from skin.commands._command import command
+from skin.commands._command import command, notify
 from skin.errors import InputError
 from skin.runs.configuration import Config
 
@@ -32,10 +31,6 @@ def main(config: Config) -> None:
     path = Path(config.out).expanduser()
     if not settings["finish"]:
         with suppress(KeyboardInterrupt):
-            record_session(device, path, config.seconds, settings["free"], _notify)
+            record_session(device, path, config.seconds, settings["free"], notify)
     written, count = convert_session(device, path)
     print(f"{written}: {count} gestures")
-
-
-def _notify(text: str) -> None:
-    print(text, file=sys.stderr, flush=True)

@@ -60,15 +60,14 @@ _MARGIN = 0.5  # of the threshold, below the baseline, from which on it does so
 _NOISE = 5.0  # standard deviations that noise does not exceed
 _HIGH, _BEGUN = 2.0, 0.5  # thresholds: a reading in the middle of a touch, and at its beginning
 _FAINT = 0.1  # thresholds: least reading that shows a touch beside a sensor, if there is no noise
-_STEADY = 0.3  # of a reading: a touch that moves away from one sensor changes its neighbours by more
 _LIFT = 0.1
 """Share of the largest reading below which no sensor beside a touch falls: 0.044 is the most that the solid
 shows, with friction of 0.5."""
 
 
 def least_visible(noise: np.ndarray, threshold: float) -> np.ndarray:
-    """Return the readings (S,), N, from which sensors show a touch beside them, given their noise (S,), N."""
-    return np.maximum(_NOISE * noise, _FAINT * threshold)
+    """Return the readings (S,), N, half of which is no noise, given its standard deviation (S,), N."""
+    return 2 * np.maximum(_NOISE * noise, _FAINT * threshold)
 
 
 class ContactDetector:
@@ -90,7 +89,8 @@ class ContactDetector:
         rate: of the readings, Hz.
         threshold: N.
         drift: N/s.
-        overlap: (S, S), bool: sensors that respond to a touch on another; None: none does.
+        shares: (S, S), reading of each sensor under a touch on another, of whose reading it is a share; None:
+            no sensor feels what is on another.
 
     Attributes:
         baseline: (S,), N, above which readings rise.
@@ -100,8 +100,8 @@ class ContactDetector:
         void: (S,), bool, sensors that read below the baseline, faster than it may drift: something touched
             them when it was taken, or the device has changed it. They stay void until the next tare.
         beyond: (S,), bool, sensors that became invalid while their reading was high.
-        lost: (S,), bool, sensors that fell to rest at once while all that overlap stayed as they were, until
-            they rise again.
+        lost: (S,), bool, sensors that fell to rest at once, though none of the others fell by its share,
+            until they rise again.
     """
 
     def __init__(
@@ -110,11 +110,12 @@ class ContactDetector:
         rate: float,
         threshold: float,
         drift: float = DRIFT,
-        overlap: np.ndarray | None = None,
+        shares: np.ndarray | None = None,
     ) -> None:
         self._rate, self._threshold, self._drift = rate, threshold, drift
         self._recent, self._long = (max(1, ceil(span * rate - 1e-9)) for span in (RELEASE, _DOUBT))
-        self._overlap = np.zeros((sensors, sensors), dtype=bool) if overlap is None else overlap
+        self._shares = np.zeros((sensors, sensors)) if shares is None else shares
+        self._witnesses = np.zeros((sensors, sensors), dtype=bool)
         self._touched, self._doubtful, self._held = (np.zeros(sensors, dtype=bool) for _ in range(3))
         self.noise = np.zeros(sensors)
         self.reset(np.zeros(sensors, dtype=bool))
@@ -197,26 +198,27 @@ class ContactDetector:
         """Find sensors whose range ends, or whose wire breaks, while something presses them.
 
         Args:
-            readings, valid: (T, S), the latest of a window of two or more.
+            readings, valid: (T, S), the latest of a window of three or more.
             risen: (S,), bool, of the latest readings.
 
         Returns:
             (S,), bool, such sensors that something still presses.
         """
         self.lost &= ~risen
-        before, now = np.where(valid, readings - self.rest, np.nan)[-2:]
-        self.beyond = ~valid[-1] & (self.beyond | self._touched | (before >= _BEGUN * self._threshold))
-        change, visible = np.abs(now - before), least_visible(self.noise, self._threshold)
-        steady = change <= _STEADY * np.maximum(before, visible)
-        pressed = self._overlap & (steady & (before >= visible))
-        moved = self._overlap & ~(steady | (change < visible))
+        # Sensors that lag may fall a little later than others.
+        before, latest, now = np.where(valid, readings - self.rest, np.nan)[-3:]
+        self.beyond = ~valid[-1] & (self.beyond | self._touched | (latest >= _BEGUN * self._threshold))
+        expected, visible = before[:, None] * self._shares, least_visible(self.noise, self._threshold)
+        shown = expected >= visible
+        steady = np.abs(now - before) < expected / 2
+        witnesses = shown & steady & (np.minimum(before, now) >= expected / 2)
         fell = (before >= _HIGH * self._threshold) & (np.abs(now) < self._threshold)
-        fell &= pressed.any(axis=1) & ~moved.any(axis=1) & ~self.lost
+        fell &= witnesses.any(axis=1) & (steady | ~shown).all(axis=1) & ~self.lost
         if fell.any():
             self.lost |= fell
-            self._levels = before
-        stay = now >= np.maximum(self._levels / 2, visible)
-        return self.beyond | self.lost & (self._overlap & stay).any(axis=1)
+            self._witnesses[fell], self._levels = witnesses[fell], before
+        still_pressed = self._witnesses & (now >= np.maximum(self._levels / 2, visible))
+        return self.beyond | self.lost & still_pressed.any(axis=1)
 
     def _follow(self, readings: np.ndarray, valid: np.ndarray, sound: np.ndarray, passed: float) -> None:
         """Move baseline and rest towards the latest readings, as far as ``passed`` s allow.

@@ -5,25 +5,27 @@ below it, and a board not at all.
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from itertools import islice
+from typing import Any
 
 import numpy as np
 import torch
 from scipy.optimize import least_squares
 
+from skin.body.base import AbstractBody, Sensors
 from skin.core.settings import configured
 from skin.device.base import AbstractSimulated
 from skin.device.calibration import Calibration
+from skin.device.resampling import Frame, StreamClock
 from skin.errors import InputError
 from skin.hardware.bench import BenchSession, Gauge, per_newton
 from skin.hardware.bench_protocol import Protocol, sent_session
 from skin.hardware.placements import Placements, find_placements
+from skin.hardware.wire.channels import UnitConversion
 from skin.hardware.wiring import find_quantum, list_numbers, measure_idle
-
-if TYPE_CHECKING:
-    from skin.runs.build import SkinModel
+from skin.mechanics.simulator.base import AbstractSimulator
 
 GRAVITY = 9.80665  # m/s2
 _HEAVIEST = 50.0  # kg: nobody puts more on a skin by hand
@@ -35,6 +37,7 @@ _UNEVEN = 0.1  # of the pressure of foam, share
 _RELIEVED = 0.5  # weight of the inverse of a reading, over that of its median, in its error
 _QUIETER = 200.0  # times that the noise of sensors may be below that of the simulated device
 _MISSED = 0.25  # share of the sensors that may have no gain
+_PATIENCE = 60.0  # s in which a further load must be put down
 
 
 @dataclass(frozen=True)
@@ -119,22 +122,28 @@ def fit_known_load(device: AbstractSimulated, session: BenchSession, load: Known
             "recorded with, as in layout=file layout.path=FILE.csv"
         )
     placements = find_placements(session)
+    if not len(placements.change):
+        touched = f" ({placements.unsteady} changed while they lay, or were touched)"
+        raise InputError(
+            f"no placement in the session{touched * bool(placements.unsteady)}: leave the skin untouched for "
+            "3 s, put the load down, let go of it for 2 s, lift it for 2 s, and so on"
+        )
     fit = _fit_weight if load.weight is not None else _fit_board
     gains, counts, differ = fit(device, placements, load)
     return _build(session, placements, load, gains, counts, differ, float(device.constants.noise.median()))
 
 
-def base_readings(device: "AbstractSimulated | SkinModel", base: float) -> np.ndarray:
+def base_readings(model: AbstractSimulator, body: AbstractBody, sensors: Sensors, base: float) -> np.ndarray:
     """Return the readings (S, S), N, under 1 N on a round base over each sensor.
 
     Near the rim the base is as far inside as it needs to be to lie on the skin.
     """
-    places = np.clip(device.sensors.positions[:, :2], base, np.array(device.size) - base)
+    places = np.clip(sensors.positions[:, :2], base, np.array(body.size) - base)
     count = len(places)
     zeros, names = np.zeros(count), np.full(count, "disc")
     presses = np.arange(count)
     rows = Gauge(presses.astype(float), zeros + 1, places, zeros + base, zeros, names, presses)
-    return per_newton(device.model, device.body, rows)
+    return per_newton(model, body, rows)
 
 
 def _fit_weight(
@@ -142,7 +151,7 @@ def _fit_weight(
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """Return gains (S,), in the session's unit per N, NaN if unknown; placements (S,); their difference."""
     assert load.base is not None
-    expected = load.force * base_readings(device, load.base)
+    expected = load.force * base_readings(device.model, device.body, device.sensors, load.base)
     sensor = _assign(expected, placements)
     gains, counts = np.full(len(expected), np.nan), np.bincount(sensor, minlength=len(expected))
     differences = []
@@ -313,6 +322,65 @@ def print_known_load(result: LoadResult) -> None:
         print(f"inverse, values fall with force: sensors {list_numbers(inverse)}")
 
 
+# A second load, measured while it is put on three sensors.
+
+
+def measure_ratios(
+    frames: Iterable[Frame],
+    first: Sequence[Frame],
+    conversion: UnitConversion,
+    expected: np.ndarray,
+    seconds: float,
+    say: Callable[[str], None],
+) -> dict[str, float]:
+    """Return measured over predicted reading of three loaded sensors, or of all if there are fewer.
+
+    Args:
+        frames: of the skin, from now on.
+        first: frames of the untouched skin before.
+        conversion: of values to N.
+        expected: readings (S, S), N, under the load on each sensor.
+        seconds: for which each load must lie.
+        say: called with each message for the user.
+
+    Raises:
+        InputError: no load lies so long, or its reading changes: the device may follow its own baseline.
+    """
+    clock, stream, ratios, enough = StreamClock(), iter(frames), dict[str, float](), min(3, len(expected))
+    rate = (len(first) - 1) / np.ptp([clock(frame) for frame in first])
+    rows = [conversion.newtons(frame.values) for frame in first]
+    shapes = expected / np.linalg.norm(expected, axis=1, keepdims=True)
+    while further := [conversion.newtons(frame.values) for frame in islice(stream, math.ceil(rate))]:
+        rows += further
+        time = np.arange(len(rows)) / rate
+        found = find_placements(BenchSession(time, np.array(rows), "N"))
+        lying = time[-1] - time[found.idle][-1]
+        # A load that has just been put down may still change.
+        if found.unsteady and not 0 < lying < 2 * seconds:
+            raise InputError(
+                "readings changed while a load lay: the device seems to follow its own baseline, so that a "
+                "long press disappears: switch that off in its firmware; or the load moved: check again"
+            )
+        counted = found.end - found.begin >= seconds
+        for change in found.change[counted]:
+            # The pattern tells the sensor, whatever the scale and its sign.
+            sensor = int(np.abs(shapes @ change).argmax())
+            if str(sensor) not in ratios:
+                say(
+                    f"sensor {sensor}: {change[sensor]:.3g} N, predicted {expected[sensor, sensor]:.3g} N; "
+                    f"{len(ratios) + 1} of {enough}, lift it"
+                )
+            ratios[str(sensor)] = float(change[sensor] / expected[sensor, sensor])
+        if len(ratios) >= enough and lying == 0:
+            return ratios
+        if time[-1] - found.begin[counted].max(initial=0.0) > _PATIENCE + seconds:
+            break
+    raise InputError(
+        f"no further load lay for {seconds:g} s within {_PATIENCE:g} s: give a heavier one, as in weight=1, "
+        "or let the device keep its baseline"
+    )
+
+
 # A session of an emulated skin under the load.
 
 
@@ -357,7 +425,8 @@ def emulate_known_load(
     randomness = np.random.default_rng(device.seed)
     if load.base is not None:
         order = np.concatenate([randomness.permutation(len(device.sensors)) for _ in range(2)])
-        readings = load.force * base_readings(device, load.base)[order]
+        each = base_readings(device.model, device.body, device.sensors, load.base)
+        readings = load.force * each[order]
     else:
         tilts = np.c_[np.ones(8), _TILT * randomness.standard_normal((8, 2))]
         readings = load.force * tilts @ board_readings(device)

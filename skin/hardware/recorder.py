@@ -15,7 +15,6 @@ from filelock import FileLock, Timeout
 
 from skin.core import files
 from skin.core.files import unwritable
-from skin.device.calibration import read_calibration
 from skin.device.files import write_recording
 from skin.device.resampling import Frame
 from skin.device.touches import concatenate
@@ -339,8 +338,7 @@ def record_session(
 
 def _about(device: Serial, header: Header | None) -> dict[str, Any]:
     """Return the metadata of a session."""
-    # Of every column, where a calibration puts the device's channels into another order.
-    channels = () if device.calibration is None else read_calibration(device.calibration).channels
+    channels = list(device.wire.channels)
     return {
         "format": 2,
         "unit": header.unit if header and header.unit else "adc",
@@ -354,7 +352,7 @@ def _about(device: Serial, header: Header | None) -> dict[str, Any]:
         "window": device.window,
         "labels": device.labels,
         "calibration": device.calibration,
-    } | ({"channels": list(channels)} if channels else {})
+    } | ({"channels": channels} if channels else {})
 
 
 def convert_session(device: Serial, path: Path) -> tuple[Path, int]:

@@ -3,7 +3,7 @@
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, fields, replace
-from functools import cached_property, partial
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from hydra import compose, initialize_config_dir
@@ -43,16 +43,6 @@ class SkinModel:
     layout: AbstractLayout
     sensors: Sensors
     simulator: Callable[[AbstractBody, Sensors], AbstractSimulator]
-
-    @property
-    def size(self) -> tuple[float, float]:
-        """Of the body, m."""
-        return self.body.size
-
-    @cached_property
-    def model(self) -> AbstractSimulator:
-        """The simulator of this skin."""
-        return self.simulator(self.body, self.sensors)
 
 
 def build_skin(config: Config) -> SkinModel:
@@ -133,7 +123,7 @@ def _geometry(config: Config) -> "Tensor":
     from skin.mechanics.geometry import sensor_geometry
 
     skin = build_skin(config)
-    return sensor_geometry(skin.body, skin.sensors, skin.model)
+    return sensor_geometry(skin.body, skin.sensors, skin.simulator(skin.body, skin.sensors))
 
 
 def build_learner(config: Config) -> AbstractLearner:

@@ -1,6 +1,7 @@
 """The command that checks the scale of a skin at a port."""
 
 import json
+from time import monotonic
 
 import numpy as np
 import pytest
@@ -13,23 +14,29 @@ from skin.runs.build import build_skin
 from tests.hardware.wire.conftest import Plug
 
 SKIN = ["layout=grid", "layout.rows=2", "layout.columns=2", "simulator=naive"]
-FAST = 5  # times real time
+LOAD, PERIOD = 2.8, 4.2  # s
 
 
 @pytest.fixture
 def port(configured):
-    """Serve a skin in counts of 0.02 N, on which 0.5 kg lies on three sensors for 4 s each."""
-    expected = 0.5 * GRAVITY * base_readings(build_skin(configured(*SKIN)), 0.006)
+    """Serve a skin in counts of 0.02 N, on which 0.5 kg lies on three sensors, one after the other."""
+    model = build_skin(configured(*SKIN))
+    simulator = model.simulator(model.body, model.sensors)
+    expected = 0.5 * GRAVITY * base_readings(simulator, model.body, model.sensors, 0.006)
     plug, noise = Plug(), np.random.default_rng(0)
+    now, sent = 0.0, monotonic()
 
     def send(number):
-        place, since = divmod(number / 100 - 12, 7)
-        load = expected[int(place)] if 0 <= place < 3 and since < 4 else np.zeros(4)
-        header = encode_header(Header(1, 4, 100.0, "adc", 12, "arm-L")) if number % 100 == 0 else b""
+        nonlocal now, sent
+        before, sent = sent, monotonic()
+        now += min(sent - before, 0.1)  # it stands still while nobody reads
+        place, since = divmod(now - 12, PERIOD)
+        load = expected[int(place)] if 0 <= place < 3 and since < LOAD else np.zeros(4)
+        header = encode_header(Header(1, 4, 50.0, "adc", 12, "arm-L")) if number % 50 == 0 else b""
         counts = np.round(100 + (load + noise.normal(0, 0.02, 4)) / 0.02).astype(int).tolist()
-        return header + encode_line(counts, number, 10_000 * number)
+        return header + encode_line(counts, number, round(1e6 * now))
 
-    with plug.streaming(send, 1 / (100 * FAST)):
+    with plug.streaming(send, 1 / 50):
         yield f"device.port={plug.port}"
     plug.unplug()
 
@@ -37,18 +44,18 @@ def port(configured):
 @pytest.mark.parametrize("scale", [0.02, 0.002])
 def test_three_loads_at_a_port(run, tmp_path, monkeypatch, port, scale):
     monkeypatch.setenv("SKIN_DATA", str(tmp_path / "data"))
-    done = run(tmp_path, "check", *SKIN, port, f"device.scale={scale}", "seconds=3.4", store=False)
+    done = run(tmp_path, "check", *SKIN, port, f"device.scale={scale}", "seconds=2", store=False)
     files = list((tmp_path / "data").rglob("*.json"))
     if scale == 0.02:
         assert done.returncode == 0, done.stderr
         (stored,) = [json.loads(file.read_text()) for file in files]
-        assert stored["device"] == "arm-L"
+        assert stored["setup"]["device"] == "arm-L"
         assert list(stored["ratios"]) == ["0", "1", "2"]
         assert stored["rest"] == pytest.approx([100] * 4, abs=3)
-        assert "3 of 3 sensors" in done.stderr
+        assert "3 of 3" in done.stderr
     else:
         assert (done.returncode, files) == (2, [])
-        assert "a decimal place" in done.stderr.splitlines()[-1]
+        assert "nothing was stored" in done.stderr.splitlines()[-1]
 
 
 def test_without_a_base_or_a_port_nothing_is_opened(run, tmp_path):

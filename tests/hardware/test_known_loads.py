@@ -15,7 +15,6 @@ from skin.hardware.known_loads import (
     fit_known_load,
     print_known_load,
 )
-from skin.hardware.placements import find_placements
 from tests.hardware.test_fit import device, solid
 
 WEIGHT, BOARD = KnownLoad(2.0, 0.02, None), KnownLoad(None, None, 200.0)
@@ -23,8 +22,12 @@ PROTOCOL = Protocol(idle=5.0)
 ORDER = [3, 0, 5, 1, 4, 2]
 
 
+def weight_readings(skin) -> np.ndarray:
+    return WEIGHT.force * base_readings(skin.model, skin.body, skin.sensors, WEIGHT.base)
+
+
 def weighed(skin, order, bits=None) -> BenchSession:
-    readings = WEIGHT.force * base_readings(skin, WEIGHT.base)[order]
+    readings = weight_readings(skin)[order]
     return emulate_placements(skin, readings, PROTOCOL, np.random.default_rng(0), bits)
 
 
@@ -40,7 +43,7 @@ def test_a_weight_in_any_order_gives_the_gains(hidden):
 def test_counts_are_converted_to_newtons_of_the_same_force():
     skin = device(noise=0.02)
     calibration = fit_known_load(device(), weighed(skin, ORDER, bits=12), WEIGHT).calibration
-    true = WEIGHT.force * base_readings(skin, WEIGHT.base)[0]
+    true = weight_readings(skin)[0]
     raw = np.round(
         2**11 + (true * skin.constants.gain.numpy() + skin.constants.offset.numpy()) / (20 / 2**11)
     )
@@ -88,13 +91,13 @@ def test_an_untouched_session_has_no_placement():
 
 def test_a_touch_or_a_sliding_load_is_no_placement():
     skin = device(noise=0.01)
-    readings = WEIGHT.force * base_readings(skin, WEIGHT.base)[[0]]
+    readings = weight_readings(skin)[[0]]
     session = emulate_placements(skin, readings, PROTOCOL, np.random.default_rng(0))
     time = session.time
     ramp = np.where((time > 5.0) & (time < 7.0), (time - 5.0) / 2, 0.0)
     session.raw[:, 0] += 3 * ramp  # a hand that leans on the weight more and more
     with pytest.raises(InputError, match="1 changed while they lay"):
-        find_placements(session)
+        fit_known_load(skin, session, WEIGHT)
 
 
 @pytest.mark.parametrize("bits", [None, 12])

@@ -79,7 +79,6 @@ class Debounce:
 Classify = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """Readings (B, T, S), float32, N, and valid (B, T, S), bool, of windows -> probabilities (B, L)."""
 
-_OVERLAP = 0.02  # of the reading of a pressed sensor: another that reads more shows the touch, too
 _DISTINCT = 10  # different frames of a block that is repeated
 _GAP = 0.5  # s without a frame after which the history of the window is lost
 _CHANGING = 0.3  # share of changes at the tare from which a channel must change within FROZEN
@@ -196,10 +195,12 @@ class Engine:
         self.task = task
         self._classify, self._detection = classify, detection
         self._patience = patience or DebounceSettings()
-        overlap = None if presses is None else presses >= _OVERLAP * np.diagonal(presses)[:, None]
-        if overlap is not None:
-            np.fill_diagonal(overlap, False)
-        self._contact = ContactDetector(sensors, rate, detection.threshold, detection.drift, overlap)
+        shares = (
+            None
+            if presses is None
+            else presses / np.maximum(np.diagonal(presses), 1e-9)[:, None] - np.eye(sensors)
+        )
+        self._contact = ContactDetector(sensors, rate, detection.threshold, detection.drift, shares)
         self._held = held_frames(detection.longest, rate, frames)
         self._shown = longest_shown(self._held, ceil(RELEASE * rate - 1e-9), frames)
         self._above = 0.5 if self._patience.above is None else self._patience.above

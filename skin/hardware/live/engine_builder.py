@@ -314,7 +314,7 @@ class Watched:
             say(found.text)
         if found.state == "unverified":
             add_note(Note("unverified", detail=found.text))
-        rest = found.check.rest if found.state == "checked" and found.check else self.source.calibrated_rest
+        rest = found.check.rest if found.check else self.source.calibrated_rest
         raised = None
         if rest is not None and conversion.rest is not None:
             raised = conversion.rest - conversion.newtons(np.asarray(rest))

@@ -193,10 +193,12 @@ def unit_conversion(
         InputError: the scale is unknown, negative beside a calibration, or the calibration has another number
             of sensors.
     """
+    check_scale(scale, calibration)
     if calibration is not None:
         calibration.fits(sensors)
-        check_scale(scale, calibration)
         quantities, signs = calibration.values(), calibration.signs
+        if quantities["dead"].all():
+            raise InputError("every sensor is broken in device.calibration: give that of this device")
         per_unit = (calibration.scale if scale is None else scale) * signs / quantities["gain"]
         offset = calibration.zero + signs * quantities["offset"] / calibration.scale
         curves = calibration.curves

@@ -28,7 +28,6 @@ from skin.hardware.wire.channels import (
     SkinTouched,
     Tare,
     UnitConversion,
-    check_scale,
     check_sensitivity,
     take_baseline,
     unit_conversion,
@@ -436,11 +435,6 @@ class SerialSource:
         self.settings, self._sensors, self._rate, self.layers = settings, sensors, rate, layers
         path = settings.calibration
         self._calibration = None if path is None else read_calibration(path)
-        check_scale(settings.scale, self._calibration)
-        if self._calibration is not None:
-            self._calibration.fits(sensors)
-            if self._calibration.values()["dead"].all():
-                raise InputError(f"every sensor is broken in device.calibration={path}")
         if settings.scale is not None or self._calibration is not None:
             self.convert(None, None)
 

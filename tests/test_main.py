@@ -96,7 +96,7 @@ def test_a_script_is_short_for_its_verb(run, tmp_path, name):
 @pytest.mark.parametrize(
     ("override", "said"),
     [
-        ("learner.rounds=20", "Could not override 'learner.rounds'."),
+        ("learner.rounds=20", "no setting or group learner.rounds, but learner=boosted_trees has it"),
         ("model=cn", "there is no model=cn: did you mean "),
         ("seed=[", "seed=["),
     ],

@@ -79,6 +79,8 @@ def suggest(error: Exception, name: str, words: Sequence[str]) -> str | None:
             for path in sorted((CONF / group).glob("*.yaml"), reverse=True)
             for key in map(str, OmegaConf.load(path))
         }
+        if unknown[1] in others:
+            return f"there is no setting or group {unknown[1]}, but {group}={others[unknown[1]]} has it"
         near = get_close_matches(unknown[1], [*names, *others], 1, 0.8)
         of = f", which {group}={others[near[0]]} has" if near and near[0] not in names else ""
         return f"there is no setting or group {unknown[1]}: did you mean {near[0]}{of}?" if near else None

@@ -17,7 +17,7 @@ from skin.commands.train import main
         ("device.nois=3", "there is no setting or group device.nois: did you mean device.noise?"),
         ("touch.rat=3", "there is no setting or group touch.rat: did you mean touch.rate?"),
         ("model.widht=3", "group model.widht: did you mean model.width, which model=pyg has?"),
-        ("model.widths=[3]", "group model.widths: did you mean model.widths, which model=gcn has?"),
+        ("model.widths=[3]", "group model.widths, but model=gcn has it"),
         ("simulator=solit", "there is no simulator=solit: did you mean solid? There are fem, naive, solid"),
         ("simulator=xyz", "there is no simulator=xyz: there are fem, naive, solid\n"),
         (

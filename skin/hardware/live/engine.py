@@ -283,7 +283,8 @@ class Engine:
         if self._latest is None:
             return False
         latest, before, _ = self._latest
-        return frame.segment != latest.segment or time - before > max(_GAP, 3 * self.window.period)
+        pause = time - before
+        return frame.segment != latest.segment or (pause > _GAP and pause > 3 * self.window.period)
 
     def _decide(self, conversion: UnitConversion | None, last: bool = False) -> list[_Decision]:
         """Return the decision on the window that ends with the latest frame; none without a conversion."""

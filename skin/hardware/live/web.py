@@ -7,7 +7,7 @@ from collections.abc import AsyncIterator, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from threading import Thread
-from time import monotonic
+from time import monotonic, time
 from typing import Any
 
 import uvicorn
@@ -61,7 +61,7 @@ def serve_page(display: Display, port: int) -> Iterator[str]:
 
 
 def message(state: DisplayState, picture: SkinPicture) -> dict[str, Any]:
-    """Return the data of each picture: forces in N, the picture as base64 of uint8 row by row."""
+    """Return the data of each picture: forces in N, the picture as base64 of uint8 row by row, time in s."""
     verdict = state.verdict
     answer = verdict and {
         "touched": verdict.touched,
@@ -74,6 +74,7 @@ def message(state: DisplayState, picture: SkinPicture) -> dict[str, Any]:
     }
     return {
         "number": state.number,
+        "sent": time(),
         "values": [round(value, 3) for value in state.values.tolist()],
         "valid": state.valid.tolist(),
         "saturated": state.saturated.tolist(),

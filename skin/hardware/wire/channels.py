@@ -69,7 +69,7 @@ class ChannelHealth:
     def __init__(self, limits: Limits = (None, None)) -> None:
         self.limits, self.largest = limits, inf
         self._last: np.ndarray | None = None
-        self._begin_time, self._worst = True, np.zeros(0, dtype=int)
+        self._begin_time, self._faults = True, (np.zeros(0, dtype=bool),) * 4
 
     def restart(self) -> None:
         """Reset the times after a restart of the device; the known range of each channel is kept."""
@@ -114,12 +114,13 @@ class ChannelHealth:
         impossible = (values > self.largest) | (values < -_BELOW * self.largest)
         saturated = at_limit | (dull & loaded & (values >= self._most))
         dull, saturated = dull & ~saturated, saturated & ~impossible
-        self._worst = np.select([impossible, dull & ~self._ever, dull], [4, 3, 2], saturated.astype(int))
+        self._faults = impossible, dull & ~self._ever, dull, saturated
         return ~dull & ~impossible, saturated
 
     def states(self) -> tuple[ChannelState, ...]:
         """Return the state of each channel at the last frame; empty before the first."""
-        return tuple(get_args(ChannelState)[number] for number in self._worst)
+        worst = np.select(self._faults, [4, 3, 2, 1], 0)
+        return tuple(get_args(ChannelState)[number] for number in worst)
 
 
 _LARGEST = 1e9  # N: more would overflow in a network or in JSON
@@ -485,7 +486,7 @@ class Tare:
         self._quiet.clear()
 
 
-_FRAMES, _FEW = 100, 3  # frames at rest with one failure, to begin with; failures that are an accident
+_FRAMES, _FEW = 100, 3  # frames at rest and failures, of which less tell nothing
 _TIMES, _ACCIDENT = 2.0, 1e-4  # times the failures at rest; least probability of an accident
 
 
@@ -496,7 +497,8 @@ def fails_in_contact(failed: int, frames: int, failed_at_rest: int, frames_at_re
     """
     usual = min(_TIMES * (failed_at_rest + 1) / (frames_at_rest + _FRAMES), 1.0)
     # The probability of so many or more.
-    return bool(failed >= _FEW and betainc(failed, frames - failed + 1, usual) < _ACCIDENT)
+    known = frames_at_rest >= _FRAMES and failed >= _FEW
+    return bool(known and betainc(failed, frames - failed + 1, usual) < _ACCIDENT)
 
 
 def _equal_chance(frames: np.ndarray) -> np.ndarray:

@@ -389,7 +389,7 @@ def test_the_page_draws_what_it_is_sent(browser):
         text = browser.run("return document.body.innerText")
         colour = browser.run(AT.format(*(place / size for place, size in zip(PLACES[2], SIZE, strict=False))))
         assert browser.run("return document.body.dataset.state") == "danger"
-        assert browser.run("return document.documentElement.scrollHeight <= innerHeight")
+        shows(browser, "document.documentElement.scrollHeight <= innerHeight", True)
     for said in ("DANGEROUS", "80 %", "90 %", "about the last 3 s", "99.9 Hz", "/dev/skin"):
         assert said in text
     # Half of the scale: between teal and yellow, and not the darkness of no force.

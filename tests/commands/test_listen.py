@@ -61,14 +61,14 @@ def test_it_names_channels_and_frames_that_fail_under_a_press(played):
 
     def say(reader, stop):
         for number in range(100_000):
-            force = max(0, min(40, number % 150 - 90)) * 10
+            force = max(0, min(40, number % 500 - 440)) * 10
             first, second = 100 + number % 3 + force, 200 + number % 2 + force // 4
             line = f"{'OL' if first > 300 else first},{second},{300 + number % 2}\n"
             reader.sendall(b"?\n" if first > 400 and number % 2 else line.encode())
             if stop.wait(0.005):
                 return
 
-    done = listen(f"device.port={played(say)}", "seconds=3", "n=3")
+    done = listen(f"device.port={played(say)}", "seconds=6", "n=3")
     assert done.returncode == 0, done.stderr
     assert re.search(
         r"\n +0 .*invalid in \d+%, more often in contact than at rest: beyond its range", done.stdout

@@ -13,6 +13,7 @@ from skin.inference.candidates import FingertipPrior, disc_readings
 from skin.inference.noise import Noise
 from skin.inference.posterior import Posterior
 from skin.mechanics.simulator.solid import Solid
+from tests.budget import free
 
 BODY = Sheet(
     (0.12, 0.08),
@@ -23,7 +24,8 @@ BODY = Sheet(
 
 @cache
 def solid():
-    return Solid(BODY, Grid(2, 3, depth=0.0195).sensors(BODY), divisions=3)
+    with free():
+        return Solid(BODY, Grid(2, 3, depth=0.0195).sensors(BODY), divisions=3)
 
 
 def design(**settings):
@@ -54,7 +56,8 @@ def monte_carlo(count=300):
     force = 5 * np.exp(0.5 * rng.standard_normal(count))
     true = disc_readings(solid(), BODY, discs, prior.rim) * force[:, None]
     readings = true + np.sqrt(noise.floor) * rng.standard_normal(true.shape)
-    estimates = Posterior(solid(), noise, BODY, prior, contacts=1).estimate(readings)
+    with free():
+        estimates = Posterior(solid(), noise, BODY, prior, contacts=1).estimate(readings)
     contacts = [estimate.contacts[0] for estimate in estimates]
     place = per_axis(np.array([contact.place for contact in contacts]) - discs[:, :2])
     radius = np.abs([contact.radius for contact in contacts] - discs[:, 2])
@@ -111,10 +114,10 @@ def test_findings_repeat_and_change_with_the_seed():
 
 
 def test_noise_and_unknown_gains_cost_precision():
-    clear, noisy = (design(touches=128, noise=noise).find(solid(), BODY)[0] for noise in (0.02, 0.5))
+    clear, noisy = (design(touches=64, noise=noise).find(solid(), BODY)[0] for noise in (0.02, 0.5))
     assert clear.place_m < noisy.place_m
     assert clear.blind_share < noisy.blind_share
-    certain, unknown = (design(touches=128, gain=gain).find(solid(), BODY)[0] for gain in (0.0, 0.3))
+    certain, unknown = (design(touches=64, gain=gain).find(solid(), BODY)[0] for gain in (0.0, 0.3))
     assert certain.force_relative < unknown.force_relative
     assert certain.place_median_m < unknown.place_median_m
 

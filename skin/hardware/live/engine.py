@@ -375,7 +375,7 @@ class Engine:
         notes = self._doubts | {note.code: note for note in decision.notes}
         # What makes a touch doubtful holds until it ends.
         self._doubts = {code: note for code, note in notes.items() if code in LASTING and touched}
-        if 0.5 < chances.get("dangerous", 0.0) <= self._above and touched:
+        if 0.5 < chances.get("dangerous", 0.0) <= self._above and touched and not self.alarm:
             notes["near_threshold"] = Note("near_threshold")
         labels = self._debounce_labels(decision, chances, period)
         return self._pack(decision._replace(notes=order_notes(notes.values())), chances, touched, labels)

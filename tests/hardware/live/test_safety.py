@@ -294,7 +294,10 @@ class TestSelfTest:
             test.run(conversion, self.COUNTED, print)
 
     @pytest.mark.parametrize("scale", [1e-9, 1e-300, 1e9, 0.02 / 1e6])
-    def test_a_scale_that_blinds_is_named(self, scale):
+    def test_a_scale_that_blinds_is_named(self, scale, monkeypatch):
+        monkeypatch.setattr(
+            "skin.hardware.live.engine_builder._SLOWLY", 1
+        )  # slow presses take most of the time
         conversion = UnitConversion(np.full(SENSORS, scale), np.full(SENSORS, 200.0), np.zeros(SENSORS, bool))
         with pytest.raises(InputError, match=r"device\.scale or device\.calibration is most likely"):
             self.run(conversion=conversion)

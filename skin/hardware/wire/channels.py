@@ -473,7 +473,7 @@ class Tare:
         noise, rest = np.diff(newtons, axis=0).std(axis=0) / np.sqrt(2), newtons.mean(axis=0)
         changing = (steps != 0).mean(axis=0)
         self.conversion = replace(
-            fresh, noise=noise, changing=changing, rest=rest, equal=_equal_chance(frames)
+            fresh, noise=noise, changing=changing, rest=rest, equal=_repeat_probability(frames)
         )
         lacks = (
             [f"{_channels(untared)} at the limit or without a value: no baseline"] if untared.any() else []
@@ -501,7 +501,7 @@ def fails_in_contact(failed: int, frames: int, failed_at_rest: int, frames_at_re
     return bool(known and betainc(failed, frames - failed + 1, usual) < _ACCIDENT)
 
 
-def _equal_chance(frames: np.ndarray) -> np.ndarray:
+def _repeat_probability(frames: np.ndarray) -> np.ndarray:
     """Return the probability (L,) that one of the frames (F, S) equals that 1, 2, ... frames before."""
     rows = np.array([hash(frame.tobytes()) for frame in frames])
     lags = range(1, min(len(rows) // 2, _LAGS) + 1)

@@ -152,10 +152,20 @@ def parse_words(words: Sequence[bytes], check: Check = "none", invalid: Collecti
     if not finite:
         values = [_field(word) for word in words]
         fields = [value if value is not None and isfinite(value) else nan for value in values]
-        for word, value in zip(words, values, strict=True):
-            if value is None and word.strip().lower() not in invalid:
-                text = word.strip().decode("ascii", "replace")
-                raise FrameError("number", word=text, numbers=fields, check=check)
+        strange = [
+            word.strip()
+            for word, value in zip(words, values, strict=True)
+            if value is None and word.strip().lower() not in invalid
+        ]
+        if strange:
+            # A word, or digits of another base, cost one value; anything else may be a line that is damaged.
+            words_alone = all(word.isalpha() or not word.strip(b"0123456789abcdefABCDEF") for word in strange)
+            raise FrameError(
+                "number",
+                word=strange[0].decode("ascii", "replace"),
+                numbers=fields if words_alone else (),
+                check=check,
+            )
     if any(b"_" in word for word in words):  # valid in Python's grammar only
         raise FrameError("number")
     return Line(fields, check, finite)

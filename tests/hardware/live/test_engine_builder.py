@@ -277,7 +277,9 @@ def test_the_example_reads_an_adapter_and_a_calibration(model, tmp_path):
         example(model, port, tmp_path / "gains.yaml", tmp_path / "board.yaml") as reader,
     ):
         said = [json.loads(reader.stdout.readline()) for _ in range(600)]
-        assert 200 < sum(one["touched"] for one in said) < 420  # a busy machine loses lines
+        # 1.2 cycles from any phase on: half a cycle and the window behind it, and a fifth; the broken sensor
+        # would add a quarter.
+        assert 250 < sum(one["touched"] for one in said) < 400
         assert re.match(r"[1-9] of 50 lines cannot be read: ", reader.stderr.readline())
 
 

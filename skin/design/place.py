@@ -103,9 +103,9 @@ class Place:
     """Chooses sites for sensors by the mutual information of noisy and true readings of sampled touches.
 
     ``run`` writes ``placement.csv``, a layout for ``layout=file layout.path=...``; ``placement.json``, with
-    the information of the placement, its upper bound and the information of other layouts; and
-    ``placement.png``. Sensors that stay come first in the layout, in their order. The others follow in rows
-    from the upper left. New sensors lie at the depth of most sensors of the layout and face the surface.
+    the information of the placement and of other layouts; and ``placement.png``. Sensors that stay come first
+    in the layout, in their order. The others follow in rows from the upper left. New sensors lie at the depth
+    of most sensors of the layout and face the surface.
 
     Args:
         count: number of sensors, with those that stay; None: as many as the layout.
@@ -178,7 +178,7 @@ class Place:
         folder: Path,
     ) -> list[Path]:
         places = problem.sensors.positions[:, :2]
-        title = f"{content['information_nats']:.1f} of at most {content['bound_nats']:.1f} nats"
+        title = f"{content['information_nats']:.1f} nats"
         figure = placement(
             places[chosen],
             places[problem.layout],
@@ -211,11 +211,7 @@ def _csv(sensors: Sensors, rows: np.ndarray) -> str:
 def _table(content: Mapping[str, Any]) -> Table:
     """Return the table of the placement and of other layouts."""
     title = f"{content['sites']} sites, {content['touches']} touches, {content['seconds']:g} s"
-    made = Table("layout", "sensors", "information, nats", "of the bound", title=title)
-    share = f"{100 * content['share_of_bound']:.1f} %"
-    made.add_row("placed", str(content["sensors"]), f"{content['information_nats']:.1f}", share)
-    for name, layout in content["layouts"].items():
-        words = name.replace("_", " ")
-        made.add_row(words, str(layout["sensors"]), f"{layout['information_nats']:.1f}", "")
-    made.add_row("upper bound", str(content["sensors"]), f"{content['bound_nats']:.1f}", "100.0 %")
+    made = Table("layout", "sensors", "information, nats", title=title)
+    for name, layout in {"placed": content, **content["layouts"]}.items():
+        made.add_row(name.replace("_", " "), str(layout["sensors"]), f"{layout['information_nats']:.1f}")
     return made

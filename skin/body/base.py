@@ -11,10 +11,9 @@ from typing import Annotated, Any, ClassVar, NamedTuple
 import numpy as np
 import psutil
 from annotated_types import Ge, Gt, Lt
-from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat
+from pydantic import PositiveFloat
 
 from skin.body.material import Material
-from skin.core.rng import Stream, generator
 from skin.core.settings import checked, configured
 from skin.errors import InputError
 
@@ -84,44 +83,6 @@ def require_memory(needed: float, what: str, mend: str) -> None:
         )
 
 
-# A modulus that varies from cell to cell.
-
-
-def factors(variation: float, seed: int, shape: tuple[int, ...]) -> np.ndarray:
-    """Return independent log-normal numbers with mean 1 and standard deviation ``variation``.
-
-    Without variation they are exactly 1.
-    """
-    spread = math.sqrt(math.log1p(variation**2))
-    values = np.exp(spread * generator(Stream.MODULUS, seed).standard_normal(shape) - spread**2 / 2)
-    values.setflags(write=False)
-    return values
-
-
-def along(field: np.ndarray, cell: tuple[float, float], first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Return the exact means (n,) of a field, constant in each cell, along straight lines.
-
-    Args:
-        field: (H, W).
-        cell: extent (x, y) of a cell, m.
-        first: start points of the lines, (n, 2), m.
-        second: end points, (n, 2), m, different from the start points.
-    """
-    rows, columns = field.shape
-    crossings = []
-    for axis, count in ((0, columns), (1, rows)):
-        start, way = first[:, axis, None], (second - first)[:, axis, None]
-        level = way == 0
-        share = (cell[axis] * np.arange(count + 1) - start) / np.where(level, 1, way)
-        crossings.append(np.where(level, 0, share))
-    ends = np.broadcast_to([0.0, 1.0], (len(first), 2))
-    cuts = np.sort(np.clip(np.hstack([*crossings, ends]), 0, 1), axis=1)
-    middle = (cuts[:, 1:] + cuts[:, :-1])[..., None] / 2
-    place = (first[:, None] + middle * (second - first)[:, None]) / np.array(cell)
-    column, row = np.clip(place, 0, [columns - 1, rows - 1]).astype(np.int64).transpose(2, 0, 1)
-    return (np.diff(cuts, axis=1) * field[row, column]).sum(axis=1)
-
-
 # What any simulator holds per cell at least: 25 sensors' float64 weights and a gesture of 30 float32 frames.
 _BYTES_PER_CELL = 25 * 8 + 30 * 4
 
@@ -154,21 +115,16 @@ class AbstractBody(ABC):
             and W = cells[0].
         layers: from the base up. A configuration gives each as ``{material, thickness}``, with the material
             as in :meth:`skin.body.material.Material.of` and the thickness in m.
-        variation: standard deviation of Young's modulus between the cells of a layer, relative to the mean
-            (independent, log-normal); 0: uniform. Another mesh gives another draw.
-        variation_seed: of the moduli.
         flat: whether the body is flat, so that the chart is the body itself.
 
     Raises:
         InputError: a size or thickness that is not positive, fewer than two cells along a side, no layer, an
-            unknown material, a variation below 0, or more cells than fit into memory.
+            unknown material, or more cells than fit into memory.
     """
 
     size: tuple[PositiveFloat, PositiveFloat]
     cells: tuple[Annotated[int, Ge(2)], Annotated[int, Ge(2)]]
     layers: tuple[Layer, ...]
-    variation: NonNegativeFloat = 0.0
-    variation_seed: NonNegativeInt = 0
 
     flat: ClassVar[bool]
 
@@ -225,31 +181,6 @@ class AbstractBody(ABC):
     def sensor_depth(self) -> float:
         """Default depth of sensors, m: below the top layer, or on the surface of a single layer."""
         return self.interfaces[-2] if len(self.layers) > 1 else 0.0
-
-    @cached_property
-    def moduli(self) -> np.ndarray:
-        """Young's modulus of each cell divided by that of its layer, (layers, H, W), from the base up."""
-        return factors(self.variation, self.variation_seed, (len(self.layers), *self.shape))
-
-    @property
-    def tension(self) -> float:
-        """Force along the surface per width and strain, N/m: the layers' E h together, without variation."""
-        return sum(layer.material.young * layer.thickness for layer in self.layers)
-
-    def stiffness(self, first: np.ndarray, second: np.ndarray, width: float) -> np.ndarray:
-        """Return the axial stiffness of strips of the body between two points, (n,), N/m.
-
-        It is the sum of E h over the layers, averaged along the line between the points, times w / d.
-
-        Args:
-            first: start points of the strips, (n, 3), m.
-            second: end points, (n, 3), m, different from the start points.
-            width: w of the strips, m.
-        """
-        per_layer = [layer.material.young * layer.thickness for layer in self.layers]
-        per_cell = np.tensordot(per_layer, self.moduli, axes=1)
-        tension = along(per_cell, self.cell, first[:, :2], second[:, :2])
-        return tension * width / np.linalg.norm(second - first, axis=1)
 
     def footprint_areas(self, sensors: "Sensors") -> np.ndarray:
         """Return the overlap of each sensor's footprint with each cell, (S, H*W), m^2.
@@ -443,8 +374,7 @@ class Arm(AbstractBody):
         length: of the sleeve along the arm, m.
         angle: of the sleeve, rad; less than a full turn.
         size: (radius * angle, length), m.
-        cells, layers, variation, variation_seed: as in :class:`skin.body.base.AbstractBody`; layers from the
-            core outwards.
+        cells, layers: as in :class:`skin.body.base.AbstractBody`; layers from the core outwards.
 
     Raises:
         InputError: as in :class:`skin.body.base.AbstractBody`, and a closed sleeve, or layers that are

@@ -17,7 +17,6 @@ class Stream(IntEnum):
     CONSTANTS = 5
     NOISE = 6
     POSITION = 7
-    MODULUS = 8
     ALARM = 10
     PLACEMENT = 11
     SKIN = 12

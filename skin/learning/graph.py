@@ -9,7 +9,6 @@ from scipy.spatial import Delaunay, QhullError, cKDTree
 from scipy.spatial.distance import cdist
 from torch import Tensor
 
-from skin.body.base import AbstractBody
 from skin.core.settings import checked
 from skin.device.touches import Touches
 from skin.errors import InputError
@@ -59,16 +58,13 @@ def typical_distance(positions: np.ndarray) -> float:
     return float(np.median((distance + np.diag(np.full(len(distance), np.inf))).min(axis=1)))
 
 
-def adjacency(
-    positions: np.ndarray, linked: np.ndarray, weight: Weight, body: AbstractBody | None = None
-) -> np.ndarray:
+def adjacency(positions: np.ndarray, linked: np.ndarray, weight: Weight) -> np.ndarray:
     """Return the weights (S, S) of the edges ``linked``; 0 where there is none.
 
     With d the distance and d0 the typical one (:func:`typical_distance`): ``exp`` is exp(-d / d0),
     ``distance`` is d / d0 (the report's edge value, free of the unit of length), ``none`` is 1. ``stiffness``
-    is that of the strip of skin between the two sensors, k = E h w / d summed over layers and averaged along
-    the line between them where the modulus varies, over that of a strip of length d0 in a skin without
-    variation ("other physical information", report, 2.2.1): d0 / d in a skin of uniform layers, whatever w.
+    is that of the strip of skin between the two sensors, k = E h w / d summed over layers, over that of a
+    strip of length d0 ("other physical information", report, 2.2.1): d0 / d, whatever w and the layers.
 
     Distances are those along the surface, on a sheet and on an arm alike: a straight line of the chart is the
     shortest way on a cylinder too, and the strip of skin along it is the one that is stretched.
@@ -77,32 +73,14 @@ def adjacency(
         positions: (S, 3), m.
         linked: (S, S), bool, symmetric.
         weight: see above.
-        body: whose surface; only ``stiffness`` needs it.
-
-    Raises:
-        InputError: stiffness without a body.
     """
     if weight == "none" or not linked.any():
         return linked.astype(float)
     unit = typical_distance(positions)
-    if weight == "stiffness":
-        return _stiffness(positions, linked, unit, body)
     distance = cdist(positions, positions)
+    if weight == "stiffness":
+        return np.divide(unit, distance, out=np.zeros_like(distance), where=linked)
     return linked * (np.exp(-distance / unit) if weight == "exp" else distance / unit)
-
-
-def _stiffness(
-    positions: np.ndarray, linked: np.ndarray, unit: float, body: AbstractBody | None
-) -> np.ndarray:
-    if body is None:
-        raise InputError(
-            "representation.weight=stiffness needs to know the skin: set representation.body=${body}, "
-            "or representation.weight=exp"
-        )
-    first, second = np.nonzero(linked)
-    weights = np.zeros(linked.shape)
-    weights[first, second] = body.stiffness(positions[first], positions[second], width=unit) / body.tension
-    return (weights + weights.T) / 2
 
 
 def normalised(edges: np.ndarray) -> np.ndarray:
@@ -135,7 +113,6 @@ class Graph(AbstractRepresentation):
         coordinates: append x / size_x and y / size_y as the last two node features of every frame.
         scale: N; readings are divided by it.
         mask: append a node feature that is 1 where the reading is not valid.
-        body: model of the skin; only ``weight=stiffness`` needs it.
 
     Raises:
         InputError: an unknown option, or sensors that do not form a graph.
@@ -146,7 +123,6 @@ class Graph(AbstractRepresentation):
     layout: Tensor
     size: Tensor
     pairs: Tensor
-    at_rest: Tensor
 
     def __init__(
         self,
@@ -160,7 +136,6 @@ class Graph(AbstractRepresentation):
         coordinates: bool = False,
         scale: float = 10.0,
         mask: bool = False,
-        body: AbstractBody | None = None,
     ) -> None:
         super().__init__()
         self.scale, self.mask, self.coordinates = scale, mask, coordinates
@@ -171,15 +146,13 @@ class Graph(AbstractRepresentation):
                 "representation.weight=exp, or representation.positions=layout"
             )
         places = layout.cpu().numpy().astype(float)
-        weights = adjacency(places, neighbours(places, edges, count), weight, body)
+        weights = adjacency(places, neighbours(places, edges, count), weight)
         first, second = np.nonzero(np.triu(weights))
         self.unit = typical_distance(places)
         self.register_buffer("adjacency", torch.from_numpy(normalised(weights)).to(torch.float32))
         self.register_buffer("layout", torch.from_numpy(places).to(torch.float32))
         self.register_buffer("size", torch.tensor(size, dtype=torch.float32))
         self.register_buffer("pairs", torch.from_numpy(np.stack([first, second])))
-        distance = np.linalg.norm(places[first] - places[second], axis=1)
-        self.register_buffer("at_rest", torch.from_numpy(weights[first, second] * distance).float())
 
     def forward(self, readings: Tensor, valid: Tensor, motion: Tensor | None = None) -> Frames:
         """Return frames (B, T, S, F) and the adjacency (S, S) or (B, T, S, S) of readings (B, T, S), N.
@@ -217,7 +190,7 @@ class Graph(AbstractRepresentation):
         first, second = self.pairs
         distance = (places.index_select(-2, first) - places.index_select(-2, second)).norm(dim=-1)
         if self.weight == "stiffness":
-            weights = self.at_rest / distance
+            weights = self.unit / distance
         else:
             share = distance / self.unit
             weights = (-share).exp() if self.weight == "exp" else share

@@ -28,7 +28,6 @@ def test_the_chart_is_a_grid_of_equal_cells(body):
     assert isinstance(body, AbstractBody)
     assert isinstance(body.flat, bool)
     assert np.multiply(body.cell, body.cells) == pytest.approx(body.size)
-    assert body.moduli.shape == (len(body.layers), *body.shape)
     assert hash(body) == hash(replace(body))
     assert replace(body, cells=(8, 6)).shape == (6, 8)
 

@@ -83,9 +83,6 @@ def test_footprint_mean_is_the_integral_of_a_fine_raster():
         ({"cells": [8.5, 8]}, "body.cells=.* must be a valid integer"),
         ({"cells": [8.0, 8]}, "body.cells=.* must be a whole number"),
         ({"layers": []}, "at least one layer"),
-        ({"variation": -0.1}, "body.variation=-0.1 must be .*: as in body.variation=0.0"),
-        ({"variation": "much"}, "body.variation=much must be"),
-        ({"variation": 0.2, "variation_seed": -1}, "body.variation_seed=-1 must be"),
         ({"layers": [{"material": "EcoFlex 00-30"}]}, "body.layers.0 needs thickness, got material"),
         (
             {"layers": [LAYERS[0], {"material": "EcoFlex 00-30", "thickness": -1}]},
@@ -102,42 +99,3 @@ def test_what_is_no_sheet_is_refused_by_name(changes, says):
 def test_a_mesh_too_fine_for_memory_is_refused_with_an_estimate():
     with pytest.raises(InputError, match=r"body.cells=\[1000000,1000000\] needs about .* GB.*32,32"):
         sheet(cells=[1_000_000, 1_000_000])
-
-
-def test_moduli_are_one_without_variation():
-    assert (sheet().moduli == 1).all()
-    assert sheet().moduli.shape == (2, 6, 8)
-
-
-def test_moduli_vary_as_asked():
-    """Mean and deviation of many draws, against what a log-normal should have; a seed is a draw."""
-    moduli = sheet(cells=[200, 200], variation=0.2, variation_seed=5).moduli
-    assert moduli.mean() == pytest.approx(1, abs=0.003)
-    assert moduli.std() == pytest.approx(0.2, abs=0.003)
-    assert moduli.min() > 0
-    assert abs(np.corrcoef(moduli[0].ravel(), moduli[1].ravel())[0, 1]) < 0.02
-    np.testing.assert_array_equal(moduli, sheet(cells=[200, 200], variation=0.2, variation_seed=5).moduli)
-    assert (moduli != sheet(cells=[200, 200], variation=0.2, variation_seed=6).moduli).all()
-
-
-def test_stiffness_of_a_uniform_strip_by_hand():
-    """(560 kPa x 10 mm + 170 kPa x 5 mm) x w / d."""
-    first, second = np.array([[0.02, 0.01, 0.005]] * 2), np.array([[0.06, 0.04, 0.005], [0.02, 0.07, 0.005]])
-    expected = (5600 + 850) * 0.01 / np.array([0.05, 0.06])
-    np.testing.assert_allclose(sheet().stiffness(first, second, 0.01), expected)
-
-
-def test_stiffness_averages_the_modulus_along_the_line():
-    """Independent answer: the moduli at many points of each line."""
-    body = sheet(variation=0.4)
-    rng = np.random.default_rng(0)
-    first, second = (np.column_stack([rng.uniform(size=(20, 2)) * body.size, np.zeros(20)]) for _ in "ab")
-    second[0, 1], second[1, 0] = first[0, 1], first[1, 0]  # one along x, one along y
-    second[2], second[3] = [0.16, 0.08, 0], first[3] + [1e-4, 0, 0]
-    steps = (np.arange(20000) + 0.5) / 20000
-    places = first[:, None, :2] + steps[:, None] * (second - first)[:, None, :2]
-    column, row = (places / body.cell).astype(int).transpose(2, 0, 1)
-    tension = 5600 * body.moduli[0][row, column] + 850 * body.moduli[1][row, column]
-    expected = tension.mean(axis=1) * 0.01 / np.linalg.norm(second - first, axis=1)
-    np.testing.assert_allclose(body.stiffness(first, second, 0.01), expected, rtol=1e-3)
-    np.testing.assert_allclose(body.stiffness(second, first, 0.01), body.stiffness(first, second, 0.01))

@@ -30,9 +30,7 @@ def model(structure: Structure, pressure: np.ndarray) -> "FEModel3D":
             corners = [(row, column), (row, column + 1), (row + 1, column + 1), (row + 1, column)]
             names = [f"{number},{j},{i}" for j, i in corners]
             name = f"{number},{row},{column}"
-            material = _add_material(
-                built, f"plate {name}", layer.material, body.moduli[number - 1, row, column]
-            )
+            material = _add_material(built, f"plate {name}", layer.material)
             built.add_plate(name, *names, layer.thickness, material)
     for (row, column), value in np.ndenumerate(pressure):
         if value:
@@ -66,9 +64,9 @@ def _add_nodes(built: "FEModel3D", structure: Structure) -> None:
             built.def_support(name, *held)
 
 
-def _add_material(built: "FEModel3D", name: str, material: Material, factor: float) -> str:
-    """Add a material whose moduli are ``factor`` times those given, and return its name."""
-    built.add_material(name, factor * material.young, factor * material.shear, material.poisson, rho=1.0)
+def _add_material(built: "FEModel3D", name: str, material: Material) -> str:
+    """Add a material and return its name."""
+    built.add_material(name, material.young, material.shear, material.poisson, rho=1.0)
     return name
 
 
@@ -81,7 +79,6 @@ def _add_beams(built: "FEModel3D", structure: Structure, number: int) -> None:
         height = body.cell[1] * (0.5 if row in {0, rows - 1} else 1)
         second_y, second_x = width * height**3 / 12, height * width**3 / 12
         name = f"{number},{row},{column}"
-        around = body.moduli[number - 1, max(row - 1, 0) : row + 1, max(column - 1, 0) : column + 1]
-        material = _add_material(built, f"beam {name}", layer.material, float(around.mean()))
+        material = _add_material(built, f"beam {name}", layer.material)
         built.add_section(name, width * height, second_y, second_x, second_y + second_x)
         built.add_member(name, f"{number - 1},{row},{column}", name, material, name)

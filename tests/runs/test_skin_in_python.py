@@ -19,7 +19,7 @@ LAYERS = [
 @pytest.mark.parametrize(
     "body",
     [
-        Sheet((0.2, 0.1), (20, 10), LAYERS, variation=0.1, variation_seed=3),
+        Sheet((0.2, 0.1), (20, 10), LAYERS),
         Arm(cells=(20, 10), layers=LAYERS, radius=0.05, length=0.1, angle=2.0),
     ],
     ids=["sheet", "arm"],

@@ -280,7 +280,6 @@ class Structure:
         )
         per_metre = np.array([layer.material.young / layer.thickness for layer in self.body.layers])
         weights = per_metre[levels][:, None, None] * np.einsum("sh,sw->shw", along_y, along_x)
-        weights = weights * _beam_moduli(self.body)[levels]
         above_table = levels > 0
         below = self._read(weights * above_table[:, None, None], np.maximum(levels - 1, 0), dof=2)
         return below - self._read(weights, levels, dof=2)
@@ -300,14 +299,14 @@ class Structure:
         beams = beam_stiffness(
             np.tile(width, len(height)), np.repeat(height, len(width)), layer.thickness, layer.material
         )
-        beams = beams * _beam_moduli(self.body)[level].reshape(-1, 1, 1)
         upper = self.nodes[level].reshape(-1, 1)
         if level == 0:
             ends, columns = upper, _dofs([1], self.free)
         else:
             ends, columns = np.hstack([self.nodes[level - 1].reshape(-1, 1), upper]), _dofs([0, 1], self.free)
         corners, corner_kept = self._unknowns(self._corners(level)), _dofs(range(4), self.free)
-        plates = plate[None, corner_kept][:, :, corner_kept] * self.body.moduli[level].reshape(-1, 1, 1)
+        kept_plate = plate[np.ix_(corner_kept, corner_kept)]
+        plates = np.broadcast_to(kept_plate, (len(corners), *kept_plate.shape))
         return [_scatter(corners, plates), _scatter(self._unknowns(ends), beams[:, columns][:, :, columns])]
 
     def _corners(self, level: int) -> np.ndarray:
@@ -325,20 +324,6 @@ def _section_edges(body: AbstractBody, axis: int) -> np.ndarray:
     """Return the borders between nodes' parts of the sheet, m: halfway between them, and the edges."""
     nodes = np.linspace(0, body.size[axis], body.cells[axis] + 1)
     return np.concatenate([nodes[:1], (nodes[1:] + nodes[:-1]) / 2, nodes[-1:]])
-
-
-def _beam_moduli(body: AbstractBody) -> np.ndarray:
-    """Return each beam's modulus over its layer's, (layers, ny+1, nx+1): the mean of the cells it touches.
-
-    A beam's section takes an equal part of each of them.
-    """
-    cells = body.moduli
-    total, count = np.zeros((2, len(cells), cells.shape[1] + 1, cells.shape[2] + 1))
-    for row, column in ((0, 0), (0, 1), (1, 0), (1, 1)):
-        part = np.s_[:, row : row + cells.shape[1], column : column + cells.shape[2]]
-        total[part] += cells
-        count[part] += 1
-    return total / count
 
 
 def _dofs(ends: Iterable[int], free: tuple[int, ...]) -> list[int]:

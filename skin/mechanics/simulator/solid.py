@@ -447,8 +447,7 @@ def build_mesh(
     for number in reversed(range(len(body.layers))):
         layer = body.layers[number]
         depths += list(depths[-1] + layer.thickness * np.arange(1, divisions + 1) / divisions)
-        moduli = body.moduli[number].repeat(refinement, axis=0).repeat(refinement, axis=1)
-        young += [layer.material.young * moduli] * divisions
+        young += [np.full([refinement * count for count in body.shape], layer.material.young)] * divisions
         ratio += [ratios[number]] * divisions
     x, y = (np.linspace(0, body.size[axis], refinement * body.cells[axis] + 1) for axis in (0, 1))
     return Hexahedra((x, y, np.array(depths)), np.stack(young), np.array(ratio), body.place, body.frame)

@@ -1,7 +1,5 @@
 """Edges and weights of the sensor graph, typed out by hand."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
@@ -88,7 +86,6 @@ def test_normalised_by_hand():
             {"weight": "density"},
             "representation.weight=density must be 'exp', 'distance', 'stiff",
         ),
-        ({"weight": "stiffness"}, "set representation.body="),
         ({"positions": "moving"}, "representation.positions=moving must be 'layout' or 'deformed'"),
         ({"positions": "deformed", "weight": "none"}, "changes nothing at representation.weight=none"),
     ],
@@ -114,36 +111,9 @@ BODY = Sheet([0.16, 0.16], [32, 32], LAYERS)
 def test_stiffness_of_a_uniform_skin_falls_as_one_over_distance():
     places = Scattered(seed=3).sensors(BODY).positions
     linked = neighbours(places, "knn", 6)
-    weights = adjacency(places, linked, "stiffness", BODY)
+    weights = adjacency(places, linked, "stiffness")
     np.testing.assert_allclose(weights[linked], 1 / adjacency(places, linked, "distance")[linked])
     assert not weights[~linked].any()
-
-
-def test_stiffness_takes_the_modulus_between_two_sensors():
-    """Three cells of one layer along x; two sensors in the outer ones, at a quarter of the sheet each."""
-    body = Sheet([0.12, 0.08], [3, 2], LAYERS[1:], variation=0.3, variation_seed=4)
-    places = np.array([[0.03, 0.02, 0.0], [0.09, 0.02, 0.0]])
-    left, middle, right = body.moduli[0, 0]
-    # 10 mm lie in the left cell, 40 in the middle one, 10 in the right one; d = d0.
-    expected = (10 * left + 40 * middle + 10 * right) / 60
-    weights = adjacency(places, neighbours(places, "knn", 1), "stiffness", body)
-    np.testing.assert_allclose(weights, [[0, expected], [expected, 0]])
-
-
-def test_stiffness_is_a_pure_number():
-    """Neither a stiffer material nor a larger sheet changes it: only where the skin is stiffer than else."""
-    places = Scattered(seed=3).sensors(BODY).positions
-    linked = neighbours(places, "knn", 6)
-    varied = replace(BODY, variation=0.2)
-    firm = replace(
-        varied, layers=tuple(replace(layer, thickness=2 * layer.thickness) for layer in BODY.layers)
-    )
-    large = replace(varied, size=(1.6, 1.6))
-    expected = adjacency(places, linked, "stiffness", varied)
-    nominal = adjacency(places, linked, "stiffness", BODY)
-    assert np.abs(expected[linked] / nominal[linked] - 1).max() > 0.01
-    np.testing.assert_allclose(adjacency(places, linked, "stiffness", firm), expected)
-    np.testing.assert_allclose(adjacency(10 * places, linked, "stiffness", large), expected)
 
 
 def test_coordinates_are_the_last_two_features():
@@ -172,32 +142,28 @@ def moves(scale=0.004):
 @pytest.mark.parametrize("weight", ["exp", "distance", "stiffness"])
 def test_a_frame_whose_sensors_moved_has_the_graph_of_where_they_are(weight):
     """Independent answer: the graph of each frame's places, made anew, with the layout's edges and d0."""
-    body = replace(BODY, variation=0.2)
-    graph = Graph(PLACES, BODY.size, positions="deformed", weight=weight, count=3, body=body)
+    graph = Graph(PLACES, BODY.size, positions="deformed", weight=weight, count=3)
     motion = moves()
     x, matrices = graph.show(touches(motion))[:2]
     assert x.shape == (2, 5, 9, 1)
     assert matrices.shape == (2, 5, 9, 9)
     rest = PLACES.double().numpy()
     linked, unit = neighbours(rest, "knn", 3), typical_distance(rest)
-    stiff = adjacency(rest, linked, "stiffness", body)
     for gesture in range(2):
         for frame in range(5):
             places = rest + motion[gesture, frame].double().numpy()
             distance = np.linalg.norm(places[:, None] - places[None], axis=-1)
-            before = np.linalg.norm(rest[:, None] - rest[None], axis=-1)
-            ratio = np.divide(before, distance, out=np.zeros_like(before), where=linked)
-            law = {"exp": np.exp(-distance / unit), "distance": distance / unit, "stiffness": stiff * ratio}
+            stiff = np.divide(unit, distance, out=np.zeros_like(distance), where=linked)
+            law = {"exp": np.exp(-distance / unit), "distance": distance / unit, "stiffness": stiff}
             expected = normalised(linked * law[weight])
             np.testing.assert_allclose(matrices[gesture, frame].numpy(), expected, rtol=1e-5, atol=1e-7)
 
 
 @pytest.mark.parametrize("weight", ["exp", "distance", "stiffness"])
 def test_sensors_that_stay_have_the_graph_of_the_layout(weight):
-    options = {"weight": weight, "body": BODY}
     still = touches(torch.zeros(2, 5, 9, 3))
-    x, matrices = Graph(PLACES, BODY.size, positions="deformed", **options).show(still)[:2]
-    plain = Graph(PLACES, BODY.size, **options).show(still)
+    x, matrices = Graph(PLACES, BODY.size, positions="deformed", weight=weight).show(still)[:2]
+    plain = Graph(PLACES, BODY.size, weight=weight).show(still)
     assert plain.adjacency.shape == (9, 9)
     torch.testing.assert_close(matrices, plain.adjacency.expand_as(matrices))
     assert torch.equal(x, plain.x)

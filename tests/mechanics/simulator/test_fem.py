@@ -238,8 +238,8 @@ def test_what_does_not_move_along_the_sheet_says_so(cache):
 
 
 def test_twice_the_modulus_everywhere_is_half_the_motion():
-    """The varied moduli enter plates and beams alike: all of them doubled halves every displacement."""
-    body = Sheet([0.06, 0.05], [6, 5], LAYERS, variation=0.3, variation_seed=1)
+    """The moduli enter plates and beams alike: all of them doubled halves every displacement."""
+    body = Sheet([0.06, 0.05], [6, 5], LAYERS)
     stiffer = [{**layer, "material": {"name": layer["material"]}} for layer in LAYERS]
     for layer, young in zip(stiffer, (2 * 560e3, 2 * 170e3), strict=True):
         layer["material"]["young"] = young
@@ -250,18 +250,6 @@ def test_twice_the_modulus_everywhere_is_half_the_motion():
     for name in ("sensor", "surface", "along_x", "along_y"):
         np.testing.assert_allclose(vars(stiff)[name], vars(soft)[name] / 2, rtol=1e-8, atol=1e-18)
     np.testing.assert_allclose(stiff.carried, soft.carried, rtol=1e-8, atol=1e-12)
-
-
-def test_thin_wide_cells_are_springs_of_their_own_moduli():
-    """Plates of 0.1 m cells hardly bend 5 mm layers: a node sinks p t / E per layer, E of its four cells."""
-    body = Sheet([0.8, 0.6], [8, 6], LAYERS, variation=0.2, variation_seed=2)
-    places = [(0.1 * i, 0.1 * j) for j in range(1, 6) for i in range(1, 8)]
-    operator = build(Structure(body), at(*[(x, y, 0.0) for x, y in places]))
-    young = np.array([560e3, 170e3])
-    for (x, y), sunk in zip(places, operator.surface.sum(axis=1), strict=True):
-        i, j = round(x / 0.1), round(y / 0.1)
-        four = body.moduli[:, j - 1 : j + 1, i - 1 : i + 1].reshape(2, 4).mean(axis=1)
-        assert sunk == pytest.approx((np.array([0.010, 0.005]) / (young * four)).sum(), rel=1e-3)
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,7 @@ BODIES = {
     "3x6, wide cells, two layers": Sheet([0.16, 0.07], [3, 6], [DRAGON, ECOFLEX]),
     "5x4, three layers": Sheet([0.06, 0.05], [5, 4], [DRAGON, ECOFLEX, FOAM]),
     "4x4, stiff on soft": Sheet([0.04, 0.04], [4, 4], [FOAM, DRAGON]),
-    "4x5, three layers, moduli that vary": Sheet([0.06, 0.05], [4, 5], [DRAGON, ECOFLEX, FOAM], 0.2, 3),
+    "4x5, three layers": Sheet([0.06, 0.05], [4, 5], [DRAGON, ECOFLEX, FOAM]),
 }
 LOADS = ("one cell off the centre", "random")
 
@@ -106,7 +106,7 @@ def test_pynite_agrees_with_the_cached_operator_on_sensors_at_every_interface(ca
     np.testing.assert_allclose(motion, answer, rtol=0, atol=1e-5 * np.abs(answer).max())
 
 
-@pytest.mark.parametrize("name", ["5x4, three layers", "4x5, three layers, moduli that vary"])
+@pytest.mark.parametrize("name", ["5x4, three layers", "4x5, three layers"])
 def test_pynite_agrees_on_the_force_that_the_layer_below_carries(name, tmp_path):
     """A footprint around one node on its own section feels the axial force of that node's beam."""
     structure = Structure(BODIES[name])

@@ -4,7 +4,7 @@
     python -m experiments.studies.known_loads alarm=true            # and any_skin on such devices
 
 Writes known_loads.csv to the folder out=, results by default. Every device has other gains, positions and
-moduli than the calibration supposes, and the pressure below a base or a board is uneven.
+moduli than the calibration supposes, and the pressure below a base is uneven.
 """
 
 from collections.abc import Iterator, Mapping
@@ -37,7 +37,7 @@ from skin.mechanics.simulator.solid import Solid
 from skin.plot.figures import COLOURS, save_figure
 from skin.touch.shapes import Shapes
 
-WEIGHT, BOARD = KnownLoad(2.0, 0.02, None), KnownLoad(None, None, 500.0)
+WEIGHT = KnownLoad(2.0, 0.02)
 SOLID = partial(Solid, poisson={"Dragon Skin 10 Medium": 0.49})
 DEFAULT = (("Dragon Skin 10 Medium", 560e3, 0.010), ("EcoFlex 00-30", 170e3, 0.005))
 LAYER = (("EcoFlex 00-30", 170e3, 0.030),)
@@ -46,16 +46,9 @@ SKINS: Mapping[str, tuple[Any, Any]] = {
     "default, solid": (DEFAULT, SOLID),
     "30 mm layer, solid": (LAYER, SOLID),
 }
-PROCEDURES: Mapping[str, tuple[KnownLoad, int]] = {
-    "weight once": (WEIGHT, 1),
-    "weight twice": (WEIGHT, 2),
-    "weight four times": (WEIGHT, 4),
-    "board 4": (BOARD, 4),
-    "board 8": (BOARD, 8),
-    "board 16": (BOARD, 16),
-}
-POSITION, MODULUS, UNEVEN, GAINS, NOISE, TILT = 0.002, 0.2, 0.1, 0.3, 0.1, 0.25
-_ALARMED = ("weight once", "board 8")
+PROCEDURES = {"weight once": 1, "weight twice": 2, "weight four times": 4}
+POSITION, MODULUS, UNEVEN, GAINS, NOISE = 0.002, 0.2, 0.1, 0.3, 0.1
+_ALARMED = "weight once"
 _SHOWN, _DRAWN = 45.0, 6  # s and sensors of the figure
 _WAVE = 0.01  # m, over which the pressure changes
 _PROTOCOL = Protocol(idle=10.0, rest=2.0)
@@ -105,7 +98,6 @@ def uneven_pressure(skin: Simulated, pressure: torch.Tensor, draw: np.random.Gen
 
 def weight_pressure(skin: Simulated, rounds: int, draw: np.random.Generator) -> torch.Tensor:
     """Return the pressures of a weight on every sensor of the layout, in any order, by hand."""
-    assert WEIGHT.base is not None
     order = np.concatenate([draw.permutation(len(skin.sensors)) for _ in range(rounds)])
     places = skin.sensors.positions[order, :2]
     margin = WEIGHT.base
@@ -117,22 +109,11 @@ def weight_pressure(skin: Simulated, rounds: int, draw: np.random.Generator) -> 
     return WEIGHT.force * images / float(np.prod(skin.body.cell))
 
 
-def board_pressure(skin: Simulated, count: int, draw: np.random.Generator) -> torch.Tensor:
-    """Return the pressures of a board that a person loads, tilted a little each time."""
-    rows, columns = skin.body.shape
-    y, x = np.meshgrid(np.linspace(-1, 1, rows), np.linspace(-1, 1, columns), indexing="ij")
-    tilts = TILT * draw.standard_normal((count, 2))
-    maps = 1 + tilts[:, :1, None] * x + tilts[:, 1:, None] * y
-    pressure = BOARD.force / float(np.prod(skin.size)) * np.maximum(maps, 0)
-    return torch.from_numpy(pressure).float()
-
-
 @torch.no_grad()
-def record(device: Simulated, load: KnownLoad, rounds: int, seed: int) -> BenchSession:
-    """Return a session of a device under placements of a load."""
+def record(device: Simulated, rounds: int, seed: int) -> BenchSession:
+    """Return a session of a device under placements of the weight."""
     draw = np.random.default_rng([seed, 2])
-    pressures = (weight_pressure if load is WEIGHT else board_pressure)(device, rounds, draw)
-    pressures = uneven_pressure(device, pressures, draw)
+    pressures = uneven_pressure(device, weight_pressure(device, rounds, draw), draw)
     readings = torch.cat([device.model(part).readings for part in pressures.split(16)]).double().numpy()
     return emulate_placements(device, readings, _PROTOCOL, draw)
 
@@ -169,11 +150,10 @@ def measure_gains(settings: Settings) -> Iterator[dict[str, Any]]:
         results: dict[str, list[tuple[np.ndarray, int]]] = {procedure: [] for procedure in PROCEDURES}
         for seed in range(settings.devices):
             device = draw_device(layers, simulator, seed)
-            for number, (procedure, (load, rounds)) in enumerate(PROCEDURES.items()):
-                session = record(device, load, rounds, 100 * seed + number)
-                results[procedure].append(
-                    compare_gains(device, fit_known_load(nominal, session, load).calibration)
-                )
+            for number, (procedure, rounds) in enumerate(PROCEDURES.items()):
+                session = record(device, rounds, 100 * seed + number)
+                calibration = fit_known_load(nominal, session, WEIGHT).calibration
+                results[procedure].append(compare_gains(device, calibration))
         for procedure in PROCEDURES:
             yield summarise_gains(name, procedure, results[procedure])
 
@@ -205,11 +185,9 @@ def measure_alarms(settings: Settings) -> Iterator[dict[str, Any]]:
         true = device.constants.gain
         gains = {"not corrected": torch.ones_like(true), "true gains": true}
         noisy = draw_device(layers, simulator, seed)
-        for procedure in _ALARMED:
-            load, rounds = PROCEDURES[procedure]
-            session = record(noisy, load, rounds, 100 * seed + list(PROCEDURES).index(procedure))
-            estimated = fit_known_load(nominal, session, load).calibration.known("gain")
-            gains[procedure] = torch.from_numpy(estimated).float()
+        session = record(noisy, PROCEDURES[_ALARMED], 100 * seed)
+        estimated = fit_known_load(nominal, session, WEIGHT).calibration.known("gain")
+        gains[_ALARMED] = torch.from_numpy(estimated).float()
         for name, gain in gains.items():
             touches = replace(measured, readings=measured.readings / gain, geometry=nominal.geometry)
             metrics = compute_metrics(learner.probabilities(touches), measured.labels, nominal.task, point)
@@ -224,7 +202,7 @@ def draw_weight() -> Figure:
     """Draw a session of a weight on a device, and its gains over the true ones."""
     layers, simulator = SKINS["default, solid"]
     nominal, device = make_skin(layers, simulator), draw_device(layers, simulator, 0)
-    session = record(device, WEIGHT, 1, 0)
+    session = record(device, 1, 0)
     calibration = fit_known_load(nominal, session, WEIGHT).calibration
     figure = Figure(figsize=(9.0, 3.2), layout="constrained")
     trace, scatter = figure.subplots(1, 2, width_ratios=[2, 1])

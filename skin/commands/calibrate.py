@@ -2,12 +2,10 @@
 
     skin calibrate session=bench.csv presses=gauge.csv
     skin calibrate session=bench.csv weight=2.0 base=0.02
-    skin calibrate session=bench.csv board=500
     skin calibrate session=demo.csv calibrate.demo=true
 
-A known weight (kg) on a round base (radius, m) that lay on every sensor, or a board over the whole skin with
-a known force (N), replaces the gauge. Writes out=, for device.calibration=. With a gauge, exits with 1 if it
-does not predict held-out presses better.
+A known weight (kg) on a round base (radius, m) that lay on every sensor replaces the gauge. Writes out=, for
+device.calibration=. With a gauge, exits with 1 if it does not predict held-out presses better.
 calibrate.demo=true first writes the session of an emulated device: no hardware is needed.
 """
 
@@ -20,7 +18,6 @@ from skin.errors import InputError
 from skin.runs.configuration import Config
 
 _UNITS = ("force_scale", "time_scale")
-_LOADS = ("weight", "base", "board")
 _CONFIRMED = ("places", "channels", "broken")
 
 
@@ -33,14 +30,14 @@ def main(config: Config) -> None:
     if missing := [name for name in files if name and not Path(name).expanduser().is_file()]:
         raise InputError(f"no file {missing[0]}: calibrate.demo=true makes a session without hardware")
 
-    if any(getattr(config, name) is not None for name in _LOADS):
+    if config.weight is not None or config.base is not None:
         _calibrate_by_load(config, config.session)
     else:
         _calibrate_by_gauge(config, config.session)
 
 
 def _calibrate_by_load(config: Config, path: str) -> None:
-    """Calibrate from placements of a weight or a board."""
+    """Calibrate from placements of a weight."""
     from skin.core.settings import configured
     from skin.device.calibration import write_calibration
     from skin.hardware.bench import Units, read_bench_session, write_bench_session
@@ -49,12 +46,11 @@ def _calibrate_by_load(config: Config, path: str) -> None:
     from skin.runs.build import build_device
 
     if config.presses is not None:
-        raise InputError("a known load replaces the gauge: leave out presses=, or weight=, base= and board=")
+        raise InputError("a known load replaces the gauge: leave out presses=, or weight= and base=")
     settings = config.calibrate
-    load = configured(KnownLoad, {name: getattr(config, name) for name in _LOADS}, "calibrate")
     confirmed = configured(Confirmed, {name: settings[name] for name in _CONFIRMED}, "calibrate")
     device = build_device(config).simulated("a calibration fits the simulation to a skin")
-    load.check(device.size)
+    load = KnownLoad.of(config.weight, config.base, device.size)
     if settings["demo"]:
         session = emulate_known_load(device, load, settings)
         print(f"{write_bench_session(session, path)}: {session.time[-1]:.0f} s")

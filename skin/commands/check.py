@@ -24,12 +24,12 @@ def main(config: Config) -> None:
     from skin.hardware.wire.reader import SkinDisconnected, SkinTimeout
     from skin.runs.build import build_device, build_skin
 
-    load, device = KnownLoad(config.weight, config.base, None), require_port(build_device(config))
-    load.check(device.size)
-    if config.base is None or not config.seconds or config.seconds < 2:
+    device = require_port(build_device(config))
+    load = KnownLoad.of(config.weight, config.base, device.size)
+    if not config.seconds or config.seconds < 2:
         raise InputError(f"seconds={config.seconds}: each load must lie for at least 2 s, as in seconds=10")
     model = build_skin(config).simulator(device.body, device.sensors)
-    expected = load.force * base_readings(model, device.body, device.sensors, config.base)
+    expected = load.force * base_readings(model, device.body, device.sensors, load.base)
     try:
         with device.wire.open()[0] as skin:
             first, conversion = device.wire.warm_up(skin, notify)

@@ -1,7 +1,7 @@
-"""Calibrate without a gauge: by a weight on a round base on every sensor, or a loaded board over the skin.
+"""Calibrate without a gauge: by a weight on a round base on every sensor.
 
 The gain of a channel is its reading over the simulated one. A wide base hardly cares where the sensor lies
-below it, and a board not at all.
+below it.
 """
 
 import math
@@ -11,8 +11,6 @@ from itertools import islice
 from typing import Any
 
 import numpy as np
-import torch
-from scipy.optimize import least_squares
 
 from skin.body.base import AbstractBody, Sensors
 from skin.core.settings import configured
@@ -29,12 +27,8 @@ from skin.mechanics.simulator.base import AbstractSimulator
 
 GRAVITY = 9.80665  # m/s2
 _HEAVIEST = 50.0  # kg: nobody puts more on a skin by hand
-_GREATEST = 5000.0  # N on a board: five people
 _SPREAD = 0.35  # of gains and model together, in assigning placements to sensors
 _FLOOR = 0.03  # of the largest reading: what a model leaves beside a base
-_TILT = 0.25  # standard deviation of the tilt of a board's pressure, share from the middle to an edge
-_UNEVEN = 0.1  # of the pressure of foam, share
-_RELIEVED = 0.5  # weight of the inverse of a reading, over that of its median, in its error
 _QUIETER = 200.0  # times that the noise of sensors may be below that of the simulated device
 _MISSED = 0.25  # share of the sensors that may have no gain
 _PATIENCE = 60.0  # s in which a further load must be put down
@@ -45,44 +39,40 @@ class KnownLoad:
     """What is put on the skin.
 
     Attributes:
-        weight: kg; None: a board.
+        weight: kg.
         base: radius of the weight's round base, m.
-        board: force on a board over the whole skin, N.
     """
 
-    weight: float | None
-    base: float | None
-    board: float | None
+    weight: float
+    base: float
 
-    def check(self, size: tuple[float, float]) -> None:
-        """Raise InputError unless this is one load that a skin of this size, m, can carry."""
-        if (self.weight is None) == (self.board is None):
-            raise InputError("give weight=2.0 base=0.02 (kg, m), or board=500 (N), not both")
-        if self.weight is None:
-            if self.base is not None:
-                raise InputError("board= covers the whole skin: leave out base=")
-            if not 0 < float(self.board or 0) <= _GREATEST:
-                raise InputError(f"board={self.board:g} is a force in N above 0 and up to {_GREATEST:g}")
-            return
-        if self.base is None:
-            raise InputError(f"weight={self.weight:g} needs the radius of its base in m, as in base=0.02")
-        if not 0 < self.weight <= _HEAVIEST:
-            in_grams = f"; for {self.weight:g} g give weight={self.weight / 1000:g}" * (self.weight >= 100)
+    @classmethod
+    def of(cls, weight: float | None, base: float | None, size: tuple[float, float]) -> "KnownLoad":
+        """Return a load that a skin of this size, m, can carry.
+
+        Raises:
+            InputError: no mass or no base, or one that is too large or not above 0.
+        """
+        if weight is None or base is None:
             raise InputError(
-                f"weight={self.weight:g} is a mass in kg above 0 and up to {_HEAVIEST:g}{in_grams}"
+                "a known load is a mass in kg on a round base of a radius in m: give weight=2.0 base=0.02"
             )
+        if not 0 < weight <= _HEAVIEST:
+            in_grams = f"; for {weight:g} g give weight={weight / 1000:g}" * (weight >= 100)
+            raise InputError(f"weight={weight:g} is a mass in kg above 0 and up to {_HEAVIEST:g}{in_grams}")
         widest = min(size) / 2
-        if not 0 < self.base <= widest:
-            in_mm = f"; for {self.base:g} mm give base={self.base / 1000:g}" * (self.base >= 1)
+        if not 0 < base <= widest:
+            in_mm = f"; for {base:g} mm give base={base / 1000:g}" * (base >= 1)
             raise InputError(
-                f"base={self.base:g} is a radius in m above 0 that fits on the skin of {size[0]:g} x "
+                f"base={base:g} is a radius in m above 0 that fits on the skin of {size[0]:g} x "
                 f"{size[1]:g} m, so at most {widest:g}{in_mm}"
             )
+        return cls(weight, base)
 
     @property
     def force(self) -> float:
         """N."""
-        return GRAVITY * self.weight if self.weight is not None else float(self.board or 0)
+        return GRAVITY * self.weight
 
 
 @dataclass(frozen=True)
@@ -91,9 +81,9 @@ class LoadResult:
 
     Attributes:
         calibration: of the skin.
-        placements: number of placements of every sensor, (S,); of a board, of all.
-        differ: median difference between placements of the same sensor, or of a board left by the fit, share;
-            NaN where every sensor has one.
+        placements: number of placements of every sensor, (S,).
+        differ: median difference between placements of the same sensor, share; NaN where every sensor has
+            one.
         never: sensors that were never loaded: their gain is the median.
     """
 
@@ -112,9 +102,8 @@ def fit_known_load(device: AbstractSimulated, session: BenchSession, load: Known
         load: what was put on it.
 
     Raises:
-        InputError: another number of channels, an impossible load, no placement, or sensors without one.
+        InputError: another number of channels, no placement, or sensors without one.
     """
-    load.check(device.size)
     channels, sensors = session.raw.shape[1], len(device.sensors)
     if channels != sensors:
         raise InputError(
@@ -128,8 +117,7 @@ def fit_known_load(device: AbstractSimulated, session: BenchSession, load: Known
             f"no placement in the session{touched * bool(placements.unsteady)}: leave the skin untouched for "
             "3 s, put the load down, let go of it for 2 s, lift it for 2 s, and so on"
         )
-    fit = _fit_weight if load.weight is not None else _fit_board
-    gains, counts, differ = fit(device, placements, load)
+    gains, counts, differ = _fit_weight(device, placements, load)
     return _build(session, placements, load, gains, counts, differ, float(device.constants.noise.median()))
 
 
@@ -150,7 +138,6 @@ def _fit_weight(
     device: AbstractSimulated, placements: Placements, load: KnownLoad
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """Return gains (S,), in the session's unit per N, NaN if unknown; placements (S,); their difference."""
-    assert load.base is not None
     expected = load.force * base_readings(device.model, device.body, device.sensors, load.base)
     sensor = _assign(expected, placements)
     gains, counts = np.full(len(expected), np.nan), np.bincount(sensor, minlength=len(expected))
@@ -184,50 +171,6 @@ def _sign(placements: Placements) -> np.ndarray:
     signs = np.sign(placements.change[strongest, np.arange(placements.change.shape[1])])
     most = -1.0 if signs[placements.reached].sum() < 0 else 1.0
     return np.where(placements.reached & (signs != 0), signs, most)
-
-
-@torch.no_grad()
-def board_readings(device: AbstractSimulated) -> np.ndarray:
-    """Return the readings (3, S), N, under 1 N on a board: even, and their change with a tilt in x and in y.
-
-    The pressure of a tilt of 1 is 0 at one edge, and twice the mean at the other.
-    """
-    rows, columns = device.body.shape
-    centres = [torch.linspace(-1, 1, 2 * number + 1)[1::2] for number in (rows, columns)]
-    y, x = torch.meshgrid(*centres, indexing="ij")
-    even = torch.full((rows, columns), 1 / (device.size[0] * device.size[1]))
-    slight = 0.1  # the report's reading is not linear in the pressure, but nearly so
-    maps = torch.stack([even, even * (1 + slight * x), even * (1 + slight * y)])
-    readings = device.model(maps).readings.double().numpy()
-    return np.stack([readings[0], *((tilted - readings[0]) / slight for tilted in readings[1:])])
-
-
-def _fit_board(
-    device: AbstractSimulated, placements: Placements, load: KnownLoad
-) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return gains, placements and their difference as :func:`_fit_weight`; tilts are estimated jointly."""
-    maps = load.force * board_readings(device)
-    alive = placements.reached
-    if not alive.any():
-        raise InputError("no channel responds to the board: check the wiring")
-    readings = placements.change * _sign(placements)
-    shown = np.log(np.maximum(readings[:, alive], 3 * placements.noise[alive]))
-    count, sensors = shown.shape
-    # Below the edge that a tilt relieves, the foam may have lost contact.
-    relief = np.median(shown, axis=0) - shown
-    uneven = _UNEVEN * np.hypot(1.0, _RELIEVED * np.exp(relief))
-    start = np.r_[(shown - np.log(maps[0, alive])).mean(axis=0), np.zeros(2 * count)]
-
-    def misfit(values: np.ndarray) -> np.ndarray:
-        tilts = values[sensors:].reshape(count, 2)
-        pressed = np.log(np.maximum(maps[0, alive] + tilts @ maps[1:, alive], 0.05 * maps[0, alive]))
-        return np.r_[((shown - values[:sensors] - pressed) / uneven).ravel(), values[sensors:] / _TILT]
-
-    fit = least_squares(misfit, start, loss="soft_l1")
-    gains = np.full(len(alive), np.nan)
-    gains[alive] = np.exp(fit.x[:sensors]) * _sign(placements)[alive]
-    left = _UNEVEN * np.abs(fit.fun[: shown.size]).mean()
-    return gains, np.full(len(alive), count), float(left) if count > 1 else math.nan
 
 
 def _build(
@@ -264,10 +207,9 @@ def _build(
     typical = float(np.nanmedian(absolute))
     quiet = float(np.median(np.maximum(noise, step_sizes / math.sqrt(12)))) / typical
     if quiet < usual / _QUIETER:
-        name = f"weight={load.weight:g} (kg)" if load.board is None else f"board={load.board:g} (N)"
         raise InputError(
-            f"{name} would mean a noise of {quiet:.2g} N, device.noise is {usual:g}: give the load in this "
-            "unit, or device.noise= if the sensors are so quiet"
+            f"weight={load.weight:g} (kg) would mean a noise of {quiet:.2g} N, device.noise is {usual:g}: "
+            "give the load in this unit, or device.noise= if the sensors are so quiet"
         )
     in_newton = session.unit == "N"
     scale = 1.0 if in_newton else 1 / typical
@@ -285,7 +227,8 @@ def _build(
     about: dict[str, Any] = {
         "unit": session.unit,
         "placements": len(placements.change),
-        **({"weight": load.weight, "base": load.base} if load.board is None else {"board": load.board}),
+        "weight": load.weight,
+        "base": load.base,
     }
     polarity = tuple(int(sign) for sign in signs) if signs.min() < 0 else ()
     calibration = Calibration(sensors, {"dead": dead}, ranges, scale, zero, about, polarity)
@@ -413,21 +356,15 @@ def emulate_placements(
 def emulate_known_load(
     device: AbstractSimulated, load: KnownLoad, settings: Mapping[str, Any]
 ) -> BenchSession:
-    """Simulate a session of a load on an emulated skin: on every sensor twice, in any order, or eight boards.
+    """Simulate a session of a load on an emulated skin: on every sensor twice, in any order.
 
     Args:
         device: the skin.
         load: what is put on it.
         settings: ``conf/calibrate.yaml`` under ``calibrate``.
     """
-    load.check(device.size)
     protocol = configured(Protocol, settings["protocol"], "calibrate.protocol")
     randomness = np.random.default_rng(device.seed)
-    if load.base is not None:
-        order = np.concatenate([randomness.permutation(len(device.sensors)) for _ in range(2)])
-        each = base_readings(device.model, device.body, device.sensors, load.base)
-        readings = load.force * each[order]
-    else:
-        tilts = np.c_[np.ones(8), _TILT * randomness.standard_normal((8, 2))]
-        readings = load.force * tilts @ board_readings(device)
+    order = np.concatenate([randomness.permutation(len(device.sensors)) for _ in range(2)])
+    readings = load.force * base_readings(device.model, device.body, device.sensors, load.base)[order]
     return emulate_placements(device, readings, protocol, randomness, settings["bits"])

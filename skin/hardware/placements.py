@@ -1,4 +1,4 @@
-"""Find steady loads in a session without a gauge: a weight, or a board, put down and lifted again."""
+"""Find steady loads in a session without a gauge: a weight put down and lifted again."""
 
 from dataclasses import dataclass
 

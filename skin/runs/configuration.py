@@ -229,7 +229,6 @@ class Config:
     presses: str | None = None
     weight: float | None = None
     base: float | None = None
-    board: float | None = None
     calibrate: dict[str, Any] = field(default_factory=dict)
     port: str | None = None
     adapter: dict[str, Any] = field(default_factory=dict)

@@ -44,20 +44,16 @@ def draw_expected(body: AbstractBody, sensors: Sensors, maps: Mapping[float, np.
     size = counts * (panel + np.array([0.2, 0.4])) + np.array([1.4, 0.5])
     figure = Figure(figsize=tuple(size), layout="constrained")
     axes = figure.subplots(counts[1], counts[0], squeeze=False, sharex=True, sharey=True)
-    scaled = {force: 1e3 * error for force, error in maps.items()}
-    values = np.array(list(scaled.values()))
-    lowest, highest = np.nanmin(values), np.nanmax(values)
-    scale = LogNorm(lowest, highest)
+    errors = 1e3 * np.array(list(maps.values()))
+    lowest, highest = np.nanmin(errors), np.nanmax(errors)
     extent = (0, 1e3 * body.size[0], 1e3 * body.size[1], 0)
-    for axis, (force, error) in zip(axes.flat, scaled.items(), strict=True):
-        picture = axis.imshow(error, cmap="viridis_r", norm=scale, extent=extent)
-        x, y = 1e3 * sensors.positions[:, :2].T
-        axis.plot(x, y, "o", color="white", markeredgecolor="black", markersize=4)
-        axis.set_title(f"{force:g} N")
-    for axis in axes[-1]:
-        axis.set_xlabel("x, mm")
-    for axis in axes[:, 0]:
-        axis.set_ylabel("y, mm")
+    for axis, force, error in zip(axes.flat, maps, errors, strict=True):
+        picture = axis.imshow(error, cmap="viridis_r", norm=LogNorm(lowest, highest), extent=extent)
+        axis.plot(
+            *(1e3 * sensors.positions[:, :2].T), "o", color="white", markeredgecolor="black", markersize=4
+        )
+        axis.set(title=f"{force:g} N", xlabel="x, mm", ylabel="y, mm")
+        axis.label_outer()
     steps = (1, 2, 5) if highest > 5 * lowest else range(1, 10)
     figure.colorbar(
         picture, ax=axes, label="expected error of the place, mm", format="%g", ticks=LogLocator(subs=steps)
@@ -67,16 +63,17 @@ def draw_expected(body: AbstractBody, sensors: Sensors, maps: Mapping[float, np.
 
 def print_sweep(steps: Sequence[Step]) -> None:
     """Print one line per step and force."""
-    rows = []
-    for step in steps:
-        about = {
+    rows = [
+        {
             "thickness\nmm": f"{1e3 * step.thickness:g}",
             "sensors": f"{step.grid[0]} x {step.grid[1]}",
             "pitch\nmm": f"{1e3 * step.pitch:.0f}",
+            **_cells(finding),
         }
-        cells = (_cells(finding) for finding in step.findings)
-        rows += [about | {name: text for name, text in texts.items() if name not in _WIDE} for texts in cells]
-    _print(rows)
+        for step in steps
+        for finding in step.findings
+    ]
+    _print([{name: text for name, text in row.items() if name not in _WIDE} for row in rows])
 
 
 def draw_sweep(steps: Sequence[Step], path: Path) -> Path:
@@ -126,9 +123,14 @@ def _cells(finding: Findings) -> dict[str, str]:
 
 
 def _print(rows: Sequence[dict[str, str]]) -> None:
-    title = "Expected posterior of a fingertip"
     # All columns fit into 80 characters.
-    table = Table(*rows[0], title=title, box=SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
+    table = Table(
+        *rows[0],
+        title="Expected posterior of a fingertip",
+        box=SIMPLE_HEAD,
+        padding=(0, 1, 0, 0),
+        pad_edge=False,
+    )
     for row in rows:
         table.add_row(*row.values())
     Console().print(table)
@@ -166,17 +168,20 @@ def placement(
     extent = (0, 1e3 * size[0], 1e3 * size[1], 0)
     marks: list[Artist] = []
     if forbidden is not None:
-        shade = np.ma.masked_equal(forbidden, False)
-        axis.imshow(shade, extent=extent, cmap=ListedColormap([_SHADE]), interpolation="nearest")
+        axis.imshow(
+            np.ma.masked_equal(forbidden, False),
+            extent=extent,
+            cmap=ListedColormap([_SHADE]),
+            interpolation="nearest",
+        )
         marks.append(Patch(color=_SHADE, label="keep-out zone"))
-    x, y = 1e3 * sites.T
-    marks += axis.plot(x, y, ".", color=_SHADE, markersize=2, label=f"{len(sites)} sites")
-    x, y = 1e3 * before.T
-    (old,) = axis.plot(x, y, "s", color=COLOURS[1], label=f"configured layout, {len(before)}")
-    old.set(markersize=9, markerfacecolor="none")
-    marks.append(old)
-    x, y = 1e3 * chosen.T
-    marks += axis.plot(x, y, "o", color=COLOURS[0], markersize=6, label=f"placed, {len(chosen)}")
+    marks += axis.plot(*(1e3 * sites.T), ".", color=_SHADE, markersize=2, label=f"{len(sites)} sites")
+    named = f"configured layout, {len(before)}"
+    marks += axis.plot(
+        *(1e3 * before.T), "s", color=COLOURS[1], markersize=9, markerfacecolor="none", label=named
+    )
+    placed = f"placed, {len(chosen)}"
+    marks += axis.plot(*(1e3 * chosen.T), "o", color=COLOURS[0], markersize=6, label=placed)
     axis.set(xlabel="x, mm", ylabel="y, mm", xlim=extent[:2], ylim=extent[2:], aspect="equal", title=title)
     axis.legend(handles=marks, loc="upper left", bbox_to_anchor=(1.01, 1), frameon=False)
     return figure

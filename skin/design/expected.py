@@ -1,6 +1,5 @@
 """The expected posterior of fingertips on a skin: errors, blind touches and reach; a sweep over designs."""
 
-import csv
 import math
 import sys
 from collections.abc import Iterator, Mapping, Sequence
@@ -9,6 +8,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
+import pandas as pd
 import torch
 from annotated_types import Ge, Gt, MinLen
 from pydantic import NonNegativeFloat, PositiveFloat, PositiveInt
@@ -19,7 +19,7 @@ from scipy.stats.qmc import Halton
 from skin.body.base import AbstractBody, Layer
 from skin.body.layout import Footprint, Grid
 from skin.body.material import Material
-from skin.core.files import json_text, whole, write
+from skin.core.files import json_text, write
 from skin.core.rng import Stream, generator
 from skin.core.settings import RISING, checked
 from skin.design.precision import Sensitivity, local_covariance, sensitivity
@@ -174,8 +174,7 @@ class ExpectedPosterior:
         findings = self.find(simulator, skin.body, trials)
         print_expected(findings)
         settings = {name + _UNITS.get(name, ""): value for name, value in asdict(self).items()}
-        lines = [asdict(finding) for finding in findings]
-        about = {"sensors": len(skin.sensors), "settings": settings, "expected": lines}
+        about = {"sensors": len(skin.sensors), "settings": settings, "expected": list(map(asdict, findings))}
         maps = {force: self.expected_map(trial, skin.body) for force, trial in trials.items()}
         print(
             write(json_text(about), folder / "design.json"),
@@ -213,8 +212,7 @@ class ExpectedPosterior:
         Raises:
             InputError: the margin leaves no place.
         """
-        if trials is None:
-            trials = self.trials(simulator, body)
+        trials = trials or self.trials(simulator, body)
         unit = torch.from_numpy(np.column_stack([self.sample(body), np.ones(self.touches)]))
         felt = sensitivity(simulator, Fingertip(body, self.rim, simulator.smooth), unit)
         simulator.float()
@@ -359,18 +357,11 @@ class Sweep(ExpectedPosterior):
         cases = [
             (thickness, (rows, columns)) for thickness in self.thicknesses for rows, columns in self.grids
         ]
-        console, interactive = Console(stderr=True), sys.stderr.isatty()
-        steps = [
-            self.step(skin, *case)
-            for case in track(cases, "solving", console=console, disable=not interactive)
-        ]
+        shown = track(cases, "solving", console=Console(stderr=True), disable=not sys.stderr.isatty())
+        steps = [self.step(skin, *case) for case in shown]
         print_sweep(steps)
-        path = folder / "design_sweep.csv"
-        with whole(path) as partial, partial.open("w", newline="") as file:
-            lines = [line for step in steps for line in step.lines()]
-            writer = csv.DictWriter(file, list(lines[0]), lineterminator="\n")
-            writer.writeheader()
-            writer.writerows(lines)
+        table = pd.DataFrame([line for step in steps for line in step.lines()])
+        path = write(table.to_csv(index=False, na_rep="nan"), folder / "design_sweep.csv")
         print(path, draw_sweep(steps, folder / "design_sweep.png"), sep="\n")
 
     def step(self, skin: SkinModel, thickness: float, grid: tuple[int, int]) -> Step:

@@ -2,7 +2,7 @@
 
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -36,30 +36,11 @@ from skin.touch.movie import Movie
 _BATCH = 256
 
 
+@torch.no_grad()
 def reading_covariance(
     device: AbstractSimulated, sensors: Sensors, touches: int, seed: int, clip: float
 ) -> tuple[np.ndarray, int]:
     """Return the covariance of the readings of sampled touches, and from how many frames it is.
-
-    Args:
-        device, sensors, touches, seed, clip: as of :func:`sampled_readings`.
-
-    Returns:
-        covariance (C, C), N^2, and the number of frames.
-    """
-    total, squares, frames = np.zeros(len(sensors)), np.zeros((len(sensors), len(sensors))), 0
-    for readings in sampled_readings(device, sensors, touches, seed, clip):
-        total, squares = total + readings.sum(axis=0), squares + readings.T @ readings
-        frames += len(readings)
-    mean = total / frames
-    return squares / frames - np.outer(mean, mean), frames
-
-
-@torch.no_grad()
-def sampled_readings(
-    device: AbstractSimulated, sensors: Sensors, touches: int, seed: int, clip: float
-) -> Iterator[np.ndarray]:
-    """Sample touches and yield their true readings in parts, (F, C), N.
 
     Only frames with contact count. Labels are balanced. The touches belong to no split of the device.
 
@@ -69,17 +50,22 @@ def sampled_readings(
         touches: their number.
         seed: of the touches.
         clip: largest reading, N.
+
+    Returns:
+        covariance (C, C), N^2, and the number of frames.
     """
     read = _reader(device, sensors)
-    wanted_labels = device.sampler.balanced(touches, generator(Stream.PLACEMENT, seed, 0))
-    parts = range(0, touches, _BATCH)
-    console, interactive = Console(stderr=True), sys.stderr.isatty()
-    for number, first in enumerate(
-        track(parts, "sampling touches", console=console, disable=not interactive)
-    ):
-        labels = wanted_labels[first : first + _BATCH]
+    wanted = device.sampler.balanced(touches, generator(Stream.PLACEMENT, seed, 0))
+    parts = [wanted[first : first + _BATCH] for first in range(0, touches, _BATCH)]
+    shown = track(parts, "sampling touches", console=Console(stderr=True), disable=not sys.stderr.isatty())
+    total, squares, frames = np.zeros(len(sensors)), np.zeros((len(sensors), len(sensors))), 0
+    for number, labels in enumerate(shown):
         movie = device.sampler.sample(len(labels), generator(Stream.PLACEMENT, seed, 1 + number), labels)
-        yield read(movie).clamp(-clip, clip).double().numpy()
+        readings = read(movie).clamp(-clip, clip).double().numpy()
+        total, squares = total + readings.sum(axis=0), squares + readings.T @ readings
+        frames += len(readings)
+    mean = total / frames
+    return squares / frames - np.outer(mean, mean), frames
 
 
 def _reader(device: AbstractSimulated, sensors: Sensors) -> Callable[[Movie], Tensor]:
@@ -178,14 +164,13 @@ class Place:
         folder: Path,
     ) -> list[Path]:
         places = problem.sensors.positions[:, :2]
-        title = f"{content['information_nats']:.1f} nats"
         figure = placement(
             places[chosen],
             places[problem.layout],
             places[: problem.sites],
             problem.body.size,
             forbidden,
-            title,
+            f"{content['information_nats']:.1f} nats",
         )
         return [
             write(_csv(problem.sensors, chosen), folder / "placement.csv"),
@@ -210,8 +195,12 @@ def _csv(sensors: Sensors, rows: np.ndarray) -> str:
 
 def _table(content: Mapping[str, Any]) -> Table:
     """Return the table of the placement and of other layouts."""
-    title = f"{content['sites']} sites, {content['touches']} touches, {content['seconds']:g} s"
-    made = Table("layout", "sensors", "information, nats", title=title)
+    made = Table(
+        "layout",
+        "sensors",
+        "information, nats",
+        title=f"{content['sites']} sites, {content['touches']} touches, {content['seconds']:g} s",
+    )
     for name, layout in {"placed": content, **content["layouts"]}.items():
         made.add_row(name.replace("_", " "), str(layout["sensors"]), f"{layout['information_nats']:.1f}")
     return made

@@ -124,14 +124,9 @@ def _find_best(variance: np.ndarray, allowed: np.ndarray) -> int:
 def _variance(signal: np.ndarray, sites: Sites) -> np.ndarray:
     """Return the variance (C,) of each noisy reading given those of some other sites."""
     rows = signal[np.asarray(sites, dtype=int)]
-    return 1 + np.diag(signal) - (rows * _solve_noisy(rows, sites)).sum(axis=0)
-
-
-def _solve_noisy(rows: np.ndarray, sites: Sites) -> np.ndarray:
-    """Return (I + A_SS)^-1 times the rows of A at S, (k, C)."""
-    if not len(sites):
-        return rows
-    return solve(np.eye(len(sites)) + rows[:, np.asarray(sites)], rows, assume_a="pos")
+    noisy = np.eye(len(rows)) + rows[:, np.asarray(sites, dtype=int)]
+    solved = solve(noisy, rows, assume_a="pos") if len(rows) else rows
+    return 1 + np.diag(signal) - (rows * solved).sum(axis=0)
 
 
 # Candidate sites of sensors on a skin.
@@ -169,10 +164,10 @@ def candidate_sites(
     """
     pitches = body.cell if raster is None else raster if isinstance(raster, Sequence) else (raster, raster)
     x, y = (_along(*axis) for axis in zip(body.size, pitches, footprint, strict=True))
-    free = np.ones((len(y), len(x)), dtype=bool)
-    if forbidden is not None:
-        free = _covered(forbidden, body.size, (x, y), footprint) <= _COVERED
-    rows, columns = np.nonzero(free)
+    covered = (
+        np.zeros((len(y), len(x))) if forbidden is None else _covered(forbidden, body.size, (x, y), footprint)
+    )
+    rows, columns = np.nonzero(covered <= _COVERED)
     if not len(rows):
         raise InputError(
             f"no site is left for a sensor of {footprint[0]:g} x {footprint[1]:g} m on {body.size[0]:g} x "
@@ -342,17 +337,16 @@ class PlacementProblem:
         fresh = eligible[sites[len(fixed) :]]
         x, y = self.sensors.positions[fresh, :2].T.round(6)
         chosen = np.concatenate([self.kept, fresh[np.lexsort((x, y))]])
+        drawn = best_of_random(inner, self.count, near, fixed, seed)
         others = {"configured": self.layout, "grid": np.arange(self.layout[-1] + 1, len(signal))}
+        others["best_of_random"] = eligible[np.array(drawn, dtype=int)]
         layouts = {
             name: {"sensors": len(rows), "information_nats": mutual_information(signal, rows)}
             for name, rows in others.items()
             if len(rows)
         }
-        if drawn := best_of_random(inner, self.count, near, fixed, seed):
-            information = mutual_information(inner, drawn)
-            layouts["best_of_random"] = {"sensors": self.count, "information_nats": information}
-        summary = {"sensors": self.count, "information_nats": mutual_information(inner, sites)}
-        return chosen, summary | {"layouts": layouts}
+        information = mutual_information(inner, sites)
+        return chosen, {"sensors": self.count, "information_nats": information, "layouts": layouts}
 
 
 def best_of_random(

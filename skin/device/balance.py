@@ -11,7 +11,6 @@ import torch
 from skin.body.base import AbstractBody
 from skin.device.base import AbstractDevice
 from skin.device.touches import Recording, only_touches
-from skin.errors import InputError
 from skin.touch.gesture import GestureSettings
 from skin.touch.labels import OPPOSITE
 from skin.touch.sampler import AbstractSampler
@@ -20,15 +19,12 @@ _log = logging.getLogger(__name__)
 
 
 def report_balance(device: AbstractDevice, recording: Recording | None = None, shown: bool = True) -> None:
-    """Log the class balance of the gestures that a simulated device is trained on, and check it.
+    """Log the class balance of the gestures that a simulated device is trained on, and check its labels.
 
     Args:
         device: the device; nothing is done unless it is simulated.
         recording: its gestures; None: its training budget.
         shown: whether to log the balance.
-
-    Raises:
-        InputError: as :func:`check_label_leakage`.
     """
     if device.simulation is None:
         return
@@ -147,10 +143,7 @@ def check_label_leakage(report: dict[str, Any], settings: AbstractSampler | Gest
     """Warn if the shape alone predicts a label.
 
     A label leaks if its balanced accuracy is above ``settings.leak`` by more than two standard errors; the
-    margin keeps small data sets from failing by chance.
-
-    Raises:
-        InputError: a label leaks and ``settings.strict`` is set.
+    margin keeps small data sets from warnings by chance.
     """
     leaking = {
         name: entry["accuracy"]
@@ -160,14 +153,13 @@ def check_label_leakage(report: dict[str, Any], settings: AbstractSampler | Gest
     if not leaking:
         return
     named = " and ".join(f"{name} ({score:.0%})" for name, score in leaking.items())
-    sentence = (
+    warnings.warn(
         f"the shape alone predicts {named} of these gestures, more than touch.leak={settings.leak:g} "
         "allows: a model may learn the shape instead of the label; give touch.shapes of one kind, raise "
-        "touch.stretch, or give touch.leak=0.5, which fits every shape to the sheet"
+        "touch.stretch, or give touch.leak=0.5, which fits every shape to the sheet",
+        RuntimeWarning,
+        stacklevel=3,
     )
-    if settings.strict:
-        raise InputError(sentence + "; touch.strict=false only warns")
-    warnings.warn(sentence, RuntimeWarning, stacklevel=3)
 
 
 # Summary of a data set in one line: forces, strains, clipped readings, accepted draws.

@@ -207,7 +207,6 @@ class GestureSettings(TouchSettings):
     dangerous_peak: _Above0 = (90.5e3, 180e3)
     stretch: Annotated[float, Ge(1)] = 4.0
     leak: Annotated[float, Ge(0.5), Le(1)] = 0.6
-    strict: bool = False
     second: Annotated[float, Ge(0), Le(1)] = 0.0
 
     def __post_init__(self) -> None:

@@ -165,7 +165,7 @@ class AbstractSampler(ABC):
 
     Attributes:
         chosen: the labels that touches can be drawn for, names of ``TOUCH``; the others are what they are.
-        leak, strict: see :func:`skin.device.balance.check_label_leakage`.
+        leak: see :func:`skin.device.balance.check_label_leakage`.
 
     Raises:
         InputError: settings or pictures that cannot be used.
@@ -173,7 +173,6 @@ class AbstractSampler(ABC):
 
     chosen: tuple[str, ...] = TOUCH.names
     leak: float = 1.0
-    strict: bool = False
 
     def __init__(
         self,
@@ -239,7 +238,7 @@ class TouchSampler(AbstractSampler):
         moments: np.ndarray | None = None,
     ) -> None:
         super().__init__(body, footprints, contact, GestureSettings.of(settings), padded, moments)
-        self.leak, self.strict = self.settings.leak, self.settings.strict
+        self.leak = self.settings.leak
         if self.settings.second and not contact.proportional:
             raise InputError(
                 "the pressures of two gestures at a time add up only with contact=prescribed: set that, or "

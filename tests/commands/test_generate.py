@@ -52,14 +52,6 @@ def test_tells_the_balance_and_warns_where_a_shape_is_the_label(run, tmp_path):
     assert "warning: the shape alone predicts big (" in done.stderr
 
 
-def test_refuses_such_gestures_if_strict(run, tmp_path):
-    done = run(tmp_path, *NAIVE, "n=160", "out=x.csv", *ONE_SIZE, "touch.strict=true", store=False)
-    assert done.returncode == 2
-    assert "the shape alone predicts big" in done.stderr.splitlines()[-1]
-    assert "Traceback" not in done.stderr
-    assert not list(tmp_path.glob("x.*"))
-
-
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [

@@ -161,15 +161,6 @@ def test_a_folder_with_other_things_is_refused(tmp_path):
         generate(tmp_path / "mine.txt")
 
 
-def test_shapes_that_predict_a_label_leave_nothing_behind(tmp_path, monkeypatch):
-    one_size = ["touch.shapes=[disc,bar]", "touch.stretch=1", "touch.big_area=[0.45,0.7]"]
-    many = ["n=640", "touch.leak=0.6", "touch.strict=true"]
-    monkeypatch.setattr("skin.device.base._PART", 40)
-    with pytest.raises(InputError, match=r"the shape alone predicts big"):
-        generate(tmp_path / "touches", *one_size, *many)
-    assert not list(tmp_path.iterdir())
-
-
 def test_only_one_process_generates_a_folder(tmp_path):
     from filelock import FileLock
 

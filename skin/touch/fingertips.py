@@ -29,7 +29,7 @@ from skin.touch.movie import Movie, join_movies, measure_gestures
 from skin.touch.sampler import AbstractSampler, ContactModel, describe_touches, steer
 from skin.touch.shapes import Shapes
 
-_DYNAMIC, _PRESS = TOUCH.names.index("dynamic"), TOUCH.names.index("press")
+_DRAWN = [TOUCH.names.index("dynamic"), TOUCH.names.index("press")]
 _TRIES = 1000
 
 
@@ -242,13 +242,6 @@ class FingertipSampler(AbstractSampler):
             )
         super().__init__(body, footprints, contact, settings, padded, moments)
 
-    def balanced(self, count: int, generator: np.random.Generator) -> np.ndarray:
-        """Return label combinations (count, 4), bool: all four of dynamic and press equally often."""
-        codes = generator.permutation(generator.permutation(4)[np.arange(count) % 4])
-        labels = np.zeros((count, len(TOUCH)), bool)
-        labels[:, _DYNAMIC], labels[:, _PRESS] = codes & 1, codes >> 1
-        return labels
-
     @torch.no_grad()
     def sample(self, count: int, generator: np.random.Generator, labels: np.ndarray | None = None) -> Movie:
         """Return the movies of ``count`` touches.
@@ -262,12 +255,16 @@ class FingertipSampler(AbstractSampler):
             InputError: other labels are wanted, or the sheet has no room.
         """
         wanted = self.balanced(count, generator) if labels is None else np.asarray(labels, bool)
-        self._check(wanted)
+        others = [n for n, name in enumerate(TOUCH.names) if name not in self.chosen]
+        if refused := [TOUCH.names[n] for n in others if wanted[:, n].any()]:
+            raise InputError(
+                f"fingertips cannot be drawn to be {' or '.join(refused)}, only dynamic, press or neither: "
+                "set touch=gestures"
+            )
         pending, movies, finished = np.arange(count), list[Movie](), list[np.ndarray]()
         for attempt in range(1, self.settings.redraws + 1):
             movie = self._draw(wanted, generator, pending, attempt)
-            columns = [_DYNAMIC, _PRESS]
-            right = (movie.labels.numpy()[:, columns] == wanted[pending][:, columns]).all(axis=1)
+            right = (movie.labels.numpy() == wanted[pending])[:, _DRAWN].all(axis=1)
             movies.append(movie[torch.from_numpy(np.flatnonzero(right))])
             finished.append(pending[right])
             pending = pending[~right]
@@ -276,17 +273,9 @@ class FingertipSampler(AbstractSampler):
                 return join_movies(movies)[torch.from_numpy(order)]
         raise InputError(
             f"no touch of fingertips in {self.settings.redraws} draws was "
-            + ", ".join(f"{'' if wanted[pending[0], n] else 'not '}{TOUCH.names[n]}" for n in columns)
+            + ", ".join(f"{'' if wanted[pending[0], n] else 'not '}{TOUCH.names[n]}" for n in _DRAWN)
             + ": touch.thresholds and the ranges under touch rule it out"
         )
-
-    def _check(self, wanted: np.ndarray) -> None:
-        others = [n for n, name in enumerate(TOUCH.names) if name not in self.chosen]
-        if refused := [TOUCH.names[n] for n in others if wanted[:, n].any()]:
-            raise InputError(
-                f"fingertips cannot be drawn to be {' or '.join(refused)}, only dynamic, press or neither: "
-                "set touch=gestures"
-            )
 
     def _draw(
         self, wanted: np.ndarray, generator: np.random.Generator, rows: np.ndarray, attempt: int
@@ -305,7 +294,7 @@ class FingertipSampler(AbstractSampler):
             "peak": np.zeros(count),  # of sample_paths, which only passes it on
         } | draw_times(wanted, settings, self.padded, generator)
         chance = generator.random((count, 4))
-        drawn |= draw_motion(wanted[:, _DYNAMIC], drawn, settings, size, chance)
+        drawn |= draw_motion(wanted[:, _DRAWN[0]], drawn, settings, size, chance)
         drawn["draws"] = np.full(count, float(attempt))
         mine = {name: values[rows] for name, values in drawn.items()}
         return self._render(mine, Group(*(values[rows] for values in group)), wanted[rows])

@@ -84,19 +84,16 @@ class GestureFrames(NamedTuple):
             ("gap", self.gap, 1, inf),
             ("stride", self.stride, 1, inf),
         ):
-            if low <= least and most <= high:
-                continue
-            within = f"at least {low} ({low / rate:g} s)"
-            if high < inf:
+            if not low <= least <= most <= high:
+                counts = f"{least}" if least == most else f"{least} to {most}"
                 within = (
                     f"{low} to {high} ({low / rate:g} to {high / rate:g} s) with this touch.window and "
                     "touch.thresholds.duration"
                 )
-            counts = f"{least}" if least == most else f"{least} to {most}"
-            raise InputError(
-                f"{_shown(settings, name)} gives {counts} frames at touch.rate={rate:g} Hz, valid are "
-                f"{within}"
-            )
+                raise InputError(
+                    f"{_shown(settings, name)} gives {counts} frames at touch.rate={rate:g} Hz, valid are "
+                    + (within if high < inf else f"at least {low} ({low / rate:g} s)")
+                )
         if self.tap[1] < self.slide:
             raise InputError(
                 f"{_shown(settings, 'tap')} gives at most {self.tap[1]} frames at touch.rate={rate:g} Hz, "

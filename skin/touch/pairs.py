@@ -29,12 +29,10 @@ def add_second(movie: Movie, share: float, contact: float, generator: np.random.
     first = torch.from_numpy(np.flatnonzero(generator.random(len(movie)) < share))
     chance = torch.from_numpy(generator.random((len(first), len(movie) + 1)))
     whole = movie.parameters["onset"] + movie.parameters["duration"] <= movie.index.shape[1]
-    allowed = whole & (movie.labels <= movie.labels[first][:, None]).all(dim=2)
-    allowed &= _apart(movie, first, contact)
+    kept = (movie.labels <= movie.labels[first][:, None]).all(dim=2)
+    allowed = whole & kept & _apart(movie, first, contact)
     score, second = chance[:, :-1].where(allowed, -1).max(dim=1)
     first, second, moment = first[score >= 0], second[score >= 0], chance[score >= 0, -1]
-    contacts = torch.ones(len(movie))
-    contacts[first] = 2
     begin, times = _overlapping(movie, first, second, moment)
 
     shares = movie.scale[first], movie.scale[second].gather(1, times)
@@ -53,6 +51,7 @@ def add_second(movie: Movie, share: float, contact: float, generator: np.random.
     column = (touched.cumsum(dim=1) - 1).clamp(min=0) + (counts.cumsum(0) - counts)[:, None]
 
     parameters = {name: values.clone() for name, values in movie.parameters.items()}
+    parameters["contacts"] = torch.ones(len(movie)).index_fill_(0, first, 2)
     for name in _LARGEST:
         parameters[name][first] = torch.maximum(parameters[name][first], movie.parameters[name][second])
     onset = torch.minimum(movie.parameters["onset"][first], begin.float())
@@ -60,8 +59,7 @@ def add_second(movie: Movie, share: float, contact: float, generator: np.random.
     parameters["force"][first] = force
     indices, scales = movie.index.clone(), movie.scale.clone()
     indices[first], scales[first] = column + len(movie.frames), scale
-    together = torch.cat([movie.frames, frames])
-    sums = Movie(together, indices, scales, movie.labels, parameters | {"contacts": contacts})
+    sums = Movie(torch.cat([movie.frames, frames]), indices, scales, movie.labels, parameters)
     return sums[torch.arange(len(movie))]  # without the frames of first gestures alone
 
 

@@ -2,8 +2,7 @@
 
 import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from typing import Any, NamedTuple, Protocol, final
 
@@ -90,10 +89,16 @@ class ContactModel(Protocol):
         """Return the pressure of gestures at a force that gives the wanted labels, if there is one."""
 
 
-def balanced(count: int, generator: np.random.Generator) -> np.ndarray:
-    """Return label combinations (count, 4), bool: all 16 equally often, to within one, in random order."""
-    order = generator.permutation(16)[np.arange(count) % 16]
-    return (generator.permutation(order)[:, None] >> np.arange(4) & 1).astype(bool)
+def balanced(count: int, generator: np.random.Generator, chosen: Sequence[str] = TOUCH.names) -> np.ndarray:
+    """Return label combinations (count, 4), bool: those of the chosen labels, balanced; others are false.
+
+    They are equally frequent, to within one, in random order.
+    """
+    kinds = 2 ** len(chosen)
+    codes = generator.permutation(generator.permutation(kinds)[np.arange(count) % kinds])
+    labels = np.zeros((count, len(TOUCH)), dtype=bool)
+    labels[:, [TOUCH.names.index(name) for name in chosen]] = codes[:, None] >> np.arange(len(chosen)) & 1
+    return labels
 
 
 def describe_touches(
@@ -108,8 +113,8 @@ def describe_touches(
         measures: of the movie.
     """
     begin = paths.trajectories.place[paths.first]
-    named = dict(zip(_FOUND, (*values, *paths.net.T, *begin.T), strict=True))
-    parameters = {name: drawn[name] for name in _DRAWN} | named
+    parameters = {name: drawn[name] for name in _DRAWN}
+    parameters |= zip(_FOUND, (*values, *paths.net.T, *begin.T), strict=True)
     floats = {name: torch.from_numpy(value).float() for name, value in parameters.items()}
     return floats | {name: value.float() for name, value in measures._asdict().items()}
 
@@ -119,35 +124,15 @@ def steer(paths: SampledPaths, shear: float) -> Tensor | None:
     return torch.from_numpy(shear * heading(paths.place, paths.first)).float() if shear else None
 
 
-@dataclass(frozen=True)
-class _Tally:
-    """Running counts per gesture (B,).
-
-    Attributes:
-        draws: paths drawn.
-        unconverged: frames whose contact did not converge.
-        misfits: drawn bodies that did not fit on the sheet.
-    """
-
-    draws: np.ndarray
-    unconverged: np.ndarray
-    misfits: np.ndarray
-
-    @classmethod
-    def of(cls, count: int) -> "_Tally":
-        """Return counts of 0."""
-        return cls(*np.zeros((3, count)))
-
-    def warn(self) -> None:
-        """Warn of frames that did not converge, if there are any."""
-        lost = int(self.unconverged.sum())
-        if lost:
-            warnings.warn(
-                f"{lost} frames did not converge to contact.tolerance within contact.iterations; their "
-                "gestures were drawn again: raise contact.iterations or contact.tolerance",
-                RuntimeWarning,
-                stacklevel=3,
-            )
+def _warn_of_unconverged(count: int) -> None:
+    """Warn of frames that did not converge, if there are any."""
+    if count:
+        warnings.warn(
+            f"{count} frames did not converge to contact.tolerance within contact.iterations; their "
+            "gestures were drawn again: raise contact.iterations or contact.tolerance",
+            RuntimeWarning,
+            stacklevel=3,
+        )
 
 
 class AbstractSampler(ABC):
@@ -189,12 +174,9 @@ class AbstractSampler(ABC):
         self.moments = None if moments is None else torch.as_tensor(moments, dtype=torch.float32)
         self.shapes = Shapes(settings.shapes, body, settings.thresholds.contact, moments is not None)
 
-    @abstractmethod
     def balanced(self, count: int, generator: np.random.Generator) -> np.ndarray:
-        """Return label combinations (count, 4), bool, for :meth:`sample`: those that can be drawn, balanced.
-
-        They are equally frequent, to within one, in random order.
-        """
+        """Return label combinations (count, 4), bool, that can be drawn, balanced, in random order."""
+        return balanced(count, generator, self.chosen)
 
     @abstractmethod
     def sample(self, count: int, generator: np.random.Generator, labels: np.ndarray | None = None) -> Movie:
@@ -250,31 +232,27 @@ class TouchSampler(AbstractSampler):
         """The fit of shapes to the sheet; None where shapes are redrawn until they fit."""
         return Fit.of(self.settings, self.shapes)
 
-    def balanced(self, count: int, generator: np.random.Generator) -> np.ndarray:
-        """Return label combinations (count, 4), bool: all 16 equally often."""
-        return balanced(count, generator)
-
     @torch.no_grad()
     def sample(self, count: int, generator: np.random.Generator, labels: np.ndarray | None = None) -> Movie:
         """Return the movies of ``count`` gestures; see :meth:`AbstractSampler.sample`."""
         targets = balanced(count, generator) if labels is None else labels
         redraws = self.settings.redraws
         pending = np.arange(count)
-        tally = _Tally.of(count)
+        draws, misfits, unconverged = np.zeros((3, count))
         fitted = self.fit and self.fit.draw(targets[:, 0], generator)
         finished: list[np.ndarray] = []
         movies: list[Movie] = []
         while len(pending):
-            if tally.draws[pending].min() >= _ATTEMPTS * redraws:
-                tally.warn()
+            if draws[pending].min() >= _ATTEMPTS * redraws:
+                _warn_of_unconverged(int(unconverged.sum()))
                 raise self._explain_impossible(targets[pending[0]])
-            if self.fit and tally.draws[pending].min() >= _LOYAL * redraws:
+            if self.fit and draws[pending].min() >= _LOYAL * redraws:
                 fitted = self.fit.draw(targets[:, 0], generator)
             gestures = draw_gestures(
                 targets, self.settings, self.shapes, self.padded, generator, self.fit, fitted
             )
-            tally.misfits[pending] += gestures["misfits"][pending]
-            gestures["misfits"] = tally.misfits
+            misfits[pending] += gestures["misfits"][pending]
+            gestures["misfits"] = misfits
             tried, hopeless = 0, []
             while tried < redraws and len(pending):
                 # The last few gestures try several paths at once, because a round has a fixed cost.
@@ -284,21 +262,29 @@ class TouchSampler(AbstractSampler):
                 # Sorted by scale, because frames of one texture level are rendered together.
                 pending = pending[np.argsort(gestures["scale"][pending], kind="stable")]
                 tried += ahead
-                chosen, given_up, movie = self._round(pending, targets, gestures, chance, tally)
+                chosen, given_up, movie = self._round(pending, targets, gestures, chance, draws, unconverged)
                 movies.append(movie)
                 finished.append(pending[chosen])
                 hopeless.append(pending[given_up])
                 pending = pending[~chosen & ~given_up]
             pending = np.concatenate([pending, *hopeless])
-        tally.warn()
+        _warn_of_unconverged(int(unconverged.sum()))
         movie = join_movies(movies)[torch.from_numpy(np.concatenate(finished).argsort())]
         share, contact = self.settings.second, self.settings.thresholds.contact
         return add_second(movie, share, contact, generator) if share else movie
 
     def _round(
-        self, pending: np.ndarray, wanted: np.ndarray, gestures: Draws, chance: np.ndarray, tally: _Tally
+        self,
+        pending: np.ndarray,
+        wanted: np.ndarray,
+        gestures: Draws,
+        chance: np.ndarray,
+        draws: np.ndarray,
+        unconverged: np.ndarray,
     ) -> tuple[np.ndarray, np.ndarray, Movie]:
-        """Try one path per row of ``chance`` (A, B, 5) for each pending gesture, and update the counts.
+        """Try one path per row of ``chance`` (A, B, 5) for each pending gesture.
+
+        The counts of each gesture, (B,), are updated: its drawn paths, and its frames that did not converge.
 
         Returns:
             Which of the pending gestures have a path with the wanted labels, bool, which cannot have one,
@@ -309,15 +295,15 @@ class TouchSampler(AbstractSampler):
         turns = np.tile(np.arange(ahead), len(pending))
         body = {name: values[rows] for name, values in gestures.items()}
         path = draw_paths(wanted[rows], body, self.settings, self.body.size, chance[turns, rows])
-        drawn = tally.draws[rows] + turns + 1
+        drawn = draws[rows] + turns + 1
         movie, pressed = self._press(body | path | {"draws": drawn}, wanted[rows])
         right = ((movie.labels.numpy() == wanted[rows]).all(axis=1) & ~pressed.refused).reshape(-1, ahead)
         chosen = right.any(axis=1)
         first = np.arange(len(pending)) * ahead + right.argmax(axis=1)
-        tally.draws[pending] += ahead
+        draws[pending] += ahead
         if pressed.unconverged is not None:
-            tally.unconverged[pending] += pressed.unconverged.reshape(-1, ahead).sum(axis=1)
-            movie.parameters["unconverged"] = torch.from_numpy(tally.unconverged[rows]).float()
+            unconverged[pending] += pressed.unconverged.reshape(-1, ahead).sum(axis=1)
+            movie.parameters["unconverged"] = torch.from_numpy(unconverged[rows]).float()
         given_up = pressed.hopeless.reshape(-1, ahead).any(axis=1) & ~chosen
         return chosen, given_up, movie[torch.from_numpy(first[chosen])]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from copy import copy
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -125,26 +125,18 @@ class Shapes:
         self, shape: np.ndarray, angle: np.ndarray, scale: np.ndarray, stretch: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return the bounding box of the outline around its place: lowest and highest (x, y), (B, 2), m."""
-        cos, sin = np.cos(angle)[:, None], np.sin(angle)[:, None]
-        x, y = self.hulls[shape, :, 0], self.hulls[shape, :, 1]
-        corners = np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1) * scale[:, None, None]
-        if stretch is not None:
-            wide = np.sqrt(stretch)
-            corners *= np.stack([wide, 1 / wide], axis=-1)[:, None]
-        return corners.min(axis=1), corners.max(axis=1)
+        return _bounds(self.hulls, shape, angle, scale, stretch)
 
     def scale(self, shape: np.ndarray, area: np.ndarray) -> np.ndarray:
         """Return the scale (B,), m, at which shapes cover a share of the sheet, on average over places.
 
         Parts beyond the sheet do not count.
         """
-        scales, roots = self._calibration
-        return _interpolate(shape, np.sqrt(area), roots, scales)
+        return _interpolate(shape, np.sqrt(area), *self._calibration[::-1])
 
     def area(self, shape: np.ndarray, scale: np.ndarray) -> np.ndarray:
         """Return the share of the sheet (B,) that shapes cover at a scale, m (inverse of :meth:`scale`)."""
-        scales, roots = self._calibration
-        return _interpolate(shape, scale, scales, roots) ** 2
+        return _interpolate(shape, scale, *self._calibration) ** 2
 
     def whole_scale(self, shape: np.ndarray, area: np.ndarray) -> np.ndarray:
         """Return the scale (B,), m, at which whole shapes cover as much as a share of the sheet."""
@@ -172,48 +164,42 @@ class Shapes:
         Cells at the rim count as whole although the shape covers them in part. The area of a shape of a given
         size therefore depends on the mesh, and is computed once. Its root is nearly linear in the scale.
         """
-        if self.fine:
-            return self._fine_calibration()
-        poses = np.random.default_rng(0).random((_CALIBRATION_POSES, 3))
-        scales = self._sizes(_CALIBRATION_SIZES)
-        angle = np.tile(2 * np.pi * poses[:, 0], _CALIBRATION_SIZES)
-        places = np.array(self.body.size) / 2 + (poses[:, 1:] - 0.5) * self.body.cell
-        places = np.tile(places, (_CALIBRATION_SIZES, 1))
-        roots = []
-        for number, sizes in enumerate(scales):
-            size = np.repeat(sizes, _CALIBRATION_POSES)
-            frames = self.render(np.full(len(size), number), angle, size, places).flatten(1)
-            share = (frames > self.contact * frames.amax(1, keepdim=True)).double().mean(1)
-            means = share.view(_CALIBRATION_SIZES, _CALIBRATION_POSES).mean(1).numpy()
-            roots.append(np.sqrt(np.maximum.accumulate(means)))
-        return scales, np.stack(roots)
-
-    def _sizes(self, count: int) -> np.ndarray:
-        """Return scales (N, count), m, from a small part of the sheet to more than the whole."""
-        width = np.ptp(self.hulls, axis=1).min(axis=1)
-        largest = 1.5 * max(self.body.size) / width
-        return largest[:, None] * np.geomspace(1 / 128, 1, count)
-
-    def _fine_calibration(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the same for fine pictures, of cells _FINER times as short, of whole shapes."""
+        if not self.fine:
+            return self._measure(_CALIBRATION_SIZES, _CALIBRATION_POSES, self._count_cells)
         images = hashlib.sha256(self.levels[0].numpy().tobytes()).hexdigest()
         key = images, self.body.size, self.body.cells, self.contact
-        if key in _FINE_AREAS:
-            return _FINE_AREAS[key]
-        poses = np.random.default_rng(0).random((_FINE_POSES, 3))
-        scales, samples = self._sizes(_FINE_SIZES), 2 * _FINER
-        number = np.repeat(np.arange(len(scales)), _FINE_SIZES * _FINE_POSES)
-        angle, *offset = np.tile(poses, (scales.size, 1)).T
-        place = np.stack(offset, axis=1) * self.body.cell
-        drawn = _Drawn(number, 2 * np.pi * angle, np.repeat(scales.ravel(), _FINE_POSES), place, None)
-        share = np.empty(len(number))
-        for part, _, _, pictures in self._pictures(drawn, samples):
+        if key not in _FINE_AREAS:
+            _FINE_AREAS[key] = self._measure(_FINE_SIZES, _FINE_POSES, self._count_fine)
+        return _FINE_AREAS[key]
+
+    def _measure(
+        self, sizes: int, poses: int, count: Callable[[_Drawn], Iterator[tuple[np.ndarray, Tensor]]]
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return scales, from a small part of the sheet to more than the whole, and the roots of areas."""
+        angle, *offset = np.tile(np.random.default_rng(0).random((poses, 3)), (len(self.names) * sizes, 1)).T
+        width = np.ptp(self.hulls, axis=1).min(axis=1)
+        scales = (1.5 * max(self.body.size) / width)[:, None] * np.geomspace(1 / 128, 1, sizes)
+        number = np.repeat(np.arange(len(scales)), sizes * poses)
+        place = np.array(self.body.size) / 2 + (np.stack(offset, axis=1) - 0.5) * self.body.cell
+        shares = torch.empty(len(number), dtype=torch.float64)
+        drawn = _Drawn(number, 2 * np.pi * angle, np.repeat(scales.ravel(), poses), place, None)
+        for part, share in count(drawn):
+            shares[torch.from_numpy(part)] = share
+        means = shares.view(len(scales), sizes, poses).mean(2).numpy()
+        return scales, np.sqrt(np.maximum.accumulate(means, axis=1))
+
+    def _count_cells(self, drawn: _Drawn) -> Iterator[tuple[np.ndarray, Tensor]]:
+        """Yield rows of shapes and the share of the sheet's cells in contact."""
+        for part in np.split(np.arange(len(drawn.shape)), len(self.names)):
+            frames = self.render(*drawn.rows(part)).flatten(1)
+            yield part, (frames > self.contact * frames.amax(1, keepdim=True)).double().mean(1)
+
+    def _count_fine(self, drawn: _Drawn) -> Iterator[tuple[np.ndarray, Tensor]]:
+        """Yield the same for fine pictures, of cells _FINER times as short, of whole shapes."""
+        for part, _, _, pictures in self._pictures(drawn, 2 * _FINER):
             pixels = avg_pool2d(pictures, 2).flatten(1)
             touched = (pixels > self.contact * pixels.amax(1, keepdim=True)).sum(1)
-            share[part] = touched.double().numpy() / (_FINER**2 * math.prod(self.body.cells))
-        means = share.reshape(len(scales), _FINE_SIZES, _FINE_POSES).mean(2)
-        _FINE_AREAS[key] = scales, np.sqrt(np.maximum.accumulate(means, axis=1))
-        return _FINE_AREAS[key]
+            yield part, touched.double() / (_FINER**2 * math.prod(self.body.cells))
 
     def press(
         self,
@@ -245,14 +231,9 @@ class Shapes:
 
     def _box(self, drawn: _Drawn) -> tuple[np.ndarray, np.ndarray]:
         """Return the upper left corners of boxes from their places, and their extents, (F, 2), in cells."""
-        cos, sin = np.cos(drawn.angle)[:, None], np.sin(drawn.angle)[:, None]
-        x, y = self._outlines[drawn.shape].transpose(2, 0, 1)
-        corners = np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
-        corners *= self._visible(drawn.scale, drawn.stretch)[:, None, None]
-        if drawn.stretch is not None:
-            wide = np.sqrt(drawn.stretch)
-            corners *= np.stack([wide, 1 / wide], axis=-1)[:, None]
-        low, high = (side / self.body.cell for side in (corners.min(axis=1), corners.max(axis=1)))
+        scale = self._visible(drawn.scale, drawn.stretch)
+        bounds = _bounds(self._outlines, drawn.shape, drawn.angle, scale, drawn.stretch)
+        low, high = (side / self.body.cell for side in bounds)
         return low, np.maximum(np.ceil(high - low), 1).astype(int)
 
     def _pictures(
@@ -441,6 +422,18 @@ class Shapes:
         return left + right
 
 
+def _bounds(
+    outlines: np.ndarray, shape: np.ndarray, angle: np.ndarray, scale: np.ndarray, stretch: np.ndarray | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return lowest and highest (x, y), (B, 2), m, of turned outlines (N, K, 2), which are in scales."""
+    cos, sin = np.cos(angle)[:, None], np.sin(angle)[:, None]
+    x, y = outlines[shape].transpose(2, 0, 1)
+    wide = np.sqrt(np.ones(len(shape)) if stretch is None else stretch)
+    corners = np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1) * scale[:, None, None]
+    corners *= np.stack([wide, 1 / wide], axis=-1)[:, None]
+    return corners.min(axis=1), corners.max(axis=1)
+
+
 def _interpolate(shape: np.ndarray, at: np.ndarray, nodes: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Return the values (B,) at places (B,), between the known ones (N, K) of each shape."""
     result = np.empty(len(shape))
@@ -556,8 +549,10 @@ def _draw_unfitted(
     scale = shapes.scale(shape, _area(big, settings, chance[:, 2]))
     low, high = shapes.extent(shape, angle, scale)
     fits = (high - low + settings.spare <= shapes.body.size).all(axis=1)
-    body = {"shape": shape, "angle": angle, "stretch": np.ones(len(big)), "scale": scale}
-    return body | {"low": low, "high": high, "fits": fits}
+    return {
+        "shape": shape, "angle": angle, "stretch": np.ones(len(big)), "scale": scale,
+        "low": low, "high": high, "fits": fits,
+    }  # fmt: skip
 
 
 def _draw_fitted(
@@ -579,8 +574,10 @@ def _draw_fitted(
     scale_own = shapes.whole_scale(shape, _area(big, settings, chance[:, 3]))
     scale = np.where(big == asked_big, scale_asked, scale_own)
     low, high = shapes.extent(shape, angle, scale, stretch)
-    body = {"shape": shape, "angle": angle, "stretch": stretch, "scale": scale}
-    return body | {"low": low, "high": high, "fits": fits}
+    return {
+        "shape": shape, "angle": angle, "stretch": stretch, "scale": scale,
+        "low": low, "high": high, "fits": fits,
+    }  # fmt: skip
 
 
 def _area(big: np.ndarray, settings: GestureSettings, chance: np.ndarray) -> np.ndarray:

@@ -22,20 +22,10 @@ _GAUSS, _WEIGHTS = np.polynomial.legendre.leggauss(4)  # exact for products of t
 _PIECES = 4  # in which a cell is integrated
 
 
-def unfolded(places: np.ndarray, count: int) -> np.ndarray:
-    """Return the splines of cells -2 to ``count`` + 1 at places (P,), in cells, (P, count + 4)."""
-    middles = np.arange(-REACH, count + REACH) + 0.5
-    return np.nan_to_num(_PIECE(places[:, None] - middles))
-
-
 def spline_values(places: np.ndarray, count: int) -> np.ndarray:
     """Return the splines of ``count`` cells at places (P,), in cells, (P, count)."""
-    wide = unfolded(places, count)
-    inner = wide[:, REACH:-REACH].copy()
-    for beyond in range(REACH):
-        inner[:, beyond] += wide[:, REACH - 1 - beyond]
-        inner[:, count - 1 - beyond] += wide[:, count + REACH + beyond]
-    return inner
+    middles = np.arange(-REACH, count + REACH) + 0.5
+    return fold_back(torch.from_numpy(np.nan_to_num(_PIECE(places[:, None] - middles)))).numpy()
 
 
 def sampled(begin: np.ndarray, count: int, samples: int, least: np.ndarray, most: np.ndarray) -> torch.Tensor:

@@ -16,7 +16,8 @@ from experiments.studies.study_page import draw_skin
 from skin.core.files import CONF
 from skin.learning.representation import Fourier, Image, Interpolation
 from skin.plot import figures
-from skin.plot.plot3d import deflection, surface
+from skin.plot.animation import still
+from skin.plot.plot3d import Scene, deflection, surface
 from skin.runs.build import build_device
 
 with initialize_config_dir(str(CONF), version_base="1.3"):
@@ -45,11 +46,11 @@ makers = {"image": Image(positions, size), "fourier": Fourier(positions, size)} 
 }
 frame = readings[None, strongest : strongest + 1]
 pictures = {name: make(frame, torch.ones_like(frame) > 0).x[0, 0, 0] for name, make in makers.items()}
-pressure, layout = movie.pressure()[hand, strongest], device.sensors.positions
-overview = figures.overview(
-    pressure, pictures["cubic"], readings, strongest, layout, (size, device.model_rate)
-)
-figures.save_figure(overview, folder / "overview.png")
+layout = device.sensors.positions
+positions = np.broadcast_to(layout, (len(readings), *layout.shape))
+title, pressure = "a sliding hand", movie.pressure()[hand].numpy()
+scene = Scene(readings.numpy(), positions, size, device.model_rate, title, pressure)
+still(scene, "flat", folder / "overview.png")
 figures.save_figure(figures.images(pictures, layout, size), folder / "figure04_interpolations.png")
 
 # %%

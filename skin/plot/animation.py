@@ -12,6 +12,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
+from mpl_toolkits.mplot3d.axes3d import Axes3D
 from PIL.Image import Dither, Image, fromarray, new
 
 from skin.body.base import AbstractBody
@@ -25,14 +26,12 @@ from skin.plot.plot3d import (
     FORCE,
     Draw,
     Scene,
-    clear,
+    beside_traces,
     draw_surface,
     draw_traces,
-    norm,
     places,
     sensors_in_space,
     skin_in_space,
-    space_and_traces,
     surface_motion,
 )
 from skin.touch.labels import TOUCH
@@ -62,9 +61,14 @@ def write_animation(scene: Scene, view: str, path: Path) -> Path:
     """
     step = thinning(len(scene.readings), scene.rate)
     pictures = _pictures(scene, view, range(0, len(scene.readings), step))
-    others, pause = pictures[1:], round(1e3 * step / scene.rate)
     with whole(path) as partial:
-        pictures[0].save(partial, save_all=True, append_images=others, duration=pause, loop=0)
+        pictures[0].save(
+            partial,
+            save_all=True,
+            append_images=pictures[1:],
+            duration=round(1e3 * step / scene.rate),
+            loop=0,
+        )
     return path
 
 
@@ -125,14 +129,15 @@ def _palette(picture: Image) -> Image:
 def _flat(figure: Figure, scene: Scene) -> Draw:
     """Show pressure and readings from above, and all readings over time."""
     left, right = figure.subplots(1, 2, width_ratios=(1.15, 1))
-    movie, what = _between(scene), "between the sensors, N"
-    if scene.pressure is not None:
-        movie, what = scene.pressure / 1e3, "pressure, kPa"
+    movie = _between(scene) if scene.pressure is None else scene.pressure / 1e3
+    what = "between the sensors, N" if scene.pressure is None else "pressure, kPa"
     picture = left.imshow(
         movie[0], cmap="Greys", extent=scene.extent, norm=Normalize(0, max(1.6 * float(movie.max()), 1e-9))
     )
     figure.colorbar(picture, ax=left, label=what, shrink=0.8)
-    dots = left.scatter(*places(scene, 0), s=60, cmap=FORCE, norm=norm(scene), c=scene.readings[0], zorder=3)
+    dots = left.scatter(
+        *places(scene, 0), s=60, cmap=FORCE, norm=Normalize(0, scene.strongest), c=scene.readings[0], zorder=3
+    )
     few = range(scene.readings.shape[1]) if scene.readings.shape[1] <= _NAMED else range(0)
     numbers = [left.text(0, 0, "", fontsize=7, color="#B03A00", ha="center", path_effects=_HALO) for _ in few]
     left.set(xlabel="x, mm", ylabel="y, mm", xlim=scene.extent[:2], ylim=scene.extent[2:])
@@ -143,9 +148,8 @@ def _flat(figure: Figure, scene: Scene) -> Draw:
         dots.set_array(scene.readings[frame])
         where = places(scene, frame)
         dots.set_offsets(where.T)
-        for sensor, number in enumerate(numbers):
-            number.set_position((where[0, sensor], where[1, sensor] - 0.03 * scene.extent[2]))
-            reading = scene.readings[frame, sensor]
+        for number, x, y, reading in zip(numbers, *where, scene.readings[frame], strict=False):
+            number.set_position((x, y - 0.03 * scene.extent[2]))
             # what is nearly nothing would only flicker
             number.set_text(f"{reading:.1f}" if reading > _SHOWN * scene.strongest else "")
         now(frame)
@@ -153,45 +157,40 @@ def _flat(figure: Figure, scene: Scene) -> Draw:
     return draw
 
 
-def _sensors3d(figure: Figure, scene: Scene) -> Draw:
+def _bars(axis: Axes3D, scene: Scene) -> Draw:
     """Show each sensor's reading as a bar over its place."""
-    if scene.body is not None:
-        return sensors_in_space(figure, scene, scene.body)
-    axis, right = space_and_traces(figure)
-    now, colour = draw_traces(right, scene), norm(scene)
+    colour = Normalize(0, scene.strongest)
     width = 450 * math.sqrt(scene.size[0] * scene.size[1] / scene.readings.shape[1])
-    axis.set(xlabel="x, mm", ylabel="y, mm", zlabel="reading, N", zlim=(0, scene.strongest))
-    axis.set(xlim=scene.extent[:2], ylim=scene.extent[2:])
+    axis.set(
+        xlabel="x, mm",
+        ylabel="y, mm",
+        zlabel="reading, N",
+        xlim=scene.extent[:2],
+        ylim=scene.extent[2:],
+        zlim=(0, scene.strongest),
+    )
     axis.set_box_aspect((*scene.size, 0.6 * max(scene.size)))
 
     def draw(frame: int) -> None:
-        clear(axis)
         height = np.maximum(scene.readings[frame], 0)
         x, y = places(scene, frame)
         colours = colormaps[FORCE](colour(height))
         axis.bar3d(x - width / 2, y - width / 2, 0, width, width, height, color=colours)
-        now(frame)
 
     return draw
 
 
-def _skin3d(figure: Figure, scene: Scene) -> Draw:
+def _surface(axis: Axes3D, scene: Scene) -> Draw:
     """Show the surface of the whole skin as it moves."""
-    if scene.body is not None:
-        return skin_in_space(figure, scene, scene.body)
     moved = scene.known(scene.moved)
-    axis, right = space_and_traces(figure)
-    now = draw_traces(right, scene)
-
-    def draw(frame: int) -> None:
-        clear(axis)
-        draw_surface(axis, moved[frame], 0.0, scene.size, float(moved.max()))
-        now(frame)
-
-    return draw
+    return lambda frame: draw_surface(axis, moved[frame], 0.0, scene.size, float(moved.max()))
 
 
-VIEWS = {"flat": _flat, "sensors3d": _sensors3d, "skin3d": _skin3d}
+VIEWS = {
+    "flat": _flat,
+    "sensors3d": beside_traces(_bars, sensors_in_space),
+    "skin3d": beside_traces(_surface, skin_in_space),
+}
 
 
 def _between(scene: Scene) -> np.ndarray:
@@ -235,16 +234,14 @@ def simulate_scene(
     movie = device.sampler.sample(1, generator, holds)
     true = device.model.respond(movie, displacement=False).readings
     readings, *_ = device.imperfection.apply(true, device.constants, generator)
-    pressure = movie.pressure()[0]
-    moved = None
-    motion = surface_motion(device.model, device.body, movie.frames) if field else None
-    if motion is not None:
-        moved = motion[movie.index[0]] * movie.scale[0, :, None, None].numpy()
+    moved = surface_motion(device.model, device.body, movie.frames) if field else None
+    if moved is not None:
+        moved = moved[movie.index[0]] * movie.scale[0, :, None, None].numpy()
     name = device.sampler.shapes.names[int(movie.parameters["shape"][0])]
-    positions = np.broadcast_to(device.sensors.positions, (len(pressure), *device.sensors.positions.shape))
+    positions = np.broadcast_to(device.sensors.positions, (*readings.shape[1:], 3))
     return Scene(
         readings[0].numpy(), positions, device.size, device.model_rate, _title(name, holds[0], TOUCH.names),
-        pressure.numpy(), moved, _round(device.body),
+        movie.pressure()[0].numpy(), moved, _round(device.body),
     )  # fmt: skip
 
 

@@ -10,8 +10,6 @@ from torch import Tensor
 
 from skin.core.files import whole
 
-Layout = tuple[tuple[float, float], float]
-
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 """Okabe and Ito's palette: told apart by colour-blind readers too."""
 
@@ -44,38 +42,6 @@ def images(pictures: Mapping[str, Tensor], points: np.ndarray, size: tuple[float
             axis.imshow(np.asarray(picture), cmap="magma", extent=extent, interpolation="nearest")
             axis.plot(points[:, 0] * 1e3, points[:, 1] * 1e3, ".", color="#56B4E9", markersize=2)
         axis.set(title=name, xticks=[], yticks=[])
-    return figure
-
-
-def overview(
-    pressure: Tensor, picture: Tensor, readings: Tensor, frame: int, points: np.ndarray, layout: Layout
-) -> Figure:
-    """Draw one frame of a gesture, what the sensors make of it, and all readings over time.
-
-    Args:
-        pressure: (H, W), Pa, of the frame.
-        picture: (H', W'), interpolated readings of the frame, any unit.
-        readings: (T, S), N.
-        frame: which of the T.
-        points: (S, 2), m, where the sensors are.
-        layout: size of the sheet (x, y), m, and frames per second, Hz.
-    """
-    size, rate = layout
-    figure = Figure(figsize=(11, 3.4), layout="constrained")
-    left, middle, right = figure.subplots(1, 3, width_ratios=(1, 1, 1.5))
-    extent = (0, size[0] * 1e3, size[1] * 1e3, 0)
-    image = left.imshow(np.asarray(pressure) / 1e3, cmap="magma", extent=extent)
-    figure.colorbar(image, ax=left, label="pressure, kPa", shrink=0.85)
-    left.set_title("what touches")
-    middle.imshow(np.asarray(picture), cmap="magma", extent=extent)
-    middle.set_title(f"what {len(points)} sensors feel")
-    for axis in (left, middle):
-        axis.plot(points[:, 0] * 1e3, points[:, 1] * 1e3, "o", color="#56B4E9", markersize=3)
-        axis.set_xlabel("x, mm")
-    time = np.arange(len(readings)) / rate
-    right.plot(time, readings, linewidth=1)
-    right.axvline(frame / rate, color="black", linewidth=0.8, linestyle=":")
-    right.set(title="their readings", xlabel="time, s", ylabel="N")
     return figure
 
 
@@ -183,10 +149,9 @@ def force_and_reading(force: Tensor, readings: Tensor, rate: float) -> Figure:
         readings: (G, T, S), N.
         rate: Hz.
     """
-    count = len(force)
-    figure = Figure(figsize=(3.6 * count, 3), layout="constrained")
+    figure = Figure(figsize=(3.6 * len(force), 3), layout="constrained")
     for axis, applied, values in zip(
-        figure.subplots(1, count, squeeze=False)[0], force, readings, strict=True
+        figure.subplots(1, len(force), squeeze=False)[0], force, readings, strict=True
     ):
         time = np.arange(len(applied)) / rate
         sensor = int(values.amax(0).argmax())

@@ -80,16 +80,6 @@ class Scene:
 Draw = Callable[[int], None]
 
 
-def space_and_traces(figure: Figure) -> tuple[Axes3D, Axes]:
-    grid = figure.add_gridspec(1, 2, width_ratios=(1.4, 1))
-    return figure.add_subplot(grid[0], projection="3d"), figure.add_subplot(grid[1])
-
-
-def clear(axis: Axes3D) -> None:
-    for artist in list(axis.collections):
-        artist.remove()
-
-
 def draw_traces(axis: Axes, scene: Scene) -> Draw:
     """Draw all readings over time, with a line that says when the rest of the picture is."""
     axis.plot(np.arange(len(scene.readings)) / scene.rate, scene.readings, linewidth=0.8)
@@ -107,8 +97,26 @@ def places(scene: Scene, frame: int) -> np.ndarray:
     return 1e3 * scene.positions[frame, :, :2].T
 
 
-def norm(scene: Scene) -> Normalize:
-    return Normalize(0, scene.strongest)
+def beside_traces(
+    sheet: Callable[[Axes3D, Scene], Draw], curved: Callable[[Axes3D, Scene, AbstractBody], Draw]
+) -> Callable[[Figure, Scene], Draw]:
+    """Return a view in space, of a sheet or of another body, beside all readings over time."""
+
+    def show(figure: Figure, scene: Scene) -> Draw:
+        grid = figure.add_gridspec(1, 2, width_ratios=(1.4, 1))
+        axis, right = figure.add_subplot(grid[0], projection="3d"), figure.add_subplot(grid[1])
+        now = draw_traces(right, scene)
+        paint = sheet(axis, scene) if scene.body is None else curved(axis, scene, scene.body)
+
+        def draw(frame: int) -> None:
+            for artist in list(axis.collections):
+                artist.remove()
+            paint(frame)
+            now(frame)
+
+        return draw
+
+    return show
 
 
 # Displacement of the whole skin under a pressure (report, figures 2 and 3).
@@ -166,8 +174,14 @@ def draw_surface(
     height = -1e3 * (moved + depth)
     colours = colormaps["viridis"](moved / most)
     axis.plot_surface(*places, height, facecolors=colours, rcount=50, ccount=50, shade=False)
-    axis.set(xlabel="x, mm", ylabel="y, mm", zlabel="height, mm", zlim=(-1e3 * (depth + most), -1e3 * depth))
-    axis.set(xlim=(0, 1e3 * size[0]), ylim=(1e3 * size[1], 0))
+    axis.set(
+        xlabel="x, mm",
+        ylabel="y, mm",
+        zlabel="height, mm",
+        xlim=(0, 1e3 * size[0]),
+        ylim=(1e3 * size[1], 0),
+        zlim=(-1e3 * (depth + most), -1e3 * depth),
+    )
     axis.zaxis.set_major_locator(MaxNLocator(4))
     axis.set_box_aspect((size[0], size[1], 0.3 * max(size)))
     axis.view_init(elev=48, azim=-65)
@@ -240,22 +254,19 @@ class _Shell:
         ]
 
 
-def skin_in_space(figure: Figure, scene: Scene, body: AbstractBody) -> Draw:
+def skin_in_space(axis: Axes3D, scene: Scene, body: AbstractBody) -> Draw:
     """Show the surface as it moves and the sensors; where nobody knows the movement, the pressure."""
     frames = scene.known(scene.pressure if scene.moved is None else scene.moved)
-    axis, right = space_and_traces(figure)
-    now, shell, most = draw_traces(right, scene), _Shell(body), max(float(frames.max()), 1e-9)
-    stretch = 1.0
+    shell, most, stretch = _Shell(body), max(float(frames.max()), 1e-9), 1.0
     if scene.moved is None:
         scale, what = Normalize(0, most / 1e3), "pressure, kPa"
     else:
         stretch = max(1.0, float(round(0.5 * body.thickness / most)))
         scale, what = Normalize(0, 1e3 * most), f"into the skin, mm (drawn {stretch:g} times)"
-    figure.colorbar(ScalarMappable(scale, FORCE), ax=axis, label=what, shrink=0.6, pad=0.02)
+    axis.figure.colorbar(ScalarMappable(scale, FORCE), ax=axis, label=what, shrink=0.6, pad=0.02)
     _stand(axis, shell)
 
     def draw(frame: int) -> None:
-        clear(axis)
         if scene.moved is None:
             _skin(axis, shell.surface(np.zeros_like(shell.lines[0])), colormaps[FORCE](frames[frame] / most))
         else:
@@ -263,23 +274,19 @@ def skin_in_space(figure: Figure, scene: Scene, body: AbstractBody) -> Draw:
             _skin(axis, shell.surface(stretch * moved), colormaps[FORCE](_mean(moved) / most))
         _rims(axis, shell)
         _dots(axis, body, scene.positions[frame])
-        now(frame)
 
     return draw
 
 
-def sensors_in_space(figure: Figure, scene: Scene, body: AbstractBody) -> Draw:
+def sensors_in_space(axis: Axes3D, scene: Scene, body: AbstractBody) -> Draw:
     """Show each sensor's reading as a bar that stands out of the surface over its place."""
-    axis, right = space_and_traces(figure)
-    now, colour, shell = draw_traces(right, scene), norm(scene), _Shell(body)
+    colour, shell, longest = Normalize(0, scene.strongest), _Shell(body), _LONGEST * min(body.size)
     bare = np.broadcast_to(_SKIN, (*body.shape, 4))
     surface = shell.surface(np.zeros_like(shell.lines[0]))
-    figure.colorbar(ScalarMappable(colour, FORCE), ax=axis, label="reading, N", shrink=0.6, pad=0.02)
-    longest = _LONGEST * min(body.size)
+    axis.figure.colorbar(ScalarMappable(colour, FORCE), ax=axis, label="reading, N", shrink=0.6, pad=0.02)
     _stand(axis, shell, longest)
 
     def draw(frame: int) -> None:
-        clear(axis)
         _skin(axis, surface, bare)
         height = np.maximum(scene.readings[frame], 0)
         foot = scene.positions[frame] * [1.0, 1.0, 0.0]
@@ -291,7 +298,6 @@ def sensors_in_space(figure: Figure, scene: Scene, body: AbstractBody) -> Draw:
         for side, order in ((~seen, 0), (seen, 4)):
             bars = Line3DCollection(list(ends[side]), colors=colours[side], linewidths=4, zorder=order)
             axis.add_collection(bars)
-        now(frame)
 
     return draw
 

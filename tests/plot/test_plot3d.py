@@ -7,8 +7,8 @@ from mpl_toolkits.mplot3d.art3d import Line3DCollection, Path3DCollection, Poly3
 
 from skin.body.base import Arm
 from skin.errors import InputError
-from skin.plot.animation import still, write_animation
-from skin.plot.plot3d import Scene, sensors_in_space, skin_in_space
+from skin.plot.animation import VIEWS, still, write_animation
+from skin.plot.plot3d import Scene
 
 LAYERS = [
     {"material": "Dragon Skin 10 Medium", "thickness": 0.010},
@@ -36,13 +36,12 @@ def moved() -> np.ndarray:
 def drawn(view, known: Scene, frame: int):
     """Return what stands in space, by kind."""
     figure = Figure()
-    assert known.body is not None
-    view(figure, known, known.body)(frame)
+    VIEWS[view](figure, known)(frame)
     return [figure.axes[0].findobj(kind) for kind in (Line3DCollection, Path3DCollection, Poly3DCollection)]
 
 
 def test_bars_stand_out_of_the_surface_as_long_as_they_read():
-    bars, _, _ = drawn(sensors_in_space, scene(), 2)
+    bars, _, _ = drawn("sensors3d", scene(), 2)
     ends = 1e-3 * np.concatenate([np.array(one._segments3d) for one in bars if len(one._segments3d)])
     radius = np.hypot(ends[..., 0], ends[..., 2])
     np.testing.assert_allclose(radius[:, 0], 0.05)
@@ -54,13 +53,13 @@ def test_bars_stand_out_of_the_surface_as_long_as_they_read():
 
 
 def test_sensors_behind_the_arm_are_not_seen():
-    shown = [len(dots._offsets3d[0]) for dots in drawn(sensors_in_space, scene(), 2)[1]]
+    shown = [len(dots._offsets3d[0]) for dots in drawn("sensors3d", scene(), 2)[1]]
     assert shown == [2]  # not the one at the left edge, whose surface looks away
 
 
 def test_the_surface_is_pressed_in_where_it_moves():
     """The most, 2 mm, is drawn as about half the thickness of 15 mm: 4 times as deep as it is."""
-    surface = drawn(skin_in_space, scene(moved=moved()), 2)[2][0]
+    surface = drawn("skin3d", scene(moved=moved()), 2)[2][0]
     x, _, z = 1e-3 * np.concatenate(surface._faces).T
     radius = np.hypot(x, z)
     assert radius.min() == pytest.approx(0.05 - 4 * 0.002)
@@ -71,10 +70,10 @@ def test_the_skin_is_coloured_by_pressure_where_nobody_knows_how_it_moves():
     pressure = np.zeros((6, 6, 10))
     pressure[2, 3, 5] = 50e3
     figure = Figure()
-    skin_in_space(figure, scene(pressure=pressure), ARM)(2)
+    VIEWS["skin3d"](figure, scene(pressure=pressure))(2)
     assert [axis.get_ylabel() for axis in figure.axes][-1] == "pressure, kPa"
     with pytest.raises(InputError, match="view=skin3d needs the pressure on the skin"):
-        skin_in_space(Figure(), scene(), ARM)
+        VIEWS["skin3d"](Figure(), scene())
 
 
 @pytest.mark.parametrize("view", ["sensors3d", "skin3d", "flat"])

@@ -77,12 +77,11 @@ class _Drawn(NamedTuple):
     angle: np.ndarray
     scale: np.ndarray
     place: np.ndarray
-    stretch: np.ndarray | None
+    stretch: np.ndarray
 
     def rows(self, rows: np.ndarray) -> _Drawn:
         """Return some of the shapes."""
-        stretch = None if self.stretch is None else self.stretch[rows]
-        return _Drawn(self.shape[rows], self.angle[rows], self.scale[rows], self.place[rows], stretch)
+        return _Drawn(*(values[rows] for values in self))
 
 
 _FINE_AREAS: dict[tuple[Any, ...], tuple[np.ndarray, np.ndarray]] = {}  # of the shapes used so far
@@ -182,7 +181,9 @@ class Shapes:
         number = np.repeat(np.arange(len(scales)), sizes * poses)
         place = np.array(self.body.size) / 2 + (np.stack(offset, axis=1) - 0.5) * self.body.cell
         shares = torch.empty(len(number), dtype=torch.float64)
-        drawn = _Drawn(number, 2 * np.pi * angle, np.repeat(scales.ravel(), poses), place, None)
+        drawn = _Drawn(
+            number, 2 * np.pi * angle, np.repeat(scales.ravel(), poses), place, np.ones(len(number))
+        )
         for part, share in count(drawn):
             shares[torch.from_numpy(part)] = share
         means = shares.view(len(scales), sizes, poses).mean(2).numpy()
@@ -210,9 +211,9 @@ class Shapes:
         stretch: np.ndarray | None = None,
     ) -> Pressed:
         """Return what shapes press, as :meth:`render` takes them, from pictures of the boxes they cover."""
-        drawn = _Drawn(shape, angle, scale, place, stretch)
+        drawn = _Drawn(shape, angle, scale, place, np.ones(len(shape)) if stretch is None else stretch)
         # Adjacent frames that differ in their place alone, as those of a path, share a picture.
-        same = [np.diff(values) == 0 for values in drawn if values is not None and values.ndim == 1]
+        same = [np.diff(values) == 0 for values in drawn if values.ndim == 1]
         first = np.flatnonzero(np.append(True, ~np.logical_and.reduce(same)))
         last = np.append(first[1:], len(shape))
         moments, peak = torch.empty(len(shape), *self.body.shape), torch.empty(len(shape))
@@ -274,7 +275,7 @@ class Shapes:
         self, texture: Tensor, drawn: _Drawn, corner: np.ndarray, box: np.ndarray, count: int
     ) -> Tensor:
         """Return samples (f, y, x) of textures (f, 1, p, p), ``count`` along each side of a box's cells."""
-        wide = np.sqrt(np.ones(len(drawn.shape)) if drawn.stretch is None else drawn.stretch)
+        wide = np.sqrt(drawn.stretch)
         turn = np.exp(-1j * drawn.angle) / self._visible(drawn.scale, drawn.stretch)
         begin = (corner * self.body.cell).T
         shift = turn * (begin[0] / wide + 1j * (begin[1] * wide))

@@ -253,7 +253,7 @@ GROUPS = {
     "body": "skin.body.base",
     "layout": "skin.body.layout",
     "simulator": "skin.mechanics.simulator.base",
-    "contact": "skin.mechanics.contact.base",
+    "contact": "skin.touch.sampler",
     "device": "skin.device.base",
     "representation": "skin.learning.representation",
     "model": "skin.learning.model",

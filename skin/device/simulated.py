@@ -23,7 +23,6 @@ from skin.device.resampling import check_rate
 from skin.device.sampling import draw_constants, idle_excess, measure
 from skin.device.touches import Part, Recording, Touches, TouchStream, draw_timeline, only_touches
 from skin.errors import InputError
-from skin.mechanics.contact.base import AbstractContact
 from skin.mechanics.contact.prescribed import Prescribed
 from skin.mechanics.geometry import sensor_geometry
 from skin.mechanics.relaxation import Relaxing, relaxes
@@ -32,7 +31,7 @@ from skin.touch.fingertips import read_touch
 from skin.touch.gesture import TouchSettings
 from skin.touch.labels import TOUCH, TOUCH_OR_NOT, TOUCH_SLIDING
 from skin.touch.movie import Movie
-from skin.touch.sampler import AbstractSampler
+from skin.touch.sampler import AbstractContact, AbstractSampler
 from skin.touch.splines import footprints
 
 # The true sensors of a simulated device and its model of them.

@@ -26,7 +26,7 @@ from skin.touch.gesture import (
 from skin.touch.images import load_image
 from skin.touch.labels import CONTACT, TOUCH
 from skin.touch.movie import Movie, join_movies, measure_gestures
-from skin.touch.sampler import AbstractSampler, ContactModel, describe_touches, steer
+from skin.touch.sampler import AbstractContact, AbstractSampler, describe_touches, steer
 from skin.touch.shapes import Shapes
 
 _DRAWN = [TOUCH.names.index("dynamic"), TOUCH.names.index("press")]
@@ -71,7 +71,7 @@ class FingertipSettings(TouchSettings):
         self,
         body: AbstractBody,
         footprints: np.ndarray,
-        contact: ContactModel,
+        contact: AbstractContact,
         padded: bool,
         moments: np.ndarray | None,
     ) -> "FingertipSampler":
@@ -230,7 +230,7 @@ class FingertipSampler(AbstractSampler):
         self,
         body: AbstractBody,
         footprints: np.ndarray,
-        contact: ContactModel,
+        contact: AbstractContact,
         settings: FingertipSettings,
         padded: bool = True,
         moments: np.ndarray | None = None,

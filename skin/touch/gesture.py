@@ -20,7 +20,7 @@ from skin.touch.labels import RELEASE, Thresholds
 from skin.touch.shapes import Fit, Shapes, draw_bodies
 
 if TYPE_CHECKING:
-    from skin.touch.sampler import AbstractSampler, ContactModel
+    from skin.touch.sampler import AbstractContact, AbstractSampler
 
 Draws = dict[str, np.ndarray]
 """Named parameters of gestures, one entry each along the first axis."""
@@ -170,7 +170,7 @@ class TouchSettings(ABC):
         self,
         body: AbstractBody,
         footprints: np.ndarray,
-        contact: "ContactModel",
+        contact: "AbstractContact",
         padded: bool,
         moments: np.ndarray | None,
     ) -> "AbstractSampler":
@@ -232,7 +232,7 @@ class GestureSettings(TouchSettings):
         self,
         body: AbstractBody,
         footprints: np.ndarray,
-        contact: "ContactModel",
+        contact: "AbstractContact",
         padded: bool,
         moments: np.ndarray | None,
     ) -> "AbstractSampler":

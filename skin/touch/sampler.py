@@ -4,7 +4,7 @@ import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from functools import cached_property
-from typing import Any, NamedTuple, Protocol, final
+from typing import Any, ClassVar, NamedTuple, final
 
 import numpy as np
 import torch
@@ -76,15 +76,19 @@ class ContactResult(NamedTuple):
     area: np.ndarray | None = None
 
 
-class ContactModel(Protocol):
-    """The interface of a contact for the sampler (:mod:`skin.mechanics.contact.base`)."""
+class AbstractContact(ABC):
+    """Computes the pressure of objects on the cells of the skin.
 
-    @property
-    def proportional(self) -> bool: ...
+    Attributes:
+        proportional: whether pressure is proportional to force. A static touch is then one frame for any time
+            profile, and the centre of pressure moves with the object.
+        advice: end of the error message where the wanted labels do not occur.
+    """
 
-    @property
-    def advice(self) -> str: ...
+    proportional: ClassVar[bool]
+    advice: ClassVar[str] = ""
 
+    @abstractmethod
     def press(self, trajectories: Trajectories, problem: ContactProblem) -> ContactResult:
         """Return the pressure of gestures at a force that gives the wanted labels, if there is one."""
 
@@ -163,7 +167,7 @@ class AbstractSampler(ABC):
         self,
         body: AbstractBody,
         footprints: np.ndarray,
-        contact: ContactModel,
+        contact: AbstractContact,
         settings: TouchSettings,
         padded: bool = True,
         moments: np.ndarray | None = None,
@@ -214,7 +218,7 @@ class TouchSampler(AbstractSampler):
         self,
         body: AbstractBody,
         footprints: np.ndarray,
-        contact: ContactModel,
+        contact: AbstractContact,
         settings: Mapping[str, Any] | GestureSettings | None = None,
         padded: bool = True,
         moments: np.ndarray | None = None,

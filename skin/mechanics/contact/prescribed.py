@@ -6,10 +6,9 @@ import numpy as np
 import torch
 
 from skin.body.base import AbstractBody
-from skin.mechanics.contact.base import AbstractContact
 from skin.mechanics.simulator.base import AbstractSimulator
 from skin.touch.gesture import Trajectories
-from skin.touch.sampler import ContactProblem, ContactResult
+from skin.touch.sampler import AbstractContact, ContactProblem, ContactResult
 
 
 @final

@@ -12,11 +12,10 @@ from torch import Tensor
 
 from skin.body.base import AbstractBody
 from skin.core.settings import checked
-from skin.mechanics.contact.base import AbstractContact
 from skin.mechanics.simulator.base import AbstractSimulator
 from skin.touch.gesture import Trajectories
 from skin.touch.movie import measure_gestures
-from skin.touch.sampler import ContactProblem, ContactResult
+from skin.touch.sampler import AbstractContact, ContactProblem, ContactResult
 
 # Contact of rigid objects with an elastic surface, in batches, by projected conjugate gradients.
 

@@ -1,13 +1,13 @@
-"""ROS 2 node that publishes the verdicts of ``skin live ... live.verdicts=7777``.
+"""ROS 2 node that starts ``skin live`` and publishes its verdicts.
 
-Topics: ~/verdict (std_msgs/String, the JSON line), ~/contacts (std_msgs/String, its field contacts: place,
-force and 90 % region of each), ~/danger, ~/unknown and ~/stale (std_msgs/Bool). Without danger, the skin is
-safe only where ~/unknown is false. Parameters: host, port. A lost connection makes all data unknown or stale.
-It does not clear an alarm.
+Topics: ~/verdict (std_msgs/String, the JSON line), ~/contacts (std_msgs/String, its contacts), ~/danger,
+~/unknown and ~/stale (std_msgs/Bool). Without danger, the skin is safe only where ~/unknown is false.
+Parameter: command, the words of ``skin live``. Without lines all is unknown and stale, which clears no alarm.
 """
 
 import json
-import socket
+import subprocess
+from queue import Empty, Queue
 from threading import Event, Thread
 
 import rclpy
@@ -15,50 +15,53 @@ from rclpy.node import Node
 from std_msgs.msg import Bool, String
 
 SCHEMA = 1
-SILENCE = 1.5  # s; skin live sends a line every 0.5 s or more often
+SILENCE = 1.5  # s; skin live prints a line every 0.5 s or more often
 
 
 class SkinNode(Node):
-    """Reads JSON lines in a thread and publishes them."""
+    """Reads the JSON lines of ``skin live`` in a thread and publishes them in another."""
 
     def __init__(self) -> None:
         super().__init__("skin")
-        host = self.declare_parameter("host", "127.0.0.1").value
-        port = self.declare_parameter("port", 7777).value
-        self._address = host, port
-        self._verdict, self._contacts = (
-            self.create_publisher(String, f"~/{name}", 10) for name in ("verdict", "contacts")
-        )
-        self._danger, self._unknown, self._stale = (
-            self.create_publisher(Bool, f"~/{name}", 10) for name in ("danger", "unknown", "stale")
-        )
-        self._over = Event()
-        self._thread = Thread(target=self._read, daemon=True)
+        command = self.declare_parameter("command", ["skin", "live", "device=serial"]).value
+        texts, states = ("verdict", "contacts"), ("danger", "unknown", "stale")
+        self._verdict, self._contacts = (self.create_publisher(String, f"~/{name}", 10) for name in texts)
+        flags = (self.create_publisher(Bool, f"~/{name}", 10) for name in states)
+        self._danger, self._unknown, self._stale = flags
+        self._over, self._lines = Event(), Queue()
+        self._live = subprocess.Popen([*command, "live.verdicts=stdout"], stdout=subprocess.PIPE)
+        Thread(target=self._read, daemon=True).start()
+        self._thread = Thread(target=self._publish_lines, daemon=True)
         self._thread.start()
 
     def destroy_node(self) -> None:
-        """End the thread and the node."""
+        """End ``skin live``, the threads and the node."""
         self._over.set()
+        self._live.terminate()
         self._thread.join(2 * SILENCE)
         super().destroy_node()
 
     def _read(self) -> None:
+        with self._live:  # its output is closed at the end
+            for line in self._live.stdout:
+                self._lines.put(line)
+
+    def _publish_lines(self) -> None:
         while not self._over.is_set():
             try:
-                with socket.create_connection(self._address, timeout=SILENCE) as connection:
-                    for line in connection.makefile("rb"):
-                        self._publish(json.loads(line), line.decode().strip())
-                        if self._over.is_set():
-                            return
-                reason = "skin live has ended"
-            except (OSError, ValueError) as error:
-                reason = str(error)
-            self._unknown.publish(Bool(data=True))
-            self._stale.publish(Bool(data=True))
-            lost = {"state": "unknown", "reason": reason, "contacts": []}
-            self._contacts.publish(String(data=json.dumps(lost)))
-            self.get_logger().warning(f"no verdicts from {self._address}: {reason}")
-            self._over.wait(SILENCE)
+                line = self._lines.get(timeout=SILENCE)
+                self._publish(json.loads(line), line.decode().strip())
+            except Empty:
+                self._lose(f"no line for {SILENCE} s; exit code of skin live: {self._live.poll()}")
+            except ValueError as error:
+                self._lose(str(error))
+
+    def _lose(self, reason: str) -> None:
+        for flag in (self._unknown, self._stale):
+            flag.publish(Bool(data=True))
+        lost = {"state": "unknown", "reason": reason, "contacts": []}
+        self._contacts.publish(String(data=json.dumps(lost)))
+        self.get_logger().warning(f"no verdicts: {reason}")
 
     def _publish(self, message: dict, line: str) -> None:
         if message["schema"] != SCHEMA:

@@ -165,7 +165,7 @@ def show(config: Config, changes: Sequence[str], own_mechanics: bool = False) ->
                 watched = watch_run(config, live, say, changes, opened, contacts, open_views, own_mechanics)
             (display,) = displays
             opened.enter_context(watch_age(display))
-            if live.verdicts != "stdout":
+            if live.verdicts is None:
                 from skin.hardware.live.terminal import show_in_terminal  # with torch
 
                 opened.enter_context(show_in_terminal(display, Console()))
@@ -197,6 +197,6 @@ def _views(display: "Display", config: Config, live: "LiveSettings", open_: Exit
 
         yield f"page: {open_.enter_context(serve_page(display, live.web_port))}"
     if live.verdicts is not None:
-        from skin.hardware.live.verdicts import stream_verdicts
+        from skin.hardware.live.verdicts import print_verdicts
 
-        yield f"verdicts: {open_.enter_context(stream_verdicts(display, live.verdicts))}"
+        open_.enter_context(print_verdicts(display))

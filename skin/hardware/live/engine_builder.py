@@ -232,7 +232,7 @@ class LiveSettings:
         top: upper end of the colour scale, N.
         touch: contact threshold, N above the baseline; None: that of the run.
         drift: N in ten minutes that the baseline may follow without touch.
-        verdicts: where JSON lines go: ``stdout``, or a TCP port, 0: any free one; None: nowhere.
+        verdicts: where JSON lines go, ``stdout``, in place of the terminal view; None: nowhere.
         log: file to which alarms are appended; None: no log.
         contacts: whether a process of its own estimates contacts.
         selftest: whether simulated dangerous touches must raise the alarm at the start.
@@ -243,7 +243,7 @@ class LiveSettings:
     top: Annotated[float, Gt(0)]
     touch: Annotated[float, Gt(0)] | None
     drift: Annotated[float, Ge(0)]
-    verdicts: Literal["stdout"] | Annotated[int, Ge(0), Le(65535)] | None
+    verdicts: Literal["stdout"] | None
     log: str | None
     contacts: bool
     selftest: bool

@@ -85,8 +85,8 @@ class DisplayState:
         alarm: the latest verdict was dangerous, and the contact has not ended as far as known.
         line: text with rate, lost frames and latency.
         peak: (S,), N, the largest of each sensor in the touch that the verdict is about; 0 without touch.
-        contacts: what is known of them, as in :func:`skin.hardware.live.contacts.contact_message`.
         notes: on what may be wrong, the gravest first.
+        contacts: what is known of them, as in :func:`skin.hardware.live.contacts.contact_message`.
     """
 
     number: int
@@ -98,8 +98,8 @@ class DisplayState:
     line: str
     alarm: bool
     peak: np.ndarray
-    contacts: dict[str, Any]
     notes: tuple[Note, ...]
+    contacts: dict[str, Any]
 
     @property
     def reason(self) -> str:
@@ -273,16 +273,16 @@ class Display:
             line = ", ".join(text for text in (note, self._line) if text)
             verdict, trouble, alarm = self._current(now)
             peak, number, valid = self._peak, self._number, self._valid
-        contacts = unknown_contacts(trouble) if verdict is None else self.contacts.state()
         values, saturated = (np.max(part, axis=0) for part in zip(*latest, strict=True))
         readings = np.where(valid, values, 0.0), valid, saturated & valid
-        notes = self.list_notes(verdict, trouble)
-        return DisplayState(number, *readings, verdict, trouble, line, alarm, peak, contacts, notes)
+        described = self.describe(verdict, trouble)
+        return DisplayState(number, *readings, verdict, trouble, line, alarm, peak, *described)
 
-    def list_notes(self, verdict: Verdict | None, trouble: str) -> tuple[Note, ...]:
-        """Return the notes on a verdict, or on its absence, and on the session, the gravest first."""
-        present = (Note("stale", detail=trouble),) if verdict is None else verdict.notes
-        return order_notes((*present, *self.notes))
+    def describe(self, verdict: Verdict | None, trouble: str) -> tuple[tuple[Note, ...], dict[str, Any]]:
+        """Return what belongs to a verdict, or to its absence: the notes, the gravest first, and contacts."""
+        if verdict is None:
+            return order_notes((Note("stale", detail=trouble), *self.notes)), unknown_contacts(trouble)
+        return order_notes((*verdict.notes, *self.notes)), self.contacts.state()
 
 
 _PATIENCE = 0.3  # s for which one read waits

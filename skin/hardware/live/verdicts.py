@@ -1,40 +1,38 @@
-"""Send the verdicts of a live view to other programs as JSON lines, and log alarms."""
+"""Write the verdicts of a live view as JSON lines for other programs, and log alarms."""
 
-import socket
 import sys
-from collections.abc import Callable, Iterator
+from collections import deque
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime, timedelta
 from math import isfinite
 from pathlib import Path
-from queue import Empty, Queue
-from threading import Event, Lock, Thread
+from threading import Condition, Thread
 from time import monotonic
-from typing import Any, Literal, TextIO
+from typing import Any, BinaryIO, TextIO
 
 from skin.core.files import json_line, unwritable
-from skin.errors import InputError
-from skin.hardware.live.contacts import unknown_contacts
 from skin.hardware.live.loop import Display
-from skin.hardware.live.verdict import Verdict, summarize_notes
+from skin.hardware.live.verdict import Note, Verdict, summarize_notes
 
 SCHEMA = 1
 """Version of the messages. A field may be added without a new version; a reader ignores unknown ones."""
 
 
-def verdict_message(display: Display, verdict: Verdict | None, reason: str, alarm: bool) -> dict[str, Any]:
+def verdict_message(
+    verdict: Verdict | None, alarm: bool, notes: Sequence[Note], contacts: dict[str, Any]
+) -> dict[str, Any]:
     """Return a verdict, or the reason why there is none, as JSON data.
 
     Args:
-        display: that tells it.
         verdict: the present one; None if there is none.
-        reason: why there is none.
-        alarm: an alarm that continues without a verdict.
+        alarm: including one that continues without a verdict.
+        notes: on the verdict or its absence, the gravest first.
+        contacts: what is known of them.
 
     Returns:
         The fields of ``docs/export.md`` but ``number`` and ``event``.
     """
-    notes = display.list_notes(verdict, reason)
     shared = {
         "schema": SCHEMA,
         "stale": verdict is None,
@@ -43,11 +41,12 @@ def verdict_message(display: Display, verdict: Verdict | None, reason: str, alar
         "alarm": alarm,
         "dangerous": True if alarm else None if verdict is None else verdict.danger,
         "notes": [note.message for note in notes],
+        "time": _utc(0.0 if verdict is None else monotonic() - verdict.t_host),
+        "contacts": contacts,
     }
     if verdict is None:
-        return shared | {"time": _utc(0.0), "contacts": unknown_contacts(reason)}
+        return shared
     return shared | {
-        "time": _utc(monotonic() - verdict.t_host),
         "device_time": verdict.t,
         "touched": verdict.touched,
         "labels": verdict.known,
@@ -60,7 +59,6 @@ def verdict_message(display: Display, verdict: Verdict | None, reason: str, alar
         "gap": verdict.gap,
         "masked": list(verdict.masked),
         "unknown": list(verdict.unknown),
-        "contacts": display.contacts.state(),
     }
 
 
@@ -72,144 +70,91 @@ def _utc(ago: float) -> str:
 
 HEARTBEAT = 0.5  # s without a line after which the state is repeated
 _WAITING = 256  # lines for a slow reader; then the oldest is dropped
-_LEAVE = 5.0  # s after which a client that reads nothing is left
-_TURN = 0.2  # s
-_HOST = "127.0.0.1"
-
-Lines = Queue[bytes | None]
+_ENDING = 1.0  # s in which a slow reader may take the last lines
 
 
-class VerdictStream:
-    """Numbers messages and hands them to readers, none of which can delay the classification.
+class VerdictLines:
+    """Numbers messages, and writes them in a thread of its own, which cannot delay the classification.
 
-    Each verdict is a line. Without verdicts, a line is sent when the reason changes and every ``HEARTBEAT``
-    seconds, with ``stale`` true.
+    Each verdict is a line. Without verdicts, a line is written when the reason changes and every
+    ``HEARTBEAT`` seconds, with ``stale`` true.
 
     Args:
-        display: that tells verdicts.
+        display: that gives verdicts; its ``closed`` is set when the file is closed by its reader.
+        file: takes a line at a time.
     """
 
-    def __init__(self, display: Display) -> None:
-        self._display = display
-        self._lock, self._number, self._readers = Lock(), 0, list[Lines]()
+    def __init__(self, display: Display, file: BinaryIO) -> None:
+        self._display, self._file = display, file
+        self._changed, self._over, self._number = Condition(), False, 0
+        self._waiting: deque[bytes] = deque(maxlen=_WAITING)
         state = display.state()
-        self._state = state.verdict, state.trouble, state.alarm
-        self._sent = monotonic()
+        self._told = state.verdict, state.trouble, state.alarm
 
     def observe(self, verdict: Verdict | None, reason: str, alarm: bool) -> None:
-        """Send a verdict, or a new reason for its absence."""
-        with self._lock:
-            before, self._state = self._state, (verdict, reason, alarm)
-            if verdict is not None or before != self._state:
-                self._send("verdict" if verdict is not None else "change")
+        """Add a verdict, or a new reason for its absence."""
+        told = verdict, reason, alarm
+        with self._changed:
+            before, self._told = self._told, told
+            if verdict is not None or told != before:
+                self._add("change" if verdict is None else "verdict")
 
-    def beat(self) -> None:
-        """Repeat the state if nothing was sent for a while."""
-        with self._lock:
-            if monotonic() - self._sent >= HEARTBEAT:
-                self._send("heartbeat")
+    def _add(self, event: str) -> None:
+        self._number += 1
+        verdict, reason, alarm = self._told
+        message = verdict_message(verdict, alarm, *self._display.describe(verdict, reason))
+        line = json_line({"number": self._number, "event": event, **message})
+        self._waiting.append(f"{line}\n".encode())
+        self._changed.notify()
 
-    def _send(self, event: str) -> None:
-        self._number, self._sent = self._number + 1, monotonic()
-        message = {
-            "number": self._number,
-            "event": event,
-            **verdict_message(self._display, *self._state),
-        }
-        line = (json_line(message) + "\n").encode()
-        for lines in self._readers:
-            _put(lines, line)
+    def run(self) -> None:
+        """Write the lines until :meth:`close`, or until nobody reads them."""
+        with suppress(OSError, ValueError):  # the reader is gone, or the file is closed
+            while line := self._next():
+                self._file.write(line)
+                self._file.flush()
+        self._display.closed.set()
 
-    def join(self, write: Callable[[bytes], object], left: Callable[[], object]) -> Thread:
-        """Write the lines from now on in a thread; call ``left`` when they cannot be written any more."""
-        lines: Lines = Queue(_WAITING)
-
-        def run() -> None:
-            with suppress(OSError, ValueError):  # the reader is gone, or its file is closed
-                while (line := lines.get()) is not None:
-                    write(line)
-            with self._lock:
-                self._readers.remove(lines)
-            left()
-
-        thread = Thread(target=run, name="skin-verdicts", daemon=True)
-        with self._lock:
-            self._readers.append(lines)
-        thread.start()
-        return thread
+    def _next(self) -> bytes:
+        """Return the next line, at the latest a heartbeat; empty at the end."""
+        with self._changed:
+            if not self._changed.wait_for(lambda: self._waiting or self._over, HEARTBEAT):
+                self._add("heartbeat")
+            return self._waiting.popleft() if self._waiting else b""
 
     def close(self) -> None:
-        """End every thread."""
-        with self._lock:
-            for lines in self._readers:
-                _put(lines, None)
-
-
-def _put(lines: Lines, line: bytes | None) -> None:
-    """Put a line into a queue to which no other thread adds; a full one drops its oldest line."""
-    if lines.full():
-        with suppress(Empty):
-            lines.get_nowait()
-    lines.put_nowait(line)
+        """Let the thread end after the lines that wait."""
+        with self._changed:
+            self._over = True
+            self._changed.notify()
 
 
 @contextmanager
-def stream_verdicts(display: Display, where: Literal["stdout"] | int) -> Iterator[str]:
-    """Send the verdicts of a display while the block runs; yield where to.
+def write_verdicts(display: Display, file: BinaryIO) -> Iterator[None]:
+    """Write the verdicts of a display to a file while the block runs, flushed line by line.
 
     Args:
-        display: its ``closed`` is set when standard output is closed.
-        where: ``stdout``, or a TCP port of this machine, 0: any free one.
-
-    Raises:
-        InputError: the port is in use or not allowed.
+        display: its ``closed`` is set when the reader closes the file.
+        file: of a pipe or standard output.
     """
-    stream, over = VerdictStream(display), Event()
-    display.observers.append(stream.observe)
-    beats = Thread(target=_beat, args=(stream, over), name="skin-heartbeat", daemon=True)
-    beats.start()
+    lines = VerdictLines(display, file)
+    display.observers.append(lines.observe)
+    thread = Thread(target=lines.run, name="skin-verdicts", daemon=True)
+    thread.start()
     try:
-        if where == "stdout":
-            thread = stream.join(_print, display.closed.set)
-            yield "standard output"
-            stream.close()
-            thread.join(1)
-        else:
-            try:
-                listening = socket.create_server((_HOST, where))
-            except (OSError, OverflowError) as error:
-                raise InputError(
-                    f"no verdicts on port {where}: {error}; give live.verdicts=0, or another"
-                ) from error
-            with listening:
-                clients = Thread(
-                    target=_accept, args=(listening, stream, over), name="skin-clients", daemon=True
-                )
-                clients.start()
-                yield "tcp://{}:{}".format(*listening.getsockname())
+        yield
     finally:
-        over.set()
-        stream.close()
+        display.observers.remove(lines.observe)
+        lines.close()
+        thread.join(_ENDING)
 
 
-def _print(line: bytes) -> None:
-    sys.stdout.buffer.write(line)
-    sys.stdout.buffer.flush()
-
-
-def _beat(stream: VerdictStream, over: Event) -> None:
-    while not over.wait(HEARTBEAT / 5):
-        stream.beat()
-
-
-def _accept(listening: socket.socket, stream: VerdictStream, over: Event) -> None:
-    listening.settimeout(_TURN)
-    with suppress(OSError):  # closed at the end
-        while not over.is_set():
-            with suppress(TimeoutError):
-                client, _ = listening.accept()
-                client.settimeout(_LEAVE)
-                stream.join(client.sendall, client.close)
+@contextmanager
+def print_verdicts(display: Display) -> Iterator[None]:
+    """Write the verdicts to standard output while the block runs; the display closes with its reader."""
+    # A file of its own, and never closed: lines that a reader did not take would fail once more.
+    with write_verdicts(display, open(sys.stdout.fileno(), "wb", closefd=False)):
+        yield
 
 
 class AlarmLog:
@@ -248,7 +193,8 @@ class AlarmLog:
         if self._file is None:
             return
         try:
-            message = verdict_message(self._display, *self._state)
+            verdict, reason, alarm = self._state
+            message = verdict_message(verdict, alarm, *self._display.describe(verdict, reason))
             self._file.write(json_line({"event": event, **message}) + "\n")
             self._file.flush()
         except OSError as error:

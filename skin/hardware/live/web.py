@@ -23,6 +23,7 @@ from skin.errors import InputError
 from skin.hardware.live.contacts import contact_text_lines
 from skin.hardware.live.loop import Display, DisplayState
 from skin.hardware.live.terminal import SkinPicture, contact_text
+from skin.hardware.live.verdicts import verdict_message
 
 HERTZ = 33  # pictures per second: 30, with a margin for a busy machine
 _PIXELS = 64
@@ -61,18 +62,13 @@ def serve_page(display: Display, port: int) -> Iterator[str]:
 
 
 def message(state: DisplayState, picture: SkinPicture) -> dict[str, Any]:
-    """Return the data of each picture: forces in N, the picture as base64 of uint8 row by row, time in s."""
+    """Return the data of each picture: the fields of a JSON line, and what the page draws.
+
+    Forces are in N, the picture is base64 of uint8 row by row, the time ``sent`` in s.
+    """
     verdict = state.verdict
-    answer = verdict and {
-        "touched": verdict.touched,
-        "dangerous": verdict.dangerous,
-        "state": verdict.state,
-        "contact": verdict.contact is not None,
-        "gap": verdict.gap,
-        "since": contact_text(verdict.contact),
-        "words": verdict.words(),
-    }
     return {
+        **verdict_message(verdict, state.alarm, state.notes, state.contacts),
         "number": state.number,
         "sent": time(),
         "values": [round(value, 3) for value in state.values.tolist()],
@@ -82,11 +78,9 @@ def message(state: DisplayState, picture: SkinPicture) -> dict[str, Any]:
         "held": state.held,
         "picture": base64.b64encode(picture(state.map, state.valid).tobytes()).decode(),
         "unknown": list(range(len(state.valid))) if verdict is None else list(verdict.unknown),
-        "verdict": answer,
-        "reason": state.reason,
-        "alarm": state.alarm,
+        "since": "" if verdict is None else contact_text(verdict.contact),
+        "words": [] if verdict is None else verdict.words(),
         "line": state.line,
-        "contacts": state.contacts,
         "contact_text": contact_text_lines(state.contacts),
     }
 

@@ -112,7 +112,7 @@ def until(found, process, what):
 
 @pytest.fixture(scope="module")
 def watched(begin, tmp_path_factory):
-    """Return what the emulated skin announces, and the addresses of the page and of the JSON lines."""
+    """Return what the emulated skin announces, the address of the page, and the command."""
     folder = tmp_path_factory.mktemp("watched")
     with ExitStack() as opened:
         emulator = opened.enter_context(begin(folder, "emulate", "port=tcp:0", *SKIN, *TOUCHES))
@@ -123,13 +123,12 @@ def watched(begin, tmp_path_factory):
         )
         tap = Tap(int(found[1]))
         opened.callback(tap.close)
-        words = ["run=any_skin", *SKIN, "web=true", "live.web_port=0", "live.verdicts=0"]
+        words = ["run=any_skin", *SKIN, "web=true", "live.web_port=0", "live.verdicts=stdout"]
         words += ["live.patience.above=0.97", "live.touch=0.3", "live.selftest=false"]
         words += ["device=serial", f"device.port=socket://127.0.0.1:{tap.port}", f"device.scale={found[2]}"]
         live = opened.enter_context(begin(folder, "live", *words))
-        lines = until(lambda: re.search(r"verdicts: tcp://127\.0\.0\.1:(\d+)", live.err), live, "JSON lines")
-        page = re.search(r"page: (http\S+)", live.err)[1]
-        yield tap, page, int(lines[1])
+        page = until(lambda: re.search(r"page: (http\S+)", live.err), live, "the page")[1]
+        yield tap, page, live
 
 
 def agrees(tap, told):
@@ -166,20 +165,8 @@ def check(errors):
 
 @pytest.mark.slow("watches a live view for long")
 def test_page_and_json_lines_agree_with_what_is_announced(watched):
-    tap, page, port = watched
-    lines, pictures = [], []
-
-    def read():
-        with socket.create_connection(("127.0.0.1", port), timeout=PATIENCE) as stream:
-            for line in stream.makefile("rb"):
-                lines.append(json.loads(line)["contacts"])
-                if over.is_set():
-                    return
-
-    over = Event()
-    thread = Thread(target=read, name="lines")
-    thread.start()
-    deadline = monotonic() + PATIENCE
+    tap, page, live = watched
+    pictures, deadline = [], monotonic() + PATIENCE
     with urlopen(f"{page}/pictures", timeout=PATIENCE) as events:
         for line in events:
             if line.startswith(b"data: "):
@@ -187,8 +174,7 @@ def test_page_and_json_lines_agree_with_what_is_announced(watched):
             if len(pictures) % 100 == 99 and len(agrees(tap, pictures)) >= ENOUGH:
                 break
             assert monotonic() < deadline, len(agrees(tap, pictures))
-    over.set()
-    thread.join()
+    lines = [json.loads(line)["contacts"] for line in live.out.splitlines(True) if line.endswith("\n")]
     for told in (pictures, lines):
         check(agrees(tap, told))
     # The same estimate is the same everywhere.

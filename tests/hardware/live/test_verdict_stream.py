@@ -2,21 +2,19 @@
 
 import importlib.util
 import json
-import socket
+import os
+import subprocess
 import sys
 from contextlib import contextmanager
-from threading import Thread
 from time import monotonic, sleep
 from types import ModuleType
 
 import numpy as np
-import pytest
 
 from skin.core.files import ROOT
-from skin.errors import InputError
 from skin.hardware.live.loop import Display, DisplayInfo, watch_age
 from skin.hardware.live.verdict import Verdict
-from skin.hardware.live.verdicts import HEARTBEAT, stream_verdicts
+from skin.hardware.live.verdicts import HEARTBEAT, write_verdicts
 
 PATIENCE = 60  # s
 
@@ -32,15 +30,18 @@ def verdict(dangerous=False, chance=0.25):
 
 
 @contextmanager
+def piped(shown):
+    """Yield the reading end of the pipe to which verdicts are written."""
+    reading, writing = os.pipe()
+    with os.fdopen(reading, "rb") as lines, os.fdopen(writing, "wb", 0) as file, write_verdicts(shown, file):
+        yield lines
+
+
+@contextmanager
 def connected(shown):
-    """Yield a function that returns the next message from a TCP port."""
-    with stream_verdicts(shown, 0) as address:
-        host, port = address.removeprefix("tcp://").split(":")
-        with socket.create_connection((host, int(port)), timeout=PATIENCE) as client:
-            lines = client.makefile("rb")
-            first = json.loads(lines.readline())  # a heartbeat, so the client is known from now on
-            assert (first["event"], first["stale"]) == ("heartbeat", True)
-            yield lambda: json.loads(lines.readline())
+    """Yield a function that returns the next message of a pipe."""
+    with piped(shown) as lines:
+        yield lambda: json.loads(lines.readline())
 
 
 def wait_for(take, accepted):
@@ -88,11 +89,10 @@ def test_a_verdict_that_is_too_old_is_stale_and_keeps_its_alarm():
 def test_the_first_line_tells_what_is_waited_for():
     shown = display()
     shown.set_verdict(None, "the threshold of the alarm is being chosen")
-    with stream_verdicts(shown, 0) as address:
-        host, port = address.removeprefix("tcp://").split(":")
-        with socket.create_connection((host, int(port)), timeout=PATIENCE) as client:
-            message = json.loads(client.makefile("rb").readline())
-    assert (message["reason"], message["state"]) == ("the threshold of the alarm is being chosen", "unknown")
+    with connected(shown) as take:
+        message = take()
+    assert (message["event"], message["stale"], message["state"]) == ("heartbeat", True, "unknown")
+    assert message["reason"] == "the threshold of the alarm is being chosen"
 
 
 def test_a_reason_is_sent_once_and_then_with_each_heartbeat():
@@ -109,25 +109,78 @@ def test_a_reason_is_sent_once_and_then_with_each_heartbeat():
     assert all(one["alarm"] for one in events)
 
 
-def test_a_reader_that_is_gone_or_slow_delays_nothing():
+def test_each_line_is_there_at_once():
+    """A reader that waits for a full buffer would show an alarm seconds late."""
     shown = display()
-    with stream_verdicts(shown, 0) as address:
-        host, port = address.removeprefix("tcp://").split(":")
-        lazy = socket.create_connection((host, int(port)), timeout=PATIENCE)
-        lazy.recv(1)
-        socket.create_connection((host, int(port))).close()
+    with connected(shown) as take:
+        for chance in (0.25, 0.5, 0.75):
+            shown.set_verdict(verdict(chance=chance))
+            found = wait_for(take, lambda message: message["event"] == "verdict")
+            assert found["probabilities"]["big"] == chance
+
+
+def test_a_reader_that_is_slow_delays_nothing_and_misses_the_oldest():
+    shown = display()
+    with piped(shown) as lines:
         began = monotonic()
-        for _ in range(20_000):
+        for _ in range(5_000):
             shown.set_verdict(verdict())
         assert monotonic() - began < PATIENCE
-        lazy.close()
+        numbers = [json.loads(lines.readline())["number"]]
+        while numbers[-1] < 5_000:
+            numbers.append(json.loads(lines.readline())["number"])
+    assert numbers == sorted(numbers)
+    assert len(numbers) < 4_000
 
 
-def test_a_port_in_use_is_refused():
-    with socket.create_server(("127.0.0.1", 0)) as other:
-        number = other.getsockname()[1]
-        with pytest.raises(InputError, match="no verdicts on port"), stream_verdicts(display(), number):
-            pass
+def test_the_view_closes_with_the_reader_of_its_lines():
+    shown = display()
+    with piped(shown) as lines:
+        lines.readline()
+        lines.close()
+        assert shown.closed.wait(PATIENCE)
+
+
+def test_what_waits_is_written_before_the_end():
+    shown = display()
+    reading, writing = os.pipe()
+    with os.fdopen(reading, "rb") as lines:
+        with os.fdopen(writing, "wb", 0) as file, write_verdicts(shown, file):
+            for _ in range(20):
+                shown.set_verdict(verdict())
+        assert [json.loads(line)["number"] for line in lines] == [*range(1, 21)]
+
+
+LIVE = """
+import sys
+import numpy as np
+from skin.hardware.live.loop import Display, DisplayInfo, watch_age
+from skin.hardware.live.verdict import Verdict
+from skin.hardware.live.verdicts import print_verdicts
+from time import monotonic
+
+assert sys.argv[-1] == "live.verdicts=stdout"
+shown = Display(DisplayInfo("run", "port", np.zeros((4, 3)), (0.1, 0.1), 4.0))
+with watch_age(shown), print_verdicts(shown):
+    shown.closed.wait(1)
+    for _ in range(40):
+        chances = {"big": 0.3, "dangerous": 1.0}
+        shown.set_verdict(Verdict(1.5, monotonic(), chances, True, {"dangerous": True}, True, False, (), 0.4))
+        if shown.closed.wait(0.05):
+            break
+print("ended", file=sys.stderr)
+sys.exit(0)
+"""
+"""What stands for ``skin live``: a heartbeat, and dangerous verdicts for two seconds."""
+
+
+def test_a_command_whose_reader_leaves_ends_with_code_0():
+    command = [sys.executable, "-c", LIVE, "live.verdicts=stdout"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as live:
+        assert json.loads(live.stdout.readline())["stale"] is True
+        live.stdout.close()
+        assert live.stderr.read() == b"ended\n"
+    assert live.returncode == 0
 
 
 def stand_in(published):
@@ -169,7 +222,7 @@ def test_the_ros_node_publishes_verdicts_and_marks_their_loss(monkeypatch):
     spec = importlib.util.spec_from_file_location("ros2_node", path)
     example = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(example)
-    monkeypatch.setattr(example, "SILENCE", 4 * HEARTBEAT)
+    monkeypatch.setattr(example, "SILENCE", 2 * HEARTBEAT)
 
     def until(entry):
         deadline = monotonic() + PATIENCE
@@ -177,27 +230,21 @@ def test_the_ros_node_publishes_verdicts_and_marks_their_loss(monkeypatch):
             assert monotonic() < deadline, published[-3:]
             sleep(0.02)
 
-    shown = display()
-    with stream_verdicts(shown, 0) as address:
-        modules["rclpy"].parameters = {"port": int(address.rpartition(":")[2])}
-        node = example.SkinNode()
-        until(("~/stale", True))
-        until(("~/danger", False))
-        pushing = Thread(
-            target=lambda: [(shown.set_verdict(verdict(dangerous=True)), sleep(0.05)) for _ in range(40)]
-        )
-        pushing.start()
-        until(("~/danger", True))
-        until(("~/stale", False))
-        pushing.join()
-        lines = [json.loads(data) for topic, data in published if topic == "~/verdict"]
-        assert any(line["event"] == "verdict" for line in lines)
-        contacts = [json.loads(data) for topic, data in published if topic == "~/contacts"]
-        assert contacts == [line["contacts"] for line in lines]
+    modules["rclpy"].parameters = {"command": [sys.executable, "-c", LIVE]}
+    node = example.SkinNode()
+    for entry in (("~/stale", True), ("~/danger", False), ("~/danger", True), ("~/stale", False)):
+        until(entry)
+    node._live.wait(PATIENCE)
+    lines = [json.loads(data) for topic, data in published if topic == "~/verdict"]
+    assert any(line["event"] == "verdict" for line in lines)
+    contacts = [json.loads(data) for topic, data in published if topic == "~/contacts"]
+    assert [told for told in contacts if len(told) > 3] == [line["contacts"] for line in lines]
+    sleep(2 * HEARTBEAT)
     published.clear()
     until(("~/stale", True))
     lost = [json.loads(data) for topic, data in published if topic == "~/contacts"]
     assert {contacts["state"] for contacts in lost} <= {"unknown"}
-    assert ("~/danger", False) not in published  # the loss of the connection clears no alarm
+    assert "exit code of skin live: 0" in lost[-1]["reason"]
+    assert ("~/danger", False) not in published  # that no line comes clears no alarm
     node.destroy_node()
     assert published[-1] == ("destroyed", "skin")

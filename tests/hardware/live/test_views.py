@@ -140,8 +140,8 @@ def test_the_page_gets_pictures_and_needs_nothing_from_elsewhere():
         with urllib.request.urlopen(f"{address}/pictures", timeout=30) as answer:
             line = answer.readline().decode()
         picture = json.loads(line.removeprefix("data: "))
-    assert picture["verdict"]["dangerous"] is True
-    assert picture["verdict"]["words"] == [["small", 0.8], ["dangerous", 0.9]]
+    assert (picture["schema"], picture["dangerous"], picture["stale"]) == (1, True, False)
+    assert picture["words"] == [["small", 0.8], ["dangerous", 0.9]]
     assert picture["values"][2] == 2.0
     assert picture["valid"] == [True, True, True, True, False]
     assert len(b64decode(picture["picture"])) == info["pixels"] ** 2
@@ -315,7 +315,7 @@ def test_an_unknown_place_is_not_shown_as_no_touch():
     masked = {"unknown": (2,), "masked": (2,), "notes": (Note("masked", (2,)), Note("pause", seconds=0.7))}
     subject.set_verdict(replace(PRESSED, touched=False, labels={}, dangerous=False, **masked))
     sent = web.message(subject.state(), SkinPicture(PLACES, SIZE, 8, 4.0))
-    assert (sent["verdict"]["state"], sent["unknown"]) == ("unknown", [2])
+    assert (sent["state"], sent["unknown"]) == ("unknown", [2])
     assert "no touch" not in terminal._sentence(subject.state())
     assert "near sensor 2 could not be felt" in terminal._sentence(subject.state())
     assert terminal._sentence(subject.state()).endswith("(and 1 more note)")

@@ -166,7 +166,7 @@ def show(config: Config, changes: Sequence[str], own_mechanics: bool = False) ->
             (display,) = displays
             opened.enter_context(watch_age(display))
             if live.verdicts is None:
-                from skin.hardware.live.terminal import show_in_terminal  # with torch
+                from skin.hardware.live.terminal import show_in_terminal
 
                 opened.enter_context(show_in_terminal(display, Console()))
             source, engine = watched.source, watched.settings.build()

@@ -263,11 +263,16 @@ class Display:
             request, self._request = self._request, ""
         return request
 
-    def state(self, since: int = 0, now: float | None = None) -> DisplayState:
-        """Return the state at ``now``, s, with the largest values after the first ``since`` frames."""
+    def state(self, since: int | None = None, now: float | None = None) -> DisplayState:
+        """Return the state at ``now``, s.
+
+        Args:
+            since: the values are the largest after so many frames; None: those of the latest frame.
+            now: s, the host's monotonic clock; None: that of the call.
+        """
         now = monotonic() if now is None else now
         with self._lock:
-            fresh = min(max(1, self._number - since), len(self._frames))
+            fresh = 1 if since is None else min(max(1, self._number - since), len(self._frames))
             latest = [self._frames[-1 - back] for back in range(fresh)]
             note = self._note if now - self._noted_at <= _CONFIRM else ""
             line = ", ".join(text for text in (note, self._line) if text)

@@ -10,7 +10,9 @@ from threading import Thread
 from time import monotonic, time
 from typing import Any
 
+import numpy as np
 import uvicorn
+from scipy.spatial import ConvexHull, Delaunay
 from starlette.applications import Starlette
 from starlette.middleware import Middleware
 from starlette.middleware.trustedhost import TrustedHostMiddleware
@@ -22,13 +24,76 @@ from skin.core.files import json_line
 from skin.errors import InputError
 from skin.hardware.live.contacts import contact_text_lines
 from skin.hardware.live.loop import Display, DisplayState
-from skin.hardware.live.terminal import SkinPicture, contact_text
+from skin.hardware.live.terminal import contact_text
 from skin.hardware.live.verdicts import verdict_message
+from skin.learning.representation import centres, weights
 
 HERTZ = 33  # pictures per second: 30, with a margin for a busy machine
 _PIXELS = 64
 _HOST = "127.0.0.1"
 _PAGE = Path(__file__).with_name("page.html")
+_FEWEST = 3
+_INWARDS = 1e-6
+
+
+class SkinPicture:
+    """Interpolates readings between the sensors, for display only.
+
+    Linear inside the sensors' hull, as ``representation=interp`` does; outside, as at the nearest point of
+    the hull, so that there is no edge. Nearest neighbour if there is no triangle.
+
+    Args:
+        positions: (S, 3), m.
+        size: extent (x, y) of the sheet, m.
+        pixels: edge length of the picture, which is stretched over the sheet.
+        top: N at the brightest value.
+    """
+
+    def __init__(self, positions: np.ndarray, size: tuple[float, float], pixels: int, top: float) -> None:
+        self.pixels, self.top = pixels, top
+        self._points, self._targets = np.asarray(positions, dtype=float)[:, :2], centres(size, pixels)
+        self._known = np.ones(len(self._points), dtype=bool)
+        self._matrix = self._weights()
+
+    def _weights(self) -> np.ndarray:
+        """Return the weights (P, S) of the known sensors."""
+        points = self._points[self._known]
+        matrix = np.zeros((len(self._targets), len(self._known)), np.float32)
+        if len(points) < _FEWEST or np.linalg.matrix_rank(points - points[0], tol=1e-6) < 2:
+            if len(points):
+                matrix[:, self._known] = weights(points, self._targets, "nearest")
+        else:
+            matrix[:, self._known] = weights(points, _inside(points, self._targets), "linear")
+        return matrix
+
+    def __call__(self, values: np.ndarray, valid: np.ndarray | None = None) -> np.ndarray:
+        """Return the picture of readings (S,), N, as (pixels, pixels), uint8: 255 is ``top`` and above.
+
+        Args:
+            values: N.
+            valid: (S,), bool; other sensors are left out, not shown as 0; None: all are known.
+        """
+        valid = np.ones(len(values), dtype=bool) if valid is None else valid
+        if not np.array_equal(valid, self._known):
+            self._known = valid.copy()
+            self._matrix = self._weights()
+        image = self._matrix @ values.astype(np.float32)
+        return (255 * np.clip(image / self.top, 0, 1)).astype(np.uint8).reshape(self.pixels, self.pixels)
+
+
+def _inside(points: np.ndarray, targets: np.ndarray) -> np.ndarray:
+    """Return targets (P, 2), those outside of the hull of points (S, 2) moved to its nearest point."""
+    outside = Delaunay(points).find_simplex(targets) < 0
+    corners = points[ConvexHull(points).vertices]
+    along = np.roll(corners, -1, axis=0) - corners
+    share = ((targets[outside, None] - corners) * along).sum(axis=2) / (along**2).sum(axis=1)
+    feet = corners + share.clip(0, 1)[..., None] * along
+    nearest = ((feet - targets[outside, None]) ** 2).sum(axis=2).argmin(axis=1)
+    moved = targets.copy()
+    on_edge = feet[np.arange(len(feet)), nearest]
+    # A little inwards, so that rounding does not leave them outside.
+    moved[outside] = on_edge + _INWARDS * (corners.mean(axis=0) - on_edge)
+    return moved
 
 
 @contextmanager

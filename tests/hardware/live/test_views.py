@@ -20,8 +20,8 @@ from skin.device.resampling import Frame
 from skin.errors import InputError
 from skin.hardware.live import loop, terminal, web
 from skin.hardware.live.loop import Display, DisplayInfo
-from skin.hardware.live.terminal import SkinPicture
 from skin.hardware.live.verdict import Note, Verdict
+from skin.hardware.live.web import SkinPicture
 from skin.hardware.wire.channels import UnitConversion
 
 PLACES = np.array([[0.02, 0.02, 0], [0.14, 0.03, 0], [0.03, 0.1, 0], [0.13, 0.11, 0], [0.08, 0.06, 0]])
@@ -116,14 +116,18 @@ def test_where_output_is_no_terminal_a_line_tells_each_change(tmp_path):
 
 def test_the_terminal_shows_the_alarm_and_the_probability():
     subject = display()
+    subject.set_verdict(replace(PRESSED, dangerous=False, contact=0.1))
+    subject.add_frame(frame([0, 0, 6.25, 0, 0]), PLAIN)
     subject.set_verdict(PRESSED)
     subject.set_status("99.9 Hz")
     console = Console(width=100, record=True, force_terminal=True, file=open("/dev/null", "w"))  # noqa: SIM115
     with console.file:
-        console.print(terminal.screen(subject, subject.state(), SkinPicture(PLACES, SIZE, 24, 4.0)))
+        console.print(terminal.screen(subject))
     text = console.export_text()
     assert "DANGEROUS" in text
     assert re.search(r"small .* 80 %", text)
+    assert "strongest reading 6.2 N, sensor 2" in text
+    assert "contacts unknown: this view estimates none" in text
     assert "99.9 Hz" in text
 
 
@@ -187,7 +191,7 @@ def test_an_alarm_outlives_silence_in_every_view():
     assert web.message(state, SkinPicture(PLACES, SIZE, 8, 4.0))["alarm"] is True
     console = Console(width=100, record=True, force_terminal=True, file=open("/dev/null", "w"))  # noqa: SIM115
     with console.file:
-        console.print(terminal.screen(subject, state, SkinPicture(PLACES, SIZE, 24, 4.0)))
+        console.print(terminal.screen(subject))
     text = console.export_text()
     assert "DANGEROUS" in text
     assert "stopped sending" in text

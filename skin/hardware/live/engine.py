@@ -1,8 +1,8 @@
 """Classify a stream of frames, without input or output: verdicts, their debouncing, and the engine."""
 
 from collections import deque
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, fields
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, fields, replace
 from math import ceil, floor, inf
 from typing import Annotated, Literal, NamedTuple
 
@@ -11,7 +11,7 @@ from annotated_types import Ge, Gt, Le, Lt
 from pydantic import NonNegativeFloat, PositiveFloat
 
 from skin.core.settings import checked
-from skin.device.resampling import Frame, StreamClock, Window
+from skin.device.resampling import Frame, Resampled, StreamClock, Window
 from skin.evaluation.decisions import (
     DECISIONS,
     DRIFT,
@@ -125,33 +125,21 @@ class EngineSettings:
 
 
 class _Decision(NamedTuple):
-    """What is known at a tick before the window is classified.
+    """A window that is to be classified.
 
     Attributes:
-        frame: the latest.
+        draft: the verdict, without what the model says.
         time: of the stream, s.
         readings, valid: of the window as the model sees it, (T, S).
-        contact: something touches the skin now.
         risen: some reading of the window rises above the threshold.
-        lasted: duration of the contact, s; None without contact.
-        gap: frames are missing in the window.
-        masked: sensors without a valid reading now.
-        unknown: sensors at which a dangerous touch could not be felt.
-        notes: on what may be wrong.
         last: the stream is interrupted behind it.
     """
 
-    frame: Frame
+    draft: Verdict
     time: float
     readings: np.ndarray
     valid: np.ndarray
-    contact: bool
     risen: bool
-    lasted: float | None
-    gap: bool
-    masked: tuple[int, ...]
-    unknown: tuple[int, ...]
-    notes: tuple[Note, ...]
     last: bool
 
 
@@ -254,18 +242,22 @@ class Engine:
         Raises:
             InputError: the stream is slower than the model's rate.
         """
-        decisions = list[_Decision]()
-        for frame in frames:
-            decisions += self._add(frame, conversion)
-        return self._judge(decisions)
+        decisions = [decision for frame in frames for decision in self._add(frame, conversion)]
+        if not decisions:
+            return []
+        readings, valid = (
+            np.stack([getattr(decision, name) for decision in decisions]) for name in ("readings", "valid")
+        )
+        probabilities = np.asarray(self._classify(readings, valid), dtype=float)
+        return [self._conclude(*pair) for pair in zip(decisions, probabilities.tolist(), strict=True)]
 
-    def _add(self, frame: Frame, conversion: UnitConversion | None) -> list[_Decision]:
-        """Add a frame to the window; return the decisions that are due."""
-        time, due = self._clock(frame), list[_Decision]()
+    def _add(self, frame: Frame, conversion: UnitConversion | None) -> Iterator[_Decision]:
+        """Add a frame to the window; yield the decisions that are due."""
+        time = self._clock(frame)
         pause = 0.0 if self._latest is None else time - self._latest[1]
         if self._interrupted(frame, time):
             # What came last before the interruption would be forgotten undecided.
-            due += self._decide(conversion, last=True)
+            yield from self._decide(conversion, last=True)
             self.window.clear()
             if frame.after in ("reset", "reconnect"):
                 self._contact.restart()
@@ -276,8 +268,7 @@ class Engine:
         tick = floor((time + _ROUNDING) * DECISIONS)
         if tick != self._tick:
             self._tick = tick
-            due += self._decide(conversion)
-        return due
+            yield from self._decide(conversion)
 
     def _interrupted(self, frame: Frame, time: float) -> bool:
         if self._latest is None:
@@ -286,51 +277,56 @@ class Engine:
         pause = time - before
         return frame.segment != latest.segment or (pause > _GAP and pause > 3 * self.window.period)
 
-    def _decide(self, conversion: UnitConversion | None, last: bool = False) -> list[_Decision]:
-        """Return the decision on the window that ends with the latest frame; none without a conversion."""
+    def _decide(self, conversion: UnitConversion | None, last: bool = False) -> Iterator[_Decision]:
+        """Yield the decision on the window that ends with the latest frame; none without a conversion."""
         seen = self.window.read(partial=True)
         if self._decided or conversion is None or seen is None or self._latest is None:
-            return []
+            return
         self._decided = True
         frame, time, pause = self._latest
         # A tap may come and go; but a device of the rate of a slow model may lose two frames, too.
         pause = pause if pause > max(_GAP / 2, 2.5 / self.window.rate) else 0.0
+        readings, valid, below = self._read_window(seen, conversion, time)
+        risen = bool(self._contact.rises(readings, valid).any())
+        readings, valid = self._fill_window(readings, valid & ~below & ~self._contact.lost, seen.before)
+        if not self.contact and not risen:
+            self._idle = readings, valid
+        lasted = None if self._contact.since is None else time - self._contact.since
+        responding = self._responds[:, valid[-1] & ~self._contact.void]
+        unknown = np.asarray(~responding.any(axis=1) | (pause > 0))
+        draft = Verdict(
+            t=frame.t,
+            t_host=frame.t_host,
+            gap=seen.gap,
+            masked=_numbers(~valid[-1]),
+            contact=lasted,
+            unknown=_numbers(unknown),
+            notes=self._find_notes(unknown, below[-1], pause),
+        )
+        yield _Decision(draft, time, *self._cut_window(readings, valid, lasted or 0.0), risen, last)
+
+    def _read_window(
+        self, seen: Resampled, conversion: UnitConversion, time: float
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Update the contact; return readings, N, valid, and which of them are below rest, each (T, S)."""
         readings, valid = conversion(seen.values, seen.valid)
         if conversion.noise is not None:
             self._contact.noise = conversion.noise
         valid = valid & ~self._freshness.stuck
         below = self._contact.falls(readings, valid)
-        contact = self._contact.update(readings, valid, time)
-        risen = bool(self._contact.rises(readings, valid).any())
+        self._contact.update(readings, valid, time)
+        return readings, valid, below
+
+    def _fill_window(
+        self, readings: np.ndarray, valid: np.ndarray, before: int
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return readings and valid, (T, S), with the rest where there is none: in the first rows, too."""
         # To the model a sensor below its rest is as one without a reading.
-        valid = valid & ~below & ~self._contact.lost
         readings = np.where(valid, readings, 0.0).astype(np.float32)
         # Unknown history counts as the rest of the sensors that are valid now.
-        readings[: seen.before] = self._contact.baseline
-        valid[: seen.before] = valid[seen.before :].any(axis=0)
-        if not contact and not risen:
-            self._idle = readings, valid
-        lasted = None if self._contact.since is None else time - self._contact.since
-        responding = self._responds[:, valid[-1] & ~self._contact.void]
-        unknown = np.asarray(~responding.any(axis=1) | (pause > 0))
-        notes = self._find_notes(unknown, below[-1], pause)
-        readings, presented = self._cut_window(readings, valid, lasted or 0.0)
-        return [
-            _Decision(
-                frame=frame,
-                time=time,
-                readings=readings,
-                valid=presented,
-                contact=contact,
-                risen=risen,
-                lasted=lasted,
-                gap=seen.gap,
-                masked=_numbers(~valid[-1]),
-                unknown=_numbers(unknown),
-                notes=notes,
-                last=last,
-            )
-        ]
+        readings[:before] = self._contact.baseline
+        valid[:before] = valid[before:].any(axis=0)
+        return readings, valid
 
     def _find_notes(self, unknown: np.ndarray, below: np.ndarray, pause: float) -> tuple[Note, ...]:
         """Return the notes on a decision.
@@ -355,54 +351,58 @@ class Engine:
         idle, idle_valid = self._idle
         return as_press(idle, readings, self._held), as_press(idle_valid, valid, self._held)
 
-    def _judge(self, decisions: Sequence[_Decision]) -> list[Verdict]:
-        """Classify the windows of decisions at once, and return their verdicts."""
-        if not decisions:
-            return []
-        readings, valid = (
-            np.stack([getattr(decision, name) for decision in decisions]) for name in ("readings", "valid")
-        )
-        chances = np.asarray(self._classify(readings, valid), dtype=float)
-        return [self._conclude(*pair) for pair in zip(decisions, chances.tolist(), strict=True)]
-
     def _conclude(self, decision: _Decision, probabilities: Sequence[float]) -> Verdict:
         """Return the verdict on a decision, given the probabilities of its window, one per label."""
         chances = dict(zip(self.task.names, probabilities, strict=True))
         learned = self._detection.learned and chances[self.task.gate or ""] > 0.5
         period = max(self.window.period, 1 / DECISIONS)
         self._update_alarm(decision, chances, learned, period)
-        touched = self._debounce_touch(decision, learned, period)
-        notes = self._doubts | {note.code: note for note in decision.notes}
-        # What makes a touch doubtful holds until it ends.
-        self._doubts = {code: note for code, note in notes.items() if code in LASTING and touched}
-        if 0.5 < chances.get("dangerous", 0.0) <= self._above and touched and not self.alarm:
-            notes["near_threshold"] = Note("near_threshold")
-        labels = self._debounce_labels(decision, chances, period)
-        return self._pack(decision._replace(notes=order_notes(notes.values())), chances, touched, labels)
+        touching = decision.draft.contact is not None or decision.risen or learned
+        # An alarm does not wait for the touch.
+        touched = self._touch(touching, decision.time, period) or self.alarm
+        labels = self._debounce_labels(decision.time, chances, period)
+        notes = self._collect_notes(decision.draft.notes, chances, touched)
+        if "dangerous" in chances:
+            labels |= {"dangerous": self.alarm}
+            chances |= {"dangerous": max(self._peak_probability, chances["dangerous"])}
+        return replace(
+            decision.draft,
+            chances=chances,
+            touched=touched,
+            labels=labels if touched else {},
+            dangerous=self.alarm,
+            notes=notes,
+            agreeing=dict(self._agreeing),
+        )
 
     def _update_alarm(
         self, decision: _Decision, chances: dict[str, float], learned: bool, period: float
     ) -> None:
         """Raise the alarm during a contact that is dangerous; keep it until the contact ends."""
+        contact = decision.draft.contact is not None
         # A touch that the window shows, but that has ended, raises no alarm.
-        present = decision.contact or (learned and not decision.risen)
+        present = contact or (learned and not decision.risen)
         chance = chances.get("dangerous", 0.0)
         # A NaN probability must not make a touch safe.
         dangerous = present and not chance <= self._above
         # No second decision can follow the last one before an interruption.
         period = inf if decision.last and dangerous else period
         raised = self._labels["dangerous"](dangerous, decision.time, period)
-        self.alarm = raised or (self.alarm and decision.contact)
+        self.alarm = raised or (self.alarm and contact)
         self._peak_probability = max(self._peak_probability, chance) if self.alarm else 0.0
 
-    def _debounce_touch(self, decision: _Decision, learned: bool, period: float) -> bool:
-        """Return whether the window shows a touch, debounced; an alarm does not wait for that."""
-        touched = decision.contact or decision.risen or learned
-        return self._touch(touched, decision.time, period) or self.alarm
+    def _collect_notes(
+        self, present: Sequence[Note], chances: dict[str, float], touched: bool
+    ) -> tuple[Note, ...]:
+        """Return the notes on a decision, those of the touch so far, and on its danger."""
+        notes = self._doubts | {note.code: note for note in present}
+        # What makes a touch doubtful holds until it ends.
+        self._doubts = {code: note for code, note in notes.items() if code in LASTING and touched}
+        if 0.5 < chances.get("dangerous", 0.0) <= self._above and touched and not self.alarm:
+            notes["near_threshold"] = Note("near_threshold")
+        return order_notes(notes.values())
 
-    def _debounce_labels(
-        self, decision: _Decision, chances: dict[str, float], period: float
-    ) -> dict[str, bool]:
+    def _debounce_labels(self, time: float, chances: dict[str, float], period: float) -> dict[str, bool]:
         """Return the predicted labels but ``dangerous``: the likeliest one if they exclude each other."""
         best = max(chances, key=chances.__getitem__)
         exclusive = self.task.kind == "exclusive"
@@ -411,33 +411,11 @@ class Engine:
             if name == "dangerous":
                 continue
             predicted = name == best if exclusive else chances[name] > 0.5
-            labels[name] = self._labels[name](predicted, decision.time, period)
+            labels[name] = self._labels[name](predicted, time, period)
             # A word must not stand beside the probability of its opposite.
             if labels[name] == predicted:
                 self._agreeing[name] = chances[name]
         return labels
-
-    def _pack(
-        self, decision: _Decision, chances: dict[str, float], touched: bool, labels: dict[str, bool]
-    ) -> Verdict:
-        """Return the verdict; ``dangerous`` is the alarm, with its largest probability so far."""
-        if "dangerous" in chances:
-            labels = labels | {"dangerous": self.alarm}
-            chances = chances | {"dangerous": max(self._peak_probability, chances["dangerous"])}
-        return Verdict(
-            t=decision.frame.t,
-            t_host=decision.frame.t_host,
-            chances=chances,
-            touched=touched,
-            labels=labels if touched else {},
-            dangerous=self.alarm,
-            gap=decision.gap,
-            masked=decision.masked,
-            contact=decision.lasted,
-            unknown=decision.unknown,
-            notes=decision.notes,
-            agreeing=dict(self._agreeing),
-        )
 
 
 def _numbers(which: np.ndarray | np.bool) -> tuple[int, ...]:

@@ -98,11 +98,11 @@ class Verdict:
 
     t: float
     t_host: float
-    chances: dict[str, float]
-    touched: bool
-    labels: dict[str, bool]
-    dangerous: bool
-    gap: bool
+    chances: dict[str, float] = field(default_factory=dict)
+    touched: bool = False
+    labels: dict[str, bool] = field(default_factory=dict)
+    dangerous: bool = False
+    gap: bool = False
     masked: tuple[int, ...] = ()
     contact: float | None = None
     unknown: tuple[int, ...] = ()

@@ -13,7 +13,7 @@ model at a port of this machine and serves the page. Ctrl-C stops.
 import gc
 import re
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from functools import partial
@@ -27,9 +27,9 @@ from skin.errors import InputError
 from skin.runs.configuration import Config, overrides, validate_config
 
 if TYPE_CHECKING:
-    from skin.hardware.live.engine_builder import LiveSettings
+    from skin.hardware.live.contacts import LiveContacts
+    from skin.hardware.live.engine_builder import LiveSettings, LiveSetup
     from skin.hardware.live.loop import Display
-    from skin.runs.trained_model import TrainedModel
 
 
 _DEMO = (
@@ -45,7 +45,8 @@ _DEMO = (
 )
 """Settings of a demonstration, unless others are given: fingertips, on a skin that tells them apart."""
 
-_EXPORTED = "an exported model has no mechanics: give the run itself, as in run=latest"
+Say = Callable[[str], None]
+"""Called with each message for the user."""
 
 
 @command("live")
@@ -128,55 +129,26 @@ def show(config: Config, changes: Sequence[str], own_mechanics: bool = False) ->
     from rich.console import Console
 
     from skin.core.interrupt import ends_on_signal
-    from skin.core.messages import quiet
     from skin.hardware.live.contacts import LiveContacts
-    from skin.hardware.live.engine_builder import LiveSettings, watch_exported, watch_run
-    from skin.hardware.live.loop import Display, DisplayInfo, LiveLoop, watch_age
-    from skin.runs.exported_model import check_overrides
+    from skin.hardware.live.engine_builder import LiveSettings
+    from skin.hardware.live.loop import LiveLoop
 
-    live = LiveSettings.of(config.live)
-    say = Console(stderr=True, highlight=False).print
-    exported = str(config.run).endswith(".onnx")
-    if exported:
-        check_overrides(str(config.run), compose("live", [*changes]), changes)
-    else:
-        quiet()
+    live, say = LiveSettings.of(config.live), Console(stderr=True, highlight=False).print
     try:
         with ExitStack() as opened:
             opened.enter_context(ends_on_signal())
-            contacts = LiveContacts("live.contacts=false")
+            setup = _load(config, live, say, changes, opened, own_mechanics)
+            contacts = _start_contacts(setup, say) if live.contacts else LiveContacts("live.contacts=false")
             opened.callback(contacts.close)
-            displays = list[Display]()
-
-            def open_views(model: "TrainedModel", name: str) -> None:
-                span = model.window / model.rate
-                info = DisplayInfo(model.title, name, model.positions, model.size, live.top, span)
-                displays.append(Display(info, contacts, live.patience.calm))
-                displays[0].set_verdict(None, "the threshold of the alarm is being chosen")
-                for text in _views(displays[0], config, live, opened):
-                    say(text)
-
-            if exported:
-                watched = watch_exported(str(config.run), config.device, live, say, opened, open_views)
-                if live.contacts:
-                    contacts.explain(_EXPORTED)
-                    say(f"no contacts: {_EXPORTED}")
-            else:
-                watched = watch_run(config, live, say, changes, opened, contacts, open_views, own_mechanics)
-            (display,) = displays
-            opened.enter_context(watch_age(display))
+            display = _open_views(setup, contacts, config, live, say, opened)
+            watched = setup.watch(live, say)
             if live.verdicts is None:
                 from skin.hardware.live.terminal import show_in_terminal
 
                 opened.enter_context(show_in_terminal(display, Console()))
             source, engine = watched.source, watched.settings.build()
-            session = LiveLoop(
-                source.skin,
-                source.tare,
-                engine,
-                display,
-                partial(watched.check, live.selftest, say, display.add_note),
-            )
+            check = partial(watched.check, live.selftest, say, display.add_note)
+            session = LiveLoop(source.skin, source.tare, engine, display, check)
             opened.callback(lambda: say(f"{session.verdicts} verdicts, {session.line}"))
             # A search for garbage among all that is loaded would stop the loop for 0.3 s, every few seconds.
             gc.collect()
@@ -186,17 +158,59 @@ def show(config: Config, changes: Sequence[str], own_mechanics: bool = False) ->
         print("ended", file=sys.stderr)
 
 
-def _views(display: "Display", config: Config, live: "LiveSettings", open_: ExitStack) -> Iterator[str]:
-    """Open what shows the verdicts; yield messages."""
-    if live.log is not None:
-        from skin.hardware.live.verdicts import log_alarms
+def _load(
+    config: Config, live: "LiveSettings", say: Say, changes: Sequence[str], opened: ExitStack, own: bool
+) -> "LiveSetup":
+    """Return the model and its device; the arguments are those of ``watch_run``."""
+    from skin.core.messages import quiet
+    from skin.hardware.live.engine_builder import watch_exported, watch_run
+    from skin.runs.exported_model import check_overrides
 
-        open_.enter_context(log_alarms(display, Path(live.log).expanduser()))
+    path = str(config.run)
+    if not path.endswith(".onnx"):
+        quiet()
+        return watch_run(config, live, say, changes, opened, own)
+    check_overrides(path, compose("live", [*changes]), changes)
+    return watch_exported(path, config.device, say, opened)
+
+
+def _start_contacts(setup: "LiveSetup", say: Say) -> "LiveContacts":
+    """Return estimates of contacts, whose process is started if the mechanics are known."""
+    from skin.hardware.live.contacts import LiveContacts
+
+    contacts = LiveContacts()
+    try:
+        contacts.start(setup.mechanics(), lambda: setup.port is not None and setup.port.raw_range.whole)
+    except InputError as error:
+        contacts.explain(str(error))
+        say(f"no contacts: {error}")
+    return contacts
+
+
+def _open_views(
+    setup: "LiveSetup",
+    contacts: "LiveContacts",
+    config: Config,
+    live: "LiveSettings",
+    say: Say,
+    opened: ExitStack,
+) -> "Display":
+    """Open what shows the verdicts but the terminal; return what they show."""
+    from skin.hardware.live.loop import Display, DisplayInfo, watch_age
+    from skin.hardware.live.verdicts import log_alarms, print_verdicts
+
+    model = setup.model
+    span = model.window / model.rate
+    info = DisplayInfo(model.title, setup.name, model.positions, model.size, live.top, span)
+    display = Display(info, contacts, live.patience.calm)
+    display.set_verdict(None, "the threshold of the alarm is being chosen")
+    if live.log is not None:
+        opened.enter_context(log_alarms(display, Path(live.log).expanduser()))
+    if live.verdicts is not None:
+        opened.enter_context(print_verdicts(display))
     if config.web:
         from skin.hardware.live.web import serve_page
 
-        yield f"page: {open_.enter_context(serve_page(display, live.web_port))}"
-    if live.verdicts is not None:
-        from skin.hardware.live.verdicts import print_verdicts
-
-        open_.enter_context(print_verdicts(display))
+        say(f"page: {opened.enter_context(serve_page(display, live.web_port))}")
+    opened.enter_context(watch_age(display))
+    return display

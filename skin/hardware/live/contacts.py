@@ -1,7 +1,8 @@
 """Contacts in the live view: where, how hard and how sure, estimated in a process of their own.
 
-No verdict waits for them: the loop leaves the newest readings behind and goes on. The process ends when the
-pipe to it is closed, however the command ends. torch is not imported here, but in that process.
+No verdict waits for them: the loop leaves the newest readings behind and goes on. The process ends with its
+present estimate when the pipe to it is closed, however the command ends. torch is not imported here, but in
+that process.
 """
 
 import os
@@ -10,13 +11,13 @@ import signal
 import subprocess
 import sys
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from queue import SimpleQueue
+from functools import partial
 from threading import Event, Lock, Thread
 from time import monotonic
-from typing import IO, TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -288,26 +289,22 @@ def estimate_contacts(posterior: "Posterior", nominal: "Noise", readings: MeanRe
 
 
 def serve() -> None:
-    """Estimate contacts: mechanics, then readings on standard input, answers on standard output."""
+    """Estimate contacts: mechanics, then readings on standard input, answers on standard output.
+
+    The first answer is why nothing can be estimated, or empty; then follows a message for each reading.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     if hasattr(os, "nice"):
         os.nice(_NICE)
-    answers, posted = os.fdopen(os.dup(1), "wb"), SimpleQueue[Any]()
+    answers = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # what a library prints is no answer
-
-    def read() -> None:
-        with suppress(EOFError, OSError, pickle.UnpicklingError):
-            while True:
-                posted.put(pickle.load(sys.stdin.buffer))
-        os._exit(0)  # the command has ended
-
-    Thread(target=read, name="skin-readings", daemon=True).start()
-    for answer in _answers(posted.get):
-        pickle.dump(answer, answers)
-        answers.flush()
+    with suppress(EOFError, OSError, pickle.UnpicklingError):  # the command has ended
+        for answer in _answers(partial(pickle.load, sys.stdin.buffer)):
+            pickle.dump(answer, answers)
+            answers.flush()
 
 
-def _answers(receive: Callable[[], Any]) -> Any:
+def _answers(receive: Callable[[], Any]) -> Iterator[Any]:
     """Yield an empty text once everything is prepared, then a message for each reading; or why not."""
     import torch
 
@@ -320,8 +317,9 @@ def _answers(receive: Callable[[], Any]) -> Any:
         return
     yield ""
     while True:
+        readings = receive()
         try:
-            yield estimate_contacts(posterior, mechanics.noise, receive())
+            yield estimate_contacts(posterior, mechanics.noise, readings)
         except (ArithmeticError, ValueError, AssertionError, InputError) as error:
             yield unknown_contacts(f"the estimate failed: {error}")
 
@@ -334,19 +332,22 @@ class LiveContacts:
     """
 
     def __init__(self, reason: str = "this view estimates none") -> None:
-        self._reason, self._lock, self._wake = reason, Lock(), Event()
-        self._latest, self._host = unknown_contacts(PREPARING), -np.inf
+        self._lock, self._wake, self._closed = Lock(), Event(), False
         self._frames: deque[Frame] = deque(maxlen=_MOST)
         self._newest: MeanReadings | None = None
         self._process: subprocess.Popen[bytes] | None = None
         self._thread: Thread | None = None
         self._whole: Callable[[], bool] = bool
-        self._closed = False
+        self.explain(reason)
 
     def explain(self, reason: str) -> None:
-        """Set why nothing is known; an empty text: it is known."""
+        """Set why nothing is known, until there is an estimate."""
+        self._set(unknown_contacts(reason), np.inf)
+
+    def _set(self, message: dict[str, Any], host: float) -> None:
+        """Set what is known of the readings at ``host``, s; infinite: it does not become old."""
         with self._lock:
-            self._reason = reason
+            self._latest, self._host = message, host
 
     def start(self, mechanics: Mechanics, whole: Callable[[], bool]) -> None:
         """Start the process, which needs some seconds.
@@ -356,7 +357,6 @@ class LiveContacts:
             whole: tells whether the device sends whole numbers.
         """
         places = os.pathsep.join(path for path in sys.path if path)
-        environment = os.environ | dict.fromkeys(_THREADS, "1") | {"PYTHONPATH": places}
         self._whole = whole
         self.explain(PREPARING)
         # In a group of its own, Ctrl-C does not reach it. In a session of its own, its priority would not
@@ -366,7 +366,7 @@ class LiveContacts:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
-            env=environment,
+            env=os.environ | dict.fromkeys(_THREADS, "1") | {"PYTHONPATH": places},
             process_group=0,
         )
         self._thread = Thread(target=self._run, args=(mechanics,), name="skin-contacts", daemon=True)
@@ -374,16 +374,12 @@ class LiveContacts:
 
     def close(self) -> None:
         """End the process."""
-        if self._process is None or self._thread is None:
-            return
-        self._closed = True
-        self._process.kill()
-        self._process.wait()
-        self._wake.set()
-        self._thread.join()
-        for pipe in (self._process.stdin, self._process.stdout):
-            with suppress(OSError):  # what was not written is lost
-                _open(pipe).close()
+        if self._process is not None and self._thread is not None:
+            self._closed = True
+            self._process.kill()
+            self._wake.set()
+            self._thread.join()
+            self._process.communicate()  # closes the pipes
 
     def look(
         self,
@@ -414,34 +410,29 @@ class LiveContacts:
     def state(self) -> dict[str, Any]:
         """Return what is known now, as JSON data."""
         with self._lock:
-            reason, latest, host = self._reason, self._latest, self._host
-        if reason:
-            return unknown_contacts(reason)
+            latest, host = self._latest, self._host
         return latest if monotonic() - host <= STALE else unknown_contacts("no estimate for half a second")
 
     def _run(self, mechanics: Mechanics) -> None:
         """Pass the newest readings to the process, and keep its answers."""
-        assert self._process is not None
-        posted, answers = _open(self._process.stdin), _open(self._process.stdout)
         try:
-            pickle.dump(mechanics, posted)
-            posted.flush()
-            self.explain(pickle.load(answers))
+            if refused := self._ask(mechanics):
+                self.explain(refused)
+                return
             while not self._closed:
                 self._wake.wait()
                 self._wake.clear()
                 readings, self._newest = self._newest, None
-                if readings is None:
-                    continue
-                pickle.dump(readings, posted)
-                posted.flush()
-                message = pickle.load(answers)
-                with self._lock:
-                    self._latest, self._host = message, readings.host
+                if readings is not None:
+                    self._set(self._ask(readings), readings.host)
         except (OSError, EOFError, ValueError, TypeError, AttributeError, pickle.PickleError):
             self.explain("the process that estimates them has ended")
 
-
-def _open(pipe: IO[bytes] | None) -> IO[bytes]:
-    assert pipe is not None
-    return pipe
+    def _ask(self, question: Mechanics | MeanReadings) -> Any:
+        """Return what the process answers."""
+        assert self._process is not None
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        pickle.dump(question, self._process.stdin)
+        self._process.stdin.flush()
+        return pickle.load(self._process.stdout)

@@ -6,6 +6,7 @@ torch is not imported.
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from time import monotonic
 from typing import Annotated, Any, Literal
 
@@ -18,7 +19,7 @@ from skin.device.resampling import Frame
 from skin.errors import InputError
 from skin.evaluation.decisions import DRIFT, least_visible
 from skin.hardware.check import verify_source
-from skin.hardware.live.contacts import LiveContacts, Mechanics
+from skin.hardware.live.contacts import Mechanics
 from skin.hardware.live.engine import DebounceSettings, Detection, EngineSettings
 from skin.hardware.live.verdict import Note, sensor_list
 from skin.hardware.wire.channels import RawRange, UnitConversion, unit_conversion
@@ -156,47 +157,38 @@ class SelfTest:
         conversion: UnitConversion,
         device: RawRange,
     ) -> str:
-        """Return why the settings in use are refused, with the one that is most likely wrong."""
+        """Return why the settings in use are refused, with those that are not nominal, or the device."""
         found = f"{raised.sum()} of {len(raised)}"
         text = f"self-test: {found} dangerous presses raise the alarm, not {expected.sum()}"
         if len(missed):
             text += f"; {sensor_list(missed.tolist())} cannot raise it"
         if expected.mean() < _LEAST:
             return f"{text}, even with nominal settings: train another run, or a longer one; {_OVERRIDE}"
-        for setting, settings, values, sent in self._repairs(conversion, device):
-            repaired = self.find(settings, values, sent)
+        if conversion.broken.mean() > _MASKED:
+            suspect = (
+                f"{conversion.broken.sum()} of {len(self.presses)} sensors have no valid reading (at most a "
+                "quarter may): they are dead, or the mask of broken sensors (device.calibration, or a tare "
+                "at the limit)"
+            )
+        else:
+            repaired = self.find(self._plausible, conversion, device)
             hidden = np.isin(self._sensors, missed) & expected & ~repaired
-            enough = repaired.sum() >= _SHARE * expected.sum()
-            if not hidden.any() and enough and values.broken.mean() <= _MASKED:
-                return f"{text}: {setting} is most likely wrong; {_OVERRIDE}"
-        return f"{text}: several settings are wrong; {_OVERRIDE}"
+            enough = not hidden.any() and repaired.sum() >= _SHARE * expected.sum()
+            suspect = self._differing if enough else ""
+        suspect = suspect or "device.limits, device.scale or device.calibration"
+        return f"{text}: {suspect} is most likely wrong; {_OVERRIDE}"
 
-    def _repairs(
-        self, conversion: UnitConversion, device: RawRange
-    ) -> Iterator[tuple[str, EngineSettings, UnitConversion, RawRange]]:
-        """Yield each setting with everything in use but this setting, which is nominal."""
+    @property
+    def _differing(self) -> str:
+        """The settings in use that are not nominal, in words."""
         used, nominal = self.used, self._plausible
-        unit = unit_conversion(len(self.presses), None, 1.0, None, None)
-        contact = replace(used.detection, threshold=nominal.detection.threshold)
-        drift = replace(used.detection, drift=nominal.detection.drift)
-        above = replace(used.patience, above=nominal.patience.above)
-        masked = replace(conversion, broken=np.zeros(len(self.presses), dtype=bool))
-        overridden = used.detection.threshold != self.nominal.detection.threshold
-        name = "live.touch" if overridden else "the contact threshold of the model"
-        yield name, replace(used, detection=contact), conversion, device
-        yield "live.drift", replace(used, detection=drift), conversion, device
-        yield "live.patience.above", replace(used, patience=above), conversion, device
-        yield "live.patience", replace(used, patience=nominal.patience), conversion, device
-        yield (
-            f"{conversion.broken.sum()} of {len(self.presses)} sensors have no valid reading (at most a "
-            "quarter may): they are dead, or the mask of broken sensors (device.calibration, or a tare at "
-            "the limit)",
-            used,
-            masked,
-            device,
-        )
-        yield "device.limits", used, conversion, replace(device, limits=(None, None))
-        yield "device.scale or device.calibration", used, unit, RawRange()
+        threshold = used.detection.threshold != nominal.detection.threshold
+        differing = {
+            "the contact threshold of the model or live.touch": threshold,
+            "live.drift": used.detection.drift != nominal.detection.drift,
+            "live.patience": used.patience != nominal.patience,
+        }
+        return " or ".join(name for name, differs in differing.items() if differs)
 
 
 def _frames(
@@ -333,27 +325,44 @@ class Watched:
         return sensors, raised
 
 
-Loaded = Callable[[TrainedModel, str], None]
-"""Called with the model and the name of its device before the threshold of the alarm is chosen."""
+@dataclass(frozen=True)
+class LiveSetup:
+    """A model and its device, before the threshold of the alarm is chosen.
+
+    Attributes:
+        model: that predicts.
+        name: of the device.
+        port: open source of a skin at a port; None: the skin is simulated or recorded.
+        begin: opens the source of such a skin, whose frames come from then on.
+        mechanics: gives what contacts are estimated with; it raises InputError if there is nothing.
+    """
+
+    model: TrainedModel
+    name: str
+    port: Source | None
+    begin: Callable[[], Source]
+    mechanics: Callable[[], Mechanics]
+
+    def watch(self, live: LiveSettings, say: Callable[[str], None]) -> Watched:
+        """Choose the threshold, which may take seconds, and return what is fed to the engine.
+
+        Raises:
+            InputError: no contact threshold is known, or no threshold raises an alarm as seldom as wanted.
+        """
+        settings = used_and_nominal(self.model, self.port, live, say)
+        return Watched(self.model, self.port or self.begin(), *settings)
 
 
 def watch_exported(
-    path: str,
-    device: Mapping[str, Any],
-    live: LiveSettings,
-    say: Callable[[str], None],
-    opened: ExitStack,
-    loaded: Loaded,
-) -> Watched:
+    path: str, device: Mapping[str, Any], say: Callable[[str], None], opened: ExitStack
+) -> LiveSetup:
     """Return an exported network and a skin at a port.
 
     Args:
         path: of the ONNX file.
         device: settings of ``device=serial``.
-        live: settings of the live view.
         say: called with each message for the user.
         opened: closes the port in the end.
-        loaded: opens the views.
 
     Raises:
         InputError: the file cannot be used, or the device is no skin at a port, or cannot be opened.
@@ -367,8 +376,11 @@ def watch_exported(
     source = SerialSource(PortSettings.select(device), len(model.positions), model.rate).open_source()
     opened.enter_context(source.skin)
     say(f"loaded {model.title} from {path}, exported by version {model.metadata.version}")
-    loaded(model, source.name)
-    return Watched(model, source, *used_and_nominal(model, source, live, say))
+    return LiveSetup(model, source.name, source, lambda: source, _refuse_contacts)
+
+
+def _refuse_contacts() -> Mechanics:
+    raise InputError("an exported model has no mechanics: give the run itself, as in run=latest")
 
 
 def watch_run(
@@ -377,10 +389,8 @@ def watch_run(
     say: Callable[[str], None],
     overrides: Sequence[str],
     opened: ExitStack,
-    contacts: LiveContacts,
-    loaded: Loaded,
     own_mechanics: bool = False,
-) -> Watched:
+) -> LiveSetup:
     """Return a finished run and the device of a configuration.
 
     Args:
@@ -389,8 +399,6 @@ def watch_run(
         say: called with each message for the user.
         overrides: settings that replace those of the run; ``config`` has their values.
         opened: closes the device in the end.
-        contacts: is started as soon as the mechanics are known.
-        loaded: opens the views, which then show that the threshold is being chosen.
         own_mechanics: the device has the mechanics of the run, though it is at a port.
 
     Raises:
@@ -422,19 +430,14 @@ def watch_run(
     # Without a simulator nothing could tune a contact threshold.
     touch = None if "simulator" in run.stored.device else live.touch
     model = load_model(run, trained, watched, touch=touch, alarm=False)
-    if live.contacts:
-        try:
-            mechanics = Mechanics.of(model.device.reference, bool(config.device.get("calibration")))
-            contacts.start(mechanics, lambda: port is not None and port.raw_range.whole)
-        except InputError as error:
-            contacts.explain(str(error))
-            say(f"no contacts: {error}")
-    loaded(model, device.name if port is None else port.name)
-    settings = used_and_nominal(model, port, live, say)
-    if port is None:
-        port = open_source(device)
-        opened.enter_context(port.skin)
-    return Watched(model, port, *settings)
+    mechanics = partial(Mechanics.of, model.device.reference, bool(config.device.get("calibration")))
+
+    def begin() -> Source:
+        source = open_source(device)
+        opened.enter_context(source.skin)
+        return source
+
+    return LiveSetup(model, device.name if port is None else port.name, port, begin, mechanics)
 
 
 def engine_settings(

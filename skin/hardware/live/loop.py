@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from math import inf
-from threading import Event, Lock, Thread
+from threading import Event, Lock, RLock, Thread
 from time import monotonic
 from typing import Any, Literal
 
@@ -23,8 +23,11 @@ from skin.hardware.wire.skin import Skin
 
 _log = logging.getLogger(__name__)
 
+Told = tuple[Verdict | None, str, bool]
+"""What is said of the skin: the present verdict, else None; why there is none; and the alarm."""
+
 Observer = Callable[[Verdict | None, str, bool], None]
-"""Takes the arguments of :meth:`Display.set_verdict`; it must return at once."""
+"""Takes what is said of the skin; it must return at once."""
 
 TareRequest = Literal["", "tare", "forced"]
 """A request for a new baseline: none, from the next quiet stretch, or from the next frames."""
@@ -36,8 +39,15 @@ _TOGETHER = 0.02  # s: decisions of one delivery
 _USUAL = 5.0  # s over which the usual interval between decisions is taken
 _OFTEN = 0.1  # s between two looks at the age of a verdict
 _CONFIRM = 60.0  # s after a refusal in which a tare may be forced
-REFUSED = "tare refused: something touches the skin; if nothing does, confirm it (terminal: force and Enter)"
-
+Refusal = Literal["", "touched", "unforced"]
+REFUSALS: dict[Refusal, str] = {
+    "": "",
+    "touched": "tare refused: something touches the skin; if nothing does, confirm it "
+    "(terminal: force and Enter)",
+    "unforced": "there is nothing to force",
+}
+"""Why the latest request for a new baseline was refused, in words."""
+_TARES = {"tare": "new tare", "tare_forced": "tare forced by the operator"}
 
 STALE = 1.5
 """s without frames after which nothing is known of the skin."""
@@ -81,7 +91,6 @@ class DisplayState:
         valid: (S,), bool, of the latest frame.
         saturated: (S,), bool, since the last call: the force is at least the value.
         verdict: the latest one; None if there is none now.
-        trouble: message about why there is no verdict; else empty.
         alarm: the latest verdict was dangerous, and the contact has not ended as far as known.
         line: text with rate, lost frames and latency.
         peak: (S,), N, the largest of each sensor in the touch that the verdict is about; 0 without touch.
@@ -94,7 +103,6 @@ class DisplayState:
     valid: np.ndarray
     saturated: np.ndarray
     verdict: Verdict | None
-    trouble: str
     line: str
     alarm: bool
     peak: np.ndarray
@@ -144,7 +152,7 @@ class Display:
         self.notes: tuple[Note, ...] = ()
         self.observers: list[Observer] = []
         self.listeners: list[Callable[[str], None]] = []
-        self._lock, self._telling = Lock(), Lock()
+        self._lock, self._telling = RLock(), Lock()
         sensors = len(info.positions)
         first = np.zeros(sensors), np.zeros(sensors, dtype=bool)
         self._frames: deque[tuple[np.ndarray, np.ndarray]] = deque([first], maxlen=_KEPT)
@@ -153,10 +161,11 @@ class Display:
         self._number = 0
         self._verdict: Verdict | None = None
         self._calm, self._alarm_at, self._decided = calm, -inf, deque([-inf])
-        self._told: tuple[Verdict | None, str, bool] | None = None
-        self._trouble, self._line, self._note = "waiting for the first frame", "", ""
+        self._told: Told | None = None
+        self._trouble, self._line = "waiting for the first frame", ""
         self._request: TareRequest = ""
-        self._noted_at = -np.inf
+        self._refusal: Refusal = ""
+        self._refused_at = -inf
 
     def add_frame(self, frame: Frame, conversion: UnitConversion) -> None:
         """Add a frame as sent, with the conversion of its values to N."""
@@ -202,27 +211,27 @@ class Display:
 
     def refresh(self, now: float) -> None:
         """Tell the observers if the latest verdict has become too old, or a late alarm ends."""
-        with self._lock:
-            changed = self._current(now) != self._told
-        if changed:
+        if self.told(now) != self._told:
             self._tell(now)
 
     def _tell(self, now: float) -> None:
         with self._telling:
-            with self._lock:
-                self._told = self._current(now)
+            self._told = self.told(now)
             for observer in self.observers:
                 observer(*self._told)
 
-    def _current(self, now: float) -> tuple[Verdict | None, str, bool]:
-        """Return the verdict, why there is none, and the alarm, as they are shown at ``now``, s."""
-        alarm = self._alarm or now - self._alarm_at < self._calm
-        # A single pause is not usual.
-        gaps = sorted(np.diff(self._decided))
-        usual = gaps[-2] if len(gaps) > 2 else 0.0
-        if self._verdict is None or now - self._decided[-1] > min(_AGE + usual, STALE):
-            return None, self._trouble or LATE, alarm
-        return self._verdict.in_alarm if alarm and not self._verdict.dangerous else self._verdict, "", alarm
+    def told(self, now: float | None = None) -> Told:
+        """Return what is said of the skin at ``now``, s, on the host's monotonic clock; None: of the call."""
+        now = monotonic() if now is None else now
+        with self._lock:
+            alarm = self._alarm or now - self._alarm_at < self._calm
+            # A single pause is not usual.
+            gaps = sorted(np.diff(self._decided))
+            usual = gaps[-2] if len(gaps) > 2 else 0.0
+            if self._verdict is None or now - self._decided[-1] > min(_AGE + usual, STALE):
+                return None, self._trouble or LATE, alarm
+            late = alarm and not self._verdict.dangerous
+            return self._verdict.in_alarm if late else self._verdict, "", alarm
 
     def add_note(self, note: Note) -> None:
         """Add a note on the whole session."""
@@ -241,21 +250,18 @@ class Display:
         a second and explicit confirmation of the operator; :meth:`state` says so as long.
         """
         with self._lock:
-            refused = self._alarm or (self._verdict is not None and self._verdict.contact is not None)
-            if force and self._note == REFUSED and monotonic() - self._noted_at <= _CONFIRM:
-                self._request, event, self._note = "forced", "tare_forced", ""
-            elif refused or force:
-                event, self._noted_at = "tare_refused", monotonic()
-                self._note = REFUSED if refused else "there is nothing to force"
+            touched = self._alarm or (self._verdict is not None and self._verdict.contact is not None)
+            forced = force and self._refusal == "touched" and monotonic() - self._refused_at <= _CONFIRM
+            refused = not forced and (touched or force)
+            self._refusal = "" if not refused else "touched" if touched else "unforced"
+            if refused:
+                event, self._refused_at = "tare_refused", monotonic()
             else:
-                self._request, event, self._note = "tare", "tare", ""
-            note = self._note
-        _log.warning(
-            "%s", {"tare": "new tare", "tare_forced": "tare forced by the operator"}.get(event, note)
-        )
+                event, self._request = ("tare_forced", "forced") if forced else ("tare", "tare")
+        _log.warning("%s", REFUSALS[self._refusal] or _TARES[event])
         for listener in self.listeners:
             listener(event)
-        return note
+        return REFUSALS[self._refusal]
 
     def take_tare(self) -> TareRequest:
         """Return the latest request for a new baseline, once."""
@@ -272,16 +278,15 @@ class Display:
         """
         now = monotonic() if now is None else now
         with self._lock:
+            verdict, trouble, alarm = self.told(now)
             fresh = 1 if since is None else min(max(1, self._number - since), len(self._frames))
             latest = [self._frames[-1 - back] for back in range(fresh)]
-            note = self._note if now - self._noted_at <= _CONFIRM else ""
-            line = ", ".join(text for text in (note, self._line) if text)
-            verdict, trouble, alarm = self._current(now)
+            refusal = REFUSALS[self._refusal] if now - self._refused_at <= _CONFIRM else ""
+            line = ", ".join(filter(None, (refusal, self._line)))
             peak, number, valid = self._peak, self._number, self._valid
         values, saturated = (np.max(part, axis=0) for part in zip(*latest, strict=True))
         readings = np.where(valid, values, 0.0), valid, saturated & valid
-        described = self.describe(verdict, trouble)
-        return DisplayState(number, *readings, verdict, trouble, line, alarm, peak, *described)
+        return DisplayState(number, *readings, verdict, line, alarm, peak, *self.describe(verdict, trouble))
 
     def describe(self, verdict: Verdict | None, trouble: str) -> tuple[tuple[Note, ...], dict[str, Any]]:
         """Return what belongs to a verdict, or to its absence: the notes, the gravest first, and contacts."""

@@ -7,6 +7,7 @@ from contextlib import contextmanager, suppress
 from datetime import datetime, timedelta
 from functools import partial
 from threading import Thread
+from typing import IO
 
 from rich.console import Console, Group, RenderableType
 from rich.live import Live
@@ -16,6 +17,7 @@ from rich.text import Text
 
 from skin.hardware.live.contacts import contact_text_lines
 from skin.hardware.live.loop import Display, DisplayState
+from skin.hardware.live.verdicts import LineWriter
 from skin.hardware.wire.segmentation import typed_lines
 
 _HERTZ = 8
@@ -33,21 +35,11 @@ def show_in_terminal(display: Display, console: Console) -> Iterator[None]:
     Thread(target=_read_keys, args=(display,), name="skin-keys", daemon=True).start()
     render = partial(screen, display)
     live = Live(get_renderable=render, console=console, refresh_per_second=_HERTZ, transient=True)
-    with live if console.is_terminal else _printed(display, console):
+    with live if console.is_terminal else print_changes(display, console.file):
         try:
             yield
         finally:
             display.closed.set()
-
-
-@contextmanager
-def _printed(display: Display, console: Console) -> Iterator[None]:
-    thread = Thread(target=print_changes, args=(display, console), name="skin-lines", daemon=True)
-    thread.start()
-    try:
-        yield
-    finally:
-        thread.join(2)
 
 
 def _read_keys(display: Display) -> None:
@@ -58,16 +50,21 @@ def _read_keys(display: Display) -> None:
                 display.request_tare(force=word == "force")
 
 
-def print_changes(display: Display, console: Console) -> None:
-    """Print the verdict whenever it changes, until the display is closed."""
-    before = ""
-    while True:
-        text = _sentence(display.state())
-        if text != before:
-            console.print(text, markup=False, highlight=False, soft_wrap=True)
-            before = text
-        if display.closed.wait(1 / (4 * _HERTZ)):
-            return
+@contextmanager
+def print_changes(display: Display, file: IO[str]) -> Iterator[None]:
+    """Write the verdict to a file whenever it changes, while the block runs."""
+    latest = ""
+
+    def observe(*told: object) -> None:
+        nonlocal latest
+        before, latest = latest, _sentence(display.state())
+        if latest != before:
+            lines.add(lambda _: latest)
+
+    with LineWriter(file, lambda _: display.closed.set()) as lines:
+        observe()
+        display.observers.append(observe)
+        yield
 
 
 def _sentence(state: DisplayState) -> str:

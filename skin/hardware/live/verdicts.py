@@ -2,17 +2,18 @@
 
 import sys
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime, timedelta
+from functools import partial
 from math import isfinite
 from pathlib import Path
 from threading import Condition, Thread
 from time import monotonic
-from typing import Any, BinaryIO, TextIO
+from typing import IO, Any
 
 from skin.core.files import json_line, unwritable
-from skin.hardware.live.loop import Display
+from skin.hardware.live.loop import Display, Told
 from skin.hardware.live.verdict import Note, Verdict, summarize_notes
 
 SCHEMA = 1
@@ -73,138 +74,118 @@ _WAITING = 256  # lines for a slow reader; then the oldest is dropped
 _ENDING = 1.0  # s in which a slow reader may take the last lines
 
 
-class VerdictLines:
-    """Numbers messages, and writes them in a thread of its own, which cannot delay the classification.
+class LineWriter:
+    """Writes lines in a thread of its own, flushed one by one: a slow reader or disk delays no verdict.
+
+    Args:
+        file: open for writing.
+        failed: called with the error when the file cannot be written any more, as its reader is gone.
+        idle: makes a line of its number when there was none for ``HEARTBEAT`` s; None: there is no such line.
+    """
+
+    def __init__(
+        self,
+        file: IO[str],
+        failed: Callable[[Exception], object],
+        idle: Callable[[int], str] | None = None,
+    ) -> None:
+        self._file, self._failed, self._idle = file, failed, idle
+        self._changed, self._over, self._number = Condition(), False, 0
+        self._waiting: deque[str] = deque(maxlen=_WAITING)
+        self._thread = Thread(target=self._run, name="skin-lines", daemon=True)
+
+    def __enter__(self) -> "LineWriter":
+        self._thread.start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        """Write the lines that wait, and end."""
+        with self._changed:
+            self._over = True
+            self._changed.notify()
+        self._thread.join(_ENDING)
+
+    def add(self, line: Callable[[int], str]) -> None:
+        """Add the line that a function makes of its number, from 1 up; return at once."""
+        with self._changed:
+            self._number += 1
+            self._waiting.append(line(self._number))
+            self._changed.notify()
+
+    def _run(self) -> None:
+        try:
+            while line := self._next():
+                self._file.write(f"{line}\n")
+                self._file.flush()
+        except (OSError, ValueError) as error:
+            self._failed(error)
+
+    def _next(self) -> str:
+        """Return the next line; empty at the end."""
+        with self._changed:
+            wait = None if self._idle is None else HEARTBEAT
+            if not self._changed.wait_for(lambda: self._waiting or self._over, wait) and self._idle:
+                self.add(self._idle)
+            return self._waiting.popleft() if self._waiting else ""
+
+
+def _line(display: Display, told: Told, event: str, number: int) -> str:
+    verdict, reason, alarm = told
+    message = verdict_message(verdict, alarm, *display.describe(verdict, reason))
+    return json_line({"number": number, "event": event, **message})
+
+
+@contextmanager
+def write_verdicts(display: Display, file: IO[str]) -> Iterator[None]:
+    """Write the verdicts of a display to a file while the block runs.
 
     Each verdict is a line. Without verdicts, a line is written when the reason changes and every
     ``HEARTBEAT`` seconds, with ``stale`` true.
 
     Args:
-        display: that gives verdicts; its ``closed`` is set when the file is closed by its reader.
-        file: takes a line at a time.
-    """
-
-    def __init__(self, display: Display, file: BinaryIO) -> None:
-        self._display, self._file = display, file
-        self._changed, self._over, self._number = Condition(), False, 0
-        self._waiting: deque[bytes] = deque(maxlen=_WAITING)
-        state = display.state()
-        self._told = state.verdict, state.trouble, state.alarm
-
-    def observe(self, verdict: Verdict | None, reason: str, alarm: bool) -> None:
-        """Add a verdict, or a new reason for its absence."""
-        told = verdict, reason, alarm
-        with self._changed:
-            before, self._told = self._told, told
-            if verdict is not None or told != before:
-                self._add("change" if verdict is None else "verdict")
-
-    def _add(self, event: str) -> None:
-        self._number += 1
-        verdict, reason, alarm = self._told
-        message = verdict_message(verdict, alarm, *self._display.describe(verdict, reason))
-        line = json_line({"number": self._number, "event": event, **message})
-        self._waiting.append(f"{line}\n".encode())
-        self._changed.notify()
-
-    def run(self) -> None:
-        """Write the lines until :meth:`close`, or until nobody reads them."""
-        with suppress(OSError, ValueError):  # the reader is gone, or the file is closed
-            while line := self._next():
-                self._file.write(line)
-                self._file.flush()
-        self._display.closed.set()
-
-    def _next(self) -> bytes:
-        """Return the next line, at the latest a heartbeat; empty at the end."""
-        with self._changed:
-            if not self._changed.wait_for(lambda: self._waiting or self._over, HEARTBEAT):
-                self._add("heartbeat")
-            return self._waiting.popleft() if self._waiting else b""
-
-    def close(self) -> None:
-        """Let the thread end after the lines that wait."""
-        with self._changed:
-            self._over = True
-            self._changed.notify()
-
-
-@contextmanager
-def write_verdicts(display: Display, file: BinaryIO) -> Iterator[None]:
-    """Write the verdicts of a display to a file while the block runs, flushed line by line.
-
-    Args:
         display: its ``closed`` is set when the reader closes the file.
         file: of a pipe or standard output.
     """
-    lines = VerdictLines(display, file)
-    display.observers.append(lines.observe)
-    thread = Thread(target=lines.run, name="skin-verdicts", daemon=True)
-    thread.start()
-    try:
+    latest = display.told()
+
+    def observe(*told: *Told) -> None:
+        nonlocal latest
+        before, latest = latest, told
+        if told[0] is not None or told != before:
+            lines.add(partial(_line, display, told, "change" if told[0] is None else "verdict"))
+
+    def repeat(number: int) -> str:
+        nonlocal latest
+        before, latest = latest, display.told()  # the age is judged here, too
+        event = "change" if latest[0] is None and latest != before else "heartbeat"
+        return _line(display, latest, event, number)
+
+    with LineWriter(file, lambda _: display.closed.set(), repeat) as lines:
+        display.observers.append(observe)
         yield
-    finally:
-        display.observers.remove(lines.observe)
-        lines.close()
-        thread.join(_ENDING)
 
 
 @contextmanager
 def print_verdicts(display: Display) -> Iterator[None]:
     """Write the verdicts to standard output while the block runs; the display closes with its reader."""
     # A file of its own, and never closed: lines that a reader did not take would fail once more.
-    with write_verdicts(display, open(sys.stdout.fileno(), "wb", closefd=False)):
+    with write_verdicts(display, open(sys.stdout.fileno(), "w", closefd=False)):
         yield
 
 
-class AlarmLog:
-    """Appends a JSON line to a file for each change.
-
-    The events are ``alarm``, ``cleared``, ``stale``, ``resumed``, ``unknown`` (of a place: its sensors have
-    no valid reading), ``known``, ``tare``, ``tare_refused`` and ``tare_forced``.
-
-    Args:
-        file: open for writing. If it becomes unwritable, a message says so once, and the live view continues.
-        display: that tells verdicts.
-    """
-
-    def __init__(self, file: TextIO, display: Display) -> None:
-        self._file: TextIO | None = file
-        self._display = display
-        self._alarm, self._stale, self._unknown = False, True, False
-        self._state: tuple[Verdict | None, str, bool] = None, "", False
-
-    def observe(self, verdict: Verdict | None, reason: str, alarm: bool) -> None:
-        """Write what has changed since the last call."""
-        self._state = verdict, reason, alarm
-        now, stale = alarm, verdict is None
-        if stale != self._stale:
-            self.write("stale" if stale else "resumed")
-        if now != self._alarm:
-            self.write("alarm" if now else "cleared")
-        unknown = verdict is not None and bool(verdict.unknown)
-        if unknown != self._unknown and not stale:
-            self.write("unknown" if unknown else "known")
-            self._unknown = unknown
-        self._alarm, self._stale = now, stale
-
-    def write(self, event: str) -> None:
-        """Write one line with the latest state."""
-        if self._file is None:
-            return
-        try:
-            verdict, reason, alarm = self._state
-            message = verdict_message(verdict, alarm, *self._display.describe(verdict, reason))
-            self._file.write(json_line({"event": event, **message}) + "\n")
-            self._file.flush()
-        except OSError as error:
-            self._file = None
-            print(f"the alarm log ends here: {error}", file=sys.stderr)
+_EVENTS = ("stale", "resumed"), ("alarm", "cleared"), ("unknown", "known")
 
 
 @contextmanager
 def log_alarms(display: Display, path: Path) -> Iterator[None]:
-    """Append the alarms of a display to a file while the block runs.
+    """Append a line to a file for each change of alarm, state and baseline while the block runs.
+
+    The events are ``started``, ``alarm``, ``cleared``, ``stale``, ``resumed``, ``unknown`` (of a place: its
+    sensors have no valid reading), ``known``, ``tare``, ``tare_refused``, ``tare_forced`` and ``ended``.
+
+    Args:
+        display: gives the verdicts.
+        path: if it becomes unwritable, a message says so once, and the live view continues.
 
     Raises:
         InputError: the file cannot be written.
@@ -214,15 +195,32 @@ def log_alarms(display: Display, path: Path) -> Iterator[None]:
         file = path.open("a", encoding="utf-8")
     except OSError as error:
         raise unwritable(path, error, "live.log=FILE.jsonl") from error
-    log = AlarmLog(file, display)
-    log.write("started")
-    display.observers.append(log.observe)
-    display.listeners.append(log.write)
+    states, latest = (True, False, False), display.told()
+
+    def observe(verdict: Verdict | None, reason: str, alarm: bool) -> None:
+        nonlocal states, latest
+        latest, before = (verdict, reason, alarm), states
+        # Places stay as they were while nothing is known of the skin.
+        states = verdict is None, alarm, before[2] if verdict is None else bool(verdict.unknown)
+        for events, former, state in zip(_EVENTS, before, states, strict=True):
+            if state != former:
+                write(events[not state])
+
+    def write(event: str) -> None:
+        lines.add(partial(_line, display, latest, event))
+
+    def failed(error: Exception) -> None:
+        print(f"the alarm log ends here: {error}", file=sys.stderr)
+
     try:
-        yield
+        with LineWriter(file, failed) as lines:
+            write("started")
+            display.observers.append(observe)
+            display.listeners.append(write)
+            try:
+                yield
+            finally:
+                write("ended")
     finally:
-        display.observers.remove(log.observe)
-        display.listeners.remove(log.write)
-        log.write("ended")
-        with suppress(OSError):  # of a full disk: the log has told of it
+        with suppress(OSError):  # of a full disk: a message has told of it
             file.close()

@@ -11,7 +11,7 @@ import pytest
 from skin.errors import InputError
 from skin.hardware.live.loop import Display, DisplayInfo
 from skin.hardware.live.verdict import Verdict
-from skin.hardware.live.verdicts import AlarmLog, log_alarms
+from skin.hardware.live.verdicts import LineWriter, log_alarms
 
 
 def display():
@@ -59,15 +59,16 @@ def test_a_folder_that_cannot_be_written_is_refused(tmp_path):
         pass
 
 
-def test_a_full_disk_ends_the_log_and_not_the_view(capsys):
+def test_a_full_disk_ends_the_log_and_not_the_view():
     class Full:
         def write(self, text):
             raise OSError("No space left on device")
 
-    log = AlarmLog(Full(), display())
-    log.observe(verdict(True), "", False)
-    log.observe(verdict(False), "", False)
-    assert capsys.readouterr().err == "the alarm log ends here: No space left on device\n"
+    errors = []
+    with LineWriter(Full(), errors.append) as lines:
+        for _ in range(3):
+            lines.add(str)
+    assert [str(error) for error in errors] == ["No space left on device"]
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no such device")

@@ -118,7 +118,7 @@ def test_it_runs_without_torch_and_writes_json_lines(model, skin, tmp_path):
 
 def test_only_a_skin_at_a_port_is_watched(model):
     with pytest.raises(InputError, match="add device=serial"), ExitStack() as opened:
-        watch_exported(str(model), {"seed": 0}, LIVE, print, opened, lambda *_: None)
+        watch_exported(str(model), {"seed": 0}, print, opened)
 
 
 @pytest.fixture(scope="module", params=[None, {"20": 0.3, "100": 0.35, "500": 0.4}], ids=["one", "rates"])
@@ -133,14 +133,14 @@ def with_thresholds(request, trained, tmp_path_factory):
 def test_the_settings_of_the_file_and_of_the_command(with_thresholds, skin):
     """The threshold is the one for the rate of the device, which sends 100 frames a second."""
     path, threshold = with_thresholds
-    said, loaded = [], []  # what is said before the views open
+    said = []
     with ExitStack() as opened:
         device = {"port": skin, "labels": "announced"}
-        ready = lambda model, name: loaded.extend([model.title, name, *said])  # noqa: E731
-        watched = watch_exported(str(path), device, LIVE, said.append, opened, ready)
+        setup = watch_exported(str(path), device, said.append, opened)
+        assert not any("alarm above" in text for text in said)  # the views open before
+        watched = setup.watch(LIVE, said.append)
     assert (watched.model.title, len(watched.model.positions)) == ("untrained", 6)
-    assert loaded[:2] == ["untrained", watched.source.name]
-    assert not any("alarm above" in text for text in loaded)
+    assert (setup.model.title, setup.name) == ("untrained", watched.source.name)
     assert said[-1] == f"alarm above {threshold:.4f}"
     assert ("single windows" in said[-2]) == (threshold == 0.25)
     assert watched.nominal.presses.shape == (6, 6)
@@ -171,8 +171,9 @@ def test_the_rate_of_a_device_is_that_of_its_arrivals_until_its_clock_is_known(a
 def test_no_frame_that_waited_while_the_threshold_was_chosen_is_judged(model, skin):
     """The first verdicts would tell of touches of some seconds ago, and those of now would be late."""
     with ExitStack() as opened:
-        slow = lambda *_: sleep(1.5)  # noqa: E731
-        watched = watch_exported(str(model), {"port": skin}, LIVE, print, opened, slow)
+        setup = watch_exported(str(model), {"port": skin}, print, opened)
+        sleep(1.5)
+        watched = setup.watch(LIVE, print)
         (frame,) = watched.source.skin.read(1)
         assert monotonic() - frame.t_host < 0.5
 
@@ -180,7 +181,7 @@ def test_no_frame_that_waited_while_the_threshold_was_chosen_is_judged(model, sk
 def test_the_command_replaces_settings_of_the_file(model, skin):
     said, other = [], replace(LIVE, touch=0.5, patience=DebounceSettings(above=0.75))
     with ExitStack() as opened:
-        watched = watch_exported(str(model), {"port": skin}, other, said.append, opened, lambda *_: None)
+        watched = watch_exported(str(model), {"port": skin}, said.append, opened).watch(other, said.append)
     assert said[-1] == "alarm above 0.75"
     assert (watched.settings.detection.threshold, watched.nominal.detection.threshold) == (0.5, 0.3)
 

@@ -160,13 +160,13 @@ COLLECTING = """
 import gc, runpy, sys, time
 from skin.hardware.live.loop import LiveLoop
 
-def take(loop, frames, take=LiveLoop._take):
-    take(loop, frames)
+def take(loop, frames, now, take=LiveLoop.take):
+    take(loop, frames, now)
     began = time.perf_counter()
     gc.collect()
     pauses.append(time.perf_counter() - began)
 
-pauses, LiveLoop._take = [], take
+pauses, LiveLoop.take = [], take
 try:
     runpy.run_module("skin", run_name="__main__")
 finally:

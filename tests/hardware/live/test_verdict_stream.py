@@ -5,7 +5,7 @@ import json
 import os
 import subprocess
 import sys
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from time import monotonic, sleep
 from types import ModuleType
 
@@ -33,7 +33,11 @@ def verdict(dangerous=False, chance=0.25):
 def piped(shown):
     """Yield the reading end of the pipe to which verdicts are written."""
     reading, writing = os.pipe()
-    with os.fdopen(reading, "rb") as lines, os.fdopen(writing, "wb", 0) as file, write_verdicts(shown, file):
+    with (
+        os.fdopen(reading, "rb") as lines,
+        os.fdopen(writing, "w", buffering=1) as file,
+        write_verdicts(shown, file),
+    ):
         yield lines
 
 
@@ -135,7 +139,7 @@ def test_a_reader_that_is_slow_delays_nothing_and_misses_the_oldest():
 
 def test_the_view_closes_with_the_reader_of_its_lines():
     shown = display()
-    with piped(shown) as lines:
+    with suppress(BrokenPipeError), piped(shown) as lines:
         lines.readline()
         lines.close()
         assert shown.closed.wait(PATIENCE)
@@ -145,7 +149,7 @@ def test_what_waits_is_written_before_the_end():
     shown = display()
     reading, writing = os.pipe()
     with os.fdopen(reading, "rb") as lines:
-        with os.fdopen(writing, "wb", 0) as file, write_verdicts(shown, file):
+        with os.fdopen(writing, "w", buffering=1) as file, write_verdicts(shown, file):
             for _ in range(20):
                 shown.set_verdict(verdict())
         assert [json.loads(line)["number"] for line in lines] == [*range(1, 21)]

@@ -271,12 +271,12 @@ def test_a_refused_tare_is_said_while_it_may_be_forced(monkeypatch):
     monkeypatch.setattr(loop, "monotonic", lambda: now[0])
     subject.set_status("99.9 Hz")
     subject.set_verdict(PRESSED)
-    assert subject.request_tare() == loop.REFUSED
+    assert subject.request_tare() == loop.REFUSALS["touched"]
     assert subject.request_tare(force=True) == ""
     assert subject.state().line == "99.9 Hz"  # it was forced
-    assert subject.request_tare(force=True) == loop.REFUSED  # a refusal is for one
+    assert subject.request_tare(force=True) == loop.REFUSALS["touched"]  # a refusal is for one
     now[0] += 59.0
-    assert subject.state().line == f"{loop.REFUSED}, 99.9 Hz"
+    assert subject.state().line == f"{loop.REFUSALS['touched']}, 99.9 Hz"
     now[0] += 2.0
     assert subject.state().line == "99.9 Hz"
     subject.set_verdict(replace(PRESSED, touched=False, dangerous=False))

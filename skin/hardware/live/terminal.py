@@ -1,4 +1,4 @@
-"""Live view in a terminal; without a terminal, one line per change of the verdict."""
+"""Live view in a terminal; where output is no terminal, JSON lines of its changes."""
 
 import signal
 import sys
@@ -7,7 +7,6 @@ from contextlib import contextmanager, suppress
 from datetime import datetime, timedelta
 from functools import partial
 from threading import Thread
-from typing import IO
 
 from rich.console import Console, Group, RenderableType
 from rich.live import Live
@@ -17,7 +16,7 @@ from rich.text import Text
 
 from skin.hardware.live.contacts import contact_text_lines
 from skin.hardware.live.loop import Display, DisplayState
-from skin.hardware.live.verdicts import LineWriter
+from skin.hardware.live.verdicts import write_changes
 from skin.hardware.wire.segmentation import typed_lines
 
 _HERTZ = 8
@@ -35,7 +34,8 @@ def show_in_terminal(display: Display, console: Console) -> Iterator[None]:
     Thread(target=_read_keys, args=(display,), name="skin-keys", daemon=True).start()
     render = partial(screen, display)
     live = Live(get_renderable=render, console=console, refresh_per_second=_HERTZ, transient=True)
-    with live if console.is_terminal else print_changes(display, console.file):
+    closing = lambda _: display.closed.set()  # noqa: E731
+    with live if console.is_terminal else write_changes(display, console.file, closing, reasons=True):
         try:
             yield
         finally:
@@ -48,31 +48,6 @@ def _read_keys(display: Display) -> None:
         for text in typed_lines(sys.stdin.fileno()):
             if (word := text.strip().lower()) in ("t", "force"):
                 display.request_tare(force=word == "force")
-
-
-@contextmanager
-def print_changes(display: Display, file: IO[str]) -> Iterator[None]:
-    """Write the verdict to a file whenever it changes, while the block runs."""
-    latest = ""
-
-    def observe(*told: object) -> None:
-        nonlocal latest
-        before, latest = latest, _sentence(display.state())
-        if latest != before:
-            lines.add(lambda _: latest)
-
-    with LineWriter(file, lambda _: display.closed.set()) as lines:
-        observe()
-        display.observers.append(observe)
-        yield
-
-
-def _sentence(state: DisplayState) -> str:
-    verdict, alarm = state.verdict, "DANGEROUS: " if state.alarm else ""
-    if verdict is None:
-        return f"{alarm}unknown: {state.reason}"
-    words = " ".join(word for word, _ in verdict.words()) or verdict.state
-    return "; ".join(text for text in (alarm + words, state.reason) if text)
 
 
 def screen(display: Display) -> RenderableType:

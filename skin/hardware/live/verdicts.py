@@ -74,7 +74,7 @@ _WAITING = 256  # lines for a slow reader; then the oldest is dropped
 _ENDING = 1.0  # s in which a slow reader may take the last lines
 
 
-class LineWriter:
+class LineQueue:
     """Writes lines in a thread of its own, flushed one by one: a slow reader or disk delays no verdict.
 
     Args:
@@ -94,7 +94,7 @@ class LineWriter:
         self._waiting: deque[str] = deque(maxlen=_WAITING)
         self._thread = Thread(target=self._run, name="skin-lines", daemon=True)
 
-    def __enter__(self) -> "LineWriter":
+    def __enter__(self) -> "LineQueue":
         self._thread.start()
         return self
 
@@ -160,7 +160,7 @@ def write_verdicts(display: Display, file: IO[str]) -> Iterator[None]:
         event = "change" if latest[0] is None and latest != before else "heartbeat"
         return _line(display, latest, event, number)
 
-    with LineWriter(file, lambda _: display.closed.set(), repeat) as lines:
+    with LineQueue(file, lambda _: display.closed.set(), repeat) as lines:
         display.observers.append(observe)
         yield
 
@@ -177,15 +177,52 @@ _EVENTS = ("stale", "resumed"), ("alarm", "cleared"), ("unknown", "known")
 
 
 @contextmanager
-def log_alarms(display: Display, path: Path) -> Iterator[None]:
-    """Append a line to a file for each change of alarm, state and baseline while the block runs.
+def write_changes(
+    display: Display, file: IO[str], failed: Callable[[Exception], object], reasons: bool = False
+) -> Iterator[None]:
+    """Write a line to a file for each change of alarm, state and baseline while the block runs.
 
     The events are ``started``, ``alarm``, ``cleared``, ``stale``, ``resumed``, ``unknown`` (of a place: its
     sensors have no valid reading), ``known``, ``tare``, ``tare_refused``, ``tare_forced`` and ``ended``.
 
     Args:
         display: gives the verdicts.
-        path: if it becomes unwritable, a message says so once, and the live view continues.
+        file: open for writing.
+        failed: called with the error when the file cannot be written any more; the live view continues.
+        reasons: write a line with the event ``change``, too, when there is another reason for no verdict.
+    """
+    states, latest = (True, False, False), display.told()
+
+    def observe(verdict: Verdict | None, reason: str, alarm: bool) -> None:
+        nonlocal states, latest
+        before, former_reason = states, latest[1]
+        # Places stay as they were while nothing is known of the skin.
+        states = verdict is None, alarm, before[2] if verdict is None else bool(verdict.unknown)
+        latest = verdict, reason, alarm
+        for events, former, state in zip(_EVENTS, before, states, strict=True):
+            if state != former:
+                write(events[not state])
+        if reasons and states == before and reason != former_reason:
+            write("change")
+
+    def write(event: str) -> None:
+        lines.add(partial(_line, display, latest, event))
+
+    with LineQueue(file, failed) as lines:
+        write("started")
+        display.observers.append(observe)
+        display.listeners.append(write)
+        try:
+            yield
+        finally:
+            write("ended")
+
+
+@contextmanager
+def log_alarms(display: Display, path: Path) -> Iterator[None]:
+    """Append the lines of :func:`write_changes` to a file while the block runs.
+
+    If it becomes unwritable, a message says so once.
 
     Raises:
         InputError: the file cannot be written.
@@ -195,32 +232,10 @@ def log_alarms(display: Display, path: Path) -> Iterator[None]:
         file = path.open("a", encoding="utf-8")
     except OSError as error:
         raise unwritable(path, error, "live.log=FILE.jsonl") from error
-    states, latest = (True, False, False), display.told()
-
-    def observe(verdict: Verdict | None, reason: str, alarm: bool) -> None:
-        nonlocal states, latest
-        latest, before = (verdict, reason, alarm), states
-        # Places stay as they were while nothing is known of the skin.
-        states = verdict is None, alarm, before[2] if verdict is None else bool(verdict.unknown)
-        for events, former, state in zip(_EVENTS, before, states, strict=True):
-            if state != former:
-                write(events[not state])
-
-    def write(event: str) -> None:
-        lines.add(partial(_line, display, latest, event))
-
-    def failed(error: Exception) -> None:
-        print(f"the alarm log ends here: {error}", file=sys.stderr)
-
+    warn = partial(print, "the alarm log ends here:", file=sys.stderr)
     try:
-        with LineWriter(file, failed) as lines:
-            write("started")
-            display.observers.append(observe)
-            display.listeners.append(write)
-            try:
-                yield
-            finally:
-                write("ended")
+        with write_changes(display, file, warn):
+            yield
     finally:
-        with suppress(OSError):  # of a full disk: a message has told of it
+        with suppress(OSError):  # of a full disk: the message has told of it
             file.close()

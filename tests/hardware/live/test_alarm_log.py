@@ -11,7 +11,7 @@ import pytest
 from skin.errors import InputError
 from skin.hardware.live.loop import Display, DisplayInfo
 from skin.hardware.live.verdict import Verdict
-from skin.hardware.live.verdicts import LineWriter, log_alarms
+from skin.hardware.live.verdicts import LineQueue, log_alarms
 
 
 def display():
@@ -65,7 +65,7 @@ def test_a_full_disk_ends_the_log_and_not_the_view():
             raise OSError("No space left on device")
 
     errors = []
-    with LineWriter(Full(), errors.append) as lines:
+    with LineQueue(Full(), errors.append) as lines:
         for _ in range(3):
             lines.add(str)
     assert [str(error) for error in errors] == ["No space left on device"]

@@ -8,6 +8,7 @@ import urllib.request
 from base64 import b64decode
 from contextlib import contextmanager
 from dataclasses import replace
+from io import StringIO
 from threading import Event, Thread
 from time import monotonic, sleep
 
@@ -41,6 +42,13 @@ def display():
 def frame(values, valid=None):
     valid = np.ones(5, bool) if valid is None else valid
     return Frame(None, 0.0, 0.0, np.asarray(values, float), valid)
+
+
+def shown(subject):
+    """Return the text in the terminal."""
+    console = Console(width=120, record=True, force_terminal=True, file=StringIO())
+    console.print(terminal.screen(subject))
+    return console.export_text()
 
 
 def fetch(address, **headers):
@@ -110,8 +118,13 @@ def test_where_output_is_no_terminal_a_line_tells_each_change(tmp_path):
         for verdict in (None, None, PRESSED, PRESSED):
             subject.set_verdict(verdict, "" if verdict else "taking the baseline: do not touch")
             sleep(0.2)
-    said = (tmp_path / "said").read_text().splitlines()
-    assert said[-2:] == ["unknown: taking the baseline: do not touch", "DANGEROUS: small dangerous"]
+    said = [json.loads(line) for line in (tmp_path / "said").read_text().splitlines()]
+    assert [line["event"] for line in said] == ["started", "change", "resumed", "alarm", "ended"]
+    assert [said[n]["reason"] for n in (0, 1)] == [
+        "waiting for the first frame",
+        "taking the baseline: do not touch",
+    ]
+    assert (said[3]["alarm"], said[3]["labels"]) == (True, {"big": False, "dangerous": True})
 
 
 def test_the_terminal_shows_the_alarm_and_the_probability():
@@ -120,10 +133,7 @@ def test_the_terminal_shows_the_alarm_and_the_probability():
     subject.add_frame(frame([0, 0, 6.25, 0, 0]), PLAIN)
     subject.set_verdict(PRESSED)
     subject.set_status("99.9 Hz")
-    console = Console(width=100, record=True, force_terminal=True, file=open("/dev/null", "w"))  # noqa: SIM115
-    with console.file:
-        console.print(terminal.screen(subject))
-    text = console.export_text()
+    text = shown(subject)
     assert "DANGEROUS" in text
     assert re.search(r"small .* 80 %", text)
     assert "strongest reading 6.2 N, sensor 2" in text
@@ -189,10 +199,7 @@ def test_an_alarm_outlives_silence_in_every_view():
     state = subject.state()
     assert (state.verdict, state.alarm) == (None, True)
     assert web.message(state, SkinPicture(PLACES, SIZE, 8, 4.0))["alarm"] is True
-    console = Console(width=100, record=True, force_terminal=True, file=open("/dev/null", "w"))  # noqa: SIM115
-    with console.file:
-        console.print(terminal.screen(subject))
-    text = console.export_text()
+    text = shown(subject)
     assert "DANGEROUS" in text
     assert "stopped sending" in text
 
@@ -320,12 +327,13 @@ def test_an_unknown_place_is_not_shown_as_no_touch():
     subject.set_verdict(replace(PRESSED, touched=False, labels={}, dangerous=False, **masked))
     sent = web.message(subject.state(), SkinPicture(PLACES, SIZE, 8, 4.0))
     assert (sent["state"], sent["unknown"]) == ("unknown", [2])
-    assert "no touch" not in terminal._sentence(subject.state())
-    assert "near sensor 2 could not be felt" in terminal._sentence(subject.state())
-    assert terminal._sentence(subject.state()).endswith("(and 1 more note)")
+    text = shown(subject)
+    assert "no touch" not in text
+    assert "near sensor 2 could not be felt" in text
+    assert "(and 1 more note)" in text
     subject.set_verdict(None, "readings are frozen")
     assert web.message(subject.state(), SkinPicture(PLACES, SIZE, 8, 4.0))["unknown"] == [0, 1, 2, 3, 4]
-    assert terminal._sentence(subject.state()) == "unknown: readings are frozen"
+    assert "unknown: readings are frozen" in shown(subject)
 
 
 def test_pictures_come_a_little_more_than_thirty_times_a_second():

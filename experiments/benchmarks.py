@@ -51,7 +51,7 @@ ROWS = ("temporal_graph", "temporal_image", "sequence_graph", "sequence_image")
 """Rows whose epochs are timed."""
 
 _FRAMES = 3000  # of which every fifth is classified
-_PACKAGES = ("torch", "pytorch-lightning", "numpy", "scipy", "scikit-fem")
+_PACKAGES = ("torch", "pytorch-lightning", "numpy", "scipy")
 _ALONE = (
     "import json, sys; from experiments import benchmarks; "
     "print(json.dumps(getattr(benchmarks, sys.argv[1])(*json.loads(sys.argv[2]))))"

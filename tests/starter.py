@@ -30,7 +30,6 @@ WARM = (
     "alembic.command",
     "mlflow.store.tracking.sqlalchemy_store",
     "pytorch_lightning.callbacks",
-    "skfem",
     "skin.learning.boosted_trees",
     "skin.learning.network",
     "skin.evaluation.report",

@@ -96,6 +96,7 @@ def test_the_example_of_the_readme_runs(readme):
     assert "dangerous" in said
 
 
+@pytest.mark.slow("solves a skin of 12 mm")
 def test_the_simulator_is_differentiable_as_documented():
     made = run_example("docs/mechanics.md")
     assert made["readings"].shape == (20,)

@@ -25,7 +25,7 @@ folder = mkdtemp()  # commands store runs in the current folder, which is this o
 layers = [{"material": "EcoFlex 00-30", "thickness": 0.012}]  # m
 body = skin.Sheet(size=(0.16, 0.12), cells=(16, 12), layers=layers)
 sensors = skin.Grid(rows=4, columns=5, depth=0.006).sensors(body)
-simulator = skin.Solid(body, sensors, divisions=2)
+simulator = skin.Solid(body, sensors)
 
 pressure = torch.zeros(body.shape)  # Pa on each cell, rows along x
 pressure[4:7, 3:6] = 20e3

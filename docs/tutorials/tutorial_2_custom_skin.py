@@ -43,7 +43,7 @@ gel = {"name": "my gel", "young": 40e3, "poisson": 0.49}
 layers = [{"material": gel, "thickness": 0.008}, {"material": "EcoFlex 00-30", "thickness": 0.004}]
 body = skin.Sheet(size=(0.12, 0.08), cells=(24, 16), layers=layers)
 sensors = skin.LayoutFile(folder / "sensors.csv", footprint=(0.008, 0.008)).sensors(body)
-simulator = skin.Solid(body, sensors, divisions=2)
+simulator = skin.Solid(body, sensors)
 print(len(sensors), "sensors,", len(body.layers), "layers,", f"{1e3 * body.thickness:g} mm")
 
 # %%

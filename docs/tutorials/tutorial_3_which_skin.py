@@ -27,7 +27,7 @@ def build(thickness: float, count: int) -> tuple[skin.Sheet, skin.Solid]:
     ]
     body = skin.Sheet(size=(0.12, 0.12), cells=(18, 18), layers=layers)
     sensors = skin.Grid(rows=count, columns=count, depth=thickness - 5e-4).sensors(body)
-    return body, skin.Solid(body, sensors, divisions=3)
+    return body, skin.Solid(body, sensors)
 
 
 design = ExpectedPosterior(forces=(5.0,), touches=128, margin=0.02)

@@ -130,12 +130,12 @@ _LIMITS = """
   [limitations](limitations.md).
 - **Surface displacements converge slowly where the skin is thin and nearly incompressible.** Elements as
   long as the skin is thick restrict the sideways motion of material under a wide object, most of all beside
-  its edge (see `mesh`). Readings are more accurate, because the layers transmit the applied force; beside
+  its edge. Readings are more accurate, because the layers transmit the applied force; beside
   an edge, however, an error of 1 % of the reading under the object can be a large part of a small reading.
 - **The thick block is finite.** It ends at 60 half sides, and its surface moves about 2 % less than that of
   a half-space, on any mesh.
-- **A sensor at the interface of two layers** interpolates linearly between the stresses above and below.
-  The stress along the layers is discontinuous there; a tilted sensor reads a mean of both sides.
+- **A tilted sensor at the interface of two layers** interpolates linearly between the stresses above and
+  below. The stress along the layers is discontinuous there: it reads a mean of both sides.
 - **A footprint is defined on the unrolled surface.** Deep in an arm it covers a shorter arc than the sensor
   (10 % less for the default sleeve). The reading is the mean stress on that arc times the sensor's full
   area.

@@ -12,12 +12,11 @@ rectangle within smooth walls is a sum of such waves.
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
-import scipy.sparse as sp
-from scipy.special import j1
-from skfem import BilinearForm, CellBasis, ElementHex1, ElementVector, MeshHex
-from skfem.helpers import ddot, div, sym_grad, trace
+from scipy.interpolate import RectBivariateSpline
+from scipy.special import j0, j1
 
 from skin.body.base import Sheet
 from skin.mechanics.simulator._hexahedra import Hexahedra
@@ -189,63 +188,56 @@ def waves(number: np.ndarray, slabs: Sequence[Slab], depth: float) -> np.ndarray
     return states
 
 
-def patch_mean(lengths: np.ndarray, side: float, low: float, high: float) -> np.ndarray:
-    """Return the means of cos(m pi x / side) between two places, (m,)."""
-    turn = np.pi * lengths / side
-    safe = np.where(turn == 0, 1, turn)
-    return np.where(turn == 0, 1, (np.sin(safe * high) - np.sin(safe * low)) / (safe * (high - low)))
+class Discs:
+    """Forces on squares at a depth of endless layers under discs of even pressure, by Hankel integrals.
 
-
-def patch(
-    slabs: Sequence[Slab],
-    size: tuple[float, float],
-    loaded: tuple[float, float, float, float],
-    felt: tuple[float, float, float, float],
-    depth: float,
-    count: int = 400,
-) -> np.ndarray:
-    """Return motion (m/Pa) and sigma_zz (Pa/Pa) per even pressure on a rectangle, (2,), means over another.
-
-    The layers lie within smooth walls, so that they continue as their own mirror image for ever.
+    The stress of a disc is tabulated over its radius and the distance, and joined by cubic splines.
 
     Args:
         slabs: from the surface down.
-        size: extent (x, y) between the walls, m.
-        loaded: x from, x to, y from, y to, m.
-        felt: the same, of the rectangle over which is averaged.
-        depth: of the averaged rectangle, m.
-        count: waves along each side.
-    """
-    order = np.arange(count)
-    weights = []
-    for axis, side in enumerate(size):
-        low, high = loaded[2 * axis : 2 * axis + 2]
-        strength = patch_mean(order, side, low, high) * (high - low) / side * np.where(order == 0, 1, 2)
-        weights.append(strength * patch_mean(order, side, *felt[2 * axis : 2 * axis + 2]))
-    number = np.pi * np.hypot(order[:, None] / size[0], order / size[1])
-    answer = waves(number.ravel(), slabs, depth).reshape(count, count, 2)
-    return np.einsum("m,n,mnk->k", weights[0], weights[1], answer)
-
-
-def disc(slabs: Sequence[Slab], radius: float, beside: np.ndarray, side: float, depth: float) -> np.ndarray:
-    """Return the force on squares under 1 Pa on a disc on endless layers, (P,), N/Pa, by a Hankel integral.
-
-    Args:
-        slabs: from the surface down.
-        radius: of the disc, m.
-        beside: (P, 2), from the middle of the disc to that of each square, m.
-        side: of the squares, m.
         depth: of the squares, m; where pressure waves shorter than 1 / 40 of it have died away.
+        radii: least and largest radius of a disc, m.
+        reach: largest distance of a square's middle, m.
+        edges: what is added to the radius, m; the pressure is the mean of such discs.
     """
-    share, weight = np.polynomial.legendre.leggauss(400)
-    longest = 40 / depth
-    number, weight = (share + 1) / 2 * longest, weight / 2 * longest
-    strength = -waves(number, slabs, depth)[:, 1] * 2 * np.pi * radius * j1(number * radius) * weight
-    angle = (np.arange(96) + 0.5) * 2 * np.pi / 96
-    x, y = (np.outer(number, way(angle)) for way in (np.cos, np.sin))
-    square = np.sinc(x * side / 2 / np.pi) * np.sinc(y * side / 2 / np.pi) * side**2
-    shift = np.cos(beside[:, :1, None] * x + beside[:, 1:, None] * y)
-    return np.einsum("k,ka,pka->p", strength, square, shift) / (2 * np.pi * len(angle))
+
+    def __init__(
+        self,
+        slabs: Sequence[Slab],
+        depth: float,
+        radii: tuple[float, float],
+        reach: float = 0.1,
+        edges: Sequence[float] = (0.0,),
+    ) -> None:
+        knots, weight = np.polynomial.legendre.leggauss(1200)
+        longest = 40 / depth
+        number, weight = (knots + 1) / 2 * longest, weight / 2 * longest
+        stress = -waves(number, slabs, depth)[:, 1] * weight
+        # Waves from the surface fade over a depth, so that a twelfth of it is a fine step.
+        step = min(depth / 12, 5e-4)
+        radius = np.linspace(*radii, max(5, math.ceil((radii[1] - radii[0]) / step)))
+        away = np.linspace(0, 1.1 * reach, math.ceil(1.1 * reach / step))
+        discs = (radius[:, None] + np.array(edges)).clip(min=0)
+        strength = stress * np.mean([part * j1(number * part) for part in discs.T[..., None]], axis=0)
+        self._stress = RectBivariateSpline(radius, away, strength @ j0(np.outer(number, away)))
+
+    def forces(self, discs: np.ndarray, squares: np.ndarray, side: float) -> np.ndarray:
+        """Return the forces (N, S), N, of discs under 1 Pa.
+
+        Args:
+            discs: (N, 3), x, y and radius, m.
+            squares: (S, 2), their middles, m.
+            side: of the squares, m.
+        """
+        points, weights = np.polynomial.legendre.leggauss(6)
+        total = np.zeros((len(discs), len(squares)))
+        radius = np.broadcast_to(discs[:, 2:], total.shape)
+        for (x, along), (y, across) in product(zip(points, weights, strict=True), repeat=2):
+            shift = squares + np.array([x, y]) * side / 2 - discs[:, None, :2]
+            total += (
+                along * across * side**2 / 4 * self._stress.ev(radius, np.hypot(*np.moveaxis(shift, 2, 0)))
+            )
+        return total
 
 
 def _even(slabs: Sequence[Slab], depth: float) -> tuple[float, float]:
@@ -350,11 +342,8 @@ def block(
         young: E, Pa, of all or of each row of elements (K,).
         poisson: nu, of all or of each row (K,).
     """
-    x, y, z = (len(line) - 1 for line in lines)
-    rows = np.broadcast_to(np.asarray(young, dtype=float), (z,))
-    modulus = np.broadcast_to(rows[:, None, None], (z, y, x)).copy()
-    ratio = np.broadcast_to(np.asarray(poisson, dtype=float), (z,)).copy()
-    return Hexahedra(lines, modulus, ratio, _FLAT.place, _FLAT.frame)
+    young, poisson = (np.broadcast_to(values, len(lines[2]) - 1).astype(float) for values in (young, poisson))
+    return Hexahedra(lines, young, poisson, _FLAT.place, _FLAT.frame)
 
 
 def graded(fine: float, count: int, far: float, growth: float) -> np.ndarray:
@@ -377,20 +366,16 @@ def held(mesh: Hexahedra, faces: Mapping[str, tuple[int, ...]]) -> np.ndarray:
     return mask.ravel()
 
 
-def solve_block(
-    mesh: Hexahedra, fixed: np.ndarray, forces: np.ndarray, stiffness: sp.csc_matrix | None = None
-) -> np.ndarray:
+def solve_block(mesh: Hexahedra, fixed: np.ndarray, forces: np.ndarray) -> np.ndarray:
     """Return the nodal displacements (3 N, L), m, under nodal forces (3 N, L), N.
 
     Args:
         mesh: the elements.
         fixed: (3 N,), bool, which degrees of freedom are fixed.
         forces: N.
-        stiffness: (3 N, 3 N), N/m; None: that of the mesh.
     """
-    whole = mesh.stiffness() if stiffness is None else stiffness
     free = np.flatnonzero(~fixed)
-    factors = factorised(whole[free][:, free].tocsc())
+    factors = factorised(mesh.stiffness()[free][:, free].tocsc())
     moves = np.zeros_like(forces)
     moves[free] = factors.solve(np.ascontiguousarray(forces[free]))
     return moves
@@ -399,16 +384,3 @@ def solve_block(
 def row_means(values: np.ndarray) -> np.ndarray:
     """Return the middles between neighbours, (n - 1,)."""
     return (values[1:] + values[:-1]) / 2
-
-
-def locking(mesh: Hexahedra) -> sp.csc_matrix:
-    """Return the stiffness of fully integrated trilinear elements, which lock when nu approaches 1/2."""
-    points = MeshHex(mesh.nodes.T.copy(), mesh.corners.T.copy())
-    basis = CellBasis(points, ElementVector(ElementHex1()), intorder=2)
-    lam, mu = (np.broadcast_to(value[:, None], basis.dx.shape) for value in mesh.lame)
-
-    def energy(u, v, w):
-        strain = sym_grad(u)
-        return 2 * w.mu * ddot(strain, sym_grad(v)) + w.lam * trace(strain) * div(v)
-
-    return BilinearForm(energy).assemble(basis, mu=mu, lam=lam).tocsc()

@@ -84,7 +84,7 @@ class SkinDistribution:
         arms: share of skins on a cylinder.
         radius: of the cylinders, m.
         position_error: standard deviation of the sensors' true positions from those of the layout, m.
-        divisions: rows of elements in each layer.
+        divisions: rows of elements in each layer; None: as few as readings under a fingertip need.
         plates: share of sheets with the mechanics of plates on beams (:mod:`skin.mechanics.simulator.fem`);
             their sensors are between the layers.
         naive: share of sheets without mechanics.
@@ -107,7 +107,7 @@ class SkinDistribution:
     arms: Annotated[float, Ge(0), Le(1)]
     radius: Range
     position_error: Annotated[tuple[NonNegativeFloat, NonNegativeFloat], RISING]
-    divisions: PositiveInt
+    divisions: PositiveInt | None = None
     plates: Annotated[float, Ge(0), Le(1)] = 0.0
     naive: Annotated[float, Ge(0), Le(1)] = 0.0
     interface: Annotated[float, Ge(0), Le(1)] = 0.0

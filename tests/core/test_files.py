@@ -19,7 +19,6 @@ from skin.errors import InputError
 from skin.evaluation.report import write_chances
 from skin.hardware.bench import BenchSession
 from skin.hardware.bench import write_bench_session as write_session
-from skin.mechanics.simulator import solid as _elastic
 from skin.plot import animation, figures
 from skin.plot.animation import simulate_scene
 from skin.runs.configuration import Tracking
@@ -114,15 +113,6 @@ def test_a_cache_that_cannot_be_kept_costs_a_warning(tmp_path):
         found = array_cache.kept(path, "key", {"a": (99,)}, lambda: {"a": np.ones(99)})
     assert found["a"].sum() == 99
     assert not list(tmp_path.iterdir())
-
-
-def test_room_for_a_mapped_file_is_claimed_before_it_is_filled(tmp_path):
-    path = tmp_path / "x.npy"
-    with path.open("wb") as file:
-        file.truncate(1 << 20)
-    assert path.stat().st_blocks == 0
-    _elastic._reserve(path)
-    assert path.stat().st_blocks * 512 >= 1 << 20
 
 
 @pytest.mark.slow("imports MLflow anew on a full disk")

@@ -11,9 +11,7 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
-from skin.body.base import Sheet
 from skin.errors import InputError
-from skin.mechanics.simulator.solid import Elastic, build_mesh
 from skin.runs.build import build_device, build_learner
 from skin.runs.configuration import Tracking, settings_of
 from skin.runs.finished_run import FinishedRun, find_run
@@ -231,14 +229,3 @@ def test_a_cache_is_built_anew_where_it_holds_objects(run, tmp_path, marker, mon
     done = run(tmp_path, *command, store=False)
     assert not marker.exists()
     assert (done.returncode, (tmp_path / "x.csv").read_bytes()) == (0, before), done.stderr
-
-
-def test_a_stored_influence_is_built_anew_where_it_holds_objects(tmp_path, marker):
-    sheet = Sheet((0.02, 0.02), (4, 4), [{"material": "EcoFlex 00-30", "thickness": 0.01}])
-    elastic, path = Elastic(build_mesh(sheet, 1, {})), tmp_path / "influence.npy"
-    wanted = np.array(elastic.influence(2, 1, path))
-    np.save(path, np.array([Payload(marker)], dtype=object))
-    np.testing.assert_array_equal(elastic.influence(2, 1, path), wanted)
-    np.save(path, wanted[:3])
-    np.testing.assert_array_equal(elastic.influence(2, 1, path), wanted)
-    assert not marker.exists()

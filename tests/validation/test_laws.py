@@ -2,9 +2,13 @@
 
 import json
 
+import numpy as np
 import pytest
 
 from experiments.validation.__main__ import LAWS, main
+from experiments.validation.references import Slab
+from experiments.validation.solid import _layers, _under_discs, exact_readings
+from skin.body.base import Sensors, Sheet
 from skin.core.files import ROOT
 from skin.errors import InputError
 from skin.mechanics.simulator._hexahedra import Hexahedra
@@ -23,6 +27,15 @@ def test_a_law_holds(law):
     for finding in outcome.findings:
         assert finding.ok, f"{finding.case}: {finding.ours}, must be {finding.reference}"
         assert finding.error <= finding.tolerance
+
+
+def test_a_thick_layer_is_read_at_its_base():
+    """Two rows of elements made 14 % of error here, and 94 % under a small disc on 30 mm."""
+    slabs, depth = [Slab(0.02, 170e3, 0.499)], 0.0195
+    body = Sheet((0.16, 0.16), (16, 16), _layers(slabs))
+    ours = _under_discs(body, Sensors(np.array([[0.08, 0.08, depth]]), (0.01, 0.01)))[2, 0]
+    exact = exact_readings(slabs, depth)[2]
+    assert ours == pytest.approx(exact, abs=0.015 * exact[0])
 
 
 def test_chosen_laws_are_written_where_they_should_be(tmp_path, capsys):

@@ -2,16 +2,16 @@
 
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
+from scipy.integrate import quad, solve_ivp
+from scipy.special import j0, j1
 
 from experiments.validation.references import (
     SQUARE_PUNCH,
+    Discs,
     HalfSpace,
     HertzContact,
     Slab,
     bonded_layer,
-    patch,
-    patch_mean,
     square_punch,
     waves,
 )
@@ -64,23 +64,48 @@ def test_two_layers_integrated_step_by_step():
 
 
 def test_an_even_pressure_is_carried_to_the_base():
-    everywhere = (0.0, 0.16, 0.0, 0.16)
-    motion, stress = patch([SOFT, HARD], (0.16, 0.16), everywhere, (0.05, 0.06, 0.02, 0.03), 0.005, 40)
-    assert stress == pytest.approx(-1, rel=1e-12)
+    motion, stress = waves(np.zeros(1), [SOFT, HARD], 0.005)[0]
+    assert stress == -1
     assert motion == pytest.approx(0.010 / HARD.confined, rel=1e-12)
 
 
-def test_stress_under_a_patch_sums_to_its_force():
-    loaded, everywhere = (0.06, 0.10, 0.03, 0.07), (0.0, 0.16, 0.0, 0.16)
-    mean = patch([SOFT, HARD], (0.16, 0.16), loaded, everywhere, 0.009, 60)[1]
-    assert mean == pytest.approx(-(0.04 * 0.04) / 0.16**2, rel=1e-9)
+def stress(slabs, radius, beside, depth):
+    """Return the pressure at a depth beside the axis of a disc under 1 Pa."""
+    table = Discs(slabs, depth, (0.8 * radius, 1.3 * radius))
+    return table.forces(np.array([[0.0, beside, radius]]), np.zeros((1, 2)), 1e-5)[0, 0] / 1e-10
 
 
-def test_means_of_waves():
-    orders = np.arange(5)
-    x = 0.02 + (np.arange(20000) + 0.5) * 0.03 / 20000
-    expected = np.cos(orders[:, None] * np.pi * x / 0.2).mean(axis=1)
-    assert patch_mean(orders, 0.2, 0.02, 0.05) == pytest.approx(expected, rel=1e-8)
+def test_below_a_disc_a_deep_layer_is_a_half_space():
+    """Boussinesq, integrated over a disc: sigma_zz = -p (1 - z^3 / (a^2 + z^2)^1.5) on its axis."""
+    for radius, depth in ((0.005, 0.002), (0.008, 0.006), (0.02, 0.01)):
+        force = stress([Slab(2.0, 1e5, 0.3)], radius, 0.0, depth)
+        exact = 1 - depth**3 / (radius**2 + depth**2) ** 1.5
+        assert force == pytest.approx(exact, rel=1e-4)
+
+
+@pytest.mark.parametrize("slabs", [[SOFT], [SOFT, HARD], [HARD, SOFT]], ids=["one", "soft", "hard"])
+def test_below_a_disc_layers_are_integrated_adaptively(slabs):
+    """sigma_zz at a point beside the axis: the integral of a J1(k a) J0(k r) times that of a wave."""
+    radius, beside, depth = 0.006, 0.004, 0.0045
+
+    def wave(number):
+        return (
+            -waves(np.array([number]), slabs, depth)[0, 1]
+            * radius
+            * j1(number * radius)
+            * j0(number * beside)
+        )
+
+    exact = quad(wave, 1e-9, 40 / depth, limit=400)[0]
+    assert stress(slabs, radius, beside, depth) == pytest.approx(exact, rel=1e-5)
+
+
+def test_a_wide_disc_presses_a_thin_layer_evenly():
+    """Far from its edge; the layer carries p to its base, and nothing beside the disc."""
+    discs, squares = np.array([[0.0, 0.0, 0.03]]), np.array([[0.0, 0.0], [0.06, 0.0]])
+    inside, outside = Discs([SOFT], 0.0045, (0.02, 0.03)).forces(discs, squares, 0.01)[0]
+    assert inside / 1e-4 == pytest.approx(1, abs=0.02)
+    assert outside / 1e-4 == pytest.approx(0, abs=0.01)
 
 
 def test_below_the_middle_of_a_square_boussinesq_is_steinbrenner():

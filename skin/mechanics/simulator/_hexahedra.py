@@ -1,32 +1,21 @@
 """Structured hexahedra of a layered body: stiffness, surface loads, and rows that read stress and motion.
 
 Three-dimensional linear elasticity with trilinear elements whose dilatation is its mean over the element
-(Nagtegaal, Parks and Rice, 1974), so that a nearly incompressible silicone does not lock. scikit-fem
-assembles.
+(Nagtegaal, Parks and Rice, 1974), so that a nearly incompressible silicone does not lock.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import product
 
 import numpy as np
 import scipy.sparse as sp
-from skfem import BilinearForm, CellBasis, ElementHex0, ElementHex1, ElementVector, MeshHex
-from skfem.helpers import ddot, div, grad, transpose
-from skfem.refdom import RefHex
 
-_CORNERS = RefHex.p.T.astype(int)  # (8, 3): scikit-fem's order of an element's nodes
-
-
-@BilinearForm
-def _shearing(u, v, w):
-    # 2 mu sym_grad(u) : sym_grad(v), but the symmetric parts take most of the time of an assembly.
-    return w.mu * (ddot(grad(u), grad(v)) + ddot(grad(u), transpose(grad(v))))
-
-
-@BilinearForm
-def _growth(u, q, _):
-    return div(u) * q
+# (8, 3): an element's nodes, in the order of scikit-fem, which the tests compare with.
+_CORNERS = np.array([[1, 1, 1], [1, 1, 0], [1, 0, 1], [0, 1, 1], [1, 0, 0], [0, 1, 0], [0, 0, 1], [0, 0, 0]])
+# (8, 3): the points at which an element is integrated, in its local coordinates, each of weight 1/8.
+_POINTS = (1 + (2 * _CORNERS - 1) / np.sqrt(3)) / 2
 
 
 @dataclass(frozen=True)
@@ -38,7 +27,7 @@ class Hexahedra:
 
     Args:
         lines: where the elements' faces are along the chart's x, y and depth, m, each ascending from 0.
-        young: (K, H, W), Pa, of each element, K rows of elements from the surface down.
+        young: (K,), Pa, of each row of elements from the surface down.
         poisson: (K,), of each row.
         place: chart points (..., 3) to space (..., 3), m.
         frame: chart points (..., 3) to unit vectors (..., 3, 3) along x, along y and into the body.
@@ -58,7 +47,7 @@ class Hexahedra:
 
     @cached_property
     def corners(self) -> np.ndarray:
-        """The nodes of each element, (E, 8), elements in the order of ``young``."""
+        """The nodes of each element, (E, 8), row by row of elements from the surface down."""
         columns, rows, deep = self.counts
         z, y, x = np.meshgrid(*(np.arange(n) for n in (deep, rows, columns)), indexing="ij")
         first = np.column_stack([x.ravel(), y.ravel(), z.ravel()])
@@ -81,28 +70,63 @@ class Hexahedra:
 
     @cached_property
     def lame(self) -> tuple[np.ndarray, np.ndarray]:
-        """Lame's constants lambda and mu of each element, (E,) each, Pa."""
-        ratio = self.poisson[:, None, None]
-        mu = self.young / (2 * (1 + ratio))
-        return (2 * mu * ratio / (1 - 2 * ratio)).ravel(), mu.ravel()
+        """Lame's constants lambda and mu of each row of elements, (K,) each, Pa."""
+        mu = self.young / (2 * (1 + self.poisson))
+        return 2 * mu * self.poisson / (1 - 2 * self.poisson), mu
 
-    @cached_property
-    def _basis(self) -> CellBasis:
-        mesh = MeshHex(self.nodes.T.copy(), self.corners.T.copy(), sort_t=False, validate=False)
-        return CellBasis(mesh, ElementVector(ElementHex1()), intorder=2)
-
-    @cached_property
-    def _growth(self) -> tuple[sp.csr_matrix, np.ndarray]:
-        """How much each element's volume grows as nodes move, (E, 3 N), m^2, and the volumes (E,), m^3."""
-        rows = _growth.assemble(self._basis, self._basis.with_element(ElementHex0()))
-        return rows.tocsr(), self._basis.dx.sum(axis=1)
-
-    def stiffness(self) -> sp.csc_matrix:
+    def stiffness(self) -> sp.csr_array:
         """Return K (3 N, 3 N), N/m, before anything is held."""
-        lam, mu = self.lame
-        growth, volume = self._growth
-        shearing = _shearing.assemble(self._basis, mu=np.repeat(mu[:, None], self._basis.X.shape[-1], axis=1))
-        return (shearing + growth.T @ sp.diags_array(lam / volume) @ growth).tocsc()
+        columns, rows, layers = self.counts
+        # Of each node, what it feels of the 27 nodes around it.
+        blocks = np.zeros((layers + 1, rows + 1, columns + 1, 3, 3, 3, 3, 3))
+        for layer in range(layers):
+            unit = self._element_stiffness(layer)
+            for (a, (i, j, k)), (b, second) in product(enumerate(_CORNERS), repeat=2):
+                there = blocks[layer + k, j : j + rows, i : i + columns, *(1 + second - (i, j, k))[::-1]]
+                there += unit[..., a, :, b, :]
+        z, y, x = (np.arange(count + 1)[:, None] + [-1, 0, 1] for count in (layers, rows, columns))
+        near = np.einsum("ai,bj,ck->abcijk", *((at >= 0) & (at < len(at)) for at in (z, y, x)))
+        plane = z[:, None, None, :, None, None] * (rows + 1) + y[:, None, None, :, None]
+        node = plane * (columns + 1) + x[:, None, None, :]
+        ends = np.concatenate([[0], near.sum(axis=(3, 4, 5)).ravel().cumsum()])
+        return sp.bsr_array((blocks[near], node[near], ends), shape=(3 * len(self.nodes),) * 2).tocsr()
+
+    def _element_stiffness(self, layer: int) -> np.ndarray:
+        """Return the stiffness of a row's elements, (rows, columns, 8, 3, 8, 3), N/m.
+
+        Elements that are copies of each other along x or y, as in a sheet, stand for each other: 1 instead of
+        rows or columns.
+        """
+        columns, rows, _ = self.counts
+        element = np.arange(layer * rows * columns, (layer + 1) * rows * columns).reshape(rows, columns)
+        for axis in (0, 1):
+            sides = np.diff(self.nodes[self.corners[element]], axis=2)
+            first = sides.take([0], axis)
+            if np.allclose(sides, first, rtol=0, atol=1e-12 * np.abs(first).max()):
+                element = element.take([0], axis)
+        gradient, weight = self._integration(element.ravel())
+        slopes = gradient.reshape(element.size, 8, 24)
+        products = (slopes * weight[:, :, None]).transpose(0, 2, 1) @ slopes
+        products = products.reshape(element.size, 8, 3, 8, 3)
+        growth = np.einsum("eg,egx->ex", weight, slopes)
+        lam, mu = (constant[layer] for constant in self.lame)
+        # 2 mu sym_grad(u) : sym_grad(v), and the volume's growth as its mean.
+        unit = mu * (
+            np.einsum("eakbk,ij->eaibj", products, np.eye(3)) + products.transpose(0, 1, 4, 3, 2)
+        ) + np.einsum("e,ex,ey->exy", lam / weight.sum(axis=1), growth, growth).reshape(products.shape)
+        return unit.reshape(*element.shape, 8, 3, 8, 3)
+
+    def _integration(self, element: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return gradients of the shape functions of elements (P,) at 8 points, and the points' volumes.
+
+        Returns:
+            (P, 8, 8, 3), points before corners, 1/m; (P, 8), m^3.
+        """
+        corners = self.nodes[self.corners[element]]
+        inner = _slopes(_POINTS)
+        jacobian = np.einsum("gai,paj->pgij", inner, corners)
+        gradient = np.linalg.inv(jacobian) @ inner.transpose(0, 2, 1)
+        return gradient.swapaxes(2, 3), np.abs(np.linalg.det(jacobian)) / 8
 
     def loads(self, axis: int) -> sp.csc_matrix:
         """Return the nodal forces (3 N, cells), N, of 1 Pa on each surface cell, along x, along y or inwards.
@@ -120,6 +144,39 @@ class Hexahedra:
         cell = np.broadcast_to(np.arange(len(force))[:, None, None], unknown.shape)
         shape = (3 * len(self.nodes), len(force))
         return sp.csc_matrix((values.ravel(), (unknown.ravel(), cell.ravel())), shape=shape)
+
+    def pushes(self, plane: int) -> sp.csr_array:
+        """Return rows (nodes of a plane, 3 N) that read with which force each node is pushed down, N.
+
+        By the row of elements above the plane; on the surface, by the load.
+        """
+        layer, (x, y, z) = max(plane - 1, 0), self.lines
+        row = replace(
+            self,
+            lines=(x, y, z[layer : layer + 2]),
+            young=self.young[layer : layer + 1],
+            poisson=self.poisson[layer : layer + 1],
+        )
+        count = len(x) * len(y)
+        forces = -row.stiffness()[3 * count :] if plane else row.stiffness()[: 3 * count]
+        places = np.stack([*np.meshgrid(x, y), np.full((len(y), len(x)), z[plane])], axis=-1).reshape(-1, 3)
+        ends = 3 * np.arange(count + 1)
+        felt = sp.csr_array((self.frame(places)[:, 2].ravel(), np.arange(3 * count), ends)) @ forces
+        return sp.csr_array(
+            (felt.data, felt.indices + 3 * layer * count, felt.indptr), shape=(count, 3 * len(self.nodes))
+        )
+
+    def plane_areas(self, plane: int) -> sp.csc_array:
+        """Return integrals of two nodes' shape functions over a plane of nodes, (n, n), m^2."""
+        columns, rows, _ = self.counts
+        node = np.arange((rows + 1) * (columns + 1)).reshape(rows + 1, columns + 1)
+        corner = np.stack([node[:-1, :-1], node[:-1, 1:], node[1:, :-1], node[1:, 1:]], axis=-1)
+        corner = corner.reshape(-1, 4)
+        a, b, c, d = self.nodes[corner + plane * node.size].swapaxes(0, 1)
+        area = np.linalg.norm(np.cross(d - a, c - b), axis=1) / 2
+        values = area[:, None, None] * np.kron([[2, 1], [1, 2]], [[2, 1], [1, 2]]) / 36
+        first = np.broadcast_to(corner[:, :, None], values.shape)
+        return sp.csc_array((values.ravel(), (first.ravel(), first.swapaxes(1, 2).ravel())))
 
     def motion(self, points: np.ndarray, directions: np.ndarray) -> sp.csr_matrix:
         """Return rows (P, 3 N) that read how far points move along directions.
@@ -156,7 +213,7 @@ class Hexahedra:
         for axis, (line, most) in enumerate(zip(self.lines, (4, 4, 2), strict=True)):
             middles = (line[1:] + line[:-1]) / 2
             at = points[:, axis] if axis < 2 else np.clip(points[:, axis], middles[0], middles[-1])
-            stencils.append(_lagrange(middles, at, min(most, len(middles))))
+            stencils.append(lagrange(middles, at, min(most, len(middles))))
         (x, u), (y, v), (z, w) = stencils
         columns, rows, _ = self.counts
         element = (z[:, :, None, None] * rows + y[:, None, :, None]) * columns + x[:, None, None]
@@ -207,13 +264,14 @@ class Hexahedra:
         self, element: np.ndarray, local: np.ndarray, n: np.ndarray, m: np.ndarray
     ) -> sp.csr_matrix:
         """Return rows (P, 3 N) that read n . sigma . m at local coordinates of elements, Pa/m."""
-        growth, volume = self._growth
+        inside, weight = self._integration(element)
         gradient = self._gradients(element, local)
         along_n, along_m = (gradient @ vector[:, :, None] for vector in (n, m))
-        lam, mu = (constant[element] for constant in self.lame)
+        columns, rows, _ = self.counts
+        lam, mu = (constant[element // (rows * columns)] for constant in self.lame)
         shearing = mu[:, None, None] * (along_n * m[:, None] + along_m * n[:, None])
-        grown = sp.diags_array(lam * (n * m).sum(axis=1) / volume[element]) @ growth[element]
-        return self._rows(element, shearing) + grown
+        grown = np.einsum("pg,pgai->pai", weight, inside) / weight.sum(axis=1)[:, None, None]
+        return self._rows(element, shearing + (lam * (n * m).sum(axis=1))[:, None, None] * grown)
 
     def _gradients(self, element: np.ndarray, local: np.ndarray) -> np.ndarray:
         """Return the gradients of the shape functions in space, (P, 8, 3), 1/m."""
@@ -239,7 +297,7 @@ class Hexahedra:
         return sp.csr_matrix((values.ravel(), (row.ravel(), unknown.ravel())), shape=shape)
 
 
-def _lagrange(knots: np.ndarray, places: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+def lagrange(knots: np.ndarray, places: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the ``count`` knots nearest to places (P,), (P, count), and their weights in a polynomial."""
     first = np.clip(np.searchsorted(knots, places) - count // 2, 0, len(knots) - count)
     near = first[:, None] + np.arange(count)

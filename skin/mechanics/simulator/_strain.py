@@ -1,7 +1,5 @@
 """Largest strains of the top layer, which show whether the linear solution is valid."""
 
-from collections.abc import Callable, Iterator
-
 import numpy as np
 import scipy.sparse as sp
 import torch
@@ -26,27 +24,33 @@ def squeeze(structure: Structure) -> np.ndarray:
     return (down[-1] - below) / structure.body.layers[-1].thickness
 
 
-def solid_rows(
-    mesh: Hexahedra, deep: int, refinement: int, read: Callable[[sp.csr_matrix], np.ndarray]
-) -> Iterator[np.ndarray]:
-    """Yield the mean strain of each cell in the upper ``deep`` rows of elements, (6, cells, cells), 1/Pa.
+def solid_rows(mesh: Hexahedra, top: float, refinement: int) -> list[sp.csr_matrix]:
+    """Return rows (6 cells, 3 N) of the mean strain of each cell in the upper and the lower half of a layer.
 
     Args:
         mesh: of the body.
-        deep: rows of elements.
+        top: thickness of the uppermost layer, m; a single row of elements has no halves.
         refinement: elements along each side of a cell.
-        read: gives rows (R, 3 N) over the cells, (R, cells).
     """
     x, y, z = ((line[1:] + line[:-1]) / 2 for line in mesh.lines)
     along = [
         sp.kron(sp.eye_array(len(line) // refinement), np.full((1, refinement), 1 / refinement))
         for line in (x, y)
     ]
-    mean = sp.kron(along[1], along[0]).tocsr()
-    for depth in z[:deep]:
-        places = np.stack(np.meshgrid(x, y, indexing="xy"), axis=-1).reshape(-1, 2)
-        rows = mesh.strain(np.column_stack([places, np.full(len(places), depth)]))
-        yield np.stack([read((mean @ part).tocsr()) for part in rows])
+    mean, places = sp.kron(along[1], along[0]).tocsr(), np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    halves = [half for half in np.array_split(z[z < top], 2) if len(half)]
+    return [
+        sp.vstack(
+            [
+                sum(mean @ part for part in parts) / len(half)
+                for parts in zip(
+                    *(mesh.strain(np.column_stack([places, np.full(len(places), depth)])) for depth in half),
+                    strict=True,
+                )
+            ]
+        ).tocsr()
+        for half in halves
+    ]
 
 
 def largest(cells: Tensor, rows: Tensor) -> Tensor:

@@ -1,8 +1,8 @@
 """Three-dimensional elasticity of a layered body, as one linear operator."""
 
-import os
-import sys
-from collections.abc import Mapping, Sequence
+import hashlib
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar
@@ -12,90 +12,23 @@ import numpy as np
 import scipy.sparse as sp
 import torch
 from pydantic import PositiveInt
-from rich.console import Console
-from rich.progress import track
-from scipy.sparse.linalg import SuperLU
 from torch import Tensor
 
 from skin.body.base import AbstractBody, Sensors, require_memory
-from skin.body.material import MATERIALS
 from skin.core import array_cache
-from skin.core.files import whole
 from skin.core.settings import checked
-from skin.errors import InputError
+from skin.mechanics.simulator._cholesky import Cholesky
 from skin.mechanics.simulator._hexahedra import Hexahedra
+from skin.mechanics.simulator._mesh import build_meshes
+from skin.mechanics.simulator._reading import reading_rows, warn_of_cut
 from skin.mechanics.simulator._strain import largest, solid_rows
-from skin.mechanics.simulator.base import AbstractSimulator, Response, factorised, flatten
+from skin.mechanics.simulator.base import AbstractSimulator, Response, flatten
 from skin.touch import splines
-
-# What a sensor feels: points and weights over its footprint, wherever it faces.
-
-
-_GAUSS = np.array([-1.0, 1.0]) / np.sqrt(3)
-
-
-def quadrature(
-    sensors: Sensors, lines: tuple[np.ndarray, np.ndarray, np.ndarray]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return points over every sensor's footprint, what they weigh, and whose they are.
-
-    A footprint is a rectangle about the sensor, across its normal. Two Gauss points stand along each side of
-    each piece into which the lines cut it, so that a stress that is a cubic between lines is integrated
-    exactly where the sensor faces the surface. What passes the edge of the body is cut off.
-
-    Args:
-        sensors: S of them.
-        lines: along x, y and depth, m, from one edge of the body to the other.
-
-    Returns:
-        points (P, 3) in the chart, m; areas (P,), m^2; sensor (P,), its index.
-    """
-    points, areas, owners = [], [], []
-    for number, (place, normal) in enumerate(zip(sensors.positions, sensors.normals, strict=True)):
-        turned = _turn(normal)
-        along = [
-            _pieces(
-                extent / 2,
-                *(_crossings(lines[across] - place[across], turned[axis, across]) for across in (axis, 2)),
-            )
-            for axis, extent in enumerate(sensors.footprint)
-        ]
-        (s, ds), (t, dt) = along
-        grid = s[:, None, None] * turned[0] + t[None, :, None] * turned[1]
-        points.append(place + grid.reshape(-1, 3))
-        areas.append(np.outer(ds, dt).ravel())
-        owners.append(np.full(areas[-1].size, number))
-    places, weights, owner = np.concatenate(points), np.concatenate(areas), np.concatenate(owners)
-    last = np.array([line[-1] for line in lines])
-    inside = ((places >= 0) & (places <= last)).all(axis=1)
-    return places[inside], weights[inside], owner[inside]
-
-
-def _turn(normal: np.ndarray) -> np.ndarray:
-    """Return the chart's axes turned the shortest way until the third is the normal, (3, 3), rows."""
-    x, y, z = normal if normal[2] >= 0 else -normal
-    return np.array(
-        [[1 - x * x / (1 + z), -x * y / (1 + z), -x], [-x * y / (1 + z), 1 - y * y / (1 + z), -y], [x, y, z]]
-    )
-
-
-def _crossings(distances: np.ndarray, slope: float) -> np.ndarray:
-    """Return where a line of some slope has gone some distances; nowhere if it stands still."""
-    return distances / slope if abs(slope) > 1e-9 else np.empty(0)
-
-
-def _pieces(half: float, *crossings: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return Gauss points between -half and half, by pieces between cuts, and their weights."""
-    cuts = np.concatenate(crossings)
-    edges = np.unique(np.concatenate([[-half, half], cuts[np.abs(cuts) < half]]))
-    middle, width = (edges[1:] + edges[:-1]) / 2, np.diff(edges)
-    return (middle[:, None] + np.outer(width / 2, _GAUSS)).ravel(), np.repeat(width / 2, 2)
-
 
 # A solid body, factorised once: rows over its surface cells, and how all of it moves under each of them.
 
 
-_AT_ONCE = 32  # right-hand sides
+_AT_ONCE = 128  # right-hand sides
 
 
 class Elastic:
@@ -121,23 +54,27 @@ class Elastic:
         self._area = mesh.lines[0][-1] * mesh.lines[1][-1] / (self.cells[0] * self.cells[1])
 
     @cached_property
-    def _factors(self) -> SuperLU:
+    def key(self) -> str:
+        """A hash of all that its motions depend on."""
+        mesh = self.mesh
+        arrays = (*mesh.lines, mesh.young, mesh.poisson, mesh.nodes, mesh.frame(np.zeros((1, 3))))
+        return hashlib.sha256(b"".join(np.ascontiguousarray(array).tobytes() for array in arrays)).hexdigest()
+
+    @cached_property
+    def _factors(self) -> Cholesky:
         columns, rows, deep = self.mesh.counts
         require_memory(
             _bytes(columns, rows, deep),
             f"the stiffness of {columns} x {rows} x {deep} solid elements",
-            "give fewer, such as body.cells=[32,32] or simulator.refinement=1",
+            "give fewer, such as body.cells=[32,32], simulator.refinement=1 or simulator.divisions=2",
         )
-        return factorised(self.mesh.stiffness()[self._free][:, self._free].tocsc())
-
-    @cached_property
-    def _free(self) -> np.ndarray:
-        return np.flatnonzero(~self.mesh.held)
+        free = self._plane * deep
+        return Cholesky(self.mesh.stiffness()[:free, :free], (rows + 1, columns + 1))
 
     def solve(self, forces: np.ndarray) -> np.ndarray:
         """Return how far nodes move (3 N, L), m, under nodal forces (3 N, L), N."""
-        moves = np.zeros_like(forces)
-        moves[self._free] = self._factors.solve(np.ascontiguousarray(forces[self._free]))
+        moves, free = np.zeros_like(forces), len(forces) - self._plane
+        moves[:free] = self._factors.solve(forces[:free])
         return moves
 
     def loads(self, axis: int, part: slice = slice(None)) -> np.ndarray:
@@ -182,68 +119,28 @@ class Elastic:
                 out[part] = self.work(axis, adjoint).T
         return influence
 
-    def influence(self, axis: int, deep: int, path: Path) -> np.ndarray:
-        """Return how upper nodes move under a moment of 1 Pa of each cell, (n, cells) float32, m/Pa.
-
-        Args:
-            axis: along which the cells are loaded.
-            deep: rows of elements, from the surface down, whose nodes are kept: the first n unknowns.
-            path: of the file from which it is read, x.npy; it is written if it is not there.
-        """
-        shape = ((deep + 1) * self._plane, self.cells[0] * self.cells[1])
-        influence = _stored(path, shape)
-        if influence is None:
-            self._write_influence(axis, path, shape)
-            influence = _stored(path, shape)
-        assert influence is not None
-        return influence
-
-    def _write_influence(self, axis: int, path: Path, shape: tuple[int, int]) -> None:
-        parts = range(0, shape[1], _AT_ONCE)
-        with whole(path, "SKIN_CACHE=FOLDER") as partial:
-            influence = np.lib.format.open_memmap(partial, mode="w+", dtype=np.float32, shape=shape)
-            _reserve(partial)
-            console = Console(stderr=True)
-            terminal = sys.stderr.isatty()
-            for first in track(parts, "solving for each surface cell", console=console, disable=not terminal):
-                part = slice(first, first + _AT_ONCE)
-                influence[:, part] = self.solve(self.loads(axis, part))[: shape[0]]
-            influence.flush()
-            del influence  # Windows does not rename a file that is mapped
-
-
-def _stored(path: Path, shape: tuple[int, int]) -> np.ndarray | None:
-    """Return the float32 array in a file, or None if there is none of this shape."""
-    try:
-        influence = np.load(path, mmap_mode="r", allow_pickle=False)
-    except (OSError, EOFError, ValueError):
-        return None
-    return influence if influence.shape == shape and influence.dtype == np.float32 else None
-
-
-def _reserve(path: Path) -> None:
-    """Claim the disk space of a file that is mapped: to write to a map of a full disk kills the process."""
-    if hasattr(os, "posix_fallocate"):
-        with open(path, "rb+") as file:
-            os.posix_fallocate(file.fileno(), 0, path.stat().st_size)
+    def of_cells(self, axis: int) -> Iterator[tuple[slice, np.ndarray]]:
+        """Yield parts of the cells, and how nodes move under a moment of 1 Pa of each, (3 N, part), m/Pa."""
+        for first in range(0, self.cells[0] * self.cells[1], _AT_ONCE):
+            part = slice(first, first + _AT_ONCE)
+            yield part, self.solve(self.loads(axis, part))
 
 
 def _bytes(columns: int, rows: int, deep: int) -> float:
     """Estimate the memory that assembly and factors take, bytes.
 
-    Measured on 16 to 48 cells a side and 4 to 6 rows: both factors have about (21.8 log2(side) - 59) entries
-    per place and squared unknown of a column, at 18 bytes with what the solver holds besides; the assembly
-    holds 24 x 24 numbers per element, five times over. The sum came within 10 % of the memory then measured.
+    The factors have 3 log2(places) entries per place and squared unknown of a column, within 7 % from 17 to
+    257 places a side; the last fronts have 4 times the squared unknowns of a side. The stiffness has 81
+    entries per unknown, which the assembly holds four times at 12 bytes.
     """
-    places = float((columns + 1) * (rows + 1))
-    filling = max(21.8 * np.log2(places**0.5) - 59, 12.0)
-    return 18 * places * (3 * deep) ** 2 * filling + 40 * 24 * 24 * columns * rows * deep
+    places, unknowns = float((columns + 1) * (rows + 1)), 3 * deep
+    return 8 * places * unknowns**2 * (3 * np.log2(places) + 4) + 4 * 12 * 81 * places * unknowns
 
 
 _HERE = Path(__file__).parent
 _SOURCES = [
     *sorted((_HERE.parents[1] / "body").glob("*.py")),
-    *(_HERE / f"{name}.py" for name in ("_hexahedra", "base", "solid")),
+    *(_HERE / f"{name}.py" for name in ("_cholesky", "_hexahedra", "_mesh", "_reading", "base", "solid")),
     Path(splines.__file__),
 ]
 _INWARDS = 2
@@ -288,17 +185,17 @@ class Solid(AbstractSimulator):
         self,
         body: AbstractBody,
         sensors: Sensors,
-        divisions: PositiveInt = 2,
+        divisions: PositiveInt | None = None,
         poisson: Mapping[str, float] | None = None,
         cache: str | Path | None = None,
         refinement: PositiveInt = 2,
     ) -> None:
         super().__init__()
         self.shape, self._area = body.shape, float(np.prod(body.cell))
-        self._mesh = build_mesh(body, divisions, poisson or {}, refinement)
-        self._divisions, self._refinement = divisions, refinement
+        self._body, self._settings = body, (divisions, poisson or {}, refinement)
         self._folder = array_cache.folder(cache)
-        self._key = array_cache.hashed(_content(body, self._mesh), _SOURCES)
+        warn_of_cut(sensors, (*body.size, body.thickness))
+        self._parts, self._strained = self._elastic(sensors), dict[int, list[Tensor]]()
         rows = self._operator(sensors)
         # (3, rows, cells) -> the moments of a pressure times this give all rows for each axis of the load.
         self.register_buffer("transfer", torch.from_numpy(rows.transpose(0, 2, 1).copy()).float())
@@ -348,9 +245,10 @@ class Solid(AbstractSimulator):
     def compliance(self) -> Tensor:
         """Return C (cells, cells), m/Pa: mean inward displacement of each cell under 1 Pa on each cell.
 
-        Symmetric. Computed once, then cached on disk.
+        Symmetric and positive definite, because it is that of the fine mesh alone: the difference of two
+        meshes need not be. Computed once, then cached on disk.
         """
-        moved = self._elastic.work(_INWARDS, self.influence(_INWARDS)) / self._area
+        moved = self._surface["cells"] / self._area
         spread = np.kron(splines.of_cells(self.shape[0]), splines.of_cells(self.shape[1]))
         compliance = spread.T @ moved @ spread
         return torch.from_numpy((compliance + compliance.T) / 2).float()
@@ -362,104 +260,116 @@ class Solid(AbstractSimulator):
             loads: (F, H, W), the moments, Pa.
         """
         cells = flatten(loads, self.shape, torch.float32).cpu()
-        moved = cells @ torch.from_numpy(_read(self._corners, self.influence(_INWARDS)).T).float()
+        moved = cells @ torch.from_numpy(self._surface["corners"].T).float()
         return moved.unflatten(1, (self.shape[0] + 1, self.shape[1] + 1))
 
     @cached_property
-    def _corners(self) -> sp.csr_matrix:
-        """Rows that read how far the corners of the cells move into the skin, m."""
-        x, y = (line[:: self._refinement] for line in self._mesh.lines[:2])
-        places = np.stack([*np.meshgrid(x, y), np.zeros((len(y), len(x)))], axis=-1).reshape(-1, 3)
-        return self._mesh.motion(places, np.tile(np.eye(3)[_INWARDS], (len(places), 1)))
+    def _surface(self) -> dict[str, np.ndarray]:
+        """How the surface moves under a moment of 1 Pa of each cell: the cells' work, J, and corners, m."""
+        elastic, cells = self._fine, math.prod(self.shape)
+        shapes = {"cells": (cells, cells), "corners": (math.prod(side + 1 for side in self.shape), cells)}
+        key = self._key([(1.0, elastic)], "surface")
+
+        def build() -> dict[str, np.ndarray]:
+            rows, moved = _corners(elastic), {name: np.empty(shape) for name, shape in shapes.items()}
+            for part, moves in elastic.of_cells(_INWARDS):
+                moved["cells"][:, part] = elastic.work(_INWARDS, moves)
+                moved["corners"][:, part] = rows @ moves
+            return moved
+
+        return array_cache.kept(self._folder / f"surface-{key}.npz", key, shapes, build)
+
+    @property
+    def _fine(self) -> Elastic:
+        return self._parts[0][1]
 
     def strain(self, loads: Tensor, shear: Tensor | None = None) -> Tensor:
-        """Return the largest principal strain of the top layer, (U,), including that from shear."""
+        """Return the largest principal strain of the top layer, (U,), including that from shear.
+
+        On the fine mesh alone: the means over the rows of elements of two meshes are at different depths.
+        """
         cells = flatten(loads, self.shape, self.transfer.dtype)
         axes, parts = [_INWARDS], [cells]
         if shear is not None:
             axes += [0, 1]
             parts += [cells * shear[:, axis, None].to(cells) for axis in (0, 1)]
-        load, fields = torch.cat(parts, dim=1), [self.influence(axis) for axis in axes]
+        load = torch.cat(parts, dim=1)
+        halves = zip(*(self._strains(axis) for axis in axes), strict=True)
+        return torch.stack([largest(load, torch.cat(half, dim=2).to(load)) for half in halves]).amax(0)
 
-        def read(rows: sp.csr_matrix) -> np.ndarray:
-            return np.hstack([_read(rows, field) for field in fields])
+    def _strains(self, axis: int) -> list[Tensor]:
+        """Return strains in halves of the top layer, (6, cells, cells), under 1 Pa of moment of each cell."""
+        if axis in self._strained:
+            return self._strained[axis]
+        top, cells = self._body.layers[-1].thickness, math.prod(self.shape)
+        rows = solid_rows(self._fine.mesh, top, self._settings[2])
+        shapes = {f"half {number}": (6, cells, cells) for number in range(len(rows))}
+        key = self._key([(1.0, self._fine)], ["strain", axis])
 
-        strains = solid_rows(self._mesh, self._divisions, self._refinement, read)
-        return torch.stack([largest(load, torch.from_numpy(rows).to(load)) for rows in strains]).amax(0)
+        def build() -> dict[str, np.ndarray]:
+            strains = {half: np.empty(shape) for half, shape in shapes.items()}
+            for part, moves in self._fine.of_cells(axis):
+                for strain, read in zip(strains.values(), rows, strict=True):
+                    strain[:, :, part] = (read @ moves).reshape(6, cells, -1)
+            return strains
 
-    def influence(self, axis: int) -> np.ndarray:
-        """Return how nodes of the top layer move under a moment of 1 Pa of each cell, (n, cells), m/Pa."""
-        path = self._folder / f"influence-{self._key}-{axis}.npy"
-        return self._elastic.influence(axis, self._divisions, path)
+        needed = 8 * sum(math.prod(shape) for shape in shapes.values())
+        require_memory(needed, f"the strains of {cells} cells", "give fewer, such as body.cells=[32,32]")
+        stored = array_cache.kept(self._folder / f"strain-{key}.npz", key, shapes, build)
+        self._strained[axis] = [torch.from_numpy(strain).float() for strain in stored.values()]
+        return self._strained[axis]
 
     def of(self, sensors: Sensors, axes: Sequence[int] = (0, 1, 2)) -> np.ndarray:
         """Return the readings of other sensors under a moment of 1 Pa of each cell, (axes, S, cells), N/Pa.
 
         Args:
-            sensors: S sensors; one solve each.
+            sensors: S sensors; one solve each, on meshes of their own depths.
             axes: of the loads: along x (0), y (1) and inwards (2).
         """
-        return self._elastic.transfer(reading_rows(self._mesh, sensors), axes)
+        parts = [
+            weight * elastic.transfer(reading_rows(elastic.mesh, sensors), axes)
+            for weight, elastic in self._elastic(sensors)
+        ]
+        return np.sum(parts, axis=0)
 
     def pressure_rows(self, sensors: Sensors) -> np.ndarray:
         """Return the readings of other sensors under a moment of 1 Pa of each cell, (S, cells), N/Pa."""
         return self.of(sensors, [_INWARDS])[0]
 
-    @cached_property
-    def _elastic(self) -> Elastic:
-        """The body, whose factors take seconds: one for all living simulators of it."""
-        return _BODIES.setdefault((self._key, self._refinement), Elastic(self._mesh, self._refinement))
+    def _elastic(self, sensors: Sensors) -> list[tuple[float, Elastic]]:
+        """Return bodies for some sensors, whose weighted sum is the solution.
+
+        Their factors take seconds: one body for all living simulators of it.
+        """
+        bodies = []
+        for weight, mesh, refinement in build_meshes(self._body, sensors, *self._settings):
+            elastic = Elastic(mesh, refinement)
+            bodies.append((weight, _BODIES.setdefault((elastic.key, refinement), elastic)))
+        return bodies
+
+    def _key(self, parts: Sequence[tuple[float, Elastic]], about: Any) -> str:
+        """Return the name of what is computed from bodies."""
+        bodies = [[weight, *elastic.cells, elastic.key] for weight, elastic in parts]
+        return array_cache.hashed({"bodies": bodies, "about": about}, _SOURCES)
 
     def _operator(self, sensors: Sensors) -> np.ndarray:
         """Return the rows of readings, D_s, D_t and displacements along x and y, (3, 5 S, cells)."""
         about = {
-            "body": self._key,
             "positions": sensors.positions.tolist(),
             "normals": sensors.normals.tolist(),
             "footprint": sensors.footprint,
         }
-        key = array_cache.hashed(about, _SOURCES)
+        key = self._key(self._parts, about)
         shape = (3, 5 * len(sensors), self.shape[0] * self.shape[1])
 
         def build() -> dict[str, np.ndarray]:
-            rows = sp.vstack([reading_rows(self._mesh, sensors), *_motions(self._mesh, sensors)]).tocsr()
-            return {"rows": self._elastic.transfer(rows)}
+            total = np.zeros(shape)
+            for weight, elastic in self._parts:
+                rows = [reading_rows(elastic.mesh, sensors), *_motions(elastic.mesh, sensors)]
+                total += weight * elastic.transfer(sp.vstack(rows).tocsr())
+            return {"rows": total}
 
         return array_cache.kept(self._folder / f"solid-{key}.npz", key, {"rows": shape}, build)["rows"]
-
-
-def build_mesh(
-    body: AbstractBody, divisions: int, poisson: Mapping[str, float], refinement: int = 1
-) -> Hexahedra:
-    """Return a body's elements: its cells cut in equal parts, ``divisions`` rows to each layer.
-
-    Args:
-        body: sheet or arm.
-        divisions: of each layer.
-        poisson: name of a material -> nu in place of its own.
-        refinement: elements along each side of a cell.
-
-    Raises:
-        InputError: as of :class:`Solid`.
-    """
-    ratios = _ratios(body, poisson)
-    depths, young, ratio = [0.0], [], []
-    for number in reversed(range(len(body.layers))):
-        layer = body.layers[number]
-        depths += list(depths[-1] + layer.thickness * np.arange(1, divisions + 1) / divisions)
-        young += [np.full([refinement * count for count in body.shape], layer.material.young)] * divisions
-        ratio += [ratios[number]] * divisions
-    x, y = (np.linspace(0, body.size[axis], refinement * body.cells[axis] + 1) for axis in (0, 1))
-    return Hexahedra((x, y, np.array(depths)), np.stack(young), np.array(ratio), body.place, body.frame)
-
-
-def reading_rows(mesh: Hexahedra, sensors: Sensors) -> sp.csr_matrix:
-    """Return rows (S, 3 N) that give the normal force on each sensor, N, from nodal displacements."""
-    # The stress is interpolated between the middles of elements, so its polynomials change there.
-    cuts = tuple(np.unique([*line, *(line[1:] + line[:-1]) / 2]) for line in mesh.lines)
-    points, areas, owner = quadrature(sensors, cuts)  # type: ignore[arg-type]
-    sums = sp.csr_matrix((-areas, (owner, np.arange(len(owner)))), shape=(len(sensors), len(points)))
-    return mesh.mean_stress((sums @ mesh.between(points)).tocsr(), sensors.normals)
 
 
 def _motions(mesh: Hexahedra, sensors: Sensors) -> list[sp.csr_matrix]:
@@ -473,37 +383,9 @@ def _motions(mesh: Hexahedra, sensors: Sensors) -> list[sp.csr_matrix]:
     ]
 
 
-def _read(rows: sp.csr_matrix, influence: np.ndarray) -> np.ndarray:
-    """Return rows @ influence; only the lines with non-zero columns in rows are read from disk."""
-    used = np.unique(rows.indices)
-    return np.asarray(rows[:, used] @ influence[used])
-
-
-def _ratios(body: AbstractBody, poisson: Mapping[str, float]) -> list[float]:
-    names = {layer.material.name for layer in body.layers}
-    if unknown := sorted(set(poisson) - names - {material.name for material in MATERIALS}):
-        raise InputError(
-            f"poisson (simulator.poisson) names {unknown[0]}, but the body is made of "
-            f"{', '.join(sorted(names))}"
-        )
-    ratios = [float(poisson.get(layer.material.name, layer.material.poisson)) for layer in body.layers]
-    for layer, ratio in zip(body.layers, ratios, strict=True):
-        if not -1 < ratio < 0.5:
-            name = layer.material.name
-            raise InputError(
-                f"{name} has Poisson's ratio {ratio:g}, but no isotropic solid is beyond -1 < nu < 0.5: "
-                f"in Python give poisson={{{name!r}: 0.49}} to Solid or use PlatesAndBeams; "
-                f"on the command line give 'simulator.poisson={{{name}: 0.49}}' or simulator=fem"
-            )
-    return ratios
-
-
-def _content(body: AbstractBody, mesh: Hexahedra) -> dict[str, Any]:
-    """Return all that the body's operators depend on."""
-    space = np.concatenate([mesh.nodes, *mesh.frame(np.zeros((1, 3)))])
-    return {
-        "lines": [line.tolist() for line in mesh.lines],
-        "young": mesh.young.tolist(),
-        "poisson": mesh.poisson.tolist(),
-        "nodes": space.tolist(),
-    }
+def _corners(elastic: Elastic) -> sp.csr_matrix:
+    """Return rows that read how far the corners of the cells move into the skin, m."""
+    lines = zip(elastic.mesh.lines, elastic.cells, strict=False)
+    x, y = (np.linspace(0, line[-1], count + 1) for line, count in lines)
+    places = np.stack([*np.meshgrid(x, y), np.zeros((len(y), len(x)))], axis=-1).reshape(-1, 3)
+    return elastic.mesh.motion(places, np.tile(np.eye(3)[_INWARDS], (len(places), 1)))

@@ -8,9 +8,11 @@ from scipy.sparse.linalg import spsolve
 
 from skin.body.base import Arm, Sensors, Sheet
 from skin.errors import InputError
+from skin.mechanics.simulator._cholesky import Cholesky
 from skin.mechanics.simulator._hexahedra import Hexahedra
-from skin.mechanics.simulator.base import factorised
-from skin.mechanics.simulator.solid import Elastic, Solid, build_mesh, reading_rows
+from skin.mechanics.simulator._mesh import build_mesh
+from skin.mechanics.simulator._reading import reading_rows
+from skin.mechanics.simulator.solid import Elastic, Solid
 from skin.touch import splines
 
 LAYERS = [
@@ -48,7 +50,7 @@ def identity(points):
 
 def test_a_place_between_nodes_moves_as_trilinear_elements_do():
     lines = tuple(np.sort(np.random.default_rng(seed).random(5)) for seed in range(3))
-    mesh = Hexahedra(lines, np.full((4, 4, 4), 2e5), np.full(4, 0.49), bent, identity)
+    mesh = Hexahedra(lines, np.full(4, 2e5), np.full(4, 0.49), bent, identity)
     strain = np.array([[1.0, 0.3, -0.2], [0.3, -0.4, 0.5], [-0.2, 0.5, 0.7]]) * 1e-3
     points = np.random.default_rng(3).uniform(np.array(lines)[:, 0], np.array(lines)[:, -1], (20, 3))
     down = mesh.motion(points, np.tile([0, 0, 1.0], (20, 1))) @ (mesh.nodes @ strain).ravel()
@@ -57,7 +59,7 @@ def test_a_place_between_nodes_moves_as_trilinear_elements_do():
 
 def test_middles_of_elements_tell_a_cubic_everywhere():
     lines = tuple(np.sort(np.random.default_rng(seed).random(7)) for seed in range(3))
-    mesh = Hexahedra(lines, np.full((6, 6, 6), 2e5), np.full(6, 0.49), bent, identity)
+    mesh = Hexahedra(lines, np.full(6, 2e5), np.full(6, 0.49), bent, identity)
     x, y, z = np.meshgrid(*((line[1:] + line[:-1]) / 2 for line in lines), indexing="ij")
 
     def cubic(x, y, z):
@@ -94,17 +96,19 @@ def test_the_table_pushes_back(body):
         assert np.abs(applied + answered).max() < 1e-8 * np.abs(applied).max()
 
 
-def test_the_operator_is_a_direct_solve():
-    mesh = build_mesh(SHEET, 2, {}, 2)
-    elastic, free = Elastic(mesh, 2), np.flatnonzero(~mesh.held)
+def test_the_operator_is_a_direct_solve_on_two_meshes():
     pressure = 1e4 * np.random.default_rng(0).random(64)
     moments = np.kron(splines.of_cells(8), splines.of_cells(8)) @ pressure
-    load = elastic.loads(2) @ moments - 0.4 * elastic.loads(0) @ moments
-    moved = np.zeros(len(load))
-    moved[free] = spsolve(mesh.stiffness()[free][:, free].tocsc(), load[free])
+    expected = np.zeros(2)
+    for weight, divisions, refinement in ((4 / 3, 2, 2), (-1 / 3, 1, 1)):
+        mesh = build_mesh(SHEET, divisions, {}, refinement)
+        elastic, free = Elastic(mesh, refinement), np.flatnonzero(~mesh.held)
+        load = elastic.loads(2) @ moments - 0.4 * elastic.loads(0) @ moments
+        moved = np.zeros(len(load))
+        moved[free] = spsolve(mesh.stiffness()[free][:, free].tocsc(), load[free])
+        expected += weight * (reading_rows(mesh, TWO) @ moved)
     frame, shear = torch.from_numpy(pressure).reshape(8, 8), torch.tensor([-0.4, 0.0])
-    felt = solid(TWO)(frame, shear).readings.numpy()
-    assert felt == pytest.approx(reading_rows(mesh, TWO) @ moved, rel=2e-6)
+    assert solid(TWO)(frame, shear).readings.numpy() == pytest.approx(expected, rel=2e-6)
 
 
 @pytest.mark.parametrize("body", [SHEET, ARM], ids=["sheet", "arm"])
@@ -115,6 +119,17 @@ def test_two_loads_do_the_same_work_on_the_motion_of_the_other(body):
     moves = elastic.solve(loads)
     assert elastic.work(1, moves) == pytest.approx(elastic.loads(1).T @ moves, rel=1e-9, abs=1e-12)
     assert loads[:, 0] @ moves[:, 1] == pytest.approx(loads[:, 1] @ moves[:, 0], rel=1e-8)
+
+
+@pytest.mark.parametrize("cells", [(2, 3), (5, 4), (13, 7)])
+def test_factors_solve_what_the_stiffness_says(cells):
+    mesh = build_mesh(Sheet([0.04, 0.03], cells, LAYERS), 2, {}, 2)
+    forces = np.random.default_rng(0).random((len(mesh.held), 3))
+    forces[mesh.held] = 0
+    moves = Elastic(mesh, 2).solve(forces)
+    assert not moves[mesh.held].any()
+    left = (mesh.stiffness() @ moves - forces)[~mesh.held]
+    assert np.abs(left).max() < 1e-9
 
 
 def test_forces_are_mutual():
@@ -173,6 +188,15 @@ def test_sensors_move_as_the_skin_does():
     assert 0 < response.displacement[0, 0] < response.displacement[0, 1]
 
 
+def test_sensors_at_many_depths_read_between_planes_of_nodes():
+    """Each as it does in a body with a plane of nodes at its depth, but for the interpolation."""
+    depths = np.linspace(0.0035, 0.0075, 6)
+    places = [(0.01 + 0.02 * number, 0.06, depth) for number, depth in enumerate(depths)]
+    together, frame = Solid(SHEET, sensors(*places)), torch.full(SHEET.shape, 1e3)
+    apart = [Solid(SHEET, sensors(place))(frame).readings.item() for place in places]
+    assert together(frame).readings.numpy() == pytest.approx(np.array(apart), rel=0.01)
+
+
 def test_operators_are_kept(tmp_path, monkeypatch):
     first = solid(cache=tmp_path)
     monkeypatch.setattr(Elastic, "transfer", None)
@@ -182,18 +206,38 @@ def test_operators_are_kept(tmp_path, monkeypatch):
 def test_simulators_of_one_body_share_its_factors(tmp_path, monkeypatch):
     made, kept = [], {"cache": tmp_path}
     monkeypatch.setattr(
-        "skin.mechanics.simulator.solid.factorised", lambda k: made.append(k) or factorised(k)
+        "skin.mechanics.simulator.solid.Cholesky", lambda *given: made.append(given) or Cholesky(*given)
     )
     coarse, fine = (Sheet([0.06, 0.06], [count, count], LAYERS) for count in (6, 12))
     skins = [solid(sensors((x, 0.03, 0.005)), coarse, **kept) for x in (0.03, 0.02)]
-    assert len(made) == 1
+    assert len(made) == 2  # a fine and a coarse mesh
     # The same elements under smaller cells.
     skins.append(solid(sensors((0.03, 0.03, 0.005)), fine, refinement=1, **kept))
     assert [skin.transfer.shape[1] for skin in skins] == [36, 36, 144]
-    assert len(made) == 2
+    assert len(made) == 3
     del skins
     solid(sensors((0.04, 0.03, 0.005)), coarse, **kept)
-    assert len(made) == 3
+    assert len(made) == 5
+
+
+def test_too_few_rows_are_said_with_the_error_to_expect():
+    thick = Sheet([0.08, 0.08], [8, 8], [{"material": "EcoFlex 00-30", "thickness": 0.03}])
+    where = sensors((0.04, 0.04, 0.0295))
+    with pytest.warns(UserWarning, match=r"divisions=2 makes rows .* 15 mm high .* by 100 %;.* 7 rows"):
+        solid(where, thick)
+
+
+@pytest.mark.parametrize(
+    ("size", "thickness", "reason"),
+    [
+        (0.08, 0.0009, r"layer 1 of the body is 0\.0009 m thick; simulator=solid takes layers from 0\.001 m"),
+        (0.02, 0.021, r"layer 1 of the body is 0\.021 m thick.*to the width of the skin, 0\.02 m"),
+    ],
+)
+def test_layers_that_no_mesh_can_hold(size, thickness, reason):
+    body = Sheet([size, 0.08], [4, 8], [{"material": "EcoFlex 00-30", "thickness": thickness}])
+    with pytest.raises(InputError, match=reason):
+        solid(sensors((0.01, 0.04, 0.0005)), body)
 
 
 @pytest.mark.parametrize(
@@ -209,14 +253,26 @@ def test_what_no_solid_can_be(settings, reason):
         solid(**settings)
 
 
-def test_the_measured_ratio_of_dragon_skin_is_refused_by_name():
-    body = Sheet([0.12, 0.12], [12, 12], [{"material": "Dragon Skin 10 Medium", "thickness": 0.01}])
-    with pytest.raises(InputError, match=r"Dragon Skin 10 Medium has Poisson's ratio 0\.54") as caught:
+def test_the_measured_ratio_of_dragon_skin_is_replaced_in_python_as_in_the_configuration():
+    where, settings = sensors((0.06, 0.06, 0.005)), {"divisions": 1}
+    made = [
+        Solid(Sheet([0.12, 0.12], [12, 12], [{"material": material, "thickness": 0.01}]), where, **settings)
+        for material in (
+            "Dragon Skin 10 Medium",
+            {"name": "Dragon Skin 10 Medium", "poisson": 0.49},
+            {"name": "other", "young": 560e3, "poisson": 0.49},
+        )
+    ]
+    assert torch.equal(made[0].transfer, made[1].transfer)
+    assert torch.equal(made[0].transfer, made[2].transfer)
+
+
+def test_an_impossible_ratio_is_refused_by_name():
+    material = {"name": "rubber", "young": 560e3, "poisson": 0.54}
+    body = Sheet([0.12, 0.12], [12, 12], [{"material": material, "thickness": 0.01}])
+    with pytest.raises(InputError, match=r"rubber has Poisson's ratio 0\.54") as caught:
         solid(sensors((0.06, 0.06, 0.0)), body)
-    python, shell = (
-        "poisson={'Dragon Skin 10 Medium': 0.49}",
-        "'simulator.poisson={Dragon Skin 10 Medium: 0.49}'",
-    )
+    python, shell = "poisson={'rubber': 0.49}", "'simulator.poisson={rubber: 0.49}'"
     assert f"in Python give {python}" in str(caught.value)
     assert f"on the command line give {shell}" in str(caught.value)
     given = eval(python.removeprefix("poisson="))

@@ -22,7 +22,8 @@ from skfem.helpers import ddot, div, sym_grad
 
 from skin.body.base import Sheet
 from skin.mechanics.simulator._hexahedra import Hexahedra
-from skin.mechanics.simulator.solid import Elastic, build_mesh
+from skin.mechanics.simulator._mesh import build_mesh
+from skin.mechanics.simulator.solid import Elastic
 
 LAYERS = [
     {"material": {"name": "muscle", "young": 560e3, "poisson": 0.49}, "thickness": 0.010},
@@ -82,7 +83,8 @@ def solve_frame(
     points = MeshHex(mesh.nodes.T.copy(), mesh.corners.T.copy())
     basis = CellBasis(points, ElementVector(ElementHex1()), intorder=2)
     inner = basis.with_element(ElementHex0())
-    lam, mu = mesh.lame
+    columns, rows, _ = mesh.counts
+    lam, mu = (constant.repeat(columns * rows) for constant in mesh.lame)
     shape = basis.dx.shape
     fields = {"mu": np.broadcast_to(mu[:, None], shape), "lam": np.broadcast_to(lam[:, None], shape)}
     elastic = BilinearForm(lambda u, v, w: 2 * w.mu * ddot(sym_grad(u), sym_grad(v))).assemble(

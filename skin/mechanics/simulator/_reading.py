@@ -1,0 +1,93 @@
+"""What a sensor feels of the motion of elements: the force across its footprint, wherever it faces."""
+
+import warnings
+
+import numpy as np
+import scipy.sparse as sp
+from scipy.sparse.linalg import spsolve
+
+from skin.body.base import Sensors
+from skin.mechanics.simulator._hexahedra import Hexahedra, lagrange
+
+_POINTS = 24  # along each side of a tilted footprint: what it loses is known to 4 %, its reading to 0.1 %
+_NOTHING = 1e-13  # of the largest weight of a node; weights fade by 0.27 from node to node
+_LEAST_CUT = 0.03  # of a footprint, of which a warning tells: less than a line of points
+
+
+def reading_rows(mesh: Hexahedra, sensors: Sensors) -> sp.csr_array:
+    """Return rows (S, 3 N) that give the normal force on each sensor, N, from nodal displacements.
+
+    A sensor that faces the surface feels the pressure that belongs to the forces between the rows of elements
+    above and below its plane of nodes; where it lies between planes, the cubic through the nearest four. A
+    tilted sensor feels the stress in the middles of elements.
+    """
+    tilted = sensors.tilted
+    near, weights = lagrange(mesh.lines[2], sensors.positions[:, 2], min(4, len(mesh.lines[2])))
+    shares = np.zeros((len(sensors), len(mesh.lines[2])))
+    np.put_along_axis(shares, near, weights * ~tilted[:, None], axis=1)
+    rows = sp.csr_array((len(sensors), 3 * len(mesh.nodes)))
+    for plane in np.flatnonzero(np.abs(shares).max(axis=0) > 1e-9).tolist():
+        rows = rows + sp.diags_array(shares[:, plane]) @ _pressed(mesh, sensors, plane)
+    return rows + _stressed(mesh, sensors) if tilted.any() else rows
+
+
+def _pressed(mesh: Hexahedra, sensors: Sensors, plane: int) -> sp.csr_array:
+    """Return rows (S, 3 N) that read the force on footprints in a plane of nodes, as if no sensor leant."""
+    along_x, along_y = (
+        _overlaps(line, sensors.positions[:, axis], sensors.footprint[axis])
+        for axis, line in enumerate(mesh.lines[:2])
+    )
+    felt = np.einsum("sy,sx->yxs", along_y, along_x).reshape(-1, len(sensors))
+    pressures = spsolve(mesh.plane_areas(plane), felt).reshape(felt.shape)
+    pressures[np.abs(pressures) < _NOTHING * np.abs(pressures).max()] = 0
+    return sp.csr_array(pressures.T) @ mesh.pushes(plane)
+
+
+def _overlaps(line: np.ndarray, middle: np.ndarray, extent: float) -> np.ndarray:
+    """Return the integrals of the nodes' hat functions over lengths about some middles, (S, nodes), m."""
+    low, high = ((middle + side * extent / 2)[:, None].clip(line[:-1], line[1:]) for side in (-1, 1))
+    share = ((low + high) / 2 - line[:-1]) / np.diff(line)
+    weights = np.zeros((len(middle), len(line)))
+    weights[:, :-1] += (high - low) * (1 - share)
+    weights[:, 1:] += (high - low) * share
+    return weights
+
+
+def _stressed(mesh: Hexahedra, sensors: Sensors) -> sp.csr_array:
+    """Return rows (S, 3 N) that read the force on tilted sensors, and nothing on others."""
+    points, inside = sample(sensors, tuple(line[-1] for line in mesh.lines))
+    owner, number = np.nonzero(inside & sensors.tilted[:, None])
+    area = np.prod(sensors.footprint) / inside.shape[1]
+    sums = sp.csr_matrix((np.full(len(owner), -area), (owner, np.arange(len(owner)))),
+                         shape=(len(sensors), len(owner)))  # fmt: skip
+    weights = (sums @ mesh.between(points[owner, number])).tocsr()
+    return sp.csr_array(mesh.mean_stress(weights, sensors.normals))
+
+
+def sample(sensors: Sensors, extent: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Return even points over each footprint, (S, P, 3) in the chart, m, and which are in the body, (S, P).
+
+    A footprint is a rectangle about the sensor, across its normal: the chart's x and y turned the shortest
+    way. What passes the surface, an edge or the base of the body, of some extent, m, reads nothing.
+    """
+    x, y, z = (sensors.normals * np.where(sensors.normals[:, 2:] < 0, -1, 1)).T
+    along_x = np.stack([1 - x * x / (1 + z), -x * y / (1 + z), -x], axis=-1)
+    along_y = np.stack([-x * y / (1 + z), 1 - y * y / (1 + z), -y], axis=-1)
+    s, t = np.meshgrid(*(side * ((np.arange(_POINTS) + 0.5) / _POINTS - 0.5) for side in sensors.footprint))
+    points = s.reshape(-1, 1) * along_x[:, None] + t.reshape(-1, 1) * along_y[:, None]
+    points += sensors.positions[:, None]
+    return points, ((points >= 0) & (points <= extent)).all(axis=2)
+
+
+def warn_of_cut(sensors: Sensors, extent: tuple[float, float, float]) -> None:
+    """Warn of tilted sensors whose footprints pass an edge or the base of a body of some extent, m."""
+    lost = (1 - sample(sensors, extent)[1].mean(axis=1)) * sensors.tilted
+    if lost.max(initial=0) > _LEAST_CUT:
+        warnings.warn(
+            f"the footprints of {(lost > _LEAST_CUT).sum()} tilted sensors pass the surface, the base or an "
+            f"edge of the body, where nothing is felt: sensor {lost.argmax() + 1} loses "
+            f"{100 * lost.max():.0f} % of its footprint; move or turn the sensors, or make layout.footprint "
+            "smaller",
+            UserWarning,
+            stacklevel=3,
+        )

@@ -104,7 +104,7 @@ def _contact(contact: "ContactEstimate") -> dict[str, Any]:
         "radius": round(contact.radius, 5),
         "radius_deviation": round(contact.radius_deviation, 5),
         "peak": round(contact.peak),
-        "peak_deviation": round(contact.peak_deviation),
+        "peak_interval": [round(limit) for limit in contact.peak_interval],
         "region": {
             "share": round(region.share, 4),
             "origin": origin.round(6).tolist(),
@@ -129,11 +129,9 @@ def contact_text_lines(message: dict[str, Any]) -> list[str]:
 def _words(contact: dict[str, Any]) -> str:
     x, y, near = (1000 * contact[name] for name in ("x", "y", "x_deviation"))
     near = max(near, 1000 * contact["y_deviation"])
-    force, pressure = (
-        f"{contact[name] / unit:.1f} ± {contact[f'{name}_deviation'] / unit:.1f}"
-        for name, unit in (("force", 1), ("peak", 1000))
-    )
-    return f"({x:.0f}, {y:.0f}) ± {near:.0f} mm, {force} N, {pressure} kPa"
+    force = f"{contact['force']:.1f} ± {contact['force_deviation']:.1f}"
+    low, high = (pressure / 1000 for pressure in contact["peak_interval"])
+    return f"({x:.0f}, {y:.0f}) ± {near:.0f} mm, {force} N, {low:.0f} to {high:.0f} kPa"
 
 
 # What is sent to the process.

@@ -15,6 +15,7 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from importlib.metadata import version
+from itertools import count
 from pathlib import Path
 from statistics import median
 from tempfile import TemporaryDirectory
@@ -61,63 +62,46 @@ _DEFAULTS = {"repeats": "3", "out": "results", "only": "", "against": ""}
 
 def benchmarks(repeats: int) -> dict[str, Benchmark]:
     """Return all benchmarks by name."""
-    chosen: dict[str, Benchmark] = {}
-    for name in ("fem", "solid"):
-        chosen[f"generation.{name}"] = ("measure_generation", (name, repeats))
-        chosen[f"operator.{name}"] = ("measure_operator", (name, repeats))
-    for row in ROWS:
-        chosen[f"training.{row}"] = ("measure_training", (row, repeats))
-    for row in ("best_fresh", "any_skin"):
-        chosen[f"live.{row}"] = ("measure_latency", (row, _FRAMES))
-    chosen["live.onnx"] = ("measure_onnx_latency", ("best_fresh", _FRAMES))
-    return chosen | {"wire": ("measure_decoder", ())}
+    built, live = ("fem", "solid"), ("best_fresh", "any_skin")
+    return {
+        **{f"generation.{name}": ("measure_generation", (name, repeats)) for name in built},
+        **{f"operator.{name}": ("measure_operator", (name, repeats)) for name in built},
+        **{f"training.{row}": ("measure_training", (row, repeats)) for row in ROWS},
+        **{f"live.{row}": ("measure_latency", (row, _FRAMES)) for row in live},
+        "live.onnx": ("measure_onnx_latency", ("best_fresh", _FRAMES)),
+        "wire": ("measure_decoder", ()),
+    }
 
 
 def main(arguments: Sequence[str]) -> None:
     """Run the benchmarks and write their figures.
 
     Raises:
-        InputError: an unknown setting, benchmark or checkout.
+        InputError: an unknown setting, benchmark or checkout, or a bad value.
     """
-    settings = benchmark_settings(arguments)
-    choice = benchmarks(int(settings["repeats"]))
+    settings = script_settings(arguments, _DEFAULTS)
+    repeats, against = settings["repeats"], settings["against"]
+    if not repeats.isdecimal() or int(repeats) < 3:
+        raise InputError(f"repeats={repeats} must be a number of at least 3: medians are returned")
+    if against and not (Path(against) / "skin").is_dir():
+        raise InputError(f"against={against} has no folder skin: give another checkout of this project")
+    choice = benchmarks(int(repeats))
     names = [name for name in settings["only"].split(",") if name] or list(choice)
     if unknown := [name for name in names if name not in choice]:
         raise InputError(f"only={','.join(unknown)} is none of {', '.join(choice)}")
+    machine = f"{platform.machine()}, {os.cpu_count()} cores, {platform.processor() or 'unknown'}"
     versions = {name: version(name) for name in _PACKAGES}
-    measured: dict[str, Any] = {
-        "repeats": int(settings["repeats"]),
-        "machine": machine(),
-        "versions": versions,
-    }
+    measured: dict[str, Any] = {"repeats": int(repeats), "machine": machine, "versions": versions}
     for name in names:
         print(name, file=sys.stderr)
         measured[name] = run_alone(*choice[name])
-        if settings["against"]:
-            baseline = run_alone(*choice[name], checkout=Path(settings["against"]))
+        if against:
+            baseline = run_alone(*choice[name], checkout=Path(against))
             ratios = {key: value / baseline[key] for key, value in measured[name].items() if baseline[key]}
             measured[name] = {"here": measured[name], "there": baseline, "ratios": ratios}
     text = json.dumps(measured, indent=2)
     write(text + "\n", results(settings["out"]) / "bench.json")
     print(text)
-
-
-def benchmark_settings(arguments: Sequence[str]) -> dict[str, str]:
-    """Return all settings from words ``name=value``.
-
-    Raises:
-        InputError: an unknown name or a bad value.
-    """
-    settings = script_settings(arguments, _DEFAULTS)
-    if not settings["repeats"].isdecimal() or int(settings["repeats"]) < 3:
-        raise InputError(
-            f"repeats={settings['repeats']} must be a number of at least 3: medians are returned"
-        )
-    if settings["against"] and not (Path(settings["against"]) / "skin").is_dir():
-        raise InputError(
-            f"against={settings['against']} has no folder skin: give another checkout of this project"
-        )
-    return settings
 
 
 def run_alone(function: str, arguments: Sequence[object], checkout: Path = ROOT) -> Figures:
@@ -158,11 +142,6 @@ def median_seconds(task: Callable[[], object], repeats: int) -> float:
     return median(taken)
 
 
-def machine() -> str:
-    """Return a description of the machine."""
-    return f"{platform.machine()}, {os.cpu_count()} cores, {platform.processor() or 'unknown'}"
-
-
 GESTURES = 4038
 
 
@@ -173,13 +152,9 @@ def measure_generation(simulator: str, repeats: int) -> dict[str, float]:
     readings, imperfections.
     """
     config = training_config(f"simulator={simulator}", f"data.gestures={GESTURES}")
-    device = build_device(config).simulated("gestures are generated")
-    durations = []
-    for seed in range(repeats + 1):
-        began = time.perf_counter()
-        device.replace(data_seed=seed).touches("train")
-        durations.append(time.perf_counter() - began)
-    return {"gestures_per_second": GESTURES / median(durations[1:])}
+    device, seeds = build_device(config).simulated("gestures are generated"), count()
+    seconds = median_seconds(lambda: device.replace(data_seed=next(seeds)).touches("train"), repeats)
+    return {"gestures_per_second": GESTURES / seconds}
 
 
 def measure_operator(simulator: str, repeats: int) -> dict[str, float]:

@@ -4,7 +4,7 @@ python -m experiments.notice
 """
 
 from collections.abc import Iterator
-from importlib.metadata import PackageMetadata, PackageNotFoundError, metadata
+from importlib.metadata import PackageNotFoundError, metadata
 from pathlib import Path
 
 from skin.core.files import ROOT, write
@@ -55,26 +55,20 @@ def licence(name: str) -> str:
         InputError: it is not installed, or states none.
     """
     try:
-        stated = metadata(name)
+        stated = metadata(name).json
     except PackageNotFoundError:
         raise InputError(f"{name} of constraints.txt is not installed: run make install") from None
-    statements = (text for text in _statements(stated) if text not in ("", "UNKNOWN"))
-    licence_text = _READ.get(name) or next(statements, None)
-    if licence_text is None:
+    expression, text = (str(stated.get(key, "")).strip() for key in ("license_expression", "license"))
+    classified = [
+        each.removeprefix(_LICENCE) for each in stated.get("classifier", []) if each.startswith(_LICENCE)
+    ]
+    classes = ", ".join(each.rpartition(" :: ")[2] for each in classified)
+    # The most exact statement first.
+    statements = (_READ.get(name, ""), expression, text if len(text) <= _LONGEST else "", classes, text)
+    known = [statement.splitlines()[0] for statement in statements if statement not in ("", "UNKNOWN")]
+    if not known:
         raise InputError(f"{name} states no licence: read it, and add it to experiments/notice.py")
-    return licence_text
-
-
-def _statements(stated: PackageMetadata) -> Iterator[str]:
-    """Yield what a package states as its licence, the most exact statement first."""
-    expression, text = (
-        (stated.get_all(name) or [""])[0].strip() for name in ("License-Expression", "License")
-    )
-    yield expression
-    yield text if len(text) <= _LONGEST else ""
-    classified = [text for text in stated.get_all("Classifier") or [] if text.startswith(_LICENCE)]
-    yield ", ".join(classifier.rpartition(" :: ")[2] for classifier in classified)
-    yield text.splitlines()[0] if text else ""
+    return known[0]
 
 
 if __name__ == "__main__":

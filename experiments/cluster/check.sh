@@ -23,5 +23,5 @@ if [ "$(id -u)" = 0 ] && command -v slurmctld munged >/dev/null; then
 else
     echo "without SLURM (Debian's slurm-wlm and munge, as root): the tasks run one after the other"
 fi
-"$PYTHON" -m experiments.cluster_checks "$folder/array" "$uri"
+"$PYTHON" -m tests.cluster.array_check "$folder/array" "$uri"
 rm -rf "$folder/array"

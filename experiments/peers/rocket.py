@@ -132,7 +132,7 @@ class Rocket(AbstractLearner):
 
     def _start(self, do: str, path: Path) -> float:
         """Fit or load a model and return the duration, s."""
-        answer = self._ask(do, path, **self._model, jobs=torch.get_num_threads())
+        answer = self._ask(do, path, model={**self._model, "jobs": torch.get_num_threads()})
         self._shape, self._labels = tuple(answer["shape"]), answer["labels"]
         self.parameters = answer["parameters"]
         return answer["seconds"]

@@ -2,9 +2,9 @@
 
 Reads requests from standard input, one JSON object per line, and answers each with a line of JSON:
 
-- ``{"do": "fit", "path": ..., "seed": ..., "jobs": ..., settings}`` fits a model to the arrays ``train``,
-  ``train_labels``, ``validation`` and ``validation_labels`` of an .npz file.
-- ``{"do": "load", "path": ..., ...}`` with the same settings restores the model that
+- ``{"do": "fit", "path": ..., "model": settings}`` fits a model to the arrays ``train``, ``train_labels``,
+  ``validation`` and ``validation_labels`` of an .npz file.
+- ``{"do": "load", "path": ..., "model": settings}`` with the same settings restores the model that
   ``{"do": "save", "path": ...}`` wrote as an .npz file.
 - ``{"do": "predict", "path": ..., "to": ...}`` reads inputs (B, ...) from an .npy file and writes
   probabilities (B, L).
@@ -30,6 +30,7 @@ Arrays = dict[str, np.ndarray]
 
 ALPHAS = np.logspace(-3, 6, 19)  # aeon stops at 1e3, but stronger ridges are selected here
 CHUNK = 1024  # touches that are transformed at a time: 54,000 features each
+STORED = ("first", "weights", "bias", "curves")
 FIRST = 4096  # touches that kernels and scales are fitted to; they are stored with the model
 
 
@@ -47,8 +48,12 @@ class KernelModel:
             TRANSFORMS[transform], jobs, seed, {} if kernels is None else {"n_kernels": kernels}
         )
 
-    def fit(self, data: Arrays) -> float:
-        """Fit kernels, ridges and logistic curves; compilation is not part of the duration."""
+    def fit(self, path: str) -> dict[str, Any]:
+        """Fit kernels, ridges and logistic curves, and describe the model.
+
+        Compilation is not part of the duration.
+        """
+        data = _load_arrays(path)
         x, held = data["train"], data["validation_labels"]
         self.make().fit_transform(x[:32])
         began, self.first = time.perf_counter(), x[:FIRST]
@@ -56,41 +61,31 @@ class KernelModel:
         table = np.concatenate(list(self._parts(x)))
         ridge = RidgeCV(ALPHAS, alpha_per_target=True).fit(table, 2 * data["train_labels"] - 1)
         self.weights, self.bias = ridge.coef_.T, ridge.intercept_
-        self.curves = np.array(
-            [platt(*pair) for pair in zip(self._scores(data["validation"]).T, held.T, strict=True)]
-        )
-        return time.perf_counter() - began
+        pairs = zip(self._scores(data["validation"]).T, held.T, strict=True)
+        self.curves = np.array([platt(*pair) for pair in pairs])
+        return self._describe(time.perf_counter() - began)
 
-    @property
-    def parameters(self) -> int:
-        """Number of weights of the ridges and of the logistic curves."""
-        return self.weights.size + self.bias.size + self.curves.size
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """(C, T)."""
-        return self.first.shape[1:]
-
-    @property
-    def labels(self) -> int:
-        """L."""
-        return len(self.bias)
-
-    def predict(self, x: np.ndarray) -> np.ndarray:
-        """Return the probability of each label, (B, L)."""
-        slope, offset = self.curves.T
-        return 1 / (1 + np.exp(-(slope * self._scores(x) + offset)))
-
-    def arrays(self) -> Arrays:
-        """Return what :meth:`restore` needs."""
-        return {"first": self.first, "weights": self.weights, "bias": self.bias, "curves": self.curves}
-
-    def restore(self, arrays: Arrays) -> None:
-        """Fit the kernels again and set the weights."""
-        self.first, self.weights, self.bias, self.curves = (
-            arrays[name] for name in ("first", "weights", "bias", "curves")
-        )
+    def load(self, path: str) -> dict[str, Any]:
+        """Fit the kernels again, set the weights, and describe the model."""
+        arrays = _load_arrays(path)
+        self.first, self.weights, self.bias, self.curves = (arrays[name] for name in STORED)
         self.transform = self.make().fit(self.first)
+        return self._describe(0.0)
+
+    def save(self, path: str) -> None:
+        """Write what :meth:`load` needs."""
+        np.savez_compressed(path, **{name: getattr(self, name) for name in STORED})
+
+    def predict(self, path: str, to: str) -> None:
+        """Write the probability of each label, (B, L), of series (B, C, T)."""
+        slope, offset = self.curves.T
+        scores = self._scores(np.load(path, allow_pickle=False))
+        np.save(to, 1 / (1 + np.exp(-(slope * scores + offset))))
+
+    def _describe(self, seconds: float) -> dict[str, Any]:
+        parameters = self.weights.size + self.bias.size + self.curves.size
+        shape = self.first.shape[1:]
+        return {"seconds": seconds, "parameters": parameters, "shape": shape, "labels": len(self.bias)}
 
     def _parts(self, x: np.ndarray) -> Iterator[np.ndarray]:
         """Yield the features of touches, (b, D), in parts."""
@@ -151,38 +146,6 @@ def platt(score: np.ndarray, truth: np.ndarray) -> tuple[float, float]:
     return curve.coef_.item(), curve.intercept_.item()
 
 
-class Worker:
-    """Answers requests, each by the method of its name, on one model."""
-
-    model: KernelModel
-
-    def fit(self, path: str, **settings: Any) -> dict[str, Any]:
-        """Fit a model and describe it."""
-        self.model = KernelModel(**settings)
-        return self._described(self.model.fit(_load_arrays(path)))
-
-    def load(self, path: str, **settings: Any) -> dict[str, Any]:
-        """Restore a model and describe it."""
-        self.model = KernelModel(**settings)
-        self.model.restore(_load_arrays(path))
-        return self._described(0.0)
-
-    def save(self, path: str) -> dict[str, Any]:
-        """Write the model."""
-        np.savez_compressed(path, **self.model.arrays())  # type: ignore[arg-type]
-        return {}
-
-    def predict(self, path: str, to: str) -> dict[str, Any]:
-        """Write the probabilities of the labels of touches."""
-        np.save(to, self.model.predict(np.load(path, allow_pickle=False)))
-        return {}
-
-    def _described(self, seconds: float) -> dict[str, Any]:
-        model = self.model
-        parameters = int(model.parameters)
-        return {"seconds": seconds, "parameters": parameters, "shape": model.shape, "labels": model.labels}
-
-
 def _load_arrays(path: str) -> Arrays:
     """Return the arrays of an .npz file."""
     with np.load(path, allow_pickle=False) as file:
@@ -194,11 +157,13 @@ def main() -> None:
     # What libraries print must not be read as an answer.
     answers = os.fdopen(os.dup(sys.stdout.fileno()), "w")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
-    worker = Worker()
+    model: KernelModel | None = None
     for line in sys.stdin:
         request = json.loads(line)
         try:
-            answer = getattr(worker, request.pop("do"))(**request)
+            if settings := request.pop("model", None):
+                model = KernelModel(**settings)
+            answer = getattr(model, request.pop("do"))(**request) or {}
         except Exception as error:
             answer = {"error": f"{type(error).__name__}: {error}"}
         print(json.dumps(answer), file=answers, flush=True)

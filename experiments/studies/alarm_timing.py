@@ -1,10 +1,11 @@
 """Time to the alarm: dangerous touches of many courses pass an engine, frame by frame."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from itertools import count
+from typing import NamedTuple
 
 import numpy as np
+import pandas as pd
 import torch
 
 from skin.core.rng import Stream, generator
@@ -14,8 +15,6 @@ from skin.errors import InputError
 from skin.hardware.emulator import gestures_with_labels, upsample
 from skin.hardware.live.engine import Engine
 from skin.hardware.wire.channels import UnitConversion
-
-FIELDS = ("course", "touches", "alarms", "kept", "early", "median_s", "p95_s", "cleared_s")
 
 _IDLE = 4.0  # s without touch before each one
 _AFTER = 5.0  # s behind it
@@ -48,22 +47,19 @@ COURSES: Mapping[str, Callable[[np.ndarray], np.ndarray] | None] = {
 """Load of a dangerous touch over time; None: that of the gesture."""
 
 
-@dataclass(frozen=True)
-class AlarmTiming:
+class AlarmTiming(NamedTuple):
     """Timing of the alarm for one dangerous touch.
 
     Attributes:
-        peak: largest true reading, N.
-        raised: s from the first force to the alarm; None without an alarm.
-        lasting: the alarm lasted until the end of the force.
-        cleared: s from the end of the force to the end of the alarm; None without an alarm or its end.
+        raised: s from the first force to the alarm; NaN without an alarm.
+        kept: the alarm lasted until the end of the force.
+        cleared: s from the end of the force to the end of the alarm; NaN without an alarm or its end.
         early: an alarm was raised before the touch.
     """
 
-    peak: float
-    raised: float | None
-    lasting: bool
-    cleared: float | None
+    raised: float
+    kept: bool
+    cleared: float
     early: bool
 
 
@@ -128,34 +124,33 @@ def play_touch(
     for number, (t, row) in enumerate(zip(time.tolist(), measured, strict=True)):
         frame = Frame(number, t, t, row, ~dead, segment)
         answers += [(verdict.t, verdict.dangerous) for verdict in engine.push([frame], conversion)]
-    return _outcome(answers, float(np.abs(true).max()), begin, end)
+    return _outcome(pd.Series(dict(answers), dtype=bool), begin, end)
 
 
-def _outcome(answers: list[tuple[float, bool]], peak: float, begin: float, end: float) -> AlarmTiming:
-    raised = next((t for t, alarm in answers if alarm and t >= begin), None)
-    early = any(alarm for t, alarm in answers if t < begin)
-    if raised is None:
-        return AlarmTiming(peak, None, True, None, early)
-    lasting = all(alarm for t, alarm in answers if raised <= t <= end)
-    last = max(t for t, alarm in answers if alarm)
-    cleared = None if last >= answers[-1][0] else max(0.0, float(last - end))
-    return AlarmTiming(peak, float(raised - begin), lasting, cleared, early)
+def _outcome(alarm: pd.Series, begin: float, end: float) -> AlarmTiming:
+    """Return the timing of an alarm by time, s, for a force from begin to end."""
+    early, after = bool(alarm[alarm.index < begin].any()), alarm[alarm.index >= begin]
+    if not after.any():
+        return AlarmTiming(np.nan, True, np.nan, early)
+    raised, last = after.idxmax(), alarm[alarm].index[-1]
+    cleared = np.nan if last >= alarm.index[-1] else max(0.0, last - end)
+    kept = bool(alarm[(alarm.index >= raised) & (alarm.index <= end)].all())
+    return AlarmTiming(float(raised - begin), kept, cleared, early)
 
 
-def timing_row(course: str, timings: Sequence[AlarmTiming]) -> list[str]:
-    """Return a line with the columns of ``FIELDS``.
-
-    These are: the course; the numbers of touches, of those with an alarm, with an alarm kept to the end, and
-    with an alarm before the touch; median and 95th percentile of the time to the alarm, and median of the
-    time from the end of the touch to the end of the alarm, s.
-    """
-    raised = [timing.raised for timing in timings if timing.raised is not None]
-    cleared = [timing.cleared for timing in timings if timing.cleared is not None]
-    counts = len(timings), len(raised), sum(t.lasting for t in timings), sum(t.early for t in timings)
-    times = [float(np.percentile(raised, share)) for share in (50, 95)] if raised else []
-    times += [float(np.median(cleared))] if cleared else []
-    words = [f"{value:.2f}" for value in times]
-    return [course, *map(str, counts), *words, *[""] * (len(FIELDS) - 5 - len(words))]
+def summarise_timings(course: str, timings: Sequence[AlarmTiming]) -> dict[str, object]:
+    """Return a row of :func:`time_courses`; times are texts, empty where there was no alarm."""
+    frame = pd.DataFrame(timings)
+    raised, cleared = frame.raised.dropna(), frame.cleared.dropna()
+    times = {"median_s": raised.quantile(0.5), "p95_s": raised.quantile(0.95), "cleared_s": cleared.median()}
+    counts = {
+        "touches": len(frame),
+        "alarms": len(raised),
+        "kept": frame.kept.sum(),
+        "early": frame.early.sum(),
+    }
+    texts = {name: "" if np.isnan(value) else f"{value:.2f}" for name, value in times.items()}
+    return {"course": course, **counts, **texts}
 
 
 def time_courses(
@@ -164,8 +159,12 @@ def time_courses(
     number: int,
     rate: float,
     track: Callable[..., Iterable[np.ndarray]],
-) -> Iterator[list[str]]:
-    """Feed every course to an engine and yield a row for each, as :func:`timing_row` gives it.
+) -> pd.DataFrame:
+    """Feed every course to an engine and return a row for each.
+
+    The columns are: the course; the numbers of touches, of those with an alarm, with an alarm kept to the
+    end, and with an alarm before the touch; median and 95th percentile of the time to the alarm, and median
+    of the time from the end of the touch to the end of the alarm, s.
 
     Args:
         engine: at rest.
@@ -174,9 +173,10 @@ def time_courses(
         rate: of the device, Hz.
         track: wraps the touches of a course to show progress, as ``rich.progress.track``.
     """
+    rows = []
     for course in COURSES:
         many = max(1, number // 10) if _LONG in course else number
         forces = track(dangerous_touches(device, course, many), course, many)
-        yield timing_row(
-            course, [play_touch(engine, device, force, rate, n) for n, force in enumerate(forces)]
-        )
+        timings = [play_touch(engine, device, force, rate, n) for n, force in enumerate(forces)]
+        rows.append(summarise_timings(course, timings))
+    return pd.DataFrame(rows)

@@ -1,86 +1,42 @@
-"""Paired comparisons over seeds, devices and gestures, and what they decide of the trials of a study."""
+"""Means, margins and paired comparisons of trials; what they decide of the statements of a study."""
 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from statistics import fmean, stdev
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from scipy.special import stdtrit
+import pandas as pd
+from scipy.stats import t
 
 from experiments.studies.study import Statement, Study
-from experiments.studies.trials import TrialResult
 from skin.evaluation.metrics import decodable, decode
 from skin.touch.labels import TOUCH
-
-RATIOS = ("at most", "ratio")
-"""Claims about one / other; all others are about one - other."""
 
 CONFIDENCE = 0.95
 """Of the intervals that a margin describes."""
 
 FEWEST = 3
-"""Paired seeds below which every verdict is ``undecided``."""
+"""Paired seeds below which every verdict is ``undecided``: two have a margin of 12.7 standard errors."""
 
+UNITS = {"seconds_per_epoch": "s", "parameters": "", "same/direction/degrees": "°"}
+UNITS |= {"same/place/rms_mm": "mm", "same/force/rms_N": "N"}
+"""Metrics that are no fractions -> their unit."""
 
+By = Literal["seed", "device"]
 Gestures = tuple[np.ndarray | None, np.ndarray | None]
-"""The figures of two variants by gesture, each (G,), NaN where a gesture does not count; None: not known."""
-
-
-class Uncertainty(NamedTuple):
-    """How far a mean may be from the true one.
-
-    The margin of a sample of n is the standard error times the quantile of Student's t distribution with
-    n - 1 degrees of freedom: 4.30 standard errors of three seeds, 1.96 of 4000 gestures.
-
-    Attributes:
-        error: standard error.
-        margin: half of the interval that covers the true mean with ``CONFIDENCE``; published behind "±".
-    """
-
-    error: float
-    margin: float
-
-    @classmethod
-    def of(cls, sample: Sequence[float]) -> "Uncertainty":
-        """Return the uncertainty of the mean of a sample; 0 of less than two values."""
-        if len(sample) < 2:
-            return cls(0.0, 0.0)
-        error = stdev(sample) / math.sqrt(len(sample))
-        return cls(error, t_quantile(len(sample)) * error)
-
-    @classmethod
-    def together(cls, *parts: "Uncertainty") -> "Uncertainty":
-        """Return the uncertainty of a sum of independent parts, the root of the sum of squares."""
-        return cls(math.hypot(*(part.error for part in parts)), math.hypot(*(part.margin for part in parts)))
-
-    def times(self, factor: float) -> "Uncertainty":
-        """Return the uncertainty of a multiple of the mean."""
-        return Uncertainty(abs(factor) * self.error, abs(factor) * self.margin)
-
-
-NOT_KNOWN = Uncertainty(math.inf, math.inf)
-"""Of a single seed."""
+"""The figures of two variants by gesture, each (G,), NaN where a gesture does not count; None: unknown."""
 
 
 class Estimate(NamedTuple):
-    """A mean, its standard error, and its margin (:class:`Uncertainty`)."""
-
-    mean: float
-    error: float
-    margin: float
-
-
-@dataclass(frozen=True)
-class Paired:
-    """A difference or a ratio of two variants.
+    """A mean, or a difference or a ratio of two variants.
 
     Attributes:
-        mean: of left - right, or left / right.
-        error: standard error of that mean; infinite with a single pair.
-        margin: half of its interval (:class:`Uncertainty`); infinite with a single pair.
-        seeds: number of pairs.
+        mean: of a variant, of left - right, or of left / right.
+        error: standard error of the mean; infinite for a comparison of a single pair.
+        margin: half of its interval (:func:`uncertainty`), published behind "±".
+        seeds: number of seeds or devices, or of pairs of them.
     """
 
     mean: float
@@ -89,18 +45,50 @@ class Paired:
     seeds: int
 
 
-def t_quantile(count: int) -> float:
-    """Return how many standard errors of the mean of ``count`` values the interval has on either side."""
-    return float(stdtrit(count - 1, (1 + CONFIDENCE) / 2))
+@dataclass(frozen=True)
+class Comparison:
+    """A statement, or a line of the table beside the one that it is compared with.
+
+    Attributes:
+        compared: name of the other side -> the comparison; fractions in percentage points.
+        verdict: agree, disagree or undecided; of lines: better, worse or undecided.
+        statement: None: of a line.
+        variant, condition: of the line.
+    """
+
+    compared: Mapping[str, Estimate | None]
+    verdict: str
+    statement: Statement | None = None
+    variant: str = ""
+    condition: str = ""
 
 
-def paired(
-    left: Mapping[str, float],
-    right: Mapping[str, float],
+def uncertainty(sample: Sequence[float] | np.ndarray | pd.Series) -> np.ndarray:
+    """Return the standard error of the mean of a sample and half of its interval, (2,); 0 of less than two.
+
+    Half of the interval is the error times the quantile of Student's t distribution: 4.30 for three seeds,
+    1.96 for 4000 gestures. NaN does not count.
+    """
+    values = np.asarray(sample, float)
+    values = values[~np.isnan(values)]
+    if len(values) < 2:
+        return np.zeros(2)
+    error = stdev(values.tolist()) / math.sqrt(len(values))
+    return error * np.array([1.0, t.interval(CONFIDENCE, len(values) - 1)[1]])
+
+
+def together(*parts: np.ndarray) -> np.ndarray:
+    """Return the uncertainty of a sum of independent parts, the root of the sum of squares, (2,)."""
+    return np.array([math.hypot(*column) for column in zip(*parts, strict=True)])
+
+
+def compare_samples(
+    left: pd.Series,
+    right: pd.Series,
     ratio: bool = False,
-    across: tuple[Mapping[str, float], Mapping[str, float]] = ({}, {}),
+    across: tuple[pd.Series, pd.Series] | None = None,
     gestures: Gestures = (None, None),
-) -> Paired | None:
+) -> Estimate | None:
     """Compare two variants; None where they share no seed (or device, where these are the first).
 
     Seeds, devices and gestures are a sample each, and every seed meets every device and gesture. The variance
@@ -110,97 +98,62 @@ def paired(
     the same way, each part with the quantile of its own number of values.
 
     Args:
-        left: seed -> figure, or device -> figure.
-        right: the same.
+        left, right: figures by seed, or by device.
         ratio: take left / right instead of left - right.
         across: the same by what the first two are not by, device or seed.
         gestures: the same by gesture, in the same unit.
     """
-    shared = [seed for seed in left if seed in right]
-    if not shared:
+    pairs = _pair(left, right, ratio)
+    if pairs.empty:
         return None
-    mean = fmean(_pairs(left, right, ratio))
-    seeds = Uncertainty.of(_pairs(left, right, ratio)) if len(shared) > 1 else NOT_KNOWN
-    devices, touches = _across(*across, ratio), _over_gestures(gestures, ratio)
-    return Paired(mean, *Uncertainty.together(seeds, devices, touches), len(shared))
+    seeds = uncertainty(pairs) if len(pairs) > 1 else np.full(2, math.inf)
+    devices = np.zeros(2)
+    if across is not None and not across[0].empty and not across[1].empty:
+        shared = _pair(*across, ratio)
+        devices = uncertainty(shared) if len(shared) > 1 else _unpaired(*across, ratio)
+    parts = seeds, devices, _over_gestures(*gestures, ratio)
+    error, margin = together(*parts)
+    return Estimate(fmean(pairs), error, margin, len(pairs))
 
 
-def estimate(
-    by_seed: Mapping[str, float], by_device: Mapping[str, float], gestures: np.ndarray | None
-) -> Estimate:
-    """Return the mean of a variant, and its error and margin over seeds, devices and gestures.
-
-    Args:
-        by_seed: seed -> figure; at least one.
-        by_device: the same by device.
-        gestures: the same by gesture, (G,); None: not known.
-    """
-    counted = [] if gestures is None else list(gestures[~np.isnan(gestures)])
-    parts = map(Uncertainty.of, ([*by_seed.values()], [*by_device.values()], counted))
-    return Estimate(fmean(by_seed.values()), *Uncertainty.together(*parts))
+def _pair(left: pd.Series, right: pd.Series, ratio: bool) -> pd.Series:
+    first, second = left.align(right, join="inner")
+    return first / second if ratio else first - second
 
 
-def _pairs(left: Mapping[str, float], right: Mapping[str, float], ratio: bool) -> list[float]:
-    pairs = [(left[key], right[key]) for key in left if key in right]
-    return [first / second if ratio else first - second for first, second in pairs]
+def _unpaired(left: pd.Series | np.ndarray, right: pd.Series | np.ndarray, ratio: bool) -> np.ndarray:
+    first, second = np.nanmean(left), np.nanmean(right)
+    scales = (1 / second, first / second**2) if ratio else (1.0, 1.0)
+    return together(scales[0] * uncertainty(left), scales[1] * uncertainty(right))
 
 
-def _across(left: Mapping[str, float], right: Mapping[str, float], ratio: bool) -> Uncertainty:
-    """Return the uncertainty over devices, of which one variant may have several and the other one."""
-    if len(pairs := _pairs(left, right, ratio)) > 1 or not left or not right:
-        return Uncertainty.of(pairs)
-    first, second = fmean(left.values()), fmean(right.values())
-    above, below = Uncertainty.of([*left.values()]), Uncertainty.of([*right.values()])
-    if not ratio:
-        return Uncertainty.together(above, below)
-    return Uncertainty.together(above.times(1 / second), below.times(first / second**2))
-
-
-def _over_gestures(gestures: Gestures, ratio: bool) -> Uncertainty:
+def _over_gestures(left: np.ndarray | None, right: np.ndarray | None, ratio: bool) -> np.ndarray:
     """Return the uncertainty over gestures: unpaired if their numbers differ, 0 if they are unknown."""
-    left, right = gestures
     if left is None or right is None:
-        return Uncertainty(0.0, 0.0)
+        return np.zeros(2)
     if len(left) != len(right):
-        parts = (Uncertainty.of(list(part[~np.isnan(part)])) for part in (left, right))
-        return Uncertainty.together(*parts)
+        return _unpaired(left, right, ratio)
     counted = ~(np.isnan(left) | np.isnan(right))
     left, right = left[counted], right[counted]
     if not ratio:
-        return Uncertainty.of(list(left - right))
+        return uncertainty(left - right)
     # The ratio of two means, linearised (delta method).
     below = right.mean()
-    return Uncertainty.of(list((left - left.mean() / below * right) / below) if below else [])
+    return uncertainty((left - left.mean() / below * right) / below) if below else np.zeros(2)
 
 
-def judge_claim(claim: str, compared: Paired | None, by: float = 0.0) -> str:
+def judge(statement: Statement, compared: Estimate | None) -> str:
     """Return ``agree``, ``disagree`` or ``undecided``.
 
-    A claim is an interval in which the difference (for ``RATIOS``: the ratio) must lie. The verdict is
-    ``agree`` if the mean with its margin on either side lies wholly inside, ``disagree`` if it lies
-    wholly outside, else, and always with fewer than three paired seeds, ``undecided``.
-
-    Args:
-        claim: ``greater`` (by to infinity), ``less`` (minus infinity to by), ``alike`` (-by to by),
-            ``no better`` and ``at most`` (minus infinity to by), ``about`` or ``ratio`` (by / 2 to 2 by).
-        compared: the variants, None without paired seeds.
-        by: in the unit of the comparison.
+    ``agree`` if the mean with its margin on either side lies wholly inside of the interval of the statement,
+    ``disagree`` if it lies wholly outside, else, and always with fewer than three pairs, ``undecided``.
     """
-    least, most = {
-        "greater": (by, math.inf),
-        "less": (-math.inf, by),
-        "alike": (-by, by),
-        "no better": (-math.inf, by),
-        "at most": (-math.inf, by),
-        "about": (by / 2, 2 * by),
-        "ratio": (by / 2, 2 * by),
-    }[claim]
     if compared is None or compared.seeds < FEWEST:
         return "undecided"
     low, high = compared.mean - compared.margin, compared.mean + compared.margin
-    if least < low and high < most:
+    if statement.minimum < low and high < statement.maximum:
         return "agree"
-    return "disagree" if high < least or low > most else "undecided"
+    return "disagree" if high < statement.minimum or low > statement.maximum else "undecided"
 
 
 def combine_verdicts(verdicts: Sequence[str]) -> str:
@@ -210,124 +163,95 @@ def combine_verdicts(verdicts: Sequence[str]) -> str:
     return "agree" if verdicts and set(verdicts) == {"agree"} else "undecided"
 
 
-UNITS = {"seconds_per_epoch": "s", "parameters": "", "same/direction/degrees": "°"}
-"""Metrics that are no shares -> their unit."""
-
-_HEADINGS = {
-    "same/dangerous/alarm_recall": "recall",
-    "same/dangerous/false_alarm_rate": "false alarms",
-    "train_accuracy": "training",
-    "seconds_per_epoch": "s/epoch",
-    "same/direction/degrees": "degrees",
-    "same/direction/accuracy": "within 45°",
-    "device_shift/dangerous/alarm_recall": "its recall",
-    "device_shift/dangerous/false_alarm_rate": "its false alarms",
-}
-
-
-@dataclass(frozen=True)
-class StatementResult:
-    """The verdict on a statement.
-
-    Attributes:
-        statement: the statement.
-        compared: name of the other side -> the comparison; shares in percentage points.
-        verdict: agree, disagree or undecided.
-    """
-
-    statement: Statement
-    compared: Mapping[str, Paired | None]
-    verdict: str
-
-
-@dataclass(frozen=True)
-class Difference:
-    """How a line of the table differs from the one that it is compared with.
-
-    Attributes:
-        variant: name.
-        condition: name, or empty.
-        compared: the two lines, shares in percentage points.
-        verdict: better, worse or undecided.
-    """
-
-    variant: str
-    condition: str
-    compared: Paired | None
-    verdict: str
-
-
-def group_trials(trials: Sequence[TrialResult]) -> dict[tuple[str, str], list[TrialResult]]:
-    """Return the trials of each variant and condition, in their order."""
-    groups: dict[tuple[str, str], list[TrialResult]] = {}
-    for trial in trials:
-        groups.setdefault((trial.variant.name, trial.condition), []).append(trial)
-    return groups
-
-
-def values(
-    trials: Sequence[TrialResult], metric: str, by: Literal["seed", "device"] = "seed"
-) -> dict[str, float]:
+def values(trials: pd.DataFrame, metric: str, by: By = "seed") -> pd.Series:
     """Return a metric, or the difference ``a - b`` of two, by training or by device, averaged over the other.
 
     Args:
         trials: of one line.
-        metric: as logged; shares come in per cent. ``/error`` is what is missing of ``/accuracy``.
-        by: attribute of the trials.
+        metric: as logged; fractions come in per cent. ``/error`` is what is missing of ``/accuracy``.
+        by: column of the trials.
     """
-    first, *subtracted = metric.split(" - ")
-    scale = 1 if metric in UNITS else 100
-    groups: dict[str, list[float]] = {}
-    for trial in trials:
-        figures = dict(trial.metrics) | {
-            f"{name.removesuffix('accuracy')}error": 1 - value
-            for name, value in trial.metrics.items()
-            if name.endswith("/accuracy")
-        }
-        if all(name in figures for name in (first, *subtracted)):
-            value = figures[first] - sum(figures[name] for name in subtracted)
-            groups.setdefault(getattr(trial, by), []).append(scale * value)
-    return {key: fmean(sample) for key, sample in groups.items()}
+    first, *subtracted = (_column(trials, name) for name in metric.split(" - "))
+    figures = first - sum(subtracted)
+    figures = (figures if metric in UNITS else 100 * figures).dropna()
+    # fmean is exact: what is halfway between two published digits does not hang on the order of the sum.
+    return figures.groupby(trials[by], sort=False).agg(fmean)
 
 
-def by_gesture(trials: Sequence[TrialResult], metric: str) -> np.ndarray | None:
-    """Return the figure of each test gesture, averaged over trials, (G,), in per cent; None: not known.
+def _column(trials: pd.DataFrame, metric: str) -> pd.Series:
+    if metric.endswith("/error"):
+        return 1 - _column(trials, metric.removesuffix("error") + "accuracy")
+    return trials[metric] if metric in trials else pd.Series(np.nan, trials.index)
+
+
+def by_gesture(trials: pd.DataFrame, metric: str) -> np.ndarray | None:
+    """Return the figure of each test gesture, averaged over trials, (G,), in per cent; None: unknown.
 
     Args:
         trials: of one line.
         metric: one of a run on its test gestures; others have no figures by gesture.
     """
-    codes = [trial.outcomes for trial in trials if trial.outcomes is not None]
-    plain, wrong = metric.removeprefix("same/"), metric.endswith("/error")
-    plain = plain.removesuffix("error") + "accuracy" if wrong else plain
-    if plain == metric or not decodable(plain, TOUCH):
+    codes = [np.frombuffer(outcomes, np.uint8) for outcomes in trials.outcomes if outcomes]
+    wrong = metric.endswith("/error")
+    plain = metric.removeprefix("same/").replace("/error", "/accuracy")
+    if not metric.startswith("same/") or not decodable(plain, TOUCH):
         return None
     if not codes or len(codes) < len(trials) or len({len(code) for code in codes}) > 1:
         return None
-    figures = decode(np.stack(codes), plain, TOUCH)
-    mean: np.ndarray = 100 * (1 - figures if wrong else figures).mean(axis=0)
-    return mean
+    figures = 100 * decode(np.stack(codes), plain, TOUCH).mean(axis=0)
+    return 100 - figures if wrong else figures
+
+
+def estimate(trials: pd.DataFrame, metric: str) -> Estimate:
+    """Return the mean of a metric over trials, and its error and margin over seeds, devices and gestures."""
+    seeds, gestures = values(trials, metric), by_gesture(trials, metric)
+    parts: tuple[Any, ...] = (seeds, values(trials, metric, "device"), () if gestures is None else gestures)
+    error, margin = together(*map(uncertainty, parts))
+    return Estimate(fmean(seeds), error, margin, len(seeds))
 
 
 def compare(
-    left: Sequence[TrialResult],
-    right: Sequence[TrialResult],
-    metric: str,
-    ratio: bool = False,
-    by: Literal["seed", "device"] = "seed",
-) -> Paired | None:
+    left: pd.DataFrame, right: pd.DataFrame, metric: str, ratio: bool = False, by: By = "seed"
+) -> Estimate | None:
     """Compare the trials of two lines, paired by seed, device and gesture; ``by`` says what is counted."""
-    across: Literal["seed", "device"] = "device" if by == "seed" else "seed"
-    first, second = ((values(left, metric, axis), values(right, metric, axis)) for axis in (by, across))
-    return paired(*first, ratio, second, (by_gesture(left, metric), by_gesture(right, metric)))
+    other: By = "device" if by == "seed" else "seed"
+    pairs = [(values(left, metric, axis), values(right, metric, axis)) for axis in (by, other)]
+    return compare_samples(*pairs[0], ratio, pairs[1], (by_gesture(left, metric), by_gesture(right, metric)))
 
 
-def conclusions(statements: Sequence[Statement], trials: Sequence[TrialResult]) -> list[StatementResult]:
-    """Return every statement with its comparisons and its verdict."""
-    return [_outcome(statement, trials) for statement in statements]
+def conclude(statement: Statement, trials: pd.DataFrame) -> Comparison:
+    """Return the comparisons of a statement, and its verdict."""
+    _, first = _line(statement.one, trials)
+    lines = dict(_line(chosen, trials) for chosen in statement.others)
+    compared = {name: compare(first, line, statement.metric, statement.ratio) for name, line in lines.items()}
+    if statement.level is not None:
+        figures, gestures = values(first, statement.metric), by_gesture(first, statement.metric)
+        level = (1 if statement.metric in UNITS else 100) * statement.level
+        even = None if gestures is None else np.full_like(gestures, level)
+        compared[f"{statement.level:g}"] = compare_samples(
+            figures, 0 * figures + level, statement.ratio, gestures=(gestures, even)
+        )
+    if not trials.outcomes.notna().any():  # published files do not hold them
+        compared = {
+            name: pair and pair._replace(margin=math.hypot(pair.margin, statement.over_gestures))
+            for name, pair in compared.items()
+        }
+    verdicts = [judge(statement, pair) for pair in compared.values()]
+    return Comparison(compared, combine_verdicts(verdicts), statement)
 
 
-def differences(study: Study, trials: Sequence[TrialResult]) -> list[Difference]:
+def _line(chosen: Mapping[str, str], trials: pd.DataFrame) -> tuple[str, pd.DataFrame]:
+    """Return the name and the trials of the first line that was so chosen; no trials without one."""
+    settings = (own | {"condition": name} for own, name in zip(trials.chosen, trials.condition, strict=True))
+    matches = trials[np.array([chosen.items() <= each.items() for each in settings], bool)]
+    if matches.empty:
+        return " ".join(chosen.values()), matches
+    first = matches.iloc[0]
+    whole = trials[(trials.variant == first.variant) & (trials.condition == first.condition)]
+    return ", ".join(filter(None, (first.variant, first.condition))), whole
+
+
+def differences(study: Study, trials: pd.DataFrame) -> list[Comparison]:
     """Compare each condition with the first one of its variant, or each variant with the first one.
 
     A comparison of devices counts these, and not the seeds of the training, as its pairs.
@@ -335,48 +259,14 @@ def differences(study: Study, trials: Sequence[TrialResult]) -> list[Difference]
     if study.differences is None:
         return []
     words = {"agree": "better", "disagree": "worse", "undecided": "undecided"}
-    by: Literal["seed", "device"] = "device" if study.devices else "seed"
-    changes, first = [], dict[str, list[TrialResult]]()
-    for (variant, condition), group in group_trials(trials).items():
+    limits: Any = {"minimum" if study.differences == "greater" else "maximum": 0.0}
+    better = Statement("", "", {}, study.metrics[0], **limits)
+    by: By = "device" if study.devices else "seed"
+    changes, first = [], dict[str, pd.DataFrame]()
+    for (variant, condition), group in trials.groupby(["variant", "condition"], sort=False):
         base = first.setdefault(variant if study.conditions else "", group)
         if base is not group:
             compared = compare(group, base, study.metrics[0], by=by)
-            word = words[judge_claim(study.differences, compared)]
-            changes.append(Difference(variant, condition, compared, word))
+            word = words[judge(better, compared)]
+            changes.append(Comparison({"": compared}, word, None, variant, condition))
     return changes
-
-
-def _outcome(statement: Statement, trials: Sequence[TrialResult]) -> StatementResult:
-    metric, ratio = statement.metric, statement.claim in RATIOS
-    _, first = _line(statement.one, trials)
-    lines = dict(_line(chosen, trials) for chosen in statement.others)
-    compared = {name: compare(first, line, metric, ratio) for name, line in lines.items()}
-    if statement.level is not None:
-        figures, gestures = values(first, metric), by_gesture(first, metric)
-        level = (1 if metric in UNITS else 100) * statement.level
-        even = None if gestures is None else np.full_like(gestures, level)
-        compared[f"{statement.level:g}"] = paired(
-            figures, dict.fromkeys(figures, level), ratio, gestures=(gestures, even)
-        )
-    verdicts = [judge_claim(statement.claim, comparison, statement.by) for comparison in compared.values()]
-    return StatementResult(statement, compared, combine_verdicts(verdicts))
-
-
-def _line(chosen: Mapping[str, str], trials: Sequence[TrialResult]) -> tuple[str, list[TrialResult]]:
-    """Return the name and the trials of the first line that was so chosen; no trials without one."""
-    for (variant, condition), group in group_trials(trials).items():
-        settings = {**group[0].variant.chosen, "condition": condition}
-        if chosen.items() <= settings.items():
-            return f"{variant}, {condition}" if condition else variant, group
-    return " ".join(chosen.values()), []
-
-
-def mean_and_margin(trials: Sequence[TrialResult], metric: str) -> Estimate:
-    """Return the mean of a metric of trials, its standard error and its margin; of shares in per cent."""
-    return estimate(values(trials, metric), values(trials, metric, "device"), by_gesture(trials, metric))
-
-
-def metric_heading(metric: str) -> str:
-    """Return a column's name: ``overall`` of ``same/overall/accuracy``."""
-    plain = metric.removeprefix("same/").removesuffix("/accuracy").replace("/overall", "")
-    return _HEADINGS.get(metric, plain.replace("_", " "))

@@ -5,11 +5,12 @@ frames of one layout have it; what differs are the nodes' labels. Documents of s
 embedded together. An SVM tells what is in them, and the variance that labels and layouts explain.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from statistics import fmean, stdev
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
+import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from sklearn.decomposition import PCA
@@ -19,9 +20,10 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 from sklearn.svm import SVC
 
-from experiments.studies.comparison import combine_verdicts, judge_claim, paired
+from experiments.studies.comparison import combine_verdicts, compare_samples, judge
 from experiments.studies.measures import ProbeSettings
 from experiments.studies.pages import Page
+from experiments.studies.study import Statement
 from skin.device.base import AbstractDevice
 from skin.device.touches import Touches
 from skin.errors import InputError
@@ -39,63 +41,68 @@ FRAME = "readings, one frame"
 _FIRST_SEED = 1_000_000  # no training draws from these
 _COSTS = (0.1, 1, 10, 100)
 _FOLDS = 3
+POINTS = 400  # touches in each panel of the figure
+_TOLERANCE = 0.02  # of the statements
 
 
-class Space(NamedTuple):
-    """Touches in an embedding's space.
-
-    Attributes:
-        vectors: (B, E), the SVM's training touches first.
-        labels: (B, L), 0 or 1, int.
-        train: how many of them the SVM is trained on.
-        mixed: (B', E), touches on several layouts; None where the device has one layout.
-        layouts: (B',), which layout, int.
-        mixed_labels: (B', L), of the same touches.
-    """
-
-    vectors: np.ndarray
-    labels: np.ndarray
-    train: int
-    mixed: np.ndarray | None
-    layouts: np.ndarray
-    mixed_labels: np.ndarray
+Row = dict[str, Any]
 
 
-class ProbeResult(NamedTuple):
-    """Result of probing one embedding with one seed.
-
-    Attributes:
-        attribute: degree, reading, or nothing where the input is no graph embedding.
-        name: of the input.
-        seed: which draw of touches.
-        accuracy: label -> share of the held-out touches that the SVM labels rightly, nan where it had no
-            choice; ``layout`` of the touches on several layouts.
-        explained: label or ``layout`` -> share of the variance on several layouts that it explains.
-        space: where the touches lie.
-    """
-
-    attribute: str
-    name: str
-    seed: int
-    accuracy: dict[str, float]
-    explained: dict[str, float]
-    space: Space
-
-
-def probe(
-    device: AbstractDevice, settings: ProbeSettings, learner: AbstractLearner | None
-) -> Iterator[ProbeResult]:
-    """Yield the result of each input and seed: graph embeddings, those of a trained encoder, plain readings.
+def probe(device: AbstractDevice, settings: ProbeSettings, learner: AbstractLearner | None) -> Iterator[Row]:
+    """Yield a row for each input and seed: graph embeddings, those of a trained encoder, plain readings.
 
     A simulated device draws new touches for each seed, separate from all training data; other devices use
     their train and test splits, once. Embeddings use the readings of all touches, but no labels.
+
+    Yields:
+        ``attribute`` (degree, reading, or nothing where the input is no graph embedding), ``name`` and
+        ``seed``; ``accuracy LABEL``, the fraction of held-out touches that an SVM labels rightly, NaN where
+        it had no choice; ``chance``, that of always predicting the commoner class; ``accuracy layout`` and
+        ``variance LABEL``, ``variance layout`` (:func:`explained`), of several layouts, NaN without;
+        of the first seed ``plane`` and ``mixed`` (:func:`planes`), with ``classes`` and ``layouts``.
     """
     if device.task.direction:
         raise InputError("embeddings are probed for labels that hold or not: set data.direction=false")
     for seed in settings.seeds if device.simulation else settings.seeds[:1]:
         touches, mixed = _touches(device, settings, seed), _layouts(device, settings, seed)
         for (attribute, name), vectors in _inputs([*touches, *mixed], settings, seed, learner):
-            yield _probed(attribute, name, seed, _space(vectors, touches, mixed), device.task.names)
+            row = {"attribute": attribute, "name": name, "seed": seed}
+            drawn = POINTS if seed == settings.seeds[0] else 0
+            yield (
+                row
+                | _probe_labels(vectors, touches, device.task.names, drawn)
+                | _probe_layouts(vectors[sum(map(len, touches)) :], mixed, device.task.names, seed, drawn)
+            )
+
+
+def _probe_labels(vectors: np.ndarray, sets: Sequence[Touches], names: Sequence[str], drawn: int) -> Row:
+    labels, train = _labels(sets), len(sets[0])
+    own = vectors[: len(labels)]
+    held = labels[train:].mean(axis=0)
+    row: Row = {
+        f"accuracy {name}": svm_accuracy(own, column, train)
+        for name, column in zip(names, labels.T, strict=True)
+    }
+    row |= {"chance": float(np.maximum(held, 1 - held).mean()), "classes": labels[:drawn].ravel().tolist()}
+    return row | {"plane": planes(own[:drawn]).ravel().tolist() if drawn else []}
+
+
+def _probe_layouts(
+    vectors: np.ndarray, sets: Sequence[Touches], names: Sequence[str], seed: int, drawn: int
+) -> Row:
+    if not sets:
+        empty = dict.fromkeys(
+            ["accuracy layout", *(f"variance {name}" for name in ("layout", *names))], np.nan
+        )
+        return empty | {"layouts": [], "mixed": []}
+    layouts = np.repeat(np.arange(len(sets)), [len(layout) for layout in sets])
+    columns = dict(zip(names, _labels(sets).T, strict=True)) | {"layout": layouts}
+    row: Row = {f"variance {name}": explained(vectors, classes) for name, classes in columns.items()}
+    order = np.random.default_rng(seed).permutation(len(vectors))
+    row["accuracy layout"] = svm_accuracy(vectors[order], layouts[order], len(order) * 2 // 3)
+    order = np.random.default_rng(0).permutation(len(vectors))[:drawn]
+    mixed = planes(vectors[order]).ravel().tolist() if drawn else []
+    return row | {"layouts": layouts[order].tolist(), "mixed": mixed}
 
 
 def strongest(touches: Touches) -> np.ndarray:
@@ -169,29 +176,6 @@ def _inputs(
     yield ("", FRAME), np.concatenate([strongest(touches) for touches in sets])
     windows = [touches.readings.where(touches.valid, 0).flatten(1).numpy() for touches in sets]
     yield ("", "readings, window"), np.concatenate(windows)
-
-
-def _space(vectors: np.ndarray, touches: Sequence[Touches], mixed: Sequence[Touches]) -> Space:
-    count = sum(map(len, touches))
-    layouts = np.repeat(np.arange(len(mixed)), [len(layout) for layout in mixed])
-    labels = _labels(touches)
-    mixed_labels = _labels(mixed) if mixed else labels[:0]
-    return Space(
-        vectors[:count], labels, len(touches[0]), vectors[count:] if mixed else None, layouts, mixed_labels
-    )
-
-
-def _probed(attribute: str, name: str, seed: int, space: Space, names: Sequence[str]) -> ProbeResult:
-    columns = zip(names, space.labels.T, strict=True)
-    right = {label: svm_accuracy(space.vectors, classes, space.train) for label, classes in columns}
-    shares: dict[str, float] = {}
-    if space.mixed is not None:
-        shares = {"layout": explained(space.mixed, space.layouts)}
-        columns = zip(names, space.mixed_labels.T, strict=True)
-        shares |= {label: explained(space.mixed, classes) for label, classes in columns}
-        order = np.random.default_rng(seed).permutation(len(space.mixed))
-        right["layout"] = svm_accuracy(space.mixed[order], space.layouts[order], len(order) * 2 // 3)
-    return ProbeResult(attribute, name, seed, right, shares, space)
 
 
 def _touches(device: AbstractDevice, settings: ProbeSettings, seed: int) -> list[Touches]:
@@ -354,20 +338,19 @@ morphology; beside it the share of an embedding's variance there that the layout
 that the best label does. On one layout all graphs have one morphology: labelled by degree, as Graph2Vec
 usually is, they are all equal.
 """
-_Figure = Callable[[ProbeResult], float]
 
 
-def build_embeddings_page(results: Sequence[ProbeResult], names: Sequence[str]) -> Page:
+def embeddings_page(frame: pd.DataFrame) -> Page:
     """Return the table, the verdicts, and figure 5 of the report, of the first seed."""
-    table = embeddings_table(results, names)
-    about = f"{_ABOUT}\n" + "".join(f"- {line}\n" for line in embedding_statements(results, names))
-    figure = spaces([result for result in results if result.seed == results[0].seed], names)
+    table, names = embeddings_table(frame), frame.attrs["labels"]
+    about = f"{_ABOUT}\n" + "".join(f"- {line}\n" for line in embedding_statements(frame))
+    figure = spaces(frame[frame.seed == frame.seed.iloc[0]], names)
     return Page(about, {"What an SVM reads in embeddings, accuracy in per cent": table}, table, figure)
 
 
-def planes(vectors: np.ndarray, points: int = 400) -> np.ndarray:
-    """Return the first touches in the plane, (points, 2): PCA to 30 axes, then t-SNE (report, 2.2.2)."""
-    few = np.asarray(vectors[:points], dtype=float)
+def planes(vectors: np.ndarray) -> np.ndarray:
+    """Return touches in the plane, (B, 2): PCA to 30 axes, then t-SNE (report, 2.2.2)."""
+    few = np.asarray(vectors, dtype=float)
     # Neither method works on vectors that are all equal.
     if np.ptp(few, axis=0).max() < 1e-9:
         return np.zeros((len(few), 2))
@@ -375,127 +358,91 @@ def planes(vectors: np.ndarray, points: int = 400) -> np.ndarray:
     return TSNE(perplexity=min(30.0, (len(few) - 1) / 3), init="pca", random_state=0).fit_transform(reduced)
 
 
-def spaces(results: Sequence[ProbeResult], names: Sequence[str], points: int = 400) -> Figure:
+def spaces(frame: pd.DataFrame, names: Sequence[str]) -> Figure:
     """Draw one row of planes per embedding, coloured by each label and by the layout (report, figure 5).
 
     Args:
-        results: of one seed.
+        frame: rows of one seed.
         names: of the labels.
-        points: touches in each panel.
     """
-    columns = len(names) + (results[0].space.mixed is not None)
-    figure = Figure(figsize=(2.1 * columns, 2.0 * len(results)), layout="constrained")
-    axes = figure.subplots(len(results), columns, squeeze=False)
-    for row, result in zip(axes, results, strict=True):
-        plane = planes(result.space.vectors, points)
-        for axis, classes in zip(row, result.space.labels.T, strict=False):
-            _scatter(axis, plane, classes[:points])
-        if result.space.mixed is not None:
-            order = np.random.default_rng(0).permutation(len(result.space.mixed))[:points]
-            _scatter(row[-1], planes(result.space.mixed[order], points), result.space.layouts[order])
-        row[0].set_ylabel(_title(result), fontsize=8)
+    columns = len(names) + bool(len(frame.mixed.iloc[0]))
+    figure = Figure(figsize=(2.1 * columns, 2.0 * len(frame)), layout="constrained")
+    axes = figure.subplots(len(frame), columns, squeeze=False)
+    for panels, row in zip(axes, frame.itertuples(), strict=True):
+        plane = np.reshape(row.plane, (-1, 2))
+        for axis, classes in zip(panels, np.reshape(row.classes, (len(plane), -1)).T, strict=False):
+            _scatter(axis, plane, classes)
+        if len(row.mixed):
+            _scatter(panels[-1], np.reshape(row.mixed, (-1, 2)), np.asarray(row.layouts))
+        panels[0].set_ylabel(_title((row.attribute, row.name)), fontsize=8)
     for axis, name in zip(axes[0], [*names, "layout"], strict=False):
         axis.set_title(name)
     figure.supxlabel("square: the label holds, circle: it does not; each layout has a mark", fontsize=8)
     return figure
 
 
-def embeddings_table(results: Sequence[ProbeResult], names: Sequence[str]) -> list[list[str]]:
-    """Return the table, its head first: accuracies and shares of variance in per cent, means over seeds."""
-    head = ["input", *names, "mean", "layout", "variance: layout", "variance: best label"]
-    table = [head]
-    for group in _groups(results).values():
-        labels = [[result.accuracy[name] for result in group] for name in names]
-        means = [_mean(result, names) for result in group]
-        layout = [result.accuracy["layout"] for result in group if "layout" in result.accuracy]
-        shares = [result.explained for result in group if result.explained]
-        variance = (
-            [share["layout"] for share in shares],
-            [max(share[name] for name in names) for share in shares],
-        )
-        table.append([_title(group[0]), *map(_percent, [*labels, means, layout, *variance])])
-    return table
+def _summary(frame: pd.DataFrame) -> pd.DataFrame:
+    """Return the columns of the table; the mean is over the labels that could be learnt."""
+    names = frame.attrs["labels"]
+    summary = pd.DataFrame({name: frame[f"accuracy {name}"] for name in names})
+    summary["mean"] = summary.mean(axis=1)
+    summary["layout"], summary["variance: layout"] = frame["accuracy layout"], frame["variance layout"]
+    summary["variance: best label"] = frame[[f"variance {name}" for name in names]].max(axis=1)
+    return summary
 
 
-def embedding_statements(results: Sequence[ProbeResult], names: Sequence[str]) -> list[str]:
+def embeddings_table(frame: pd.DataFrame) -> pd.DataFrame:
+    """Return accuracies and fractions of variance in per cent, means over seeds and their deviation."""
+    keys = [frame.attribute, frame["name"]]
+    table = _summary(frame).groupby(keys, sort=False).agg(_percent)
+    table.insert(0, "input", [_title(key) for key in table.index])
+    return table.reset_index(drop=True)
+
+
+def embedding_statements(frame: pd.DataFrame) -> list[str]:
     """Return verdicts on the report's statements about pretrained embeddings (3.2.4), one line each.
 
     A statement holds if it holds for each embedding. Agree and disagree need the margin of at least
     three seeds; "chance" has a tolerance of two points.
     """
-    groups = _groups(results)
-    frame = {result.seed: _mean(result, names) for result in groups[("", FRAME)]}
-    claims: tuple[tuple[str, str, _Figure, _Figure], ...] = (
-        (
-            "emphasise the graph's morphology (variance explained by layout over best label)",
-            "greater",
-            lambda result: result.explained["layout"],
-            lambda result: max(result.explained[name] for name in names),
-        ),
-        (
-            "are not purposeful on a fixed layout (mean accuracy below the readings of the same frame)",
-            "less",
-            lambda result: _mean(result, names),
-            lambda result: frame[result.seed],
-        ),
-        (
-            "leave an SVM at chance (mean accuracy over the commoner class)",
-            "no better",
-            lambda result: _mean(result, names),
-            _chance,
-        ),
-    )
+    summary = _summary(frame).assign(attribute=frame.attribute, name=frame["name"], chance=frame.chance)
+    summary.index = frame.seed
+    summary["frame"] = summary.loc[(summary.attribute == "") & (summary["name"] == FRAME), "mean"]
+    claims: tuple[tuple[str, str, str, Any], ...] = (
+        ("emphasise the graph's morphology (variance explained by layout over best label)",
+         "variance: layout", "variance: best label", {"minimum": _TOLERANCE}),
+        ("are not purposeful on a fixed layout (mean accuracy below the readings of the same frame)",
+         "mean", "frame", {"maximum": _TOLERANCE}),
+        ("leave an SVM at chance (mean accuracy over the commoner class)", "mean", "chance",
+         {"maximum": _TOLERANCE}),
+    )  # fmt: skip
     lines = []
-    for attribute in dict.fromkeys(result.attribute for result in results if result.attribute):
-        mine = [group for key, group in groups.items() if key[0] == attribute]
-        for says, claim, figure, reference in claims:
-            verdicts = [_compare(group, claim, figure, reference) for group in mine]
-            whole = combine_verdicts([word for word, _ in verdicts])
-            details = "; ".join(detail for _, detail in verdicts)
-            lines.append(f"Nodes labelled by {attribute}: the embeddings {says}: **{whole}**. {details}.")
+    for attribute, group in summary[summary.attribute != ""].groupby("attribute", sort=False):
+        for says, first, second, limits in claims:
+            verdicts, details = [], []
+            for name, rows in group.groupby("name", sort=False):
+                pairs = rows[[first, second]].dropna()
+                difference = compare_samples(pairs[first], pairs[second])
+                verdicts.append(judge(Statement("", says, {}, "", **limits), difference))
+                text = "has one layout only"
+                if difference is not None:
+                    spread = f" ± {100 * difference.margin:.1f}" if difference.seeds > 1 else ""
+                    text = f"{100 * difference.mean:+.1f}{spread} points"
+                details.append(f"{name} {text} ({verdicts[-1]})")
+            verdict = combine_verdicts(verdicts)
+            lines.append(
+                f"Nodes labelled by {attribute}: the embeddings {says}: **{verdict}**. {'; '.join(details)}."
+            )
     return lines
 
 
-def _compare(
-    group: Sequence[ProbeResult], claim: str, figure: _Figure, reference: _Figure
-) -> tuple[str, str]:
-    """Return the verdict on a claim about one embedding, and its figures."""
-    able = [result for result in group if result.explained or claim != "greater"]
-    left, right = ({str(result.seed): value(result) for result in able} for value in (figure, reference))
-    difference = paired(left, right)
-    word = judge_claim(claim, difference, by=0.02)
-    if difference is None:
-        return word, f"{group[0].name} has one layout only ({word})"
-    spread = f" ± {100 * difference.margin:.1f}" if difference.seeds > 1 else ""
-    return word, f"{group[0].name} {100 * difference.mean:+.1f}{spread} points ({word})"
+def _title(key: tuple[str, str]) -> str:
+    return f"{key[1]}, {key[0]}" if key[0] else key[1]
 
 
-def _groups(results: Iterable[ProbeResult]) -> dict[tuple[str, str], list[ProbeResult]]:
-    """Return the results of each input, by seed."""
-    groups: dict[tuple[str, str], list[ProbeResult]] = {}
-    for result in results:
-        groups.setdefault((result.attribute, result.name), []).append(result)
-    return groups
-
-
-def _mean(result: ProbeResult, names: Sequence[str]) -> float:
-    """Return the mean accuracy over the labels that could be learnt."""
-    return float(np.nanmean([result.accuracy[name] for name in names]))
-
-
-def _chance(result: ProbeResult) -> float:
-    """Return the mean share of the held-out touches that are of their label's commoner class."""
-    share = result.space.labels[result.space.train :].mean(axis=0)
-    return float(np.maximum(share, 1 - share).mean())
-
-
-def _title(result: ProbeResult) -> str:
-    return f"{result.name}, {result.attribute}" if result.attribute else result.name
-
-
-def _percent(values: Sequence[float]) -> str:
-    """Return the mean of shares in per cent, with the deviation over seeds if there are several."""
-    if not values or np.isnan(values).any():
+def _percent(values: pd.Series) -> str:
+    """Return the mean of fractions in per cent, with the deviation over seeds if there are several."""
+    if values.isna().any():
         return ""
     spread = f" ± {100 * stdev(values):.1f}" if len(values) > 1 else ""
     return f"{100 * fmean(values):.1f}{spread}"

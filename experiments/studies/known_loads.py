@@ -1,90 +1,61 @@
 """How well gains are known after a calibration without a gauge, and what an alarm then does.
 
-    python -m experiments.studies.known_loads                       # gains
-    python -m experiments.studies.known_loads alarm=true            # and any_skin on such devices
-
-Writes known_loads.csv to the folder out=, results by default. Every device has other gains, positions and
-moduli than the calibration supposes, and the pressure below a base is uneven.
+Every device has other gains, positions and moduli than the calibration supposes, and the pressure below a
+base is uneven.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import partial
-from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
+import pandas as pd
 import torch
 from annotated_types import Ge
+from hydra.utils import instantiate
 from matplotlib.figure import Figure
-from omegaconf import OmegaConf
 from scipy.ndimage import gaussian_filter
 
-from experiments import run_script
-from experiments.studies.pages import csv_text
-from skin.body.base import Layer, Sheet
-from skin.body.layout import Grid
-from skin.body.material import Material
-from skin.core.files import write
-from skin.core.settings import checked, configured
-from skin.device.calibration import Calibration
+from experiments.studies.pages import Page
 from skin.device.simulated import Simulated
+from skin.evaluation.metrics import compute_metrics
+from skin.evaluation.operating_point import choose_operating_point
+from skin.evaluation.settings import check_evaluation
 from skin.hardware.bench import BenchSession
 from skin.hardware.bench_protocol import Protocol
 from skin.hardware.known_loads import KnownLoad, emulate_placements, fit_known_load
-from skin.mechanics.simulator.fem import PlatesAndBeams
-from skin.mechanics.simulator.solid import Solid
-from skin.plot.figures import COLOURS, save_figure
+from skin.plot.figures import COLOURS
 from skin.touch.shapes import Shapes
 
+if TYPE_CHECKING:
+    from experiments.studies.trials import Subject
+
 WEIGHT = KnownLoad(2.0, 0.02)
-SOLID = partial(Solid, poisson={"Dragon Skin 10 Medium": 0.49})
-DEFAULT = (("Dragon Skin 10 Medium", 560e3, 0.010), ("EcoFlex 00-30", 170e3, 0.005))
-LAYER = (("EcoFlex 00-30", 170e3, 0.030),)
-SKINS: Mapping[str, tuple[Any, Any]] = {
-    "default, fem": (DEFAULT, PlatesAndBeams),
-    "default, solid": (DEFAULT, SOLID),
-    "30 mm layer, solid": (LAYER, SOLID),
-}
 PROCEDURES = {"weight once": 1, "weight twice": 2, "weight four times": 4}
 POSITION, MODULUS, UNEVEN, GAINS, NOISE = 0.002, 0.2, 0.1, 0.3, 0.1
 _ALARMED = "weight once"
 _SHOWN, _DRAWN = 45.0, 6  # s and sensors of the figure
+_PICTURED = "default, solid"
 _WAVE = 0.01  # m, over which the pressure changes
 _PROTOCOL = Protocol(idle=10.0, rest=2.0)
 
 
-@checked("known_loads")
-@dataclass(frozen=True)
-class Settings:
-    """Settings of the command line.
-
-    Attributes:
-        devices: simulated devices for every skin.
-        alarm: also evaluate ``any_skin`` on the devices, as they are and calibrated.
-        touches: test touches of every device, for the alarm.
-        out: folder of the results.
-    """
-
-    devices: Annotated[int, Ge(1)] = 10
-    alarm: bool = False
-    touches: Annotated[int, Ge(16)] = 1000
-    out: str = "results"
-
-
-def make_skin(layers: Any, simulator: Any, **settings: Any) -> Simulated:
-    """Return a device on a sheet of these layers (material, Pa, m)."""
-    entries = tuple(Layer(replace(Material.of(name), young=young), thick) for name, young, thick in layers)
-    body = Sheet((0.16, 0.16), (32, 32), entries)
-    return Simulated(body=body, layout=Grid(5, 5), simulator=simulator, **settings)
-
-
-def draw_device(layers: Any, simulator: Any, seed: int, **settings: Any) -> Simulated:
-    """Return a device whose positions, moduli and gains differ from the nominal ones."""
-    draw = np.random.default_rng([seed, 1])
-    other = [(name, young * draw.uniform(1 - MODULUS, 1 + MODULUS), thick) for name, young, thick in layers]
-    errors: dict[str, Any] = {"gain_spread": GAINS, "noise": NOISE, "dead": 1, "position_error": POSITION}
-    return make_skin(other, simulator, seed=seed, **errors | settings)
+def make_skin(subject: "Subject", seed: int | None = None, **settings: Any) -> Simulated:
+    """Return the nominal device, or with a seed one that differs in positions, moduli and gains."""
+    config = subject.config
+    body = instantiate(config.body)
+    if seed is not None:
+        draw = np.random.default_rng([seed, 1])
+        materials = [
+            replace(layer.material, young=layer.material.young * draw.uniform(1 - MODULUS, 1 + MODULUS))
+            for layer in body.layers
+        ]
+        layers = zip(body.layers, materials, strict=True)
+        body = replace(body, layers=tuple(replace(layer, material=material) for layer, material in layers))
+        errors: dict[str, Any] = {"gain_spread": GAINS, "noise": NOISE, "dead": 1, "position_error": POSITION}
+        settings = {"seed": seed} | errors | settings
+    layout, simulator = instantiate(config.layout), instantiate(config.simulator)
+    return Simulated(body=body, layout=layout, simulator=simulator, **settings)
 
 
 def uneven_pressure(skin: Simulated, pressure: torch.Tensor, draw: np.random.Generator) -> torch.Tensor:
@@ -110,137 +81,123 @@ def weight_pressure(skin: Simulated, rounds: int, draw: np.random.Generator) -> 
 
 
 @torch.no_grad()
-def record(device: Simulated, rounds: int, seed: int) -> BenchSession:
-    """Return a session of a device under placements of the weight."""
-    draw = np.random.default_rng([seed, 2])
-    pressures = uneven_pressure(device, weight_pressure(device, rounds, draw), draw)
+def record(device: Simulated, procedure: str, seed: int) -> BenchSession:
+    """Return the session of a device under a procedure."""
+    draw = np.random.default_rng([100 * seed + list(PROCEDURES).index(procedure), 2])
+    pressures = uneven_pressure(device, weight_pressure(device, PROCEDURES[procedure], draw), draw)
     readings = torch.cat([device.model(part).readings for part in pressures.split(16)]).double().numpy()
     return emulate_placements(device, readings, _PROTOCOL, draw)
 
 
-def compare_gains(device: Simulated, calibration: Calibration) -> tuple[np.ndarray, int]:
-    """Return gain over true gain of the working sensors, and how many of them have none."""
-    alive = ~device.constants.dead.numpy()
-    gains = np.array([np.nan if gain is None else gain for gain in calibration.sensors["gain"]])
-    ratios = (gains / device.constants.gain.numpy())[alive]
-    return ratios[np.isfinite(ratios)], int((~np.isfinite(ratios)).sum())
+@dataclass(frozen=True)
+class KnownLoadGains:
+    """Errors of the gains after each procedure, % over the sensors of all devices.
+
+    Args:
+        devices: simulated devices.
+    """
+
+    devices: Annotated[int, Ge(1)] = 10
+
+    def __call__(self, subject: "Subject") -> pd.DataFrame:
+        nominal, parts = make_skin(subject), []
+        for seed in range(self.devices):
+            device = make_skin(subject, seed)
+            working = ~device.constants.dead.numpy()
+            for procedure in PROCEDURES:
+                session = record(device, procedure, seed)
+                gains = fit_known_load(nominal, session, WEIGHT).calibration.known("gain")
+                ratio = (gains / device.constants.gain.numpy())[working]
+                parts.append(pd.DataFrame({"procedure": procedure, "device": seed, "ratio": ratio}))
+                if seed == 0 and procedure == _ALARMED:
+                    drawn = _shown(session, gains[working], device.constants.gain.numpy()[working])
+        sensors = pd.concat(parts)
+        sensors["scale"] = sensors.groupby(["procedure", "device"]).ratio.transform("median")
+        rows = [
+            {"skin": subject.condition, "procedure": name, "devices": self.devices} | _errors(group)
+            for name, group in sensors.groupby("procedure", sort=False)
+        ]
+        frame = pd.DataFrame(rows)
+        frame.attrs["drawn"] = drawn
+        return frame
+
+    def page(self, frame: pd.DataFrame, title: str) -> Page:
+        """Return the rows, and of one skin a figure of a session with a weight."""
+        return Page("", {}, frame, _draw(frame.attrs["drawn"]) if frame.skin[0] == _PICTURED else None)
 
 
-def summarise_gains(skin: str, procedure: str, results: list[tuple[np.ndarray, int]]) -> dict[str, Any]:
-    """Return a row: errors over the sensors of all devices, %."""
-    ratios = np.concatenate([ratios for ratios, _ in results])
-    scales = np.array([np.median(ratios) for ratios, _ in results])
-    relative = np.concatenate([ratios / np.median(ratios) for ratios, _ in results])
-    return {
-        "skin": skin,
-        "procedure": procedure,
-        "devices": len(results),
-        "gain_rms_percent": 100 * float(np.sqrt(np.mean((ratios - 1) ** 2))),
-        "relative_rms_percent": 100 * float(np.sqrt(np.mean((relative - 1) ** 2))),
-        "scale_rms_percent": 100 * float(np.sqrt(np.mean((scales - 1) ** 2))),
-        "scale_median_percent": 100 * float(np.median(scales) - 1),
-        "without_gain": sum(missing for _, missing in results),
+def _errors(sensors: pd.DataFrame) -> dict[str, float]:
+    """Return rms errors of gains, of gains over the median of the device, and of that median, %."""
+    known = sensors.dropna()
+    scales = known.groupby("device").scale.first()
+    samples = {"gain": known.ratio, "relative": known.ratio / known.scale, "scale": scales}
+    errors = {
+        f"{name}_rms_percent": round(100 * float(np.sqrt(np.mean((sample - 1) ** 2))), 2)
+        for name, sample in samples.items()
+    }
+    median = round(100 * float(np.median(scales) - 1), 2)
+    return errors | {"scale_median_percent": median, "without_gain": len(sensors) - len(known)}
+
+
+@dataclass(frozen=True)
+class KnownLoadAlarms:
+    """Accuracy and alarms of ``any_skin``, windows of the model, for every way to correct the gains.
+
+    The threshold lets 2 % of the safe touches of the nominal skin raise the alarm.
+
+    Args:
+        devices: simulated devices.
+        touches: test touches of every device.
+    """
+
+    devices: Annotated[int, Ge(1)] = 10
+    touches: Annotated[int, Ge(16)] = 1000
+
+    def __call__(self, subject: "Subject") -> pd.DataFrame:
+        quiet: dict[str, Any] = {"noise": 0.05, "tare": True}
+        nominal = make_skin(subject, gain_spread=0.02, **quiet)
+        model, rows = subject.load("any_skin"), []
+        point = choose_operating_point(model.learner, nominal, check_evaluation(model.config.evaluation))
+        for seed in range(self.devices):
+            device = make_skin(subject, seed, test_gestures=self.touches, **quiet)
+            measured, true = device.touches("test"), device.constants.gain
+            gains = {"not corrected": torch.ones_like(true), "true gains": true}
+            session = record(make_skin(subject, seed), _ALARMED, seed)
+            fitted = fit_known_load(nominal, session, WEIGHT).calibration
+            gains[_ALARMED] = torch.from_numpy(fitted.known("gain")).float()
+            for name, gain in gains.items():
+                touches = replace(measured, readings=measured.readings / gain, geometry=nominal.geometry)
+                probabilities = model.learner.probabilities(touches)
+                metrics = compute_metrics(probabilities, measured.known_labels, nominal.task, point)
+                rows.append({"correction": name} | metrics)
+        names = ["overall/accuracy", "dangerous/alarm_recall", "dangerous/false_alarm_rate"]
+        means = (100 * pd.DataFrame(rows).groupby("correction", sort=False)[names].mean()).round(2)
+        means.insert(0, "devices", self.devices)
+        means.insert(1, "touches", self.touches)
+        return means.reset_index()
+
+
+def _shown(session: BenchSession, gains: np.ndarray, true: np.ndarray) -> dict[str, Any]:
+    """Return the readings of the strongest sensors, N, by time, s, and the gains, of the figure."""
+    part = session.time < _SHOWN
+    strongest = np.argsort(-np.nanmax(session.raw[part], axis=0))[:_DRAWN]
+    readings = {f"sensor {number}": session.raw[part, number].tolist() for number in strongest}
+    return {"time": session.time[part].tolist(), "readings": readings} | {
+        "gains": [true.tolist(), gains.tolist()]
     }
 
 
-def measure_gains(settings: Settings) -> Iterator[dict[str, Any]]:
-    """Yield a row for every skin and procedure."""
-    for name, (layers, simulator) in SKINS.items():
-        nominal = make_skin(layers, simulator)
-        results: dict[str, list[tuple[np.ndarray, int]]] = {procedure: [] for procedure in PROCEDURES}
-        for seed in range(settings.devices):
-            device = draw_device(layers, simulator, seed)
-            for number, (procedure, rounds) in enumerate(PROCEDURES.items()):
-                session = record(device, rounds, 100 * seed + number)
-                calibration = fit_known_load(nominal, session, WEIGHT).calibration
-                results[procedure].append(compare_gains(device, calibration))
-        for procedure in PROCEDURES:
-            yield summarise_gains(name, procedure, results[procedure])
-
-
-def measure_alarms(settings: Settings) -> Iterator[dict[str, Any]]:
-    """Yield a row for every way to correct the gains: ``any_skin`` on the default skin, windows of the model.
-
-    The threshold lets 2 % of the safe touches of the nominal skin raise the alarm.
-    """
-    from skin.evaluation.metrics import compute_metrics
-    from skin.evaluation.operating_point import choose_operating_point
-    from skin.evaluation.settings import check_evaluation
-    from skin.runs.model_of_run import RunModel, load_run
-
-    layers, simulator = SKINS["default, solid"]
-    mild: dict[str, Any] = {"noise": 0.05, "tare": True}
-    nominal = make_skin(layers, simulator, gain_spread=0.02, **mild)
-    model = load_run("any_skin", body=nominal.body, layout=nominal.layout)
-    assert isinstance(model, RunModel)
-    assert model.config is not None
-    learner = model.learner
-    point = choose_operating_point(learner, nominal, check_evaluation(model.config.evaluation))
-    rows: dict[str, list[dict[str, float]]] = {}
-    for seed in range(settings.devices):
-        errors: dict[str, Any] = {"test_gestures": settings.touches, **mild}
-        device = draw_device(layers, simulator, seed, **errors)
-        measured = device.touches("test")
-        assert measured.labels is not None
-        true = device.constants.gain
-        gains = {"not corrected": torch.ones_like(true), "true gains": true}
-        noisy = draw_device(layers, simulator, seed)
-        session = record(noisy, PROCEDURES[_ALARMED], 100 * seed)
-        estimated = fit_known_load(nominal, session, WEIGHT).calibration.known("gain")
-        gains[_ALARMED] = torch.from_numpy(estimated).float()
-        for name, gain in gains.items():
-            touches = replace(measured, readings=measured.readings / gain, geometry=nominal.geometry)
-            metrics = compute_metrics(learner.probabilities(touches), measured.labels, nominal.task, point)
-            rows.setdefault(name, []).append(metrics)
-    for name, metrics_of_devices in rows.items():
-        names = ("overall/accuracy", "dangerous/alarm_recall", "dangerous/false_alarm_rate")
-        means = {name: 100 * float(np.mean([row[name] for row in metrics_of_devices])) for name in names}
-        yield {"correction": name, "devices": settings.devices, "touches": settings.touches, **means}
-
-
-def draw_weight() -> Figure:
+def _draw(drawn: Mapping[str, Any]) -> Figure:
     """Draw a session of a weight on a device, and its gains over the true ones."""
-    layers, simulator = SKINS["default, solid"]
-    nominal, device = make_skin(layers, simulator), draw_device(layers, simulator, 0)
-    session = record(device, 1, 0)
-    calibration = fit_known_load(nominal, session, WEIGHT).calibration
     figure = Figure(figsize=(9.0, 3.2), layout="constrained")
     trace, scatter = figure.subplots(1, 2, width_ratios=[2, 1])
-    part = session.time < _SHOWN
-    highest = np.nanmax(session.raw[part], axis=0)
-    for number in np.argsort(-highest)[:_DRAWN]:
-        trace.plot(session.time[part], session.raw[part, number], linewidth=0.7, label=f"sensor {number}")
+    for name, readings in drawn["readings"].items():
+        trace.plot(drawn["time"], readings, linewidth=0.7, label=name)
     trace.set(xlabel="time, s", ylabel="reading, N", title="2 kg put on one sensor after the other")
     trace.legend(fontsize=8, ncols=2)
-    alive = ~device.constants.dead.numpy()
-    true, estimated = device.constants.gain.numpy()[alive], calibration.known("gain")[alive]
+    true, estimated = drawn["gains"]
     ends = [min(true) * 0.9, max(true) * 1.1]
     scatter.plot(ends, ends, color="grey", linewidth=0.8)
     scatter.plot(true, estimated, "o", markersize=4, color=COLOURS[0])
-    scatter.set(xlabel="true gain", ylabel="gain from the weight", title="24 working sensors")
+    scatter.set(xlabel="true gain", ylabel="gain from the weight", title=f"{len(true)} working sensors")
     return figure
-
-
-def write_rows(rows: Iterator[dict[str, Any]], path: Path) -> None:
-    """Print rows as they come, and write them as CSV, rounded to two digits."""
-    whole = []
-    for row in rows:
-        shown = {name: round(value, 2) if isinstance(value, float) else value for name, value in row.items()}
-        print(*shown.values(), sep=", ", flush=True)
-        whole.append(shown)
-    print(write(csv_text([[*whole[0]], *([*row.values()] for row in whole)]), path))
-
-
-def main(words: list[str]) -> None:
-    """Run what the words ``name=value`` select."""
-    given = OmegaConf.to_container(OmegaConf.from_dotlist(words))
-    settings = configured(Settings, given, "known_loads")  # type: ignore[arg-type]
-    folder = Path(settings.out)
-    print(save_figure(draw_weight(), folder / "known_loads.png"))
-    write_rows(measure_gains(settings), folder / "known_loads.csv")
-    if settings.alarm:
-        write_rows(measure_alarms(settings), folder / "known_loads_alarm.csv")
-
-
-if __name__ == "__main__":
-    run_script(main)

@@ -6,7 +6,7 @@ They import heavy packages when called, so that errors in their settings are rep
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from annotated_types import Ge, Gt, MinLen
 
@@ -15,110 +15,39 @@ from skin.evaluation.settings import StreamSettings, check_evaluation
 
 if TYPE_CHECKING:
     import numpy as np
-    from mlflow.entities import Run
+    import pandas as pd
     from torch import Tensor
 
     from experiments.studies.pages import Page
-    from skin.device.base import AbstractDevice
-    from skin.evaluation.operating_point import OperatingPoint
-    from skin.learning.learner import AbstractLearner
-    from skin.runs.configuration import Config
-    from skin.runs.model_of_run import RunModel
+    from experiments.studies.trials import Subject
 
 _COUNTED = 1_000_003  # seed of the touches that are counted, which chose no threshold
-
-
-@dataclass(frozen=True)
-class Subject:
-    """The subject of a measure.
-
-    Attributes:
-        config: of the run, with the changes of the condition; that of the command without a run.
-        device: as ``config`` describes it.
-        run: as MLflow has it; None where a study has no runs.
-        model: what the run learned, and the device that it was trained on.
-    """
-
-    config: "Config"
-    device: "AbstractDevice"
-    run: "Run | None" = None
-    model: "RunModel | None" = None
-
-    @property
-    def trained(self) -> "RunModel":
-        """What the run learned.
-
-        Raises:
-            InputError: there is no run.
-        """
-        if self.model is None:
-            raise InputError("this study needs a finished run: study.run=latest, or study.rows=[features]")
-        return self.model
-
-    @property
-    def title(self) -> str:
-        """The name of the run, for pages and figures."""
-        run = self.run
-        assert run is not None
-        # As in the published tables; the id of a run differs between databases.
-        return f"{run.info.run_name}, run {run.data.tags.get('fingerprint', run.info.run_id)[:8]}"
-
-    @property
-    def learner(self) -> "AbstractLearner":
-        """What the run learned."""
-        return self.trained.learner
-
-    def point(self) -> "OperatingPoint":
-        """Return where the run raises the alarm on this device."""
-        from skin.evaluation.operating_point import OperatingPoint
-        from skin.runs.model_of_run import alarm_point
-
-        run = self.trained.run
-        point = self.trained.point if run is None else alarm_point(run, self.learner, self.config)
-        return point or OperatingPoint.default(check_evaluation(self.config.evaluation).false_alarm_rate)
-
-
-@dataclass(frozen=True)
-class Measurement:
-    """The result of a measure.
-
-    Attributes:
-        metrics: name -> value; shares are of 1.
-        page: what is published; None where the metrics tell everything.
-        outcomes: of each test gesture (:func:`skin.evaluation.metrics.encode`); None: not known.
-        cannot: why the learner does not accept the touches; empty where it does.
-    """
-
-    metrics: dict[str, float]
-    page: "Page | None" = None
-    outcomes: "np.ndarray | None" = None
-    cannot: str = ""
-
-
-class StudyMeasure(Protocol):
-    """A frozen dataclass of settings that measures."""
-
-    def __call__(self, subject: Subject) -> Measurement:
-        """Measure; InputError where the device or the learner cannot be measured so."""
 
 
 @dataclass(frozen=True)
 class Accuracy:
     """Accuracy and the like on the test touches, and alarms at the operating point of the run."""
 
-    def __call__(self, subject: Subject) -> Measurement:
+    def __call__(self, subject: "Subject") -> "pd.DataFrame":
+        import pandas as pd
+
         from skin.evaluation.metrics import compute_metrics, encode
 
-        touches = subject.device.touches("test")
-        task = subject.device.task
+        touches, task = subject.device.touches("test"), subject.device.task
+        frame = pd.DataFrame([{"outcomes": None}])
         try:
-            chances = subject.learner.probabilities(touches)
+            probabilities = subject.learner.probabilities(touches)
         except InputError as reason:  # another number of sensors, for example
-            return Measurement({}, cannot=str(reason))
+            frame.attrs["cannot"] = str(reason)
+            return frame
         point = subject.point() if subject.trained.point else None
-        values = compute_metrics(chances, touches.known_labels, task, point)
-        outcomes = encode(chances, touches.known_labels, task, point)
-        return Measurement({f"same/{name}": value for name, value in values.items()}, outcomes=outcomes)
+        labels = touches.known_labels
+        codes = encode(probabilities, labels, task, point)
+        metrics = compute_metrics(probabilities, labels, task, point)
+        return pd.DataFrame(
+            [{f"same/{name}": value for name, value in metrics.items()}
+             | {"outcomes": None if codes is None else codes.tobytes()}]
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -134,28 +63,40 @@ class Margins:
 
     gestures: Annotated[int, Ge(1)] = 20000
 
-    def __call__(self, subject: Subject) -> Measurement:
-        from experiments.studies.pages import margins_page
+    def __call__(self, subject: "Subject") -> "pd.DataFrame":
+        from experiments.studies.pages import margins_frame
         from skin.evaluation.margins import measure_margins
 
-        report = measure_margins(subject.learner, subject.device, self.gestures, subject.point())
-        return Measurement(report.metrics, margins_page(report, subject.title))
+        return margins_frame(measure_margins(subject.learner, subject.device, self.gestures, subject.point()))
+
+    def page(self, frame: "pd.DataFrame", title: str) -> "Page":
+        """Return the page of a run."""
+        from experiments.studies.pages import margins_page
+
+        return margins_page(frame, title)
 
 
 class Streams(StreamSettings):
-    """False alarms per hour of a stream, and accuracy by the share of a touch that a window shows."""
+    """False alarms per hour of a stream, and accuracy by the fraction of a touch that a window shows."""
 
-    def __call__(self, subject: Subject) -> Measurement:
+    def __call__(self, subject: "Subject") -> "pd.DataFrame":
         from rich.console import Console
         from rich.progress import track
 
-        from experiments.studies.pages import streams_page
+        from experiments.studies.pages import streams_frame
         from skin.evaluation.streams import evaluate_windows
 
         console = Console(stderr=True)
-        progress = partial(track, description=subject.title, console=console, transient=True)
-        report = evaluate_windows(subject.learner, subject.device, self, subject.point(), progress)
-        return Measurement(report.metrics(), streams_page(report, subject.title))
+        progress = partial(track, description="streams", console=console, transient=True)
+        return streams_frame(
+            evaluate_windows(subject.learner, subject.device, self, subject.point(), progress)
+        )
+
+    def page(self, frame: "pd.DataFrame", title: str) -> "Page":
+        """Return the page of a run."""
+        from experiments.studies.pages import streams_page
+
+        return streams_page(frame, title)
 
 
 @dataclass(frozen=True)
@@ -177,27 +118,21 @@ class Holds:
     touch: Annotated[float, Gt(0)] | None = None
     drift: Annotated[float, Ge(0)] = 0.2
 
-    def __call__(self, subject: Subject) -> Measurement:
+    def __call__(self, subject: "Subject") -> "pd.DataFrame":
         from rich.progress import track
 
-        from experiments.studies.alarm_timing import FIELDS, time_courses
-        from experiments.studies.pages import Page
+        from experiments.studies.alarm_timing import time_courses
         from skin.hardware.live import engine_builder
         from skin.hardware.live.engine import DebounceSettings
-        from skin.runs.model_of_run import load_model
 
-        run = subject.trained.run
-        assert run is not None  # it was loaded
-        model = load_model(run, subject.config)
+        model = subject.reloaded
         engine = engine_builder.engine_settings(model, DebounceSettings(), self.touch, self.drift).build()
         device = model.device.simulated("held touches are simulated").replace(stream=False)
-        table = [
-            FIELDS,
-            *time_courses(engine, device, self.gestures, self.rate, partial(track, transient=True)),
-        ]
-        courses = (zip(FIELDS, values, strict=True) for values in table[1:])
-        lines = [", ".join(f"{name} {value}" for name, value in line if value) for line in courses]
-        return Measurement({}, Page("\n".join(lines), {"Time to alarm": table}, table))
+        frame = time_courses(engine, device, self.gestures, self.rate, partial(track, transient=True))
+        lines = (", ".join(f"{name} {value}" for name, value in row.items() if value)
+                 for row in frame.to_dict("records"))  # fmt: skip
+        frame.attrs["about"] = "\n".join(lines)
+        return frame
 
 
 @dataclass(frozen=True)
@@ -213,10 +148,10 @@ class TouchAlarms:
     safe: Annotated[int, Ge(1)] = 10000
     dangerous: Annotated[int, Ge(1)] = 2000
 
-    def __call__(self, subject: Subject) -> Measurement:
+    def __call__(self, subject: "Subject") -> "pd.DataFrame":
         import numpy as np
+        import pandas as pd
 
-        from experiments.studies.pages import Page
         from skin.core.rng import Stream, generator
         from skin.evaluation.operating_point import (
             LABEL,
@@ -231,40 +166,37 @@ class TouchAlarms:
 
         trained, settings = subject.trained, check_evaluation(subject.config.evaluation)
         device = subject.device.simulated("touches are simulated")
-        patience = DebounceSettings().alarm
         rate = float(np.ravel(device.rate)[0])
-        aligned = rate <= device.model_rate
-        watching = trained.watching(rate, patience, aligned)
-        at_once = trained.watching(rate, 0.0, aligned)
-        target = settings.false_alarm_rate
-        touch = choose_for_touches(subject.learner, device, watching, target)
+        watching, at_once = (
+            trained.watching(rate, patience, rate <= device.model_rate)
+            for patience in (DebounceSettings().alarm, 0.0)
+        )
+        touch = choose_for_touches(subject.learner, device, watching, settings.false_alarm_rate)
         window = choose_operating_point(subject.learner, device, settings)
         assert window is not None  # it has the label
         labels = device.sampler.balanced(2 * max(self.safe, self.dangerous), generator(Stream.TEST, 7))
         danger = labels[:, TOUCH.names.index(LABEL)]
         counted = np.concatenate([labels[~danger][: self.safe], labels[danger][: self.dangerous]])
-        scores = touch_scores(subject.learner, device, watching, counted, _COUNTED)
         few = min(self.safe, SAFE_TOUCHES)
+        alarms = touch.alarm(touch_scores(subject.learner, device, watching, counted, _COUNTED))
         single = touch_scores(subject.learner, device, at_once, counted[:few], _COUNTED)
         tests = device.touches("test")
-        chances = subject.learner.probabilities(tests)
-        metrics, lines = dict[str, float](), list[str]()
-        alarms = touch.alarm(scores)
-        alarms_of = {
-            "touch": Reached(
-                self.dangerous, int(alarms[self.safe :].sum()), self.safe, int(alarms[: self.safe].sum())
-            ),
-            "window": window.reached(chances, tests.known_labels, trained.device.task),
+        raised, false = int(alarms[self.safe :].sum()), int(alarms[: self.safe].sum())
+        probabilities = subject.learner.probabilities(tests)
+        reached = {
+            "touch": Reached(self.dangerous, raised, self.safe, false),
+            "window": window.reached(probabilities, tests.known_labels, trained.device.task),
             "touch_at_window_threshold": Reached(0, 0, few, int(window.alarm(single).sum())),
         }
-        for name, reached in alarms_of.items():
-            low, high = reached.range
-            metrics |= {f"{name}/false_alarm_rate": reached.false_alarm_rate}
-            metrics |= {f"{name}/false_alarm_low": low, f"{name}/false_alarm_high": high}
-            metrics |= {f"{name}/recall": reached.recall} if reached.dangerous else {}
-            lines.append(f"{name}: {reached.sentence()}")
-        metrics |= {"touch/threshold": touch.threshold, "window/threshold": window.threshold}
-        return Measurement(metrics, Page("\n".join(lines), {}, []))
+        metrics = {"touch/threshold": touch.threshold, "window/threshold": window.threshold}
+        for name, alarm in reached.items():
+            rates = (alarm.false_alarm_rate, *alarm.range)
+            kinds = ("false_alarm_rate", "false_alarm_low", "false_alarm_high")
+            metrics |= {f"{name}/{kind}": value for kind, value in zip(kinds, rates, strict=True)}
+            metrics |= {f"{name}/recall": alarm.recall} if alarm.dangerous else {}
+        frame = pd.DataFrame([metrics])
+        frame.attrs["about"] = "\n".join(f"{name}: {alarm.sentence()}" for name, alarm in reached.items())
+        return frame
 
 
 @dataclass(frozen=True)
@@ -279,11 +211,11 @@ class Motion:
     gestures: Annotated[int, Ge(1)] = 1000
     count: Annotated[int, Ge(1)] = 6
 
-    def __call__(self, subject: Subject) -> Measurement:
+    def __call__(self, subject: "Subject") -> "pd.DataFrame":
         import numpy as np
+        import pandas as pd
         import torch
 
-        from experiments.studies.pages import Page
         from skin.core.rng import Stream, generator
         from skin.learning.graph import neighbours
 
@@ -296,13 +228,12 @@ class Motion:
         motion = device.model.motion(movie.frames)[movie.index] * movie.scale[..., None, None]
         changes = distance_changes(positions, motion[motion.flatten(2).any(dim=-1)], *pairs)
         largest, quantile = float(changes.max()), float(np.quantile(changes, 0.99))
-        return Measurement(
-            {"distance/largest": largest, "distance/quantile": quantile},
-            Page(
-                f"Over {self.gestures} gestures neighbours change their distance by {largest:.2%} at most, "
-                f"99 % quantile {quantile:.2%} of pairs and frames in contact."
-            ),
+        frame = pd.DataFrame([{"distance/largest": largest, "distance/quantile": quantile}])
+        frame.attrs["about"] = (
+            f"Over {self.gestures} gestures neighbours change their distance by {largest:.2%} at most, "
+            f"99 % quantile {quantile:.2%} of pairs and frames in contact."
         )
+        return frame
 
 
 def distance_changes(
@@ -316,8 +247,8 @@ def distance_changes(
         first, second: sensors of each pair (P,).
     """
     rest, moved = (
-        (places[..., first, :] - places[..., second, :]).norm(dim=-1)
-        for places in (positions, positions + motion)
+        (points[..., first, :] - points[..., second, :]).norm(dim=-1)
+        for points in (positions, positions + motion)
     )
     return (moved / rest - 1).abs()
 
@@ -341,16 +272,24 @@ class ProbeSettings:
 class Embeddings(ProbeSettings):
     """Accuracy of an SVM on graph embeddings, readings, and the encoder of a run, if one is given."""
 
-    def __call__(self, subject: Subject) -> Measurement:
+    def __call__(self, subject: "Subject") -> "pd.DataFrame":
+        import pandas as pd
         from rich.console import Console
         from rich.progress import track
 
-        from experiments.studies.embeddings import build_embeddings_page, probe
+        from experiments.studies.embeddings import probe
         from skin.device.balance import report_balance
 
         device, learner = subject.device, subject.learner if subject.model else None
         report_balance(device)
         count = (len(self.attributes) * 3 + (learner is not None) + 2) * len(self.seeds)
         steps = probe(device, self, learner)
-        results = list(track(steps, "probing", count, console=Console(stderr=True)))
-        return Measurement({}, build_embeddings_page(results, device.task.names))
+        frame = pd.DataFrame(track(steps, "probing", count, console=Console(stderr=True)))
+        frame.attrs["labels"] = list(device.task.names)
+        return frame
+
+    def page(self, frame: "pd.DataFrame", title: str) -> "Page":
+        """Return the page of a run."""
+        from experiments.studies.embeddings import embeddings_page
+
+        return embeddings_page(frame)

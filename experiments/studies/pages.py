@@ -2,29 +2,20 @@
 
 import csv
 import io
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import cycle
 from pathlib import Path
-from statistics import fmean
 
 import numpy as np
+import pandas as pd
 from matplotlib.figure import Figure
-from rich import table as terminal
-from rich.console import Console
-from rich.markup import escape
-from torch import Tensor
 
-from skin.core.files import write
-from skin.evaluation.margins import ALARM_NAME, Faint, MarginReport, Span
+from skin.core.files import whole, write
+from skin.evaluation.margins import ALARM_NAME, MarginReport
 from skin.evaluation.streams import WindowReport
 from skin.plot.figures import COLOURS, MARKS, save_figure
-from skin.touch.labels import OPPOSITE, TOUCH
-
-Table = Sequence[Sequence[str]]
-
-_WIDEST = 250  # characters, more than the table of the report needs
+from skin.touch.labels import TOUCH
 
 
 @dataclass(frozen=True)
@@ -33,24 +24,32 @@ class Page:
 
     Attributes:
         about: what matters most, for a person.
-        tables: heading -> table.
-        data: every figure, as the table of the CSV file; empty: there is no such file.
+        tables: heading -> table of texts.
+        data: every figure, as the CSV file has it; empty: there is no such file.
         figure: of the most important ones; None: there is none.
     """
 
     about: str
-    tables: Mapping[str, Table] = field(default_factory=dict)
-    data: Sequence[Sequence[object]] = ()
+    tables: Mapping[str, pd.DataFrame] = field(default_factory=dict)
+    data: pd.DataFrame = field(default_factory=pd.DataFrame)
     figure: Figure | None = None
 
 
 def publish_page(page: Page, title: str, path: Path) -> list[Path]:
     """Write ``path`` with the endings .md, .csv and .png, each whole, and return their paths."""
-    sections = [f"#{markdown(table, heading)}" for heading, table in page.tables.items()]
-    parts = [f"# {title}\n", *([f"{page.about}\n"] if page.about else []), *sections]
+    parts = [f"# {title}\n", *([f"{page.about}\n"] if page.about else [])]
+    parts += [f"## {heading}\n\n{markdown(table)}" for heading, table in page.tables.items()]
     paths = [write("\n".join(parts), path.with_name(f"{path.name}.md"))]
-    paths += [write(csv_text(page.data), path.with_name(f"{path.name}.csv"))] if page.data else []
+    if not page.data.empty:
+        paths.append(write_csv(page.data, path.with_name(f"{path.name}.csv")))
     return paths + ([save_figure(page.figure, path.with_name(f"{path.name}.png"))] if page.figure else [])
+
+
+def write_csv(frame: pd.DataFrame, path: Path) -> Path:
+    """Write a frame as CSV, whole, and return the path."""
+    with whole(path) as partial:
+        frame.to_csv(partial, index=False, lineterminator="\n")
+    return path
 
 
 def csv_text(table: Iterable[Sequence[object]]) -> str:
@@ -60,34 +59,10 @@ def csv_text(table: Iterable[Sequence[object]]) -> str:
     return buffer.getvalue()
 
 
-def markdown(table: Table, title: str) -> str:
-    """Return a table as Markdown, below its title."""
-    lines = ["| " + " | ".join(line) + " |" for line in table]
-    return "\n".join([f"# {title}", "", lines[0], "|" + "---|" * len(table[0]), *lines[1:]]) + "\n"
-
-
-def print_table(
-    table: Table, title: str, console: Console | None = None, wrapped: Sequence[str] = ()
-) -> None:
-    """Print a table, all numbers whole, however narrow the terminal is.
-
-    Args:
-        table: the head first.
-        title: of it.
-        console: where to print; None takes standard output.
-        wrapped: the columns that may be broken into lines.
-    """
-    console = console or Console()
-    printed = terminal.Table(title=escape(title), box=None, pad_edge=False, padding=(0, 1, 0, 0))
-    for name in table[0]:
-        printed.add_column(escape(name), no_wrap=name not in wrapped)
-    for line in table[1:]:
-        printed.add_row(*map(escape, line))
-    if not set(wrapped) & set(table[0]):
-        # A number cut short would be another number: rather let a narrow terminal wrap.
-        needed = console.measure(printed, options=console.options.update(width=_WIDEST)).maximum
-        console.width = max(console.width, needed)
-    console.print(printed)
+def markdown(table: pd.DataFrame) -> str:
+    """Return a table of texts as Markdown."""
+    lines = ["| " + " | ".join(line) + " |" for line in [list(table.columns), *table.to_numpy().tolist()]]
+    return "\n".join([lines[0], "|" + "---|" * len(table.columns), *lines[1:]]) + "\n"
 
 
 @dataclass(frozen=True)
@@ -136,244 +111,121 @@ def draw_panels(title: str, panels: Sequence[Panel]) -> Figure:
     return figure
 
 
-_MEASURES = {
-    "big": "area",
-    "dynamic": "travel",
-    "press": "duration",
-    "dangerous": "pressure",
-    ALARM_NAME: "pressure",
-}
-_NEAR = (0.9, 1.1)  # times its threshold
-_FAINT = 1.0  # N
+_CLOSE = (0.9, 1.1)  # times its threshold: within 10 %
+_WEAK = 1.0  # N
+_INTERVAL = ["mean", "lower", "upper"]
 
 
-def margins_page(report: MarginReport, title: str) -> Page:
-    """Return the tables, the CSV (``label,by,low,high,touches,said,wrong``) and the figure, under a title."""
-    tables = {
-        f"Alarm above {report.point.threshold:.4f}"
-        if name == ALARM_NAME
-        else f"{name.capitalize()} or {OPPOSITE[name]}": [
-            [
-                f"{_MEASURES[name]} over threshold",
-                "touches",
-                f"called {'dangerous' if name == ALARM_NAME else name}, %",
-                "95 %",
-                "wrong",
-            ],
-            *([_range(span), str(span.count), *_share(span), str(span.wrong)] for span in spans),
-        ]
-        for name, spans in report.spans.items()
-    }
-    kinds = ("accuracy", "balanced_accuracy", "ece")
-    tables["All touches"] = [
-        ["label", "accuracy, %", "balanced accuracy, %", "calibration error, %"],
-        *(
-            [name, *(f"{100 * report.metrics[f'{name}/{kind}']:.2f}" for kind in kinds)]
-            for name in (*TOUCH.names, "overall")
-        ),
-    ]
-    tables["Errors by the highest reading above idle"] = [
-        ["N", "touches", *(f"{name} wrong, %" for name in TOUCH.names)],
-        *(
-            [_range(faint), str(faint.count), *(f"{100 * n / faint.count:.1f}" for n in faint.wrong.values())]
-            for faint in report.faint
-        ),
-    ]
-    data: list[Sequence[object]] = [["label", "by", "low", "high", "touches", "said", "wrong"]]
+def margins_frame(report: MarginReport) -> pd.DataFrame:
+    """Return touches by their measure over its threshold, and by the highest reading.
+
+    Columns: label, by, low, high, touches, said, wrong; ``mean`` of the measure, and ``lower`` and ``upper``
+    end of the interval of said over touches. Limits are texts.
+    """
+    rows: list[dict[str, object]] = []
     for name, spans in report.spans.items():
-        data += ([name, "threshold", s.low, s.high, s.count, s.said, s.wrong] for s in spans)
+        for span in spans:
+            rows.append({"label": name, "by": "threshold", "low": str(span.low), "high": str(span.high)})
+            rows[-1] |= {"touches": span.count, "said": str(span.said), "wrong": span.wrong}
+            rows[-1] |= dict(zip(_INTERVAL, (span.mean, *span.range), strict=True))
     for name in TOUCH.names:
-        data += ([name, "reading", f.low, f.high, f.count, "", f.wrong[name]] for f in report.faint)
-    return Page(margins_summary(report), tables, data, _margins_figure(report, title))
+        for group in report.faint:
+            rows.append({"label": name, "by": "reading", "low": str(group.low), "high": str(group.high)})
+            rows[-1] |= {"touches": group.count, "said": "", "wrong": group.wrong[name]}
+    frame = pd.DataFrame(rows)
+    frame.attrs |= {"metrics": report.metrics, "about": _summarise_margins(report)}
+    return frame
 
 
-def margins_summary(report: MarginReport) -> str:
-    """Return a summary in one line: the number of errors close to a threshold or on weak touches."""
+def _summarise_margins(report: MarginReport) -> str:
+    """Return the number of errors close to a threshold or on weak touches, in one line."""
     wrong = {name: sum(span.wrong for span in report.spans[name]) for name in TOUCH.names}
-    near = {
-        name: sum(span.wrong for span in report.spans[name] if _NEAR[0] <= span.low and span.high <= _NEAR[1])
+    close = {
+        name: sum(s.wrong for s in report.spans[name] if _CLOSE[0] <= s.low and s.high <= _CLOSE[1])
         for name in ("big", "dangerous")
     }
-    faint = sum(span.wrong["dynamic"] for span in report.faint if span.high <= _FAINT)
-    clear = [span for span in report.spans[ALARM_NAME] if span.low >= _NEAR[1]]
+    weak = sum(group.wrong["dynamic"] for group in report.faint if group.high <= _WEAK)
+    clear = [span for span in report.spans[ALARM_NAME] if span.low >= _CLOSE[1]]
     return (
-        f"within 10 % of their thresholds lie {near['big']} of {wrong['big']} errors of big and "
-        f"{near['dangerous']} of {wrong['dangerous']} of dangerous; no reading passes {_FAINT:g} N in "
-        f"{faint} of {wrong['dynamic']} errors of dynamic; {sum(span.wrong for span in clear)} of "
+        f"within 10 % of their thresholds lie {close['big']} of {wrong['big']} errors of big and "
+        f"{close['dangerous']} of {wrong['dangerous']} of dangerous; no reading passes {_WEAK:g} N in "
+        f"{weak} of {wrong['dynamic']} errors of dynamic; {sum(span.wrong for span in clear)} of "
         f"{sum(span.count for span in clear)} touches more than 10 % above the threshold of dangerous raise "
         f"no alarm; {report.point.sentence()}; {report.reached.sentence()}"
     )
 
 
-def _margins_figure(report: MarginReport, title: str) -> Figure:
-    """Draw what is said against measure over threshold, and errors against the highest reading."""
+def margins_page(frame: pd.DataFrame, title: str) -> Page:
+    """Return the page of :func:`margins_frame`: said against measure over threshold, errors by reading."""
+    data = frame.drop(columns=_INTERVAL)
+    groups = {" by ".join(key): group for key, group in data.groupby(["label", "by"], sort=False)}
+    spans, faint = (dict([*frame[frame.by == by].groupby("label")]) for by in ("threshold", "reading"))
     called = {
-        name: np.array(
-            [(s.mean, 100 * s.said / s.count, 100 * s.range[0], 100 * s.range[1]) for s in report.spans[name]]
-        ).T
+        name: np.stack(
+            [spans[name]["mean"], 100 * spans[name].said.astype(int) / spans[name].touches,
+             100 * spans[name].lower, 100 * spans[name].upper]
+        )
         for name in ("big", "dangerous", ALARM_NAME)
-    }
+    }  # fmt: skip
     wrong = {
-        name: np.array([(n, 100 * f.wrong[name] / f.count) for n, f in enumerate(report.faint)]).T
+        name: np.stack([np.arange(len(faint[name])), 100 * faint[name].wrong / faint[name].touches])
         for name in TOUCH.names
     }
+    ranges = [
+        f"above {row.low}" if row.high == "inf" else f"{row.low} to {row.high}"
+        for row in faint["big"].itertuples()
+    ]
+    ticks = [f"{each}\n{count}" for each, count in zip(ranges, faint["big"].touches, strict=True)]
     label = "area (big) or pressure (dangerous) over its threshold"
-    ticks = [f"{_range(faint)}\n{faint.count}" for faint in report.faint]
-    return draw_panels(
-        title,
-        [
-            Panel(label, "touches called so, %, with 95 %", called, limits=(0.4, 2.5)),
-            Panel("highest reading above idle, N; touches", "wrong, %", wrong, ticks=ticks),
-        ],
-    )
-
-
-def _share(span: Span) -> tuple[str, str]:
-    low, high = span.range
-    return f"{100 * span.said / span.count:.1f}", f"{100 * low:.1f} to {100 * high:.1f}"
-
-
-def _range(span: Span | Faint) -> str:
-    return f"above {span.low:g}" if math.isinf(span.high) else f"{span.low:g} to {span.high:g}"
-
-
-def streams_page(report: WindowReport, title: str) -> Page:
-    """Return the tables, the CSV (``measure,name,at,value``) and the figure, under a title."""
-    trained = "windows of streams" if report.streamed else "whole touches"
-    about = f"Trained on {trained}, tried on windows of streams; {report.point.sentence()}."
-    return Page(
-        f"{streams_summary(report)}\n\n{about}",
-        _streams_tables(report),
-        _streams_data(report),
-        _streams_figure(report, title),
-    )
-
-
-def streams_summary(report: WindowReport) -> str:
-    """Return a summary in one line."""
-    parts = []
-    if report.bins:
-        shares = (
-            f"{100 * part.overall:.1f} % at share {part.name} (always the commoner answer: "
-            f"{100 * fmean(part.majority.values()):.1f} %)"
-            for part in (report.bins[0], report.bins[-1])
-        )
-        parts.append(f"accuracy {', '.join(shares)}")
-    parts += [f"touch by {gate} {100 * _right(counts):.1f} %" for gate, counts in report.gates.items()]
-    hourly = ", ".join(f"{alarms.per_hour:.1f} ({gate})" for gate, alarms in report.alarms.items())
-    touched = 100 * (1 - _idle_hours(report) / report.hours)
-    raised = ", ".join(f"{alarms.raised} of {alarms.safe} ({gate})" for gate, alarms in report.alarms.items())
-    windows = ", ".join(f"{window:g} s: {_length(value)}" for window, value in report.lengths.items())
-    parts += [
-        f"false alarms per hour without touch {hourly}; {touched:.0f} % of {report.hours:g} h show a touch",
-        f"safe touches that raised the alarm {raised}",
-        f"window {windows}",
+    panels = [
+        Panel(label, "touches called so, %, with 95 %", called, limits=(0.4, 2.5)),
+        Panel("highest reading above idle, N; touches", "wrong, %", wrong, ticks=ticks),
     ]
-    return "; ".join(parts)
+    tables = {name: group.iloc[:, 2:].astype(str) for name, group in groups.items()}
+    return Page(frame.attrs["about"], tables, data, draw_panels(title, panels))
 
 
-def _streams_tables(report: WindowReport) -> dict[str, list[list[str]]]:
-    """Return heading -> table, its head first."""
-    bins = report.bins
-    accuracies = [
-        [name, *(f"{100 * part.accuracy[name]:.1f} ({100 * part.majority[name]:.1f})" for part in bins)]
-        for name in (bins[0].accuracy if bins else ())
-    ]
-    gates = [
-        [gate, *(str(int(count)) for count in counts.flatten()), f"{100 * _right(counts):.1f}"]
-        for gate, counts in report.gates.items()
-    ]
-    alarms = [
-        [
-            gate,
-            str(heard.false),
-            f"{heard.per_hour:.1f} ({heard.range[0]:.1f} to {heard.range[1]:.1f})",
-            f"{heard.found} of {heard.dangerous}",
-            f"{heard.raised} of {heard.safe}",
-        ]
-        for gate, heard in report.alarms.items()
-    ]
-    return {
-        "Accuracy by the share of the touch that is seen, % (always the commoner answer)": [
-            ["label", *(part.name for part in bins)],
-            *accuracies,
-            ["windows", *(str(part.count) for part in bins)],
-        ],
-        f"Touch or none, truth: said (threshold {report.threshold:.3f} N)": [
-            ["gate", "idle: idle", "idle: touched", "touched: idle", "touched: touched", "right, %"],
-            *gates,
-        ],
-        f"Alarms in a stream of {report.hours:g} h, {_idle_hours(report):.2f} h of it without touch": [
-            ["gate", "false", "false per hour (95 %)", "dangerous found", "safe that raised one"],
-            *alarms,
-        ],
-        "Windows of other lengths": [
-            ["s", "overall accuracy, %"],
-            *([f"{window:g}", _length(value)] for window, value in report.lengths.items()),
-        ],
-    }
-
-
-def _streams_data(report: WindowReport) -> list[Sequence[object]]:
-    """Return every figure as ``measure,name,at,value``."""
-    data: list[Sequence[object]] = [["measure", "name", "at", "value"]]
+def streams_frame(report: WindowReport) -> pd.DataFrame:
+    """Return every figure of an evaluation on streams, as texts: measure, name, at, value."""
+    rows: list[Sequence[object]] = []
     for part in report.bins:
-        data.append(["windows", "", part.name, part.count])
-        data += (["accuracy", name, part.name, f"{v:.4f}"] for name, v in part.accuracy.items())
-        data += (["majority", name, part.name, f"{v:.4f}"] for name, v in part.majority.items())
+        rows.append(["windows", "", part.name, part.count])
+        rows += (["accuracy", name, part.name, f"{v:.4f}"] for name, v in part.accuracy.items())
+        rows += (["majority", name, part.name, f"{v:.4f}"] for name, v in part.majority.items())
     cells = ("idle said idle", "idle said touched", "touched said idle", "touched said touched")
     for gate, counts in report.gates.items():
-        data += ([cell, gate, "", int(n)] for cell, n in zip(cells, counts.flatten(), strict=True))
+        rows += ([cell, gate, "", int(n)] for cell, n in zip(cells, counts.flatten(), strict=True))
     for gate, alarms in report.alarms.items():
-        data += ([f"alarms {name}", gate, "", value] for name, value in vars(alarms).items())
-    data.append(["threshold, N", "threshold", "", f"{report.threshold:.4f}"])
-    data.append(["stream, h", "", "", report.hours])
-    data += (["window, s", "overall", f"{window:g}", value] for window, value in report.lengths.items())
-    return data
-
-
-def _streams_figure(report: WindowReport, title: str) -> Figure:
-    """Draw accuracy against the share that is seen, and alarms by gate."""
-    bins = report.bins
-    shares = {
-        name: np.array([(n, 100 * part.accuracy[name]) for n, part in enumerate(bins)]).T
-        for name in (bins[0].accuracy if bins else ())
-    }
-    heard = {
-        "false alarms": np.array(
-            [(n, alarms.per_hour, *alarms.range) for n, alarms in enumerate(report.alarms.values())]
-        ).T
-    }
-    gates = [
-        f"{gate}\n{alarms.found}/{alarms.dangerous} found\n{alarms.raised}/{alarms.safe} safe raised"
-        for gate, alarms in report.alarms.items()
-    ]
-    return draw_panels(
-        title,
-        [
-            Panel(
-                "share of the touch in the window, number of windows",
-                "accuracy, %",
-                shares,
-                ticks=[f"{part.name}\n{part.count}" for part in bins],
-            ),
-            Panel(
-                f"{_idle_hours(report):.2f} h without touch",
-                "false alarms per hour, 95 %",
-                heard,
-                ticks=gates,
-            ),
-        ],
+        rows += ([f"alarms {name}", gate, "", value] for name, value in vars(alarms).items())
+    rows.append(["threshold, N", "threshold", "", f"{report.threshold:.4f}"])
+    rows.append(["stream, h", "", "", report.hours])
+    rows += (["window, s", "overall", f"{window:g}", value] for window, value in report.lengths.items())
+    frame = pd.DataFrame(
+        [[str(value) for value in row] for row in rows], columns=["measure", "name", "at", "value"]
     )
+    bins = (report.bins[0], report.bins[-1]) if report.bins else ()
+    parts = [f"accuracy {100 * part.overall:.1f} % at share {part.name}" for part in bins]
+    for gate, alarms in report.alarms.items():
+        low, high = alarms.range
+        parts.append(
+            f"gate {gate}: {alarms.per_hour:.1f} ({low:.1f} to {high:.1f}) false alarms per hour without "
+            f"touch, {alarms.found} of {alarms.dangerous} dangerous touches and {alarms.raised} of "
+            f"{alarms.safe} safe ones raised the alarm"
+        )
+    trained = "windows of streams" if report.streamed else "whole touches"
+    parts.append(f"trained on {trained}; {report.point.sentence()}")
+    frame.attrs |= {"metrics": report.metrics(), "about": "; ".join(parts)}
+    return frame
 
 
-def _idle_hours(report: WindowReport) -> float:
-    return next(iter(report.alarms.values())).idle_hours
-
-
-def _right(counts: Tensor) -> float:
-    return float(counts.diag().sum() / counts.sum())
-
-
-def _length(value: float | str) -> str:
-    return f"cannot ({value})" if isinstance(value, str) else f"{100 * value:.1f}"
+def streams_page(frame: pd.DataFrame, title: str) -> Page:
+    """Return the page of :func:`streams_frame`, with the accuracy by the fraction that is seen."""
+    tables = {}
+    for measure, group in frame.groupby("measure", sort=False):
+        table = group.pivot(index="name", columns="at", values="value").fillna("")
+        tables[measure] = table.reindex(columns=group["at"].unique()).reset_index()
+    accuracy = tables.get("accuracy", pd.DataFrame({"name": []})).set_index("name").astype(float)
+    lines = {name: np.stack([np.arange(len(row)), 100 * row]) for name, row in accuracy.iterrows()}
+    ticks = list(accuracy.columns)
+    panel = Panel("fraction of the touch in the window", "accuracy, %", lines, ticks=ticks)
+    return Page(frame.attrs["about"], tables, frame, draw_panels(title, [panel]))

@@ -5,18 +5,15 @@
 The statements are in conf/study/, and those without a study in conf/statements.yaml.
 """
 
-import csv
-import math
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Mapping
 from typing import Any
 
+import pandas as pd
 from omegaconf import OmegaConf
 
-from experiments.studies.comparison import StatementResult, combine_verdicts, conclusions, judge_claim
-from experiments.studies.study import Statement, Study, Variant, configured_study, trained_settings
+from experiments.studies.comparison import conclude
+from experiments.studies.study import Statement, Study, configured_study, trained_settings
 from experiments.studies.study_page import comparison_text
-from experiments.studies.trials import TrialResult
 from skin.core.files import CONF, ROOT, write
 from skin.core.settings import configured
 
@@ -60,7 +57,7 @@ def every_study() -> Iterator[tuple[str, tuple[str, Study]]]:
             yield name, (command, configured_study(settings | parts.get(name, {}), name))
 
 
-def published_trials(name: str, chosen: Mapping[str, Mapping[str, str]] | None = None) -> list[TrialResult]:
+def published_trials(name: str, chosen: Mapping[str, Mapping[str, str]] | None = None) -> pd.DataFrame:
     """Return the trials in a published file of a study; none without the file.
 
     Args:
@@ -68,35 +65,22 @@ def published_trials(name: str, chosen: Mapping[str, Mapping[str, str]] | None =
         chosen: settings of each variant, by its name.
     """
     path = ROOT / "docs" / "results" / f"study_{name}.csv"
-    lines = list(csv.DictReader(path.read_text().splitlines())) if path.exists() else []
-    # Several devices of one training are the sample.
-    several = len({line["seed"] for line in lines}) == 1 and any(line.get("device") for line in lines)
-    trials = []
-    for line in lines:
-        variant, seed, condition, device, run = (
-            line.pop(key, "") for key in ("variant", "seed", "condition", "device", "run")
-        )
-        settings = (chosen or {}).get(variant, {"name": variant, "row": variant.split()[0]})
-        metrics = {key: float(value) for key, value in line.items() if value}
-        seed = device if several else seed
-        trials.append(TrialResult(Variant(variant, settings, {}), seed, condition, "", run, metrics))
-    return trials
-
-
-def judge(statement: Statement, trials: Sequence[TrialResult]) -> StatementResult:
-    """Return the verdict on a statement, with its margin over gestures, which published files do not hold."""
-    (result,) = conclusions([statement], trials)
-    compared = {
-        name: pair and replace(pair, margin=math.hypot(pair.margin, statement.over_gestures))
-        for name, pair in result.compared.items()
-    }
-    verdicts = [judge_claim(statement.claim, pair, statement.by) for pair in compared.values()]
-    return StatementResult(statement, compared, combine_verdicts(verdicts))
+    if not path.exists():
+        return pd.DataFrame()
+    texts = dict.fromkeys(("variant", "seed", "condition", "device", "run"), str)
+    trials = pd.read_csv(path, dtype=texts)
+    for column in texts:
+        trials[column] = trials[column].fillna("") if column in trials else ""
+    if trials.seed.nunique() == 1 and trials.device.any():  # several devices of one training are the sample
+        trials["seed"] = trials.device
+    settings = {each: {"name": each, "row": each.split()[0]} for each in trials.variant} | dict(chosen or {})
+    trials["chosen"] = trials.variant.map(settings)
+    return trials.assign(device="", outcomes=None)
 
 
 def _study_lines(command: str, study: Study) -> Iterator[str]:
     trials = published_trials(study.name, trained_settings(study))
-    if not trials:
+    if trials.empty:
         yield f"| {len(study.statements)} on the {study.about} | `{command}` | *not tested* |\n"
         return
     for number, statement in enumerate(study.statements):
@@ -110,9 +94,9 @@ def _tested(settings: dict[str, Any]) -> str:
     return _line(configured(Statement, {"id": ""} | settings, "statement"), link, published_trials(name))
 
 
-def _line(statement: Statement, command: str, trials: Sequence[TrialResult]) -> str:
+def _line(statement: Statement, command: str, trials: pd.DataFrame) -> str:
     says = statement.says + (f" ({statement.section})" if statement.section else "")
-    result = judge(statement, trials)
+    result = conclude(statement, trials)
     return f"| {says} | {command} | {comparison_text(result).replace(' points', '')}: *{result.verdict}* |\n"
 
 

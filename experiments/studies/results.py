@@ -7,11 +7,9 @@ Writes into docs/results; rerun to resume.
 """
 
 import sys
-import time
 import traceback
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from shlex import join, split
 from typing import Annotated, Any, Literal
 
@@ -19,6 +17,7 @@ from annotated_types import Ge, Gt
 
 from experiments import peers
 from skin.commands._command import command
+from skin.core.files import results
 from skin.core.settings import check_settings, configured
 from skin.errors import InputError
 from skin.runs.configuration import Config, overrides
@@ -86,75 +85,48 @@ def main(config: Config) -> None:
 
 def _publish(chosen: PublishedResults, config: Config) -> int:
     """Run the commands of a part; return 1 if one failed."""
-    from skin.core.messages import format_duration
-    from skin.runs.sweep import SweepProgress
-
-    full, failed = chosen.budget == "full", []
-    lines = list(_lines(chosen, config))
-    progress = SweepProgress([3600 * hours if full else None for hours, _ in lines])
-    for number, (hours, line) in enumerate(lines):
-        left = progress.left()
-        estimate = "" if left is None else f", about {format_duration(left)} left"
-        print(f"== [{number + 1}/{len(lines)}] skin {join(line)}{estimate}", flush=True)
-        began = time.monotonic()
-        if _fails(line):
-            failed.append(f"skin {join(line)}")
-        took = time.monotonic() - began
-        # A command whose runs have finished before does not tell the speed of this machine.
-        progress.finish(number, took, full and took < 0.05 * 3600 * hours)
-    if failed:
-        print("failed:", *failed, sep="\n", file=sys.stderr)
-    return 1 if failed else 0
-
-
-def _fails(line: Sequence[str]) -> bool:
-    """Run a command and return whether it failed; a crash is reported, and must not stop the others."""
     from experiments.studies.trials import run_command
     from skin import __main__ as cli
 
-    try:
-        return run_command(cli.main, line) != 0
-    except Exception:
-        traceback.print_exc()
-        return True
+    failed, lines = [], list(_lines(chosen, config))
+    for number, (_, line) in enumerate(lines):
+        left = sum(each for each, _ in lines[number:])
+        estimate = f", at most {left:.1f} h left" if chosen.budget == "full" else ""
+        print(f"== [{number + 1}/{len(lines)}] skin {join(line)}{estimate}", flush=True)
+        try:
+            code = run_command(cli.main, line)
+        except Exception:  # is reported, and must not stop the others
+            traceback.print_exc()
+            code = 1
+        failed += [f"skin {join(line)}"] if code else []
+    if failed:
+        print("failed:", *failed, sep="\n", file=sys.stderr)
+    return int(bool(failed))
 
 
 def _lines(chosen: PublishedResults, config: Config) -> Iterator[tuple[float, list[str]]]:
     """Yield hours, and verb and overrides, of each command; the overrides of the command line last."""
-    smoke = chosen.budget == "smoke"
+    smoke, jobs = chosen.budget == "smoke", chosen.jobs
     passed = [word for word in overrides() if word.split("=")[0].split(".")[0] not in ("results", "out")]
+    # Smoke budgets are published in a folder in it.
+    folder = results(config.out or ("results" if smoke else "docs/results"))
+    fresh = [f"tracking.{name}={value}" for name, value in _FRESH.items() if chosen.fresh]
+    parallel = {
+        "train": ["hydra/launcher=joblib", f"hydra.launcher.n_jobs={jobs}"],
+        "study": [f"study.jobs={jobs}"],
+    }
     for step in chosen.steps():
         verb, *words = split(step.run)
         if smoke and _PEERS in words and not peers.python().is_file():
-            print(
-                f"left out without {peers.python()}, which make peers builds: skin {step.run}",
-                file=sys.stderr,
-            )
+            missing = f"left out without {peers.python()}, which make peers builds: skin {step.run}"
+            print(missing, file=sys.stderr)
             continue
         if smoke and verb not in chosen.smoke:
             raise InputError(f"results.smoke has no settings for skin {verb}: add +results.smoke.{verb}=[]")
         words += chosen.smoke[verb] if smoke else ()
-        if verb != "design":
-            words += [f"tracking.{name}={value}" for name, value in _FRESH.items() if chosen.fresh]
-        if chosen.jobs > 1 and verb == "train":
-            words += ["hydra/launcher=joblib", f"hydra.launcher.n_jobs={chosen.jobs}"]
-        if chosen.jobs > 1 and verb == "study":
-            words += [f"study.jobs={chosen.jobs}"]
-        folder = _folder(chosen, config)
         if verb == "design":  # has no runs, and takes no settings of trainings
-            yield step.hours, [verb, *_within(folder, words)]
+            words = [f"out={folder / word[4:]}" if word.startswith("out=") else word for word in words]
+            yield step.hours, [verb, *words]
             continue
-        words += [f"out={folder}"] if verb == "study" else []
-        yield step.hours, [verb, *words, *passed]
-
-
-def _within(folder: Path, words: Sequence[str]) -> list[str]:
-    """Return overrides with the place of the results in a folder."""
-    return [f"out={folder / word[4:]}" if word.startswith("out=") else word for word in words]
-
-
-def _folder(chosen: PublishedResults, config: Config) -> Path:
-    """Return the folder of the published files; smoke budgets are published in a folder in it."""
-    from skin.core.files import results
-
-    return results(config.out or ("docs/results" if chosen.budget == "full" else "results"))
+        words += [*fresh, *(parallel.get(verb, []) if jobs > 1 else [])]
+        yield step.hours, [verb, *words, *([f"out={folder}"] if verb == "study" else []), *passed]

@@ -5,18 +5,19 @@
     skin study -m study=graphs,late_early simulator=naive
     skin study study=robustness study.part=dead study.rows=[features,gru]
     skin study study=margins study.run=latest
+    skin study study=known_loads
 
 A study is a file of conf/study; study.part=NAME chooses a comparison of a file with several. It trains the
 runs that are missing, with the budget in that file; rerun to resume. Writes study_<name>.md, .csv and .png
 into out=, with the name of the study or the part. A measure of single runs, such as margins, writes files for
-each, and of several runs study_<name>.csv with all values. Evaluations are kept in results/trials.
+each, and of several runs study_<name>.csv with all values. A study without runs measures skins, and writes
+<name>.md, .csv and .png. Measurements are kept in results/trials.
 """
 
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 from annotated_types import Ge, MinLen
 from hydra import compose
@@ -33,30 +34,30 @@ from skin.errors import InputError
 from skin.runs.configuration import Config, overrides, validate_config
 from skin.runs.sweep import sweep_jobs
 
-if TYPE_CHECKING:
-    from experiments.studies.trials import TrialResult
-
 _OWN = ("study", "smoke", "out", "shard")
 _NAMED = ("experiment", "simulator", "row")
-
-
-Claim = Literal["greater", "less", "alike", "no better", "at most", "about", "ratio"]
-"""What a statement says of two figures (:func:`experiments.studies.comparison.judge_claim`)."""
+MEASURE = "measure."
+"""Beginning of the names of conditions that are settings of the measure."""
 
 
 @dataclass(frozen=True)
 class Statement:
-    """A sentence that runs can test; ``conf/study.yaml`` explains the fields."""
+    """A sentence that runs can test; ``conf/study.yaml`` explains the fields.
+
+    The quantity is ``one`` - other, or ``one`` / other; the sentence holds if it lies between ``minimum`` and
+    ``maximum``.
+    """
 
     id: str
     says: str
     one: Mapping[str, str]
     metric: str
-    claim: Claim
     section: str = ""
     others: Sequence[Mapping[str, str]] = ()
     level: float | None = None
-    by: float = 0.0
+    ratio: bool = False
+    minimum: float = float("-inf")
+    maximum: float = float("inf")
     over_gestures: float = 0.0
 
 
@@ -105,10 +106,15 @@ class Study:
     numbered: Sequence[str] = ()
     measure: Any = None
     metrics: Sequence[str] = ()
-    differences: Claim | None = None
+    differences: Literal["greater", "less"] | None = None
     statements: Sequence[Statement] = ()
     minutes: float | None = None
     axis: str | None = None
+
+    @property
+    def has_runs(self) -> bool:
+        """Whether runs are measured; else the skin of the command."""
+        return bool(self.trainings) or self.rows is not None or self.run is not None
 
 
 def chosen_studies(config: Config) -> list[Study]:
@@ -271,86 +277,10 @@ def main(config: Config) -> None:
     studies = chosen_studies(config)
     folder = results(config.out) / ("smoke" if config.smoke else "")
 
+    from experiments.studies.trials import run_study
     from skin.core.messages import quiet
 
     quiet()
-    missing = False
-    for study in studies:
-        if not study.trainings and study.rows is None and study.run is None:
-            if config.shard is not None:
-                raise InputError(f"study={study.name} has no runs to divide: leave out shard={config.shard}")
-            _measure_skin(study, folder)
-        else:
-            missing |= _compare(study, config, folder)
-    if missing:
+    complete = [run_study(study, config, folder) for study in studies]
+    if not all(complete):
         sys.exit(1)
-
-
-def _compare(study: Study, config: Config, folder: Path) -> bool:
-    """Measure the runs of a study, publish the results, and return whether a run is missing."""
-    from rich.console import Console
-    from rich.progress import track
-
-    from experiments.studies.trials import find_runs, log_summary, run_trials, train_study, votes
-    from skin.core.files import whole
-    from skin.runs.store import Store
-    from skin.runs.sweep import Shard
-
-    shard = Shard.parse(config.shard) if config.shard is not None else None
-    if study.trainings:
-        store, planned = train_study(study, shard, bool(config.smoke))
-    else:
-        store = Store.open(config.tracking)
-        planned = find_runs(study, config, store)
-        if shard:
-            fingerprints = shard.part(run.run.data.tags["fingerprint"] for run in planned if run.run)
-            planned = [run for run in planned if run.run and run.run.data.tags["fingerprint"] in fingerprints]
-    trials, console = list["TrialResult"](), Console(stderr=True)
-    runs = track(planned, "measuring", console=console, transient=True, disable=not console.is_terminal)
-    for trial in (trial for run in runs for trial in run_trials(store, run, study, config)):
-        trials.append(trial)
-        for name, content in trial.files.items():
-            with whole(folder / name) as partial:
-                partial.write_bytes(content)
-        if trial.line:
-            names = [folder / name for name in trial.files]
-            print(f"{trial.variant.name} ({trial.run[:8]}): {trial.line}", *names, sep="\n", flush=True)
-    if shard:
-        print(f"shard {config.shard} is measured: the same command without shard= writes the results")
-    else:
-        paths = _publish(study, [*trials, *votes(study, trials)], config, folder)
-        if study.measure or any(trial.condition for trial in trials):
-            log_summary(store, study, trials, paths)
-    return any(run.run is None for run in planned)
-
-
-def _publish(study: Study, trials: Sequence["TrialResult"], config: Config, folder: Path) -> list[Path]:
-    """Write and print the results of a study, and return the paths of its tables."""
-    from experiments.studies.study_page import draw_report, publish_files, publish_study
-
-    path = folder / f"study_{study.name}"
-    if not study.metrics:
-        paths = publish_files(study, trials, path.with_suffix(".csv"))
-    else:
-        smoke = "SMOKE, one epoch on little data, ignore the scores: " * bool(config.smoke)
-        settings = [word for word in passed_overrides() if not word.startswith("tracking.")]
-        small = study.small if smoke else ()
-        title = smoke + ", ".join([f"{study.name}: {study.about}", *small, *settings])
-        paths = publish_study(study, title, trials, path)
-    if study.report_figures:
-        print(f"{len(draw_report(trials, folder))} figures of the report in {folder}")
-    return paths
-
-
-def _measure_skin(study: Study, folder: Path) -> None:
-    """Apply the measure of a study without runs to the skin."""
-    from experiments.studies.measures import Subject
-    from experiments.studies.pages import publish_page
-    from skin.runs.build import build_device
-
-    if study.measure is None:
-        raise InputError(f"study={study.name} has nothing to measure: set study.rows=all or study.trainings")
-    config = validate_config(compose("train", [*as_overrides(study.test), *passed_overrides()]))
-    page = study.measure(Subject(config, build_device(config))).page
-    paths = publish_page(page, f"{study.name}: {study.about}", folder / f"study_{study.name}")
-    print(page.about, *paths, sep="\n")

@@ -57,7 +57,7 @@ def test_a_killed_command_goes_on_where_it_was(run, begin, tmp_path):
     done = run(tmp_path, "results", *PARTS, *SMALL)
     assert done.returncode == 0, done.stderr
     assert done.stdout.count("== [") == 3
-    assert "about 3.0 h left" in done.stdout
+    assert "at most 3.0 h left" in done.stdout
     small = "gestures=160 test_gestures=64 devices=0 layouts=0 safe_gestures=64"
     assert sorted(name for name, status in runs(tmp_path) if status == "FINISHED") == [
         shorten(f"rules naive {small}", f" seed {seed}") for seed in range(4)

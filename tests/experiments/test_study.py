@@ -68,7 +68,7 @@ def test_finished_runs_are_found_and_judged(run, folder):
         (["study=margin"], "margins"),
         (["study=graphs", "study.part=pooling"], "graph_pooling"),
         (["study=graphs", "study.seeds=[]"], "seeds"),
-        (["study=layouts", "study.statements.0.claim=fewer"], "study.statements[0].claim=fewer must be"),
+        (["study=layouts", "study.statements.0.maximum=few"], "study.statements[0].maximum=few"),
         (["study=graphs", "study.statements=[{id: a, says: b}]"], "study.statements[0]"),
     ],
 )
@@ -175,7 +175,7 @@ def test_verdicts_are_sorted_by_margins(run, trained):
     wrong, also = (sum(int(one["wrong"]) for one in each) for each in ways)
     assert wrong == also > 0
     assert f"of {wrong} errors of big" in said[0]
-    assert "## Alarm above 0." in path.with_suffix(".md").read_text()
+    assert "## alarm by threshold" in path.with_suffix(".md").read_text()
     with Image.open(path.with_suffix(".png")) as picture:
         assert picture.size[0] > 800
     joined, head = lines(trained / "margins" / "study_margins.csv"), list(lines(path)[0])

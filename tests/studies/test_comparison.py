@@ -3,17 +3,26 @@
 import math
 
 import numpy as np
+import pandas as pd
 import pytest
 from scipy.stats import ttest_rel
 
 from experiments.studies.comparison import (
-    Paired,
-    Uncertainty,
+    Estimate,
     combine_verdicts,
-    estimate,
-    judge_claim,
-    paired,
+    compare_samples,
+    judge,
+    together,
+    uncertainty,
 )
+from experiments.studies.study import Statement
+
+
+def paired(one, other, ratio=False, across=None, gestures=(None, None)):
+    """Compare figures by seed, as dictionaries."""
+    samples = [pd.Series(each, dtype=float) for each in (one, other)]
+    devices = across and tuple(pd.Series(each, dtype=float) for each in across)
+    return compare_samples(*samples, ratio, devices, gestures)
 
 
 def test_a_paired_difference_is_that_of_the_paired_t_test():
@@ -26,52 +35,45 @@ def test_a_paired_difference_is_that_of_the_paired_t_test():
 def test_only_common_seeds_count():
     found = paired({"0": 3.0, "1": 5.0, "7": 99.0}, {"1": 4.0, "0": 1.0, "8": 0.0})
     # differences 2 and 1: mean 1.5, deviation 1 / sqrt 2, by sqrt 2
-    assert found == Paired(1.5, pytest.approx(0.5), pytest.approx(12.7062 * 0.5), 2)
+    assert found == Estimate(1.5, pytest.approx(0.5), pytest.approx(12.7062 * 0.5), 2)
 
 
 def test_a_ratio_is_taken_seed_by_seed():
     found = paired({"0": 8.0, "1": 30.0}, {"0": 2.0, "1": 5.0}, ratio=True)
-    assert found == Paired(5.0, pytest.approx(1.0), pytest.approx(12.7062), 2)
+    assert found == Estimate(5.0, pytest.approx(1.0), pytest.approx(12.7062), 2)
 
 
 def test_one_seed_has_no_known_error_and_none_no_difference():
-    assert paired({"0": 2.0}, {"0": 1.0}) == Paired(1.0, math.inf, math.inf, 1)
+    assert paired({"0": 2.0}, {"0": 1.0}) == Estimate(1.0, math.inf, math.inf, 1)
     assert paired({"0": 2.0}, {"1": 1.0}) is None
 
 
 @pytest.mark.parametrize(
-    ("claim", "by", "mean", "error", "said"),
+    ("minimum", "maximum", "mean", "margin", "said"),
     [
-        ("greater", 0, 2.1, 1.0, "agree"),
-        ("greater", 0, 1.9, 1.0, "undecided"),
-        ("greater", 0, -1.9, 1.0, "undecided"),
-        ("greater", 0, -2.1, 1.0, "disagree"),
-        ("less", 0, -2.1, 1.0, "agree"),
-        ("less", 0, 2.1, 1.0, "disagree"),
-        ("alike", 2, 0.9, 0.5, "agree"),
-        ("alike", 2, 1.1, 0.5, "undecided"),
-        ("alike", 2, -3.1, 0.5, "disagree"),
-        ("no better", 1, -9.0, 1.0, "agree"),
-        ("no better", 1, 0.5, 0.2, "agree"),
-        ("no better", 1, 0.5, 0.3, "undecided"),
-        ("no better", 1, 1.5, 0.2, "disagree"),
-        ("at most", 0.5, 0.47, 0.01, "agree"),
-        ("at most", 0.5, 0.49, 0.01, "undecided"),
-        ("about", 3, 2.0, 0.2, "agree"),
-        ("about", 3, 7.0, 0.2, "disagree"),
-        ("ratio", 10, 12.0, 1.0, "agree"),
-        ("ratio", 10, 5.5, 0.5, "undecided"),
-        ("ratio", 10, 4.0, 0.2, "disagree"),
-        ("ratio", 10, 21.0, 0.2, "disagree"),
+        (0, math.inf, 2.1, 2.0, "agree"),
+        (0, math.inf, 1.9, 2.0, "undecided"),
+        (0, math.inf, -1.9, 2.0, "undecided"),
+        (0, math.inf, -2.1, 2.0, "disagree"),
+        (-math.inf, 0, -2.1, 2.0, "agree"),
+        (-math.inf, 0, 2.1, 2.0, "disagree"),
+        (-2, 2, 0.9, 1.0, "agree"),
+        (-2, 2, 1.1, 1.0, "undecided"),
+        (-2, 2, -3.1, 1.0, "disagree"),
+        (5, 20, 12.0, 2.0, "agree"),
+        (5, 20, 5.5, 1.0, "undecided"),
+        (5, 20, 4.0, 0.4, "disagree"),
     ],
 )
-def test_a_verdict_needs_the_margin_as_room(claim, by, mean, error, said):
-    assert judge_claim(claim, Paired(mean, error / 2, 2 * error, 3), by) == said
+def test_a_verdict_needs_the_margin_as_room(minimum, maximum, mean, margin, said):
+    statement = Statement("", "", {}, "", minimum=minimum, maximum=maximum)
+    assert judge(statement, Estimate(mean, margin / 2, margin, 3)) == said
 
 
 def test_two_seeds_decide_nothing():
-    assert judge_claim("greater", Paired(50.0, 0.1, 0.4, 2)) == "undecided"
-    assert judge_claim("greater", None) == "undecided"
+    statement = Statement("", "", {}, "", minimum=0)
+    assert judge(statement, Estimate(50.0, 0.1, 0.4, 2)) == "undecided"
+    assert judge(statement, None) == "undecided"
 
 
 @pytest.mark.parametrize(
@@ -99,11 +101,10 @@ def test_the_error_is_that_of_repeated_comparisons(ratio):
         ]
         one, other = sum(parts) + np.array([8.0, 20.0]).reshape(2, 1, 1, 1)
         seeds, devices = (
-            [dict(enumerate(map(float, each.mean(axis=axes)))) for each in (one, other)]
-            for axes in ((1, 2), (0, 2))
+            [pd.Series(each.mean(axis=axes)) for each in (one, other)] for axes in ((1, 2), (0, 2))
         )
         gestures = one.mean(axis=(0, 1)), other.mean(axis=(0, 1))
-        found = paired(*seeds, ratio, tuple(devices), gestures)
+        found = compare_samples(*seeds, ratio, tuple(devices), gestures)
         means.append(found.mean)
         errors.append(found.error)
     assert np.mean(means) == pytest.approx(0.4 if ratio else -12, abs=0.05)
@@ -117,9 +118,8 @@ def test_the_interval_of_three_seeds_covers_the_truth(seeds, touches):
     covered, narrow, count = 0, 0, 2000
     for _ in range(count):
         by_seed = seeds * random.standard_normal((3, 1)) + touches * random.standard_normal((1, 100))
-        mean, error, margin = estimate(
-            dict(enumerate(map(float, by_seed.mean(axis=1)))), {}, by_seed.mean(axis=0)
-        )
+        mean = by_seed.mean()
+        error, margin = together(uncertainty(by_seed.mean(axis=1)), uncertainty(by_seed.mean(axis=0)))
         covered += abs(mean) < margin
         narrow += abs(mean) < 2 * error
     assert 0.94 < covered / count < 0.99
@@ -130,7 +130,7 @@ def test_the_interval_of_three_seeds_covers_the_truth(seeds, touches):
 def test_a_variant_on_one_device_is_compared_with_one_on_several():
     seeds = {"0": 3.0, "1": 3.0}, {"0": 1.0, "1": 1.0}
     found = paired(*seeds, across=({"1": 2.0, "2": 3.0, "3": 4.0}, {"": 1.0}))
-    assert found == Paired(2.0, pytest.approx(3**-0.5), pytest.approx(4.30265 * 3**-0.5), 2)
+    assert found == Estimate(2.0, pytest.approx(3**-0.5), pytest.approx(4.30265 * 3**-0.5), 2)
 
 
 def test_gestures_that_are_not_the_same_are_not_paired():
@@ -150,7 +150,7 @@ def test_gestures_that_are_not_the_same_are_not_paired():
 )
 def test_the_margin_of_three_published_seeds_is_that_of_students_distribution(row, overall, gestures, margin):
     """The published rows: features had ± 0.28 points with two standard errors, sequence_image ± 1.0."""
-    found = estimate(dict(enumerate(overall)), {}, None)
-    assert found.margin == pytest.approx(4.30265 * found.error, rel=1e-5)
-    both = Uncertainty.together(Uncertainty(*found[1:]), Uncertainty(gestures, 1.9606 * gestures))
-    assert both.margin == pytest.approx(margin, abs=5e-5), row
+    found = uncertainty(overall)
+    assert found[1] == pytest.approx(4.30265 * found[0], rel=1e-5)
+    both = together(found, np.array([gestures, 1.9606 * gestures]))
+    assert both[1] == pytest.approx(margin, abs=5e-5), row

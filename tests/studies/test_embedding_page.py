@@ -1,35 +1,33 @@
 """The table, the verdicts and the figure say what was found."""
 
 import numpy as np
+import pandas as pd
 import pytest
 
-from experiments.studies.embeddings import (
-    FRAME,
-    ProbeResult,
-    Space,
-    embedding_statements,
-    embeddings_table,
-    planes,
-    spaces,
-)
+from experiments.studies.embeddings import FRAME, embedding_statements, embeddings_table, planes, spaces
 
 NAMES = ("big", "press")
 
 
 def found(attribute, name, seed, right, layout):
-    """Return a finding whose accuracies and explained shares are given."""
-    generator = np.random.default_rng(seed)
-    labels = np.tile([[0, 1], [1, 0]], (20, 1))
-    space = Space(generator.standard_normal((40, 5)), labels, 30, generator.standard_normal((40, 5)),
-                  np.arange(40) % 2, labels)  # fmt: skip
-    accuracy = {"big": right, "press": right - 0.1, "layout": 1.0}
-    return ProbeResult(attribute, name, seed, accuracy, {"layout": layout, "big": 0.2, "press": 0.1}, space)
+    """Return a row whose accuracies and explained fractions are given."""
+    points = np.random.default_rng(seed).standard_normal(40).tolist()
+    row = {"attribute": attribute, "name": name, "seed": seed, "chance": 0.5, "accuracy layout": 1.0}
+    row |= {"accuracy big": right, "accuracy press": right - 0.1, "variance layout": layout}
+    row |= {"variance big": 0.2, "variance press": 0.1, "plane": points, "mixed": points}
+    return row | {"classes": [0, 1, 1, 0] * 10, "layouts": [0, 1] * 10}
+
+
+def framed(rows):
+    frame = pd.DataFrame(rows)
+    frame.attrs["labels"] = list(NAMES)
+    return frame
 
 
 @pytest.fixture
 def three():
     """Three seeds of an embedding at chance that shows the layout, of one that does not, and of readings."""
-    return [
+    return framed(
         one
         for seed, noise in enumerate([-0.01, 0.0, 0.01])
         for one in (
@@ -37,11 +35,12 @@ def three():
             found("reading", "Graph2Vec", seed, 0.95 + noise, 0.1 + noise),
             found("", FRAME, seed, 0.95 - noise, 0.2),
         )
-    ]
+    )
 
 
 def test_the_table_has_means_and_deviations(three):
-    head, degree, *_ = embeddings_table(three, NAMES)
+    table = embeddings_table(three)
+    head, (degree, *_) = list(table.columns), table.to_numpy().tolist()
     assert head[:4] == ["input", "big", "press", "mean"]
     assert degree[0] == "Graph2Vec, degree"
     assert degree[1:4] == ["55.0 ± 1.0", "45.0 ± 1.0", "50.0 ± 1.0"]
@@ -49,22 +48,23 @@ def test_the_table_has_means_and_deviations(three):
 
 
 def test_verdicts_follow_the_figures(three):
-    words = [line.split("**")[1] for line in embedding_statements(three, NAMES)]
+    words = [line.split("**")[1] for line in embedding_statements(three)]
     # layout against the best label; against readings, 0 ± 5.0; against chance, 0 ± 2.5 and 45 ± 2.5
     assert words == ["agree", "agree", "undecided", "disagree", "undecided", "disagree"]
 
 
 def test_one_seed_decides_nothing(three):
-    assert all("**undecided**" in line for line in embedding_statements(three[:3], NAMES))
+    assert all("**undecided**" in line for line in embedding_statements(three[:3]))
 
 
 def test_without_layouts_morphology_is_undecided(three):
-    alone = [one._replace(explained={}, space=one.space._replace(mixed=None)) for one in three]
-    said = embedding_statements(alone, NAMES)
+    empty = dict.fromkeys(["accuracy layout", "variance layout", "variance big", "variance press"], np.nan)
+    alone = three.assign(**empty)
+    said = embedding_statements(alone)
     assert "**undecided**" in said[0]
     assert "one layout only" in said[0]
     assert "**agree**" in said[1]
-    assert embeddings_table(alone, NAMES)[1][-2:] == ["", ""]
+    assert embeddings_table(alone).to_numpy().tolist()[0][-2:] == ["", ""]
 
 
 def test_clusters_stay_apart_in_the_plane():
@@ -78,7 +78,7 @@ def test_clusters_stay_apart_in_the_plane():
 
 
 def test_the_figure_has_a_panel_per_label_and_layout(three):
-    figure = spaces(three[:2], NAMES, points=20)
+    figure = spaces(three[:2], NAMES)
     assert len(figure.axes) == 2 * 3
     assert figure.axes[2].get_title() == "layout"
     assert [len(group.get_offsets()) for group in figure.axes[0].collections] == [10, 10]

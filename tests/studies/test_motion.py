@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from experiments.studies.measures import Motion, Subject, distance_changes
+from experiments.studies.measures import Motion, distance_changes
+from experiments.studies.trials import Subject
 from skin.errors import InputError
 from skin.runs.build import build_device
 
@@ -19,8 +20,9 @@ def measure(configured, *settings: str):
 
 def test_the_largest_change_is_that_of_two_neighbours(configured):
     result = measure(configured, *FREE, "layout.columns=1")
-    assert 1e-6 < result.metrics["distance/quantile"] <= result.metrics["distance/largest"] < 0.1
-    assert f"{result.metrics['distance/largest']:.2%}" in result.page.about
+    (metrics,) = result.to_dict("records")
+    assert 1e-6 < metrics["distance/quantile"] <= metrics["distance/largest"] < 0.1
+    assert f"{metrics['distance/largest']:.2%}" in result.attrs["about"]
 
 
 def test_changes_are_those_of_sensors_moved_by_hand():

@@ -1,48 +1,42 @@
 """What a study found: figures by seed, comparisons, verdicts and differences."""
 
+import pandas as pd
 import pytest
 
-from experiments.studies.comparison import conclusions, differences, values
-from experiments.studies.study import Statement, Study, Variant
-from experiments.studies.trials import TrialResult
+from experiments.studies.comparison import conclude, differences, values
+from experiments.studies.study import Statement, Study
 
 ACCURACY = "same/overall/accuracy"
 
 
 def trials(pooling, *accuracies, seconds=1.0, condition="", device=""):
     """Return the trials of a variant whose runs, of seeds 0, 1, ..., have these accuracies."""
-    variant = Variant(f"pooling={pooling}", {"model.pooling": pooling, "experiment": "x"}, {})
-    return [
-        TrialResult(
-            variant,
-            str(seed),
-            condition,
-            device,
-            "id",
-            {ACCURACY: value, "train_accuracy": 0.9, "seconds_per_epoch": seconds + seed},
-        )
-        for seed, value in enumerate(accuracies)
-    ]
+    rows = []
+    for seed, value in enumerate(accuracies):
+        row = {"variant": f"pooling={pooling}", "chosen": {"model.pooling": pooling, "experiment": "x"}}
+        row |= {"seed": str(seed), "condition": condition, "device": device, "run": "id", "outcomes": None}
+        rows.append(row | {ACCURACY: value, "train_accuracy": 0.9, "seconds_per_epoch": seconds + seed})
+    return rows
 
 
-def said(claim, *others, metric=ACCURACY, **more):
+def said(*others, metric=ACCURACY, **more):
     fields = {"one": {"model.pooling": "max"}, "others": [{"model.pooling": other} for other in others]}
-    return Statement(id="x", section="3.2.2", says="x", metric=metric, claim=claim, **fields, **more)
+    return Statement(id="x", section="3.2.2", says="x", metric=metric, **fields, **more)
 
 
 def study(**settings):
     return Study(**{"name": "x", "about": "x", "seeds": [0], "metrics": [ACCURACY]} | settings)
 
 
-FOUND = [
+FOUND = pd.DataFrame([
     *trials("max", 0.80, 0.82, 0.81, seconds=20.0),
     *trials("mean", 0.70, 0.71, 0.72, seconds=2.0),
     *trials("attention", 0.80, 0.79, 0.83, seconds=2.0),
-]
+])  # fmt: skip
 
 
 def test_shares_are_compared_in_points():
-    (outcome,) = conclusions([said("greater", "mean")], FOUND)
+    outcome = conclude(said("mean", minimum=0), FOUND)
     (compared,) = outcome.compared.values()
     # differences 10, 11 and 9 points: deviation 1, by the root of 3
     assert (compared.mean, compared.error) == (pytest.approx(10.0), pytest.approx(3**-0.5))
@@ -50,33 +44,34 @@ def test_shares_are_compared_in_points():
 
 
 def test_a_statement_about_several_is_as_good_as_its_weakest():
-    (outcome,) = conclusions([said("greater", "mean", "attention")], FOUND)
+    outcome = conclude(said("mean", "attention", minimum=0), FOUND)
     assert (outcome.verdict, len(outcome.compared)) == ("undecided", 2)
 
 
 def test_costs_are_compared_as_they_are():
-    (outcome,) = conclusions([said("ratio", "mean", metric="seconds_per_epoch", by=10)], FOUND)
+    outcome = conclude(said("mean", metric="seconds_per_epoch", ratio=True), FOUND)
     (compared,) = outcome.compared.values()
     assert compared.mean == pytest.approx((20 / 2 + 21 / 3 + 22 / 4) / 3)
 
 
 def test_a_gap_is_a_difference_of_two_metrics():
     gap = values(FOUND[:3], f"train_accuracy - {ACCURACY}")
-    assert gap == {"0": pytest.approx(10), "1": pytest.approx(8), "2": pytest.approx(9)}
+    assert dict(gap) == {"0": pytest.approx(10), "1": pytest.approx(8), "2": pytest.approx(9)}
 
 
 def test_a_level_stands_for_the_other():
-    (outcome,) = conclusions([said("alike", level=0.5, by=2)], trials("max", 0.50, 0.505, 0.495))
+    alike = said(level=0.5, minimum=-2, maximum=2)
+    outcome = conclude(alike, pd.DataFrame(trials("max", 0.50, 0.505, 0.495)))
     (compared,) = outcome.compared.values()
     assert (compared.mean, outcome.verdict) == (pytest.approx(0.0), "agree")
-    (outcome,) = conclusions([said("alike", level=0.5, by=2)], FOUND)
+    outcome = conclude(alike, FOUND)
     assert outcome.verdict == "disagree"
 
 
 def test_what_did_not_finish_decides_nothing():
-    (outcome,) = conclusions([said("greater", "mean")], FOUND[:5])
+    outcome = conclude(said("mean", minimum=0), FOUND[:5])
     assert (next(iter(outcome.compared.values())).seeds, outcome.verdict) == (2, "undecided")
-    (outcome,) = conclusions([said("greater", "set2set")], FOUND)
+    outcome = conclude(said("set2set", minimum=0), FOUND)
     assert (outcome.compared, outcome.verdict) == ({"set2set": None}, "undecided")
 
 
@@ -85,8 +80,8 @@ def test_a_statement_may_be_about_a_condition():
         *trials("max", 0.8, 0.8, 0.8, condition="none"),
         *trials("max", 0.7, 0.7, 0.7, condition="5 dead"),
     ]
-    one = Statement("x", "x", {"condition": "5 dead"}, ACCURACY, "less", others=[{"condition": "none"}])
-    (outcome,) = conclusions([one], here)
+    one = Statement("x", "x", {"condition": "5 dead"}, ACCURACY, others=[{"condition": "none"}], maximum=0)
+    outcome = conclude(one, pd.DataFrame(here))
     assert (list(outcome.compared), outcome.verdict) == (["pooling=max, none"], "agree")
 
 
@@ -101,11 +96,11 @@ def test_conditions_are_compared_over_devices_of_several_trainings():
         ),
     ]
     (one,) = differences(
-        study(devices=3, conditions={"0 dead": {}, "1 dead": {}}, differences="greater"), found
+        study(devices=3, conditions={"0 dead": {}, "1 dead": {}}, differences="greater"), pd.DataFrame(found)
     )
-    assert (one.condition, one.verdict, one.compared.seeds) == ("1 dead", "worse", 3)
+    assert (one.condition, one.verdict, one.compared[""].seeds) == ("1 dead", "worse", 3)
     # losses 2, 3 and 4: mean 3, deviation 1, by the root of 3
-    assert (one.compared.mean, one.compared.error) == (pytest.approx(-3), pytest.approx(3**-0.5))
+    assert one.compared[""][:2] == (pytest.approx(-3), pytest.approx(3**-0.5))
 
 
 def test_variants_are_compared_with_the_first_one_where_there_are_no_conditions():

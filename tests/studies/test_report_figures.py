@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from experiments.studies.study_page import confusion_rows
+from experiments.studies.report_figures import confusion_rows
 from skin.evaluation.metrics import encode
 from skin.touch.labels import TOUCH
 
@@ -25,8 +25,7 @@ def test_the_two_kinds_of_errors_are_shares_of_safe_and_of_dangerous_gestures():
     dangerous = [0.0] * 8 + [1.0] * 4
     first = outcomes([1.0] * 4 + [0.0] * 4 + [1.0] * 4, dangerous)  # half of the safe ones
     second = outcomes([1.0] * 4 + [0.0] * 5 + [1.0] * 3, dangerous)  # and one of four dangerous ones
-    (head, row) = confusion_rows({"gru": np.array([first, second])})
-    found = dict(zip(head, row, strict=True))
+    (found,) = confusion_rows({"gru": np.array([first, second])}).to_dict("records")
     assert float(found["safe_called_dangerous"]) == 0.5
     assert float(found["dangerous_called_safe"]) == 0.125
     assert float(found["difference"]) == 0.375

@@ -2,7 +2,8 @@
 
 import pytest
 
-from experiments.studies.reproduce import every_study, judge, published_trials, reproduce_page
+from experiments.studies.comparison import conclude
+from experiments.studies.reproduce import every_study, published_trials, reproduce_page
 from experiments.studies.study import Statement
 from skin.core.files import ROOT
 
@@ -17,7 +18,7 @@ def test_every_statement_is_on_the_page():
     for command, study in dict(every_study()).values():
         if study.statements:
             assert f"`{command}`" in text
-            for statement in study.statements if published_trials(study.name) else ():
+            for statement in () if published_trials(study.name).empty else study.statements:
                 assert f"| {statement.says}" in text
 
 
@@ -25,11 +26,11 @@ def test_a_margin_over_gestures_counts():
     trials = published_trials("sensors")
     lines = {"one": {"name": "placed 16", "condition": "above a sensor"}}
     lines |= {"others": [{"name": "grid 25", "condition": "above a sensor"}]}
-    about = {"metric": "same/overall/accuracy", "claim": "greater"}
-    (narrow,) = judge(Statement("a", "b", **lines, **about), trials).compared.values()
-    about["by"] = narrow.mean + 1.01 * narrow.margin  # just beyond the margin over trainings
-    sure = judge(Statement("a", "b", **lines, **about), trials)
-    wide = judge(Statement("a", "b", **lines, **about, over_gestures=0.2), trials)
+    about = {"metric": "same/overall/accuracy"}
+    (narrow,) = conclude(Statement("a", "b", **lines, **about), trials).compared.values()
+    about["minimum"] = narrow.mean + 1.01 * narrow.margin  # just beyond the margin over trainings
+    sure = conclude(Statement("a", "b", **lines, **about), trials)
+    wide = conclude(Statement("a", "b", **lines, **about, over_gestures=0.2), trials)
     (margin,) = wide.compared.values()
     assert (sure.verdict, wide.verdict) == ("disagree", "undecided")
     assert margin.margin == pytest.approx((narrow.margin**2 + 0.2**2) ** 0.5)
@@ -37,6 +38,6 @@ def test_a_margin_over_gestures_counts():
 
 
 def test_devices_of_one_training_are_the_sample():
-    assert {trial.seed for trial in published_trials("dead")} == {"1", "2", "3", "4", "5"}
-    assert {trial.seed for trial in published_trials("layouts")} == {"0", "1", "2"}
-    assert published_trials("nothing") == []
+    assert {*published_trials("dead").seed} == {"1", "2", "3", "4", "5"}
+    assert {*published_trials("layouts").seed} == {"0", "1", "2"}
+    assert published_trials("nothing").empty

@@ -1,25 +1,24 @@
 """A study's tables say what was found, in files and on a narrow terminal."""
 
 import csv
-import io
 from dataclasses import replace
 
 import numpy as np
+import pandas as pd
 import pytest
 from PIL import Image
-from rich.console import Console
 
-from experiments.studies.comparison import Paired, StatementResult
-from experiments.studies.study import Statement, Study, Variant
+from experiments.studies.comparison import Comparison, Estimate
+from experiments.studies.pages import Page
+from experiments.studies.study import Statement, Study
 from experiments.studies.study_page import (
     comparison_text,
-    publish_files,
     publish_study,
+    publish_tables,
     read_reference,
     study_figure,
     variants_table,
 )
-from experiments.studies.trials import TrialResult
 from skin.errors import InputError
 
 LABELS = ("overall", "big", "dynamic", "press", "dangerous")
@@ -33,30 +32,38 @@ METRICS = [
 
 
 def trial(name, seed, accuracy, **more):
-    variant, metrics = Variant(name, {"weight": name}, {}), {}
+    metrics = {}
     if accuracy is not None:
         metrics = {f"same/{label}/accuracy": accuracy for label in LABELS}
         metrics |= {"same/dangerous/alarm_recall": 0.25, "same/dangerous/false_alarm_rate": 0.02}
         metrics |= {"seconds_per_epoch": 1.5, "parameters": 105621.0}
-    return TrialResult(
-        variant, seed, more.get("condition", ""), more.get("device", ""), "abc" if metrics else "", metrics
-    )
+    row = {"variant": name, "seed": seed, "chosen": {"weight": name}, "condition": "", "device": ""}
+    row |= {"row": "", "simulator": "", "cannot": (), "outcomes": None, "run": "abc" if metrics else ""}
+    return row | metrics | more
 
 
-FOUND = [
-    trial("weight=exp", "0", 0.8),
-    trial("weight=exp", "1", 0.9),
-    trial("weight=none", "0", None),
-    trial("weight=none", "1", 0.7),
-    trial("weight=stiffness", "0", None),
-]
-SAID = Statement("x", "one [sic] beats the other", {"weight": "weight=exp"}, METRICS[0], "greater", "3.2.2",
-                 [{"weight": "weight=none"}])  # fmt: skip
-STUDY = Study("edges", "edges", [0, 1], metrics=METRICS, statements=[SAID])
+FOUND = pd.DataFrame(
+    [
+        trial("weight=exp", "0", 0.8),
+        trial("weight=exp", "1", 0.9),
+        trial("weight=none", "0", None),
+        trial("weight=none", "1", 0.7),
+        trial("weight=stiffness", "0", None),
+    ]
+)
+SAID = Statement("x", "one [sic] beats the other", {"weight": "weight=exp"}, METRICS[0], "3.2.2",
+                 [{"weight": "weight=none"}], minimum=0)  # fmt: skip
+STUDY = Study("edges", "edges", [0, 1], rows="all", metrics=METRICS, statements=[SAID])
+
+
+def table(trials, *settings):
+    """Return the head and the lines of the table of variants."""
+    shown = variants_table(pd.DataFrame(trials), *settings)
+    return [list(shown.columns), *shown.to_numpy().tolist()]
 
 
 def test_a_line_per_variant_with_mean_and_margin():
-    head, first, second, third = variants_table(FOUND, METRICS)
+    head, first, second, third = table(FOUND, METRICS)
     # of 0.8 and 0.9: mean 0.85, standard error 0.05, and 12.71 of them with one degree of freedom
     assert dict(zip(head, first, strict=True)) | {"big": "", "dynamic": "", "press": "", "dangerous": ""} == {
         "variant": "weight=exp",
@@ -83,7 +90,7 @@ def under_conditions(name):
 
 
 def test_conditions_are_columns_of_the_first_metric():
-    assert variants_table([*under_conditions("a"), *under_conditions("b")], METRICS) == [
+    assert table([*under_conditions("a"), *under_conditions("b")], METRICS) == [
         ["variant", "none", "5 dead"],
         ["a", "85.0 ± 63.5", "85.0 ± 63.5"],
         ["b", "85.0 ± 63.5", "85.0 ± 63.5"],
@@ -91,7 +98,7 @@ def test_conditions_are_columns_of_the_first_metric():
 
 
 def test_conditions_of_a_single_variant_are_lines_of_all_metrics():
-    assert variants_table(under_conditions("a"), METRICS[:2]) == [
+    assert table(under_conditions("a"), METRICS[:2]) == [
         ["a", "overall", "big"],
         ["none", "85.0 ± 63.5", "85.0 ± 63.5"],
         ["5 dead", "85.0 ± 63.5", "85.0 ± 63.5"],
@@ -101,44 +108,42 @@ def test_conditions_of_a_single_variant_are_lines_of_all_metrics():
 @pytest.mark.parametrize(
     ("fields", "compared", "text"),
     [
-        ({}, {"a": Paired(12.345, 0.3, 1.356, 3)}, "+12.3 ± 1.4 points"),
+        ({}, {"a": Estimate(12.345, 0.3, 1.356, 3)}, "+12.3 ± 1.4 points"),
         (
             {},
-            {"a": Paired(-1.0, 0.5, 1.0, 3), "b": Paired(2.0, 0.5, 1.0, 3)},
+            {"a": Estimate(-1.0, 0.5, 1.0, 3), "b": Estimate(2.0, 0.5, 1.0, 3)},
             "-1.0 ± 1.0 points (a); +2.0 ± 1.0 points (b)",
         ),
-        ({}, {"a": Paired(1.0, float("inf"), float("inf"), 1)}, "+1.0 points"),
+        ({}, {"a": Estimate(1.0, float("inf"), float("inf"), 1)}, "+1.0 points"),
         ({}, {"a": None}, "no paired runs"),
         (
-            {"metric": "seconds_per_epoch", "claim": "less"},
-            {"a": Paired(-0.12, 0.01, 0.02, 3)},
+            {"metric": "seconds_per_epoch"},
+            {"a": Estimate(-0.12, 0.01, 0.02, 3)},
             "-0.12 ± 0.02 s",
         ),
         (
-            {"metric": "seconds_per_epoch", "claim": "ratio"},
-            {"a": Paired(4.44, 0.1, 0.2, 3)},
+            {"metric": "seconds_per_epoch", "ratio": True},
+            {"a": Estimate(4.44, 0.1, 0.2, 3)},
             "4.44 ± 0.20 times",
         ),
     ],
 )
 def test_what_was_measured_has_its_unit(fields, compared, text):
     said = Statement(**vars(SAID) | fields)
-    assert comparison_text(StatementResult(said, compared, "undecided")) == text
+    assert comparison_text(Comparison(compared, "undecided", said)) == text
 
 
-def test_files_and_terminal_say_the_same(tmp_path):
-    console = Console(width=40, file=io.StringIO())
-    publish_study(STUDY, "edges, little [data]", FOUND, tmp_path / "study_edges", console)
+def test_files_and_terminal_say_the_same(tmp_path, capsys):
+    publish_study(STUDY, "edges, little [data]", FOUND, tmp_path / "study_edges")
     page = (tmp_path / "study_edges.md").read_text()
     assert page.splitlines()[0] == "# edges, little [data]"
     assert "| 3.2.2 | one [sic] beats the other | +20.0 points | undecided |" in page
     assert len([line for line in page.splitlines() if line.startswith("| weight=")]) == 3
-    text = console.file.getvalue()
+    text = capsys.readouterr().out
     assert all(
         part in text
         for part in ("85.0 ± 63.5", "105621", "weight=stiffness (1 failed)", "[sic]", "undecided")
     )
-    assert "…" not in text  # a narrow terminal cuts no number short
     read = list(csv.DictReader((tmp_path / "study_edges.csv").read_text().splitlines()))
     assert [(line["variant"], line["seed"], line["same/overall/accuracy"]) for line in read] == [
         ("weight=exp", "0", "0.8"),
@@ -158,7 +163,7 @@ def test_an_axis_draws_lines_over_the_numbers_in_the_names(single):
     ]
     for name in ("other", "equation 10"):  # no number, and a single one
         found += [trial("any" if single else name, "0", 0.5, condition=name if single else "")]
-    (axis,) = study_figure(replace(STUDY, axis="number of sensors"), found).axes
+    (axis,) = study_figure(replace(STUDY, axis="number of sensors"), pd.DataFrame(found)).axes
     (line,) = axis.containers
     assert line[0].get_xdata().tolist() == [4, 9, 25]
     assert line[0].get_ydata().tolist() == pytest.approx([90, 95, 97])
@@ -168,7 +173,7 @@ def test_an_axis_draws_lines_over_the_numbers_in_the_names(single):
 def test_names_of_several_words_before_the_number_have_a_panel_for_each_beginning():
     names = ["long sheet grid", "long sheet placed", "arm grid", "arm placed"]
     found = [trial(f"{name} {n}", "0", 0.9 + n / 1000) for name in names for n in (9, 16)]
-    axes = study_figure(replace(STUDY, axis="number of sensors"), found).axes
+    axes = study_figure(replace(STUDY, axis="number of sensors"), pd.DataFrame(found)).axes
     assert [one.get_title() for one in axes] == ["long sheet", "arm"]
     for one in axes:
         assert [text.get_text() for text in one.get_legend().get_texts()] == ["grid", "placed"]
@@ -178,43 +183,51 @@ def test_names_of_several_words_before_the_number_have_a_panel_for_each_beginnin
 
 def test_several_variants_under_several_conditions_have_a_line_each_and_a_legend():
     found = [trial(name, "0", 0.9, condition=at) for name in ("one", "other") for at in ("", "rough")]
-    drawn = study_figure(STUDY, found)
+    drawn = study_figure(STUDY, pd.DataFrame(found))
     (axis,), (legend,) = drawn.axes, drawn.legends
     assert [text.get_text() for text in axis.get_yticklabels()] == ["one", "other"]
     assert [text.get_text() for text in legend.get_texts()] == ["no condition", "rough"]
 
 
-def test_files_of_several_runs_become_one(tmp_path, capsys):
-    trials = [
-        replace(
-            trial("a", str(n), None),
-            run=f"run{n}",
-            files={"a.md": b"", "a.csv": f'course,alarms\n"hold, 1 s",{n}\n'.encode()},
+def test_tables_of_several_runs_become_one(tmp_path, capsys):
+    tables = [
+        (
+            trial("a", str(n), None, run=f"run{n}"),
+            Page("", {}, pd.DataFrame([{"course": "hold, 1 s", "alarms": n}])),
         )
         for n in range(2)
     ]
-    path = tmp_path / "study_edges.csv"
-    publish_files(STUDY, trials[:1], path)
-    assert not path.exists(), "one file needs no other"
-    publish_files(STUDY, trials, path)
-    assert path.read_text().splitlines() == [
+    path = tmp_path / "study_edges"
+    publish_tables(STUDY, tables[:1], path)
+    assert not list(tmp_path.iterdir()), "one table needs no other"
+    assert publish_tables(STUDY, tables, path) == [path.with_suffix(".csv")]
+    assert path.with_suffix(".csv").read_text().splitlines() == [
         "variant,seed,run,course,alarms",
         'a,0,run0,"hold, 1 s",0',
         'a,1,run1,"hold, 1 s",1',
     ]
-    assert capsys.readouterr().out == f"{path}\n"
+    assert capsys.readouterr().out == f"{path}.csv\n"
+
+
+def test_a_study_without_runs_writes_the_rows_of_all_conditions(tmp_path, capsys):
+    study = replace(STUDY, rows=None)
+    pages = [Page("said", {}, pd.DataFrame([{"set": name, "value": n}])) for n, name in enumerate("ab")]
+    paths = publish_tables(study, [({"run": ""}, page) for page in pages], tmp_path / "edges")
+    assert [path.name for path in paths] == ["edges.md", "edges.csv"]
+    assert paths[1].read_text() == "set,value\na,0\nb,1\n"
+    assert "| b | 1 |" in paths[0].read_text()
+    assert capsys.readouterr().out.startswith("said\nsaid\n")
 
 
 def reported(name, accuracy, simulator="fem", **more):
-    chosen = {"row": name, "simulator": simulator}
-    return replace(trial(name, "0", accuracy), variant=Variant(name, chosen, {}), **more)
+    return trial(name, "0", accuracy, row=name, simulator=simulator, **more)
 
 
 def test_the_reports_number_stands_where_it_has_one():
     reference = {("temporal_graph", "fem", "overall"): 0.732}
     metrics = [*METRICS[:2], "unseen_layout/overall/accuracy", "device_shift/overall/accuracy"]
     runs = [reported("temporal_graph", 0.8, cannot=["unseen_layout"]), reported("gru", 0.9)]
-    assert variants_table(runs, metrics, reference)[1:] == [
+    assert table(runs, metrics, reference)[1:] == [
         ["temporal_graph", "80.0 (73.2)", "80.0", "cannot", ""],
         ["gru", "90.0", "90.0", "", ""],
     ]
@@ -224,12 +237,12 @@ def test_the_margin_is_also_one_over_gestures():
     """By hand: half of 100 gestures have one of four labels wrong."""
     codes = np.repeat(np.array([0, 1], dtype=np.uint8), 50)
     # a standard deviation of 0.125 sqrt(100 / 99) over gestures, by sqrt(100); 1.984 of them
-    assert variants_table([reported("rules", 0.875, outcomes=codes)], METRICS[:1])[1] == [
+    assert table([reported("rules", 0.875, outcomes=codes.tobytes())], METRICS[:1])[1] == [
         "rules",
         "87.5 ± 2.5",
     ]
     right = np.zeros(100, dtype=np.uint8)
-    assert variants_table([reported("rules", 1.0, outcomes=right)], METRICS[:1])[1] == [
+    assert table([reported("rules", 1.0, outcomes=right.tobytes())], METRICS[:1])[1] == [
         "rules",
         "100.0 ± 0.0",
     ]
@@ -239,7 +252,7 @@ def test_the_csv_has_the_reference_and_another_file_may_be_chosen(tmp_path):
     path = tmp_path / "report.csv"
     path.write_text("row,simulator,label,value\ngru,fem,overall,0.5\n")
     study = replace(STUDY, reference=str(path), statements=())
-    publish_study(study, "t", [reported("gru", 0.9), reported("rules", 0.8)], tmp_path / "s")
+    publish_study(study, "t", pd.DataFrame([reported("gru", 0.9), reported("rules", 0.8)]), tmp_path / "s")
     lines = list(csv.DictReader((tmp_path / "s.csv").read_text().splitlines()))
     assert [line["reference"] for line in lines] == ["0.5", ""]
     with pytest.raises(InputError, match=r"study\.reference=nowhere"):

@@ -1,18 +1,17 @@
 """Conditions of a study and their devices."""
 
 import time
-from dataclasses import replace
+from functools import partial
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
+import pandas as pd
 import pytest
 from hydra import compose, initialize_config_dir
 
 from experiments.studies import trials
-from experiments.studies.measures import Margins
-from experiments.studies.study import Study, Variant
-from experiments.studies.trials import RestoredRun, TrialResult, numbered_settings, read_row, votes, write_row
+from experiments.studies.measures import Accuracy, Margins
+from experiments.studies.study import Study
+from experiments.studies.trials import RestoredRun, Subject, numbered_settings, read_frame, votes, write_frame
 from skin.core.files import CONF
 from skin.errors import InputError
 from skin.runs.configuration import fingerprint
@@ -23,19 +22,10 @@ from skin.runs.store import Store
 pytestmark = pytest.mark.filterwarnings("ignore:The ``noload`` loader strategy")
 
 
-ROW = {
-    "run": "a" * 16,
-    "name": "rules",
-    "condition": "rough",
-    "device": "2",
-    "measure": "Accuracy()",
-    "source": {"source_commit": "0", "source_dirty": "false"},
-    "metrics": {"same/overall/accuracy": 0.5},
-    "line": "a line",
-    "cannot": "",
-    "outcomes": b"\x00\x01",
-    "files": {"a.csv": b"x\n1\n"},
-}
+def measured_frame():
+    frame = pd.DataFrame([{"same/overall/accuracy": 0.5, "outcomes": b"\x00\x01"}])
+    frame.attrs |= {"about": "a line", "metrics": {"a": float("nan")}, "source": {"source_commit": "0"}}
+    return frame
 
 
 def study(**settings):
@@ -54,6 +44,11 @@ def test_a_list_gives_each_device_its_value():
     ]
 
 
+def test_a_list_for_the_measure_is_one_setting():
+    condition = {"measure.recordings": ["a", "b"]}
+    assert list(numbered_settings(study(), condition)) == [("", condition)]
+
+
 def test_numbered_settings_are_the_number_of_the_device():
     found = list(numbered_settings(study(devices=2, numbered=["device.seed"]), {"device.dead": 1}))
     assert found == [("1", {"device.dead": 1, "device.seed": 1}), ("2", {"device.dead": 1, "device.seed": 2})]
@@ -70,12 +65,8 @@ def measured(configured, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     config = configured("experiment=rules", f"tracking.uri=sqlite:///{tmp_path}/m.db")
     store, count = Store.open(config.tracking), []
-
-    def measure(self, what, own, name):
-        count.append(name)
-        return ROW | {"run": self.run.data.tags["fingerprint"], "name": name}
-
-    monkeypatch.setattr(RestoredRun, "_measured", measure)
+    monkeypatch.setattr(trials, "build_device", lambda config: None)
+    monkeypatch.setattr(RestoredRun, "trained", None)
 
     def compose_row(name, words):
         with initialize_config_dir(str(CONF), version_base="1.3"):
@@ -91,8 +82,16 @@ def measured(configured, tmp_path, monkeypatch):
         own = RestoredRun(store, run, config)
         own.finished.__dict__["stored"] = config
 
+        class Counted(type(settings.get("measure", Accuracy()))):
+            def __call__(self, subject):
+                count.append(subject.condition)
+                return measured_frame()
+
+        measure = Counted(**vars(settings.get("measure", Accuracy())))
+
         def trial(line="device.dead=1"):
-            assert own.measure(study(**settings), "a, b", "1", [], [line])["metrics"] == ROW["metrics"]
+            frame, _ = own.measure("x", measure, partial(Subject, condition="a, b"), [], [line])
+            assert frame["same/overall/accuracy"].tolist() == [0.5]
             return len(count)
 
         return trial
@@ -104,8 +103,7 @@ def test_a_trial_is_measured_once_for_a_training(measured, tmp_path):
     trial = measured()
     assert [trial(), trial()] == [1, 1]
     assert [trial("device.dead=2"), trial("device.dead=2"), trial()] == [2, 2, 2]
-    table = pq.read_table(tmp_path / "results" / "trials" / "x").to_pylist()
-    assert [(row["condition"], row["device"]) for row in table] == [("a, b", "1")] * 2
+    assert len(pd.read_parquet(tmp_path / "results" / "trials" / "x")) == 2
     assert measured(measure=Margins(100))() == 3
 
 
@@ -123,39 +121,42 @@ def test_a_trial_of_an_earlier_training_is_not_reused(measured):
     assert [again(), again()] == [2, 2]
 
 
-def test_a_row_is_read_as_it_was_written_and_a_damaged_one_is_refused(tmp_path):
-    path = tmp_path / "new" / "a.parquet"
-    assert read_row(path) is None
-    write_row(ROW, path)
-    assert read_row(path) == ROW
+def test_a_frame_is_read_as_it_was_written_and_a_damaged_one_is_refused(tmp_path):
+    path, frame = tmp_path / "new" / "a.parquet", measured_frame()
+    assert read_frame(path) is None
+    write_frame(frame, path)
+    pd.testing.assert_frame_equal(read_frame(path), frame)
+    assert read_frame(path).attrs["about"] == "a line"
     assert [file.name for file in path.parent.iterdir()] == ["a.parquet"]
     content = bytearray(path.read_bytes())
     content[len(content) // 2] ^= 1
     path.write_bytes(content)
     with pytest.raises(InputError, match="remove it, and it is measured again"):
-        read_row(path)
-    pq.write_table(pa.table({"run": ["a"]}), path)
-    with pytest.raises(InputError, match="not one row of results"):
-        read_row(path)
+        read_frame(path)
+    pd.DataFrame({"run": ["a"]}).to_parquet(path)
+    with pytest.raises(InputError, match="it is no measurement"):
+        read_frame(path)
 
 
 def trial(model, seed, outcomes, **chosen):
-    codes = None if outcomes is None else np.array(outcomes, dtype=np.uint8)
-    return TrialResult(
-        Variant(model, {"experiment": model, **chosen}, {}), seed, "", "", f"run_{model}", {}, outcomes=codes
-    )
+    codes = None if outcomes is None else np.array(outcomes, dtype=np.uint8).tobytes()
+    row = {"variant": model, "seed": seed, "run": f"run_{model}", "outcomes": codes, "row": model}
+    return row | {"simulator": chosen.get("simulator", ""), "chosen": {"experiment": model, **chosen}}
 
 
 def test_models_vote_by_seed_and_by_equal_other_settings():
     """Of three gestures, the second is wrong in two of three models, the third in one."""
     found = [trial("a", "0", [0, 1, 0]), trial("b", "0", [0, 1, 1]), trial("c", "0", [0, 0, 0])]
     found += [trial("d", "0", [1, 1, 1]), trial("a", "1", [0, 0, 0]), trial("b", "1", None)]
-    (vote,) = votes(study(vote=["a", "b", "c"]), found)
-    assert (vote.variant.name, vote.seed, vote.run) == ("vote", "0", "run_a run_b run_c")
-    assert vote.metrics["same/big/accuracy"] == pytest.approx(2 / 3)
-    assert vote.metrics["same/dynamic/accuracy"] == 1
-    assert vote.metrics["same/any/disagreement"] == pytest.approx(2 / 3)
-    assert not list(votes(study(), found))
-    both = [replace(one, variant=replace(one.variant, chosen={**one.variant.chosen, "simulator": name}))
+    (vote,) = votes(study(vote=["a", "b", "c"]), pd.DataFrame(found))
+    assert (vote["variant"], vote["seed"], vote["run"]) == ("vote", "0", "run_a run_b run_c")
+    assert vote["same/big/accuracy"] == pytest.approx(2 / 3)
+    assert vote["same/dynamic/accuracy"] == 1
+    assert vote["same/any/disagreement"] == pytest.approx(2 / 3)
+    assert not list(votes(study(), pd.DataFrame(found)))
+    both = [trial(one["row"], "0", [*one["outcomes"]], simulator=name)
             for name in ("naive", "fem") for one in found[:3]]  # fmt: skip
-    assert [one.variant.name for one in votes(study(vote="all"), both)] == ["naive vote", "fem vote"]
+    assert {one["variant"] for one in votes(study(vote="all"), pd.DataFrame(both))} == {
+        "naive vote",
+        "fem vote",
+    }

@@ -1,6 +1,6 @@
 """Check that a job array loses no run, although processes are killed.
 
-    python -m experiments.cluster_checks FOLDER http://127.0.0.1:5000
+    python -m tests.cluster.array_check FOLDER http://127.0.0.1:5000
 
 Trains 60 short runs on this machine, then as an array of 8 tasks on the server, of which two are killed with
 -9; submits the array again, and compares the tables. Uses SLURM where ``SLURM_CONF`` names a cluster

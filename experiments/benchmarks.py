@@ -41,8 +41,8 @@ from skin.learning.data import TouchData
 from skin.learning.network import Network
 from skin.runs.build import build_data, build_device, build_learner
 from skin.runs.configuration import Config, validate_config
-from skin.runs.model_of_run import RunModel
-from skin.runs.trained_model import TrainedModel
+from skin.runs.model import Model
+from skin.runs.torch_model import TorchModel
 
 Figures = dict[str, float]
 Benchmark = tuple[str, tuple[object, ...]]
@@ -224,7 +224,7 @@ def measure_latency(row: str, frames: int) -> dict[str, float]:
 
 def measure_onnx_latency(row: str, frames: int) -> dict[str, float]:
     """Return the times of :func:`measure_latency` for the exported row, without torch in the engine."""
-    from skin.runs.exported_model import ExportedModel
+    from skin.runs.model import OnnxModel
     from skin.runs.onnx_writer import write_model
 
     torch.set_num_threads(1)
@@ -232,10 +232,10 @@ def measure_onnx_latency(row: str, frames: int) -> dict[str, float]:
     with TemporaryDirectory() as folder:
         path = Path(folder) / "model.onnx"
         write_model(model.learner.pipeline(model.places), model.describe(), data.touches("train"), path)
-        return _time_verdicts(device, ExportedModel(path), frames)
+        return _time_verdicts(device, OnnxModel(path), frames)
 
 
-def _untrained(row: str) -> tuple[AbstractSimulated, RunModel, TouchData]:
+def _untrained(row: str) -> tuple[AbstractSimulated, TorchModel, TouchData]:
     """Return the device of a row, its network with random weights, and a few touches."""
     config = training_config(
         *_SETTINGS.get(row, ("simulator=naive",)), f"experiment={row}", "data.gestures=100"
@@ -245,10 +245,10 @@ def _untrained(row: str) -> tuple[AbstractSimulated, RunModel, TouchData]:
     assert isinstance(learner, Network)
     data = build_data(config, device)
     learner.build(data)
-    return device, RunModel(device, learner, data.example, touch=_TOUCH), data
+    return device, TorchModel(device, learner, data.example, touch=_TOUCH), data
 
 
-def _time_verdicts(device: AbstractSimulated, model: TrainedModel, frames: int) -> dict[str, float]:
+def _time_verdicts(device: AbstractSimulated, model: Model, frames: int) -> dict[str, float]:
     """Return the times of :func:`measure_latency` for a model on a stream of a device."""
     engine = Engine(
         model.probabilities, model.task, len(model.positions), model.window, model.rate, Detection(_TOUCH)

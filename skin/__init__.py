@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from skin.mechanics.simulator.fem import PlatesAndBeams as PlatesAndBeams
     from skin.mechanics.simulator.solid import Solid as Solid
     from skin.runs.build import training_data as data
-    from skin.runs.model_of_run import load_run as load_run
+    from skin.runs.torch_model import load_run as load_run
 
 __version__ = "0.2.0"
 __all__ = ["Arm", "Grid", "InputError", "LayoutFile", "PlatesAndBeams", "Sheet", "Solid"]
@@ -38,7 +38,7 @@ _PLACES = {
     "Sheet": "skin.body.base",
     "Solid": "skin.mechanics.simulator.solid",
     "data": "skin.runs.build:training_data",
-    "load_run": "skin.runs.model_of_run",
+    "load_run": "skin.runs.torch_model",
     "open_skin": "skin.hardware.wire.skin",
     "read_recording": "skin.device.files",
 }

@@ -18,9 +18,8 @@ from scipy.ndimage import gaussian_filter
 
 from experiments.studies.pages import Page
 from skin.device.simulated import Simulated
+from skin.evaluation.alarm import AlarmSource, choose_alarm_threshold
 from skin.evaluation.metrics import compute_metrics
-from skin.evaluation.operating_point import choose_operating_point
-from skin.evaluation.settings import check_evaluation
 from skin.hardware.bench import BenchSession
 from skin.hardware.bench_protocol import Protocol
 from skin.hardware.known_loads import KnownLoad, emulate_placements, fit_known_load
@@ -157,7 +156,8 @@ class KnownLoadAlarms:
         quiet: dict[str, Any] = {"noise": 0.05, "tare": True}
         nominal = make_skin(subject, gain_spread=0.02, **quiet)
         model, rows = subject.load("any_skin"), []
-        point = choose_operating_point(model.learner, nominal, check_evaluation(model.config.evaluation))
+        source = AlarmSource("any_skin", model.config.evaluation, model.learner, device=nominal)
+        point = choose_alarm_threshold(source, anew=True)
         for seed in range(self.devices):
             device = make_skin(subject, seed, test_gestures=self.touches, **quiet)
             measured, true = device.touches("test"), device.constants.gain

@@ -4,7 +4,7 @@ They import heavy packages when called, so that errors in their settings are rep
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -126,7 +126,9 @@ class Holds:
         from skin.hardware.live.engine import DebounceSettings
 
         model = subject.reloaded
-        engine = engine_builder.engine_settings(model, DebounceSettings(), self.touch, self.drift).build()
+        engine = engine_builder.engine_settings(
+            model, DebounceSettings(above=model.threshold), self.touch, self.drift
+        ).build()
         device = model.device.simulated("held touches are simulated").replace(stream=False)
         frame = time_courses(engine, device, self.gestures, self.rate, partial(track, transient=True))
         lines = (", ".join(f"{name} {value}" for name, value in row.items() if value)
@@ -153,32 +155,28 @@ class TouchAlarms:
         import pandas as pd
 
         from skin.core.rng import Stream, generator
-        from skin.evaluation.operating_point import (
-            LABEL,
-            SAFE_TOUCHES,
-            Reached,
-            choose_for_touches,
-            choose_operating_point,
-            touch_scores,
-        )
+        from skin.evaluation.alarm import SAFE_TOUCHES, AlarmSource, choose_alarm_threshold
+        from skin.evaluation.operating_point import LABEL, Reached
+        from skin.evaluation.touch_scores import touch_scores
         from skin.hardware.live.engine import DebounceSettings
         from skin.touch.labels import TOUCH
 
         trained, settings = subject.trained, check_evaluation(subject.config.evaluation)
         device = subject.device.simulated("touches are simulated")
         rate = float(np.ravel(device.rate)[0])
-        watching, at_once = (
-            trained.watching(rate, patience, rate <= device.model_rate)
-            for patience in (DebounceSettings().alarm, 0.0)
-        )
-        touch = choose_for_touches(subject.learner, device, watching, settings.false_alarm_rate)
-        window = choose_operating_point(subject.learner, device, settings)
+        aligned = rate <= device.model_rate
+        live = trained.live_conditions(rate, DebounceSettings().alarm, aligned)
+        at_once = replace(live, patience=0.0)
+        source = AlarmSource("this run", settings, subject.learner, device=device)
+        touch = choose_alarm_threshold(source, live, anew=True)
+        window = choose_alarm_threshold(source, anew=True)
+        assert touch is not None
         assert window is not None  # it has the label
         labels = device.sampler.balanced(2 * max(self.safe, self.dangerous), generator(Stream.TEST, 7))
         danger = labels[:, TOUCH.names.index(LABEL)]
         counted = np.concatenate([labels[~danger][: self.safe], labels[danger][: self.dangerous]])
         few = min(self.safe, SAFE_TOUCHES)
-        alarms = touch.alarm(touch_scores(subject.learner, device, watching, counted, _COUNTED))
+        alarms = touch.alarm(touch_scores(subject.learner, device, live, counted, _COUNTED))
         single = touch_scores(subject.learner, device, at_once, counted[:few], _COUNTED)
         tests = device.touches("test")
         raised, false = int(alarms[self.safe :].sum()), int(alarms[: self.safe].sum())

@@ -72,23 +72,22 @@ class PublishedResults:
 
 
 @command("results")
-def main(config: Config) -> None:
+def main(config: Config, results: dict[str, Any], out: str | None) -> None:
     """Publish; exit code 1 if a command failed."""
-    settings = config.results
-    chosen = configured(PublishedResults, settings, "results")
+    chosen = configured(PublishedResults, results, "results")
 
     from skin.core.messages import quiet
 
     quiet()
-    sys.exit(_publish(chosen, config))
+    sys.exit(_publish(chosen, out))
 
 
-def _publish(chosen: PublishedResults, config: Config) -> int:
+def _publish(chosen: PublishedResults, out: str | None) -> int:
     """Run the commands of a part; return 1 if one failed."""
     from experiments.studies.trials import run_command
     from skin import __main__ as cli
 
-    failed, lines = [], list(_lines(chosen, config))
+    failed, lines = [], list(_lines(chosen, out))
     for number, (_, line) in enumerate(lines):
         left = sum(each for each, _ in lines[number:])
         estimate = f", at most {left:.1f} h left" if chosen.budget == "full" else ""
@@ -104,12 +103,12 @@ def _publish(chosen: PublishedResults, config: Config) -> int:
     return int(bool(failed))
 
 
-def _lines(chosen: PublishedResults, config: Config) -> Iterator[tuple[float, list[str]]]:
+def _lines(chosen: PublishedResults, out: str | None) -> Iterator[tuple[float, list[str]]]:
     """Yield hours, and verb and overrides, of each command; the overrides of the command line last."""
     smoke, jobs = chosen.budget == "smoke", chosen.jobs
     passed = [word for word in overrides() if word.split("=")[0].split(".")[0] not in ("results", "out")]
     # Smoke budgets are published in a folder in it.
-    folder = results(config.out or ("results" if smoke else "docs/results"))
+    folder = results(out or ("results" if smoke else "docs/results"))
     fresh = [f"tracking.{name}={value}" for name, value in _FRESH.items() if chosen.fresh]
     parallel = {
         "train": ["hydra/launcher=joblib", f"hydra.launcher.n_jobs={jobs}"],

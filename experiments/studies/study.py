@@ -117,7 +117,7 @@ class Study:
         return bool(self.trainings) or self.rows is not None or self.run is not None
 
 
-def chosen_studies(config: Config) -> list[Study]:
+def chosen_studies(settings: dict[str, Any]) -> list[Study]:
     """Return the comparisons that a configuration of ``skin study`` chooses: its study, or parts of it.
 
     A part has the settings of the study, then its own, then those of the command line.
@@ -129,7 +129,7 @@ def chosen_studies(config: Config) -> list[Study]:
     if not option:
         options = ", ".join(sorted(path.stem for path in (CONF / "study").glob("*.yaml")))
         raise InputError(f"which study? choose one of {options}, as in study=graphs")
-    settings = dict(config.study)
+    settings = dict(settings)
     parts, part = settings.pop("parts"), settings.pop("part")
     names = [*parts] if part is None else [part] if isinstance(part, str) else part
     if unknown := [name for name in names if name not in parts]:
@@ -272,15 +272,15 @@ def _key(override: str) -> str:
 
 
 @command("study")
-def main(config: Config) -> None:
+def main(config: Config, study: dict[str, Any], smoke: bool, out: str | None) -> None:
     """Train or find the runs of a study, measure them, and write and print the results."""
-    studies = chosen_studies(config)
-    folder = results(config.out) / ("smoke" if config.smoke else "")
+    folder = results(out) / ("smoke" if smoke else "")
+    studies = chosen_studies(study)
 
     from experiments.studies.trials import run_study
     from skin.core.messages import quiet
 
     quiet()
-    complete = [run_study(study, config, folder) for study in studies]
+    complete = [run_study(chosen, config, folder, smoke) for chosen in studies]
     if not all(complete):
         sys.exit(1)

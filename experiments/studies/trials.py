@@ -56,16 +56,17 @@ from skin.core.files import whole
 from skin.core.messages import PARENT
 from skin.device.base import AbstractDevice
 from skin.errors import InputError
+from skin.evaluation.alarm import choose_alarm_threshold
 from skin.evaluation.metrics import OUTCOMES, decode, disagreement, vote
 from skin.evaluation.operating_point import OperatingPoint
 from skin.evaluation.settings import check_evaluation
 from skin.learning.learner import AbstractLearner
 from skin.runs.build import build_device
 from skin.runs.configuration import Config, fingerprint, source_tags, validate_config
-from skin.runs.finished_run import TAG, FinishedRun, find_run
-from skin.runs.model_of_run import RunModel, alarm_point, load_model, load_run
+from skin.runs.run import TAG, FinishedRun, find_run
 from skin.runs.store import Store, note_reuse, note_source
 from skin.runs.sweep import LEFT_OUT, Shard
+from skin.runs.torch_model import TorchModel, alarm_source, load_model, load_run
 from skin.runs.train import simulator
 from skin.touch.labels import TOUCH
 
@@ -111,12 +112,12 @@ class Subject:
     config: Config
     device: AbstractDevice
     run: Run | None = None
-    model: RunModel | None = None
+    model: TorchModel | None = None
     condition: str = ""
     changes: Sequence[str] = ()
 
     @property
-    def trained(self) -> RunModel:
+    def trained(self) -> TorchModel:
         """What the run learned.
 
         Raises:
@@ -132,7 +133,7 @@ class Subject:
         return self.trained.learner
 
     @property
-    def reloaded(self) -> RunModel:
+    def reloaded(self) -> TorchModel:
         """What the run learned, with the device of the condition."""
         assert self.trained.run is not None
         return load_model(self.trained.run, self.config)
@@ -146,7 +147,9 @@ class Subject:
     def point(self) -> OperatingPoint:
         """Return where the run raises the alarm on this device."""
         run = self.trained.run
-        point = self.trained.point if run is None else alarm_point(run, self.learner, self.config)
+        point = self.trained.point
+        if run is not None:
+            point = choose_alarm_threshold(alarm_source(run, self.learner, self.config))
         return point or OperatingPoint.default(check_evaluation(self.config.evaluation).false_alarm_rate)
 
 
@@ -157,10 +160,10 @@ class StudyMeasure(Protocol):
         """Measure; InputError where the device or the learner cannot be measured so."""
 
 
-def run_study(study: Study, config: Config, folder: Path) -> bool:
+def run_study(study: Study, config: Config, folder: Path, smoke: bool) -> bool:
     """Measure the runs of a study, publish the results, and return whether all runs have finished."""
     shard = Shard.parse(config.shard) if config.shard is not None else None
-    store, planned = plan_runs(study, config, shard)
+    store, planned = plan_runs(study, config, shard, smoke)
     trials, tables = list[dict[str, Any]](), list[tuple[dict[str, Any], Page]]()
     console = Console(stderr=True)
     runs = track(planned, "measuring", console=console, transient=True, disable=not console.is_terminal)
@@ -179,9 +182,9 @@ def run_study(study: Study, config: Config, folder: Path) -> bool:
     path = folder / (f"study_{study.name}" if store else study.name)
     if study.metrics and store:
         words = [word for word in passed_overrides() if not word.startswith("tracking.")]
-        small = study.small if config.smoke else ()
-        smoke = "SMOKE, one epoch on little data, ignore the scores: " * bool(config.smoke)
-        title = smoke + ", ".join([f"{study.name}: {study.about}", *small, *words])
+        small = study.small if smoke else ()
+        warning = "SMOKE, one epoch on little data, ignore the scores: " * smoke
+        title = warning + ", ".join([f"{study.name}: {study.about}", *small, *words])
         paths = publish_study(study, title, frame, path)
     else:
         paths = publish_tables(study, tables, path)
@@ -193,7 +196,9 @@ def run_study(study: Study, config: Config, folder: Path) -> bool:
     return not store or all(run.run for run in planned)
 
 
-def plan_runs(study: Study, config: Config, shard: Shard | None) -> tuple[Store | None, list[Planned]]:
+def plan_runs(
+    study: Study, config: Config, shard: Shard | None, smoke: bool
+) -> tuple[Store | None, list[Planned]]:
     """Return the store and the runs of a study, or of a shard of it; those to train are trained.
 
     A study without runs has no store, and one entry.
@@ -202,7 +207,7 @@ def plan_runs(study: Study, config: Config, shard: Shard | None) -> tuple[Store 
         InputError: there is nothing to measure, or to divide.
     """
     if study.trainings:
-        return _train(study, shard, bool(config.smoke))
+        return _train(study, shard, smoke)
     if not study.has_runs:
         if shard:
             raise InputError(f"study={study.name} has no runs to divide: leave out shard={config.shard}")
@@ -443,7 +448,7 @@ class RestoredRun:
         )
 
     @cached_property
-    def trained(self) -> RunModel | None:
+    def trained(self) -> TorchModel | None:
         """What it learned."""
         return load_model(self.finished) if self.finished else None
 
@@ -456,8 +461,11 @@ class RestoredRun:
         line: Sequence[str],
     ) -> tuple[pd.DataFrame, str]:
         """Return the frame of a measure on the device that overrides describe, and a name for its files."""
-        composed = compose("train", [*base, *line])
-        config = self.finished.configured(composed, line) if self.finished else validate_config(composed)
+        if self.finished:
+            general = [word for word in base if word.startswith(("hydra", "tracking"))]
+            config = self.finished.configured([*general, *line])
+        else:
+            config = validate_config(compose("train", [*base, *line]))
         depends: list[Any] = [repr(measure), fingerprint(config)]
         identity, name = "skin", study
         if self.run is not None:

@@ -36,8 +36,8 @@ from skin.runs.configuration import (
     check_server,
     hide_password,
     overrides,
-    refuse_null_groups,
     validate_config,
+    verb_settings,
 )
 from skin.runs.sweep import left_out
 
@@ -134,11 +134,12 @@ def _settings(part: Any, above: str) -> Iterator[str]:
 _GROUPS = ("body", "layout", "touch", "device", "contact")
 
 
-def check_quickly(config: Config, overrides: Sequence[str]) -> None:
+def check_quickly(config: Config, run: str | None, overrides: Sequence[str]) -> None:
     """Refuse settings of a skin that no skin has, and a port that does not exist.
 
     Args:
         config: of a command; groups that it lacks are not checked.
+        run: that the command uses; None: none.
         overrides: of its command line. The groups that they name are checked further, which imports torch.
 
     Raises:
@@ -157,7 +158,7 @@ def check_quickly(config: Config, overrides: Sequence[str]) -> None:
         PortSettings.select({name: value for name, value in device.items() if value is not None})
         check_port(port)
     named = {override.split("=")[0].split(".")[0] for override in overrides}
-    if config.run is not None and not config.run.endswith(".onnx"):
+    if run is not None and not run.endswith(".onnx"):
         check_groups({name: groups[name] for name in ("device", "contact") if name in groups.keys() & named})
         if "touch" in named:
             from skin.touch.fingertips import read_touch
@@ -180,8 +181,10 @@ _WORDS = (
 )
 
 
-def command(name: str = "train") -> Callable[[Callable[[Config], Any]], Callable[..., None]]:
-    """Return a decorator that turns a function of a checked configuration into a command.
+def command(name: str = "train") -> Callable[[Callable[..., Any]], Callable[..., None]]:
+    """Return a decorator that turns a function into a command.
+
+    The function gets a checked configuration, and the settings of the command as annotated parameters.
 
     Bad input ends the command with a message and exit code 2. In a multirun the job fails and the others
     continue. The command takes a list of arguments; None: those of the process.
@@ -190,7 +193,7 @@ def command(name: str = "train") -> Callable[[Callable[[Config], Any]], Callable
         name: the primary configuration, a file in ``conf/``.
     """
 
-    def decorate(task: Callable[[Config], Any]) -> Callable[..., None]:
+    def decorate(task: Callable[..., Any]) -> Callable[..., None]:
         started = []
 
         @wraps(task)
@@ -199,11 +202,10 @@ def command(name: str = "train") -> Callable[[Callable[[Config], Any]], Callable
             if HydraConfig.get().mode == RunMode.MULTIRUN and left_out():
                 return None
             try:
-                refuse_null_groups(config)
-                checked = validate_config(config)
+                own, checked = verb_settings(config, task), validate_config(config)
                 check_server(checked.tracking.uri)
-                check_quickly(checked, overrides())
-                return task(checked)
+                check_quickly(checked, own.get("run"), overrides())
+                return task(checked, **own)
             except Exception as error:
                 refused = to_input_error(error)
                 if refused is None:

@@ -12,10 +12,10 @@ from skin.runs.configuration import Config, overrides
 
 
 @command("adapt")
-def main(config: Config) -> None:
+def main(config: Config, run: str) -> None:
     """Fine-tune a run, log the result, and print the figures before and after."""
     from skin.core.messages import quiet
     from skin.runs.adaptation import adapt
 
     quiet()
-    adapt(config, overrides())
+    adapt(config, run, overrides())

@@ -12,11 +12,18 @@ from skin.runs.configuration import Config
 
 
 @command("animate")
-def main(config: Config) -> None:
+def main(
+    config: Config,
+    out: str | None,
+    view: str,
+    labels: list[str] | None,
+    shape: str | None,
+    index: int | None,
+) -> None:
     """Write a GIF or PNG of a simulated or recorded touch."""
-    if config.out is None or not config.out.endswith((".gif", ".png")):
+    if out is None or not out.endswith((".gif", ".png")):
         raise InputError(
-            f"an animation is a .gif file, a still a .png file, got out={config.out}: add out=touch.gif"
+            f"an animation is a .gif file, a still a .png file, got out={out}: add out=touch.gif"
         )
 
     from pathlib import Path
@@ -26,10 +33,10 @@ def main(config: Config) -> None:
 
     device = build_device(config)
     if device.simulation is None:
-        scene = read_scene(device, config.index or 0)
+        scene = read_scene(device, index or 0)
     else:
-        field = config.view == "skin3d"
-        scene = simulate_scene(device.simulation, config.labels, config.shape, config.seed, field)
-    path = Path(config.out).expanduser()
-    path = (still if path.suffix == ".png" else write_animation)(scene, str(config.view), path)
+        field = view == "skin3d"
+        scene = simulate_scene(device.simulation, labels, shape, config.seed, field)
+    path = Path(out).expanduser()
+    path = (still if path.suffix == ".png" else write_animation)(scene, str(view), path)
     print(f"{path}: {scene.title}, {len(scene.readings)} frames at {scene.rate:g} Hz")

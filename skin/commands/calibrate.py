@@ -12,6 +12,7 @@ calibrate.demo=true first writes the session of an emulated device: no hardware 
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from skin.commands._command import command
 from skin.errors import InputError
@@ -22,21 +23,33 @@ _CONFIRMED = ("places", "channels", "broken")
 
 
 @command("calibrate")
-def main(config: Config) -> None:
+def main(
+    config: Config,
+    session: str | None,
+    presses: str | None,
+    weight: float | None,
+    base: float | None,
+    out: str,
+    calibrate: dict[str, Any],
+) -> None:
     """Print the errors on held-out presses, or what a known load gives, and write the calibration."""
-    if config.session is None:
+    if session is None:
         raise InputError("which session? add session=bench.csv, or try session=demo.csv calibrate.demo=true")
-    files = [config.presses, None if config.calibrate["demo"] else config.session]
+    files = [presses, None if calibrate["demo"] else session]
     if missing := [name for name in files if name and not Path(name).expanduser().is_file()]:
         raise InputError(f"no file {missing[0]}: calibrate.demo=true makes a session without hardware")
 
-    if config.weight is not None or config.base is not None:
-        _calibrate_by_load(config, config.session)
+    if weight is not None or base is not None:
+        if presses is not None:
+            raise InputError("a known load replaces the gauge: leave out presses=, or weight= and base=")
+        _calibrate_by_load(config, calibrate, weight, base, session, out)
     else:
-        _calibrate_by_gauge(config, config.session)
+        _calibrate_by_gauge(config, calibrate, presses, session, out)
 
 
-def _calibrate_by_load(config: Config, path: str) -> None:
+def _calibrate_by_load(
+    config: Config, settings: dict[str, Any], weight: float | None, base: float | None, path: str, out: str
+) -> None:
     """Calibrate from placements of a weight."""
     from skin.core.settings import configured
     from skin.device.calibration import write_calibration
@@ -45,12 +58,9 @@ def _calibrate_by_load(config: Config, path: str) -> None:
     from skin.hardware.wiring import Confirmed, device_channels
     from skin.runs.build import build_device
 
-    if config.presses is not None:
-        raise InputError("a known load replaces the gauge: leave out presses=, or weight= and base=")
-    settings = config.calibrate
     confirmed = configured(Confirmed, {name: settings[name] for name in _CONFIRMED}, "calibrate")
     device = build_device(config).simulated("a calibration fits the simulation to a skin")
-    load = KnownLoad.of(config.weight, config.base, device.size)
+    load = KnownLoad.of(weight, base, device.size)
     if settings["demo"]:
         session = emulate_known_load(device, load, settings)
         print(f"{write_bench_session(session, path)}: {session.time[-1]:.0f} s")
@@ -61,10 +71,12 @@ def _calibrate_by_load(config: Config, path: str) -> None:
     print_known_load(result)
     about = dict(result.calibration.about) | {"session": path}
     calibration = replace(result.calibration, about=about, channels=device_channels(session, confirmed))
-    print(write_calibration(calibration, str(config.out)))
+    print(write_calibration(calibration, out))
 
 
-def _calibrate_by_gauge(config: Config, path: str) -> None:
+def _calibrate_by_gauge(
+    config: Config, settings: dict[str, Any], presses: str | None, path: str, out: str
+) -> None:
     """Calibrate from presses of a force gauge."""
     from rich.console import Console
 
@@ -82,7 +94,6 @@ def _calibrate_by_gauge(config: Config, path: str) -> None:
     from skin.hardware.wiring import Confirmed, check_usable, device_channels, wired_bench
     from skin.runs.build import build_device
 
-    settings = config.calibrate
     confirmed = configured(Confirmed, {name: settings[name] for name in _CONFIRMED}, "calibrate")
     device = build_device(config).simulated("a calibration fits the simulation to a skin")
     if settings["demo"]:
@@ -90,7 +101,7 @@ def _calibrate_by_gauge(config: Config, path: str) -> None:
     shape = settings["indenter"], settings["radius"]
     units = configured(Units, {name: settings[name] for name in _UNITS}, "calibrate")
     session = read_bench_session(path, *shape, settings["unit"], units)
-    rows = None if config.presses is None else read_gauge(config.presses, *shape, settings["delay"], units)
+    rows = None if presses is None else read_gauge(presses, *shape, settings["delay"], units)
     with Console(stderr=True).status("fitting"):
         bench = wired_bench(device, session, rows, confirmed)
         check_gauge(bench)
@@ -102,12 +113,12 @@ def _calibrate_by_gauge(config: Config, path: str) -> None:
     print_calibration(calibration, outcome)
     if not outcome.helps:
         print(
-            f"The calibration does not reduce the error, so {config.out} was not written: is the layout, the "
+            f"The calibration does not reduce the error, so {out} was not written: is the layout, the "
             "body or the clock wrong?"
         )
         sys.exit(1)
     rmse = {name: round(getattr(outcome, name), 6) for name in ("simulated", "tared", "calibrated")}
     about = dict(calibration.about) | {"held_out": list(outcome.held_out), "rmse": rmse}
-    about |= {"session": path, "presses_file": config.presses}
+    about |= {"session": path, "presses_file": presses}
     channels = device_channels(session, confirmed)
-    print(write_calibration(replace(calibration, about=about, channels=channels), str(config.out)))
+    print(write_calibration(replace(calibration, about=about, channels=channels), out))

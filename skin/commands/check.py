@@ -16,7 +16,7 @@ from skin.runs.configuration import Config
 
 
 @command("check")
-def main(config: Config) -> None:
+def main(config: Config, weight: float | None, base: float | None, seconds: float | None) -> None:
     """Compare readings under the load with predicted ones, and store the result."""
     from skin.hardware.check import Check, describe_setup, store_check
     from skin.hardware.known_loads import KnownLoad, base_readings, measure_ratios
@@ -25,9 +25,9 @@ def main(config: Config) -> None:
     from skin.runs.build import build_device, build_skin
 
     device = require_port(build_device(config))
-    load = KnownLoad.of(config.weight, config.base, device.size)
-    if not config.seconds or config.seconds < 2:
-        raise InputError(f"seconds={config.seconds}: each load must lie for at least 2 s, as in seconds=10")
+    load = KnownLoad.of(weight, base, device.size)
+    if not seconds or seconds < 2:
+        raise InputError(f"seconds={seconds}: each load must lie for at least 2 s, as in seconds=10")
     model = build_skin(config).simulator(device.body, device.sensors)
     expected = load.force * base_readings(model, device.body, device.sensors, load.base)
     try:
@@ -35,9 +35,9 @@ def main(config: Config) -> None:
             first, conversion = device.wire.warm_up(skin, notify)
             notify(
                 f"put {load.weight:g} kg on {min(3, len(expected))} sensors in turn, far from each other and "
-                f"from the rim, each for {config.seconds:g} s and until it is counted"
+                f"from the rim, each for {seconds:g} s and until it is counted"
             )
-            ratios = measure_ratios(skin, first, conversion, expected, config.seconds, notify)
+            ratios = measure_ratios(skin, first, conversion, expected, seconds, notify)
     except (SkinTimeout, SkinDisconnected) as error:
         raise InputError(f"{config.device['port']}: {error}") from error
     rest = conversion.zero if conversion.rest is None else conversion.raw(conversion.rest)

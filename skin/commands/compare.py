@@ -8,7 +8,7 @@ out=; run= compares the predictions of a run, too.
 """
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from skin.commands._command import command
 from skin.core.files import results
@@ -21,9 +21,16 @@ if TYPE_CHECKING:
 
 
 @command("compare")
-def main(config: Config) -> None:
+def main(
+    config: Config,
+    session: str | None,
+    presses: str | None,
+    run: str | None,
+    out: str | None,
+    compare: dict[str, Any],
+) -> None:
     """Simulate a session, compare readings and, with ``run=``, predictions; write a page."""
-    if config.session is None:
+    if session is None:
         raise InputError("which session? add session=session.csv, of skin record or a bench")
 
     from skin.core.messages import quiet
@@ -31,30 +38,29 @@ def main(config: Config) -> None:
     from skin.runs.build import build_device
 
     quiet()
-    settings = config.compare
     device = build_device(config).simulated("a session is compared with a simulation")
-    folder = results(config.out)
-    about = f"Session {config.session}, simulated by {type(device.model).__name__}" + (
+    folder = results(out)
+    about = f"Session {session}, simulated by {type(device.model).__name__}" + (
         f" with {device.calibration}." if device.calibration else ", not calibrated."
     )
-    comparison = compare_session(device, config.session, config.presses, settings)
-    agreement = None if config.run is None else _compare_predictions(config, device, comparison)
-    page, picture = publish_comparison(comparison, agreement, about, settings["shown"], folder)
+    comparison = compare_session(device, session, presses, compare)
+    agreement = None if run is None else _compare_predictions(run, config, device, comparison)
+    page, picture = publish_comparison(comparison, agreement, about, compare["shown"], folder)
     print(page.read_text(encoding="utf-8"), page, picture, sep="\n")
 
 
 def _compare_predictions(
-    config: Config, device: "AbstractSimulated", comparison: "SessionComparison"
+    name: str, config: Config, device: "AbstractSimulated", comparison: "SessionComparison"
 ) -> "Agreement":
     """Return the predictions of a run for both sides; warn if it learned another mechanics."""
     import numpy as np
 
     from skin.device.base import Blank
     from skin.hardware.comparison import Agreement
-    from skin.runs.finished_run import FinishedRun
-    from skin.runs.model_of_run import load_model
+    from skin.runs.run import FinishedRun
+    from skin.runs.torch_model import load_model
 
-    run, blank = FinishedRun.named(config), Blank.of(device.task, device.size, comparison.touches[0])
+    run, blank = FinishedRun.named(name, config), Blank.of(device.task, device.size, comparison.touches[0])
     if (learned := run.stored.simulator["_target_"]) != config.simulator["_target_"]:
         print(
             f"run {run.identity} was trained with {learned}: add simulator= to simulate the session with it\n"

@@ -16,26 +16,26 @@ from skin.runs.configuration import Config
 
 
 @command("convert")
-def main(config: Config) -> None:
+def main(config: Config, from_: str | None, path: str | None, out: str | None) -> None:
     """Read the files of a mapping and write one recording."""
-    if config.from_ is None or config.out is None:
+    if from_ is None or out is None:
         raise InputError("skin convert needs from= and out=, as in from=map.yaml out=x.parquet")
-    out = tabular(config.out, "a recording")
+    file = tabular(out, "a recording")
 
     from skin.device.conversion import convert_files, summarise_conversion
     from skin.device.files import write_recording
     from skin.device.formats import read_format
     from skin.runs.build import build_skin
 
-    mapping = read_format(config.from_)
-    written = config.from_.endswith((".yaml", ".yml"))
-    if config.path is None and not written:
-        raise InputError(f"from={config.from_} needs path=FOLDER, where the recordings are")
-    folder = Path(config.path if config.path is not None else Path(config.from_).parent).expanduser()
+    mapping = read_format(from_)
+    written = from_.endswith((".yaml", ".yml"))
+    if path is None and not written:
+        raise InputError(f"from={from_} needs path=FOLDER, where the recordings are")
+    folder = Path(path if path is not None else Path(from_).parent).expanduser()
     if mapping.positions == "layout":
         skin = build_skin(config)
         recording = convert_files(mapping, folder, skin.sensors, skin.body.size)
     else:
         recording = convert_files(mapping, folder)
-    write_recording(recording, out)
-    print(f"{out}: {summarise_conversion(recording)}")
+    write_recording(recording, file)
+    print(f"{file}: {summarise_conversion(recording)}")

@@ -6,6 +6,8 @@
 Writes tables, pictures and JSON into out=.
 """
 
+from typing import Any
+
 from skin.commands._command import command
 from skin.core.files import results
 from skin.core.settings import configured, import_target
@@ -13,8 +15,8 @@ from skin.runs.configuration import Config
 
 
 @command("design")
-def main(config: Config) -> None:
+def main(config: Config, out: str | None, design: dict[str, Any]) -> None:
     """Build the chosen analysis from its settings, run it and write its files."""
-    settings = dict(config.design)
+    settings = dict(design)
     target = import_target(settings.pop("_target_"), "design")
-    configured(target, settings, "design").run(config, results(config.out))
+    configured(target, settings, "design").run(config, results(out))

@@ -11,8 +11,8 @@ from skin.runs.configuration import Config, overrides
 
 
 @command("evaluate")
-def main(config: Config) -> None:
+def main(config: Config, run: str, out: str | None) -> None:
     """Restore a finished run, evaluate it, and print and log the metrics."""
     from skin.runs.train import evaluate_run
 
-    evaluate_run(config, overrides())
+    evaluate_run(config, run, out, overrides())

@@ -12,10 +12,9 @@ recorded touches first. The folder holds any run: run=my_skin then selects it wh
 import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from annotated_types import Ge, Gt, MinLen
-from hydra import compose
 
 from skin.commands._command import command
 from skin.core.files import results
@@ -25,7 +24,7 @@ from skin.runs.configuration import Config, overrides
 if TYPE_CHECKING:
     from skin.core.messages import Steps
     from skin.device.touches import Touches
-    from skin.runs.model_of_run import RunModel
+    from skin.runs.torch_model import TorchModel
 
 _FORMATS = ("onnx", "folder")
 
@@ -57,48 +56,57 @@ _STEPS = {
 
 
 @command("export")
-def main(config: Config) -> None:
+def main(
+    config: Config,
+    run: str,
+    format: str,
+    out: str | None,
+    name: str | None,
+    licence: str | None,
+    export: dict[str, Any],
+) -> None:
     """Restore a finished run, write it, and print the path."""
-    if config.format not in _FORMATS:
-        raise InputError(f"format must be one of {', '.join(_FORMATS)}, got {config.format}")
-    if config.format == "folder":
-        _export_folder(config)
+    if format not in _FORMATS:
+        raise InputError(f"format must be one of {', '.join(_FORMATS)}, got {format}")
+    if format == "folder":
+        if out is not None:
+            raise InputError(f"a folder is written to models/NAME, not to out={out}: add name=my_skin")
+        _export_folder(run, config, name, licence)
         return
 
     from skin.core.messages import Steps
+    from skin.core.settings import configured
 
-    if config.name is not None or config.licence is not None:
+    if name is not None or licence is not None:
         raise InputError("name and licence are those of a folder: add format=folder, or leave them out")
     with Steps(_STEPS) as steps:
-        _export_file(config, steps)
+        _export_file(run, config, configured(ExportSettings, export, "export"), out, steps)
 
 
-def _export_folder(config: Config) -> None:
+def _export_folder(run: str, config: Config, name: str | None, licence: str | None) -> None:
     """Write the files of a pretrained model, all or none."""
-    from skin.runs.finished_run import FinishedRun
-    from skin.runs.model_folder import check_folder, write_folder
+    from skin.runs.card import check_folder, write_folder
+    from skin.runs.run import FinishedRun
 
-    if config.out is not None:
-        raise InputError(f"a folder is written to models/NAME, not to out={config.out}: add name=my_skin")
-    folder = check_folder(config.name, config.licence)
-    write_folder(FinishedRun.named(config), folder, str(config.licence))
+    folder = check_folder(name, licence)
+    write_folder(FinishedRun.named(run, config), folder, str(licence))
     print(folder)
 
 
-def _export_file(config: Config, steps: "Steps") -> None:
+def _export_file(
+    name: str, config: Config, settings: ExportSettings, out: str | None, steps: "Steps"
+) -> None:
     """Write the network of a run for one skin, with the thresholds of its alarm."""
-    from skin.core.settings import configured
-
-    settings = configured(ExportSettings, config.export, "export")
-    path = None if config.out is None else Path(config.out).expanduser()
+    path = None if out is None else Path(out).expanduser()
     if path is not None and path.suffix != ".onnx":
-        raise InputError(f"out={config.out} must end in .onnx: as in out=skin.onnx")
+        raise InputError(f"out={out} must end in .onnx: as in out=skin.onnx")
 
     from skin.core.messages import quiet
+    from skin.evaluation.alarm import choose_alarm_threshold
     from skin.hardware.live.engine import DebounceSettings
-    from skin.runs.exported_model import describe_skin
-    from skin.runs.finished_run import FinishedRun
-    from skin.runs.model_of_run import equation10_warning, load_model
+    from skin.runs.model import describe_skin
+    from skin.runs.run import FinishedRun
+    from skin.runs.torch_model import equation10_warning, load_model
 
     try:
         from skin.runs.onnx_writer import write_model
@@ -107,8 +115,8 @@ def _export_file(config: Config, steps: "Steps") -> None:
             "skin export needs onnx, onnxscript and onnxruntime: pip install 'tactile-skin[export]'"
         ) from error
     quiet()
-    run = FinishedRun.named(config)
-    whole = run.configured(compose("export", overrides()), overrides())
+    run = FinishedRun.named(name, config)
+    whole = run.configured(overrides())
     model = load_model(run, whole, touch=settings.touch, one_skin=True)
     module = model.learner.pipeline(model.places)  # refused before anything else is simulated
     if advice := equation10_warning(run.stored):
@@ -118,7 +126,10 @@ def _export_file(config: Config, steps: "Steps") -> None:
     if "simulator" in run.stored.device and model.threshold is not None:
         steps.begin(_THRESHOLDS)
         patience = DebounceSettings().alarm
-        points = {f"{rate:g}": model.point_at(rate, patience, False, print) for rate in settings.rates}
+        conditions = (model.live_conditions(rate, patience, False) for rate in settings.rates)
+        points = {
+            f"{live.rate:g}": choose_alarm_threshold(model.alarm, live, say=print) for live in conditions
+        }
         hiding = [at.warning() for at in points.values() if at and at.useless]
         refused = "".join(f"{text}: skin live refuses the file at this rate\n" for text in hiding)
         print(refused, end="", file=sys.stderr)
@@ -135,7 +146,7 @@ def _export_file(config: Config, steps: "Steps") -> None:
     print(f"{path}: differs from the run by {difference:.1g} at most on {len(touches)} touches")
 
 
-def _touches(model: "RunModel", count: int) -> "Touches":
+def _touches(model: "TorchModel", count: int) -> "Touches":
     """Return at most ``count`` touches; a run on a recording has those of its own only."""
     if (simulation := model.device.reference) is None:
         return model.device.touches("test")[:count]

@@ -8,7 +8,6 @@ has the displacements under the sensors. Prints a summary of the touches, and wa
 predicts a label.
 """
 
-from dataclasses import replace
 from pathlib import Path
 
 from skin.commands._command import command
@@ -17,16 +16,16 @@ from skin.runs.configuration import Config
 
 
 @command("generate")
-def main(config: Config) -> None:
+def main(config: Config, n: int, out: str | None) -> None:
     """Draw a budget of n gestures and write readings, labels and parameters."""
-    if config.out is None:
+    if out is None:
         raise InputError(
             "out is missing: add out=touches.parquet or out=touches.csv, or out=touches for a folder"
         )
-    path = Path(config.out).expanduser()
+    path = Path(out).expanduser()
     if path.suffix not in ("", ".parquet", ".csv"):
         raise InputError(
-            f"touches are written to a .parquet or .csv file, or to a folder, got {config.out}: add "
+            f"touches are written to a .parquet or .csv file, or to a folder, got {out}: add "
             "out=touches.parquet, or out=touches for a folder"
         )
 
@@ -35,5 +34,4 @@ def main(config: Config) -> None:
 
     device = build_device(config)
     generate = generate_file if path.suffix else generate_data_set
-    # The path of the file does not change the touches.
-    print(f"{path}: {generate(device, replace(config, out=None), path)}")
+    print(f"{path}: {generate(device, config, path)}")

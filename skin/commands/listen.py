@@ -10,7 +10,7 @@ Listens for seconds=, or until Ctrl-C.
 import signal
 import sys
 from contextlib import closing, suppress
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from skin.commands._command import command
 from skin.errors import InputError
@@ -23,7 +23,7 @@ _ENOUGH = 5.0  # s of a stream that show what a board sends
 
 
 @command("listen")
-def main(config: Config) -> None:
+def main(config: Config, n: int | None, seconds: float | None, adapter: Any) -> None:
     """Print rate and errors once a second, and statistics of each channel at the end."""
     device = config.device
     if device["port"] is None:
@@ -39,20 +39,20 @@ def main(config: Config) -> None:
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     settings = PortSettings.select(device)
     if settings.frames.kind == "auto":
-        _propose(settings, config.seconds)
+        _propose(settings, seconds)
         return
-    sensors = None if config.n is None else range(config.n)
+    sensors = None if n is None else range(n)
     with open_skin(settings, sensors) as skin:
         listener = PortMonitor(skin)
         try:
             with suppress(KeyboardInterrupt):
-                for line in listener.lines(config.seconds):
+                for line in listener.lines(seconds):
                     print(line, flush=True)
         except (SkinTimeout, SkinDisconnected) as error:
             raise InputError(f"{device['port']}: {error}") from error
         except SensorCountError as error:
             raise InputError(
-                f"n={config.n}, but the device sends {error.sent} values per frame: give n={error.sent}, or "
+                f"n={n}, but the device sends {error.sent} values per frame: give n={error.sent}, or "
                 "leave it out"
             ) from error
         print(listener.summary())

@@ -15,12 +15,12 @@ import re
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from hydra import compose
+from omegaconf import OmegaConf
 
 from skin.commands._command import command
 from skin.errors import InputError
@@ -50,24 +50,29 @@ Say = Callable[[str], None]
 
 
 @command("live")
-def main(config: Config) -> None:
+def main(
+    config: Config, run: str, demo: bool, web: bool, seconds: float | None, live: dict[str, Any]
+) -> None:
     """Load a run or an exported model, open the skin, and show verdicts until the command is ended."""
-    if config.demo:
-        with emulated_skin(overrides()) as (demo, words):
-            show(demo, words, own_mechanics=True)
+    if demo:
+        with emulated_skin(overrides()) as words:
+            composed = compose("live", words)
+            plain: Any = OmegaConf.to_container(composed)
+            run, web, seconds, live = (plain[name] for name in ("run", "web", "seconds", "live"))
+            show(validate_config(composed), words, run, web, seconds, live, own_mechanics=True)
     else:
-        show(config, overrides())
+        show(config, overrides(), run, web, seconds, live)
 
 
 @contextmanager
-def emulated_skin(words: Sequence[str]) -> Iterator[tuple[Config, list[str]]]:
+def emulated_skin(words: Sequence[str]) -> Iterator[list[str]]:
     """Emulate the skin of a run, without the imperfections of its training, at a port of this machine.
 
     Args:
         words: overrides of the command line.
 
     Yields:
-        The configuration of a live view of this skin, and its overrides.
+        The overrides of a live view of this skin.
 
     Raises:
         InputError: a device is given, or the run cannot be emulated.
@@ -77,24 +82,22 @@ def emulated_skin(words: Sequence[str]) -> Iterator[tuple[Config, list[str]]]:
     from skin.core.messages import quiet
     from skin.hardware.emulator import Emulator, EmulatorSettings, Faults, open_port
     from skin.runs.build import build_device
-    from skin.runs.finished_run import FinishedRun
+    from skin.runs.run import FinishedRun
 
     quiet()
     if devices := [word for word in words if word.startswith("device=")]:
         raise InputError(f"demo=true emulates a skin at a port: leave out {devices[0]}, or demo=true")
     words, touched = _demo_overrides(words)
-    config = validate_config(compose("live", words))
-    device = build_device(FinishedRun.named(config).configured(compose("train", touched), touched))
+    composed = compose("live", words)
+    run = FinishedRun.named(composed.run, validate_config(composed))
+    device = build_device(run.configured(touched))
     port = open_port("tcp:0", None)
     emulator = Emulator(device.simulated("a skin is emulated"), port, EmulatorSettings(), Faults())
     thread = Thread(target=emulator.run, name="skin-emulator", daemon=True)
     thread.start()
     try:
         settings = {"port": port.address, "scale": emulator.converter.scale}
-        yield (
-            replace(config, device=config.device | settings),
-            [*words, *(f"device.{name}={value}" for name, value in settings.items())],
-        )
+        yield [*words, *(f"device.{name}={value}" for name, value in settings.items())]
     finally:
         emulator.stop()
         thread.join()
@@ -118,12 +121,21 @@ def _group(word: str) -> str:
     return re.split(r"[.=]", word, maxsplit=1)[0]
 
 
-def show(config: Config, changes: Sequence[str], own_mechanics: bool = False) -> None:
+def show(
+    config: Config,
+    changes: Sequence[str],
+    run: str,
+    web: bool,
+    seconds: float | None,
+    settings: dict[str, Any],
+    own_mechanics: bool = False,
+) -> None:
     """Show the predictions of a run for a skin until the command is ended.
 
     Args:
         config: of the command.
         changes: settings that replace those of the run, as overrides; ``config`` has their values.
+        run, web, seconds, settings: as :func:`main` takes them; ``settings`` are those under ``live:``.
         own_mechanics: the skin at the port is emulated with the simulator of the run.
     """
     from rich.console import Console
@@ -133,14 +145,14 @@ def show(config: Config, changes: Sequence[str], own_mechanics: bool = False) ->
     from skin.hardware.live.engine_builder import LiveSettings
     from skin.hardware.live.loop import LiveLoop
 
-    live, say = LiveSettings.of(config.live), Console(stderr=True, highlight=False).print
+    live, say = LiveSettings.of(settings), Console(stderr=True, highlight=False).print
     try:
         with ExitStack() as opened:
             opened.enter_context(ends_on_signal())
-            setup = _load(config, live, say, changes, opened, own_mechanics)
+            setup = _load(run, config, live, say, changes, opened, own_mechanics)
             contacts = _start_contacts(setup, say) if live.contacts else LiveContacts("live.contacts=false")
             opened.callback(contacts.close)
-            display = _open_views(setup, contacts, config, live, say, opened)
+            display = _open_views(setup, contacts, web, live, say, opened)
             watched = setup.watch(live, say)
             if live.verdicts is None:
                 from skin.hardware.live.terminal import show_in_terminal
@@ -153,25 +165,30 @@ def show(config: Config, changes: Sequence[str], own_mechanics: bool = False) ->
             # A search for garbage among all that is loaded would stop the loop for 0.3 s, every few seconds.
             gc.collect()
             gc.freeze()
-            session.run(config.seconds)
+            session.run(seconds)
     except KeyboardInterrupt:
         print("ended", file=sys.stderr)
 
 
 def _load(
-    config: Config, live: "LiveSettings", say: Say, changes: Sequence[str], opened: ExitStack, own: bool
+    run: str,
+    config: Config,
+    live: "LiveSettings",
+    say: Say,
+    changes: Sequence[str],
+    opened: ExitStack,
+    own_mechanics: bool,
 ) -> "LiveSetup":
     """Return the model and its device; the arguments are those of ``watch_run``."""
     from skin.core.messages import quiet
     from skin.hardware.live.engine_builder import watch_exported, watch_run
-    from skin.runs.exported_model import check_overrides
+    from skin.runs.model import check_overrides
 
-    path = str(config.run)
-    if not path.endswith(".onnx"):
+    if not run.endswith(".onnx"):
         quiet()
-        return watch_run(config, live, say, changes, opened, own)
-    check_overrides(path, compose("live", [*changes]), changes)
-    return watch_exported(path, config.device, say, opened)
+        return watch_run(run, config, live, say, changes, opened, own_mechanics)
+    check_overrides(run, changes)
+    return watch_exported(run, config.device, say, opened)
 
 
 def _start_contacts(setup: "LiveSetup", say: Say) -> "LiveContacts":
@@ -190,7 +207,7 @@ def _start_contacts(setup: "LiveSetup", say: Say) -> "LiveContacts":
 def _open_views(
     setup: "LiveSetup",
     contacts: "LiveContacts",
-    config: Config,
+    web: bool,
     live: "LiveSettings",
     say: Say,
     opened: ExitStack,
@@ -208,7 +225,7 @@ def _open_views(
         opened.enter_context(log_alarms(display, Path(live.log).expanduser()))
     if live.verdicts is not None:
         opened.enter_context(print_verdicts(display))
-    if config.web:
+    if web:
         from skin.hardware.live.web import serve_page
 
         say(f"page: {opened.enter_context(serve_page(display, live.web_port))}")

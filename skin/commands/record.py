@@ -8,6 +8,7 @@ record.finish=true writes only that.
 
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 from skin.commands._command import command, notify
 from skin.errors import InputError
@@ -15,12 +16,11 @@ from skin.runs.configuration import Config
 
 
 @command("record")
-def main(config: Config) -> None:
+def main(config: Config, out: str | None, seconds: float | None, record: dict[str, Any]) -> None:
     """Record raw frames to a session, then convert its gestures to a recording."""
-    if config.out is None or not config.out.endswith(".csv"):
-        raise InputError(f"a session is a .csv file, got {config.out}: add out=session.csv")
-    settings = dict(config.record)
-    if unknown := sorted(set(settings) - {"free", "finish"}):
+    if out is None or not out.endswith(".csv"):
+        raise InputError(f"a session is a .csv file, got {out}: add out=session.csv")
+    if unknown := sorted(set(record) - {"free", "finish"}):
         raise InputError(f"record has no {unknown[0]}: it takes free, finish")
 
     from skin.hardware.recorder import convert_session, record_session
@@ -28,9 +28,9 @@ def main(config: Config) -> None:
     from skin.runs.build import build_device
 
     device = require_port(build_device(config))
-    path = Path(config.out).expanduser()
-    if not settings["finish"]:
+    path = Path(out).expanduser()
+    if not record["finish"]:
         with suppress(KeyboardInterrupt):
-            record_session(device, path, config.seconds, settings["free"], notify)
+            record_session(device, path, seconds, record["free"], notify)
     written, count = convert_session(device, path)
     print(f"{written}: {count} gestures")

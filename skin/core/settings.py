@@ -71,6 +71,7 @@ def check_settings(
     for key, value in zip(map(str, settings), settings.values(), strict=True):
         if key.startswith("_"):
             continue
+        label = f"{name}.{key}".removeprefix(".")
         if key not in parameters:
             if any(parameter.kind == Parameter.VAR_KEYWORD for parameter in parameters.values()):
                 continue
@@ -79,13 +80,13 @@ def check_settings(
             meant = f": did you mean {near[0]}?" if near else ":"
             raise InputError(f"{name} has no setting {key}{meant} it has {', '.join(choices)}")
         if key in hints and _takes_made(hints[key]) and _is_nothing_made(hints[key], value):
-            raise InputError(f"{name}.{key}={str(value)[:_LONG]} must be an option with its settings")
+            raise InputError(f"{label}={str(value)[:_LONG]} must be an option with its settings")
         if key in hints and _is_plain(hints[key]) and (wrong := _explain_refusal(hints[key], value)):
             default = _written(parameters[key].default)
-            example = f": as in {name}.{key}={default}" if default else ""
+            example = f": as in {label}={default}" if default else ""
             text = str(list(value) if isinstance(value, tuple) else value)
             text = text if len(text) <= _LONG else f"{text[:_LONG]}..."
-            raise InputError(f"{name}.{key}={text} {wrong}{example}")
+            raise InputError(f"{label}={text} {wrong}{example}")
     if whole and (missing := [key for key in required if key not in settings]):
         raise InputError(f"{name} needs {' and '.join(missing)}, got {', '.join(settings) or 'nothing'}")
 

@@ -1,5 +1,6 @@
 """Contact detection: readings against the tared baseline, over time."""
 
+from dataclasses import dataclass
 from math import ceil
 
 import numpy as np
@@ -11,6 +12,32 @@ from skin.touch.labels import RELEASE
 
 DECISIONS = 20.0
 """Decisions per second of device time; one per frame of a slower device."""
+
+
+@dataclass(frozen=True)
+class LiveConditions:
+    """How a live view watches a skin.
+
+    Attributes:
+        rate: of the device, Hz.
+        contact: N above the baseline that count as contact.
+        longest: s, longest touch of the training.
+        patience: s for which decisions must be dangerous before the alarm is raised.
+        column: of ``dangerous`` among the labels of the learner.
+        aligned: a device at the model's rate gives the frames of the model, as the simulator does; otherwise
+            it reads at any phase of their intervals.
+    """
+
+    rate: float
+    contact: float
+    longest: float
+    patience: float
+    column: int
+    aligned: bool = False
+
+    def decisions(self, rate: float) -> int:
+        """Return how many decisions in a row raise the alarm, for a device of ``rate``, Hz."""
+        return max(1, ceil(self.patience * min(DECISIONS, rate) - 1e-6))
 
 
 def held_frames(longest: float, rate: float, window: int) -> int:

@@ -24,7 +24,6 @@ from typing import Annotated, Any, Literal
 
 import torch
 from annotated_types import Ge, Le, MinLen
-from hydra import compose
 from hydra.utils import instantiate
 from pydantic import NonNegativeInt, PositiveFloat, PositiveInt
 from rich.console import Console
@@ -36,8 +35,9 @@ from skin.core.settings import checked, configured, import_target
 from skin.device.base import AbstractDevice, Blank
 from skin.device.touches import Touches, touches_hash
 from skin.errors import InputError
+from skin.evaluation.alarm import AlarmSource, choose_alarm_threshold, threshold_device
 from skin.evaluation.metrics import compute_metrics
-from skin.evaluation.operating_point import OperatingPoint, choose_operating_point
+from skin.evaluation.operating_point import OperatingPoint
 from skin.evaluation.report import evaluate, metrics_table
 from skin.evaluation.settings import check_evaluation
 from skin.learning.data import TouchData
@@ -45,9 +45,9 @@ from skin.learning.few import AbstractFew, few_features, predict_held_out, split
 from skin.learning.network import TouchClassifier, probabilities
 from skin.runs.build import build_data, build_device, build_learner, default_option
 from skin.runs.configuration import Config
-from skin.runs.finished_run import TAG, FinishedRun
-from skin.runs.model_of_run import alarm_point, threshold_device
+from skin.runs.run import TAG, FinishedRun
 from skin.runs.store import Store, note_reuse
+from skin.runs.torch_model import alarm_source, device_on_skin
 from skin.runs.train import log_configuration, log_learner, log_report, tags
 from skin.touch.labels import Task
 
@@ -357,14 +357,16 @@ def find_target(
         InputError: no skin is given, or its gestures have other labels than the run.
     """
     words = [word for word in overrides if _group(word) not in _COMMAND]
-    measured = parent.configured(compose("adapt", words), words)
+    measured = parent.configured(words)
     if "test" in measured.device:  # a recording, which is used as a whole
         measured = replace(measured, device=measured.device | {"test": "all"})
     # The device of the run, on this skin: its fresh gestures determine the threshold of the alarm.
     words = [word for word in words if _group(word) not in ("device", "profile")]
     words += [] if "simulator" in parent.stored.device else ["device=simulated"]
-    simulated = replace(parent.configured(compose("adapt", words), words), evaluation=config.evaluation)
-    device, twin = build_device(measured), threshold_device(simulated, simulated)
+    simulated = replace(parent.configured(words), evaluation=config.evaluation)
+    source = AlarmSource("", config.evaluation, None, simulated.device, simulated.device)
+    device = build_device(measured)
+    twin = threshold_device(replace(source, build=device_on_skin(simulated, simulated)))
     _check(parent, device, twin)
     device = device.with_labels(twin.task)
     drawn = device.simulation is not None
@@ -441,13 +443,14 @@ def simulated_budget(count: int) -> int:
     return -(-count * 10 // 8)
 
 
-def adapt(config: Config, overrides: Sequence[str]) -> None:
+def adapt(config: Config, run: str, overrides: Sequence[str]) -> None:
     """Adapt a finished run to the skin of a configuration: log a new run and print the figures.
 
     Nothing is done if a run with the same fingerprint has finished, unless ``tracking.resume=false``.
 
     Args:
         config: of ``skin adapt``.
+        run: name of the run.
         overrides: of the command line.
 
     Raises:
@@ -455,15 +458,15 @@ def adapt(config: Config, overrides: Sequence[str]) -> None:
             fewer than wanted.
     """
     with Steps(_STEPS) as steps:
-        _adapt(config, overrides, steps)
+        _adapt(config, run, overrides, steps)
 
 
-def _adapt(config: Config, overrides: Sequence[str], steps: Steps) -> None:
+def _adapt(config: Config, name: str, overrides: Sequence[str], steps: Steps) -> None:
     settings = configured(FineTuning, config.adapt, "adapt")
     options = _scratch_options(settings.scratch)
     if config.tracking.threads:
         torch.set_num_threads(config.tracking.threads)
-    parent = FinishedRun.named(config)
+    parent = FinishedRun.named(name, config)
     target = find_target(parent, config, settings, overrides)
     identity = tags(target.config) | {ADAPTED: parent.identity, "target": " ".join(overrides)}
     if config.tracking.resume and (
@@ -481,7 +484,8 @@ def _adapt(config: Config, overrides: Sequence[str], steps: Steps) -> None:
     touches, others = choose_gestures(target.device, settings)
     steps.silent = False
     steps.begin("choosing the threshold of the alarm")
-    point = alarm_point(parent, learner, target.config, one_skin=True, device=target.twin)
+    source = replace(alarm_source(parent, learner, target.config), device=target.twin)
+    point = choose_alarm_threshold(source, one_skin=True)
     figures: dict[str, float] = {}
     if others is not None:
         tests = others.touches("test")
@@ -492,20 +496,17 @@ def _adapt(config: Config, overrides: Sequence[str], steps: Steps) -> None:
         steps.begin("fine-tuning")
         adaptation = fine_tune(network, data, touches, settings)
         scratch = learn_from_scratch(touches, task, adaptation, settings, options)
-        chosen, choice = target.config, ""
+        after = adaptation.after if adaptation.better else adaptation.before
+        chosen, choice = target.config, adaptation.choice
         if scratch is not None:
-            learner, chosen = scratch.learner, replace(target.config, learner=scratch.settings)
-            choice = f"{scratch.name}, from scratch"
-        elif adaptation.better:
-            choice = adaptation.choice
+            learner, after, choice = scratch.learner, scratch.chances, f"{scratch.name}, from scratch"
+            chosen = replace(chosen, learner=scratch.settings)
         log_configuration(store, run.info.run_id, chosen, touches_hash(touches))
         log_learner(store, run, learner)
         steps.begin("evaluating the result")
         if choice and point is not None:
-            point = choose_operating_point(learner, target.twin, evaluation)
+            point = choose_alarm_threshold(replace(source, learner=learner), anew=True)
         figures |= _figures("validation_before", adaptation.before, touches, task)
-        after = adaptation.after if adaptation.better else adaptation.before
-        after = after if scratch is None else scratch.chances
         figures |= _figures("validation", after, touches, task)
         if others is None:
             store.client.set_tag(run.info.run_id, TAG, "null" if point is None else point.text())
@@ -517,8 +518,13 @@ def _adapt(config: Config, overrides: Sequence[str], steps: Steps) -> None:
         store.client.log_text(run.info.run_id, _table(adaptation.trials), "adapt.csv")
         store.client.set_tag(run.info.run_id, "chosen", choice)
     Console().print(metrics_table(figures, f"{name}, run {run.info.run_id}"))
-    about = "validation: the gestures to adapt on, each predicted by a model that was not trained on it"
-    print(about, "" if others is None else "; before, same: other gestures of the skin", sep="")
+    _say(choice, parent, others is not None)
+
+
+def _say(choice: str, parent: FinishedRun, reported: bool) -> None:
+    """Print what the figures mean, and which model was kept."""
+    meaning = "validation: the gestures to adapt on, each predicted by a model that was not trained on it"
+    print(meaning, "; before, same: other gestures of the skin" if reported else "", sep="")
     unchanged = "nothing is better on held-out gestures: the new run keeps the weights of run "
     print(f"chosen: {choice}" if choice else f"{unchanged}{parent.identity}")
 

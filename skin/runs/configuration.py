@@ -10,17 +10,17 @@ import platform
 import re
 import socket
 import subprocess
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import cache
-from keyword import iskeyword
+from inspect import signature
 from math import isnan
 from pathlib import Path
 from typing import Any, cast
 from urllib.parse import urlsplit
 
-from hydra import initialize_config_dir
-from hydra._internal.defaults_list import create_defaults_list
+from hydra import compose, initialize_config_dir
+from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -30,7 +30,7 @@ from omegaconf.errors import OmegaConfBaseException
 from skin import __version__
 from skin.core.files import BUNDLED, CONF, MANIFEST, ROOT, candidates
 from skin.core.messages import one_line
-from skin.core.settings import walk_settings
+from skin.core.settings import check_settings, walk_settings
 from skin.errors import InputError
 from skin.evaluation.settings import Evaluation
 
@@ -187,9 +187,10 @@ class Tracking:
 
 @dataclass(frozen=True)
 class Config:
-    """A checked configuration in plain containers. What it does not set is None, a group that it lacks empty.
+    """A checked configuration of a skin or a training, in plain containers.
 
-    Groups without a type here are checked by their class.
+    What it does not set is None, a group that it lacks empty. Groups without a type here are checked by their
+    class. What a command adds is an annotated parameter of its function (:func:`verb_settings`).
     """
 
     row: str | None = None
@@ -212,43 +213,7 @@ class Config:
     tracking: Tracking = field(default_factory=Tracking)
     contact: dict[str, Any] = field(default_factory=dict)
     shard: str | None = None
-    # What a command other than training adds.
-    run: str | None = None
-    name: str | None = None
-    licence: str | None = None
     trust: bool = False
-    n: int | None = None
-    out: str | None = None
-    view: str | None = None
-    labels: list[str] | None = None
-    shape: str | None = None
-    index: int | None = None
-    session: str | None = None
-    from_: str | None = None  # a Python keyword: from= on the command line
-    path: str | None = None
-    presses: str | None = None
-    weight: float | None = None
-    base: float | None = None
-    calibrate: dict[str, Any] = field(default_factory=dict)
-    port: str | None = None
-    adapter: dict[str, Any] = field(default_factory=dict)
-    link: str | None = None
-    seconds: float | None = None
-    web: bool | None = None
-    demo: bool | None = None
-    live: dict[str, Any] = field(default_factory=dict)
-    export: dict[str, Any] = field(default_factory=dict)
-    gestures: int | None = None
-    format: str | None = None
-    emulate: dict[str, Any] = field(default_factory=dict)
-    faults: dict[str, Any] = field(default_factory=dict)
-    record: dict[str, Any] = field(default_factory=dict)
-    compare: dict[str, Any] = field(default_factory=dict)
-    study: dict[str, Any] = field(default_factory=dict)
-    smoke: bool | None = None
-    table: dict[str, Any] = field(default_factory=dict)
-    results: dict[str, Any] = field(default_factory=dict)
-    design: dict[str, Any] = field(default_factory=dict)
     adapt: dict[str, Any] = field(default_factory=dict)
 
 
@@ -320,48 +285,78 @@ def validate_config(config: Any) -> Config:
     """Return a configuration that fits the schema, with every interpolation resolved.
 
     Args:
-        config: as Hydra composes it, or in plain containers.
+        config: as Hydra composes it, in which settings of a verb are left out; or in plain containers.
 
     Raises:
         InputError: a key or a value does not fit, or an interpolation cannot be resolved.
     """
     try:
-        whole = OmegaConf.merge(OmegaConf.structured(Config), _without_keywords(config))
-        # NaN would pass most comparisons, and numbers of more than 64 bits overflow in arrays.
-        for path, value in walk_settings(OmegaConf.to_container(whole)):
-            unfit = isinstance(value, int) and abs(value) >= _TOO_LARGE
-            if unfit or (isinstance(value, float) and isnan(value)):
-                reason = "too large" if unfit else "nan"
-                raise InputError(f"{'.'.join(path)} is {reason}: give a number")
-            if path in _COUNTED and value is not None and value < 0:
-                raise InputError(f"{path[0]}={value:g} is below 0: give a number above 0")
+        if isinstance(config, DictConfig):
+            _check_numbers(OmegaConf.to_container(config))
+            plain = _resolved(config)
+            config = {name: plain[name] for name in Config.__annotations__ if name in plain}
+        whole = OmegaConf.merge(OmegaConf.structured(Config), config)
+        _check_numbers(OmegaConf.to_container(whole))
         return cast(Config, OmegaConf.to_object(whole))
     except OmegaConfBaseException as error:
         raise InputError(one_line(error)) from error
 
 
-def _without_keywords(config: Any) -> Any:
-    """Return a configuration whose keys are names in Python, as ``from_`` is for ``from``."""
-    if not isinstance(config, Mapping) or not any(iskeyword(str(name)) for name in config):
-        return config
-    plain: Any = OmegaConf.to_container(config, resolve=False) if OmegaConf.is_config(config) else config
-    return {f"{name}_" if iskeyword(str(name)) else name: value for name, value in plain.items()}
-
-
-def refuse_null_groups(config: DictConfig) -> None:
-    """Raise InputError where a group of a composed configuration was replaced by null.
+def refuse_unknown(config: DictConfig, own: Sequence[str] = ()) -> None:
+    """Raise InputError where a composed configuration has a setting that neither it nor a verb knows.
 
     Args:
-        config: as Hydra composes it; groups that a command does not have are missing in it.
+        config: as Hydra composes it.
+        own: settings of the verb alone.
     """
-    groups = {
-        name for name, hint in Config.__annotations__.items() if "dict" in str(hint) or "skin." in str(hint)
-    }
-    for name in sorted(groups & set(config)):
-        if config[name] is None:
+    if unknown := {*config} - {"hydra", *Config.__annotations__, *own}:
+        raise InputError(f"there is no setting {', '.join(map(str, unknown))}: --help lists them")
+
+
+def _resolved(config: DictConfig) -> dict[str, Any]:
+    """Return a composed configuration in plain containers, without Hydra's own settings."""
+    own = OmegaConf.masked_copy(config, [str(name) for name in config if name != "hydra"])
+    return OmegaConf.to_container(own, resolve=True)  # type: ignore[return-value]
+
+
+def _check_numbers(settings: Any) -> None:
+    """Raise InputError for numbers that no setting takes."""
+    # NaN would pass most comparisons, and numbers of more than 64 bits overflow in arrays.
+    for path, value in walk_settings(settings):
+        unfit = isinstance(value, int) and abs(value) >= _TOO_LARGE
+        if unfit or (isinstance(value, float) and isnan(value)):
+            raise InputError(f"{'.'.join(path)} is {'too large' if unfit else 'nan'}: give a number")
+        if path in _COUNTED and isinstance(value, int | float) and value < 0:
+            raise InputError(f"{path[0]}={value:g} is below 0: give a number above 0")
+
+
+def verb_settings(config: DictConfig, verb: Callable[..., Any]) -> dict[str, Any]:
+    """Return the settings of a verb alone, by the names of its parameters after the first.
+
+    Args:
+        config: as Hydra composes it.
+        verb: its function; ``from_`` is the setting ``from``, which is a keyword of Python.
+
+    Raises:
+        InputError: a value does not fit the annotation of its parameter, a group is null, or a setting is
+            unknown.
+    """
+    hints = {name: str(hint) for name, hint in (Config.__annotations__ | verb.__annotations__).items()}
+    for name in sorted(name for name, hint in hints.items() if "dict" in hint or "skin." in hint):
+        if name in config and config[name] is None:
             raise InputError(
                 f"{name}=null leaves nothing to use: give settings or an option, or leave it out"
             )
+    names = [*signature(verb).parameters][1:]
+    refuse_unknown(config, [name.removesuffix("_") for name in names])
+    try:
+        plain = _resolved(config)
+    except OmegaConfBaseException as error:
+        raise InputError(one_line(error)) from error
+    settings = {name: plain[name.removesuffix("_")] for name in names}
+    _check_numbers({name.removesuffix("_"): value for name, value in settings.items()})
+    check_settings(verb, settings, "")
+    return settings
 
 
 def settings_of(config: Config) -> dict[str, Any]:
@@ -380,10 +375,10 @@ def overrides() -> list[str]:
     return list(HydraConfig.get().overrides.task)
 
 
-# The configuration of a finished run with the overrides of a command line.
+# A run composed again, with the overrides of a command line.
 
 
-# Groups that the weights of a run depend on.
+# What the weights of a run depend on.
 _FIXED = (
     "representation",
     "model",
@@ -395,81 +390,94 @@ _FIXED = (
     "sweep",
     "seed",
 )
+# Groups of the skin and its touches, in the order of conf/skin.yaml; the others of a run come after them.
+_SKIN = ("touch", "layout", "simulator", "contact", "device", "profile", "data", "body")
 
 
-def apply_overrides(stored: Config, composed: DictConfig, overrides: Sequence[str]) -> Config:
-    """Return a run's configuration with the overrides of a command line, checked.
+def recompose(stored: Config, overrides: Sequence[str]) -> Config:
+    """Return the configuration of a run with the overrides of a command line, which Hydra composes over it.
 
-    An option that the command line chooses may set more than its own group: the file of a skin in
-    docs/your-skin.md has a body, positions and a simulator. All of its settings are taken.
+    An option that the command line chooses replaces its group. It may set more than that: the file of a skin
+    in docs/your-skin.md has a body, positions and a simulator.
 
     Args:
-        stored: as :attr:`skin.runs.finished_run.FinishedRun.stored` gives it.
-        composed: a new configuration with the overrides, as Hydra composes it.
-        overrides: of the command line; only these settings are taken from ``composed``.
+        stored: as :attr:`skin.runs.run.FinishedRun.stored` gives it.
+        overrides: of the command line; those of a run count, and those of ``tracking``.
 
     Raises:
-        InputError: an override changes a setting that the weights depend on.
+        InputError: an override, or an option, changes a setting that the weights depend on.
     """
-    whole = OmegaConf.create(asdict(stored))
-    _follow(whole, composed)
+    if not GlobalHydra.instance().is_initialized():  # in Python, not in a command
+        with initialize_config_dir(str(CONF), version_base=None):
+            return recompose(stored, overrides)
     parsed = OverridesParser.create().parse_overrides(list(overrides))
-    keys = [override.key_or_group for override in parsed if not _is_steering(override.key_or_group)]
+    lines = {override.key_or_group: str(override.input_line) for override in parsed}
+    groups = {key: key.split(".")[0].split("/")[0] for key in lines}
+    keys = [key for key, group in groups.items() if group in (*_FIXED, *_SKIN, "task", "evaluation")]
+    if fixed := next((key for key in keys if groups[key] in _FIXED), None):
+        raise InputError(f"{fixed} was fixed when the run was trained: leave it out, or train another run")
+    general = [lines[key] for key, group in groups.items() if group in ("hydra", "tracking")]
+    fresh = compose("train", [*general, *(lines[key] for key in keys)])
+    run = _restored(stored, _raw(fresh.device))
+    options = [lines[key] for key, group in groups.items() if key in _SKIN or group == "hydra"]
+    whole = _compose_options(run, options)
+    for group in _SKIN:
+        changed = (whole.get(group) or {}) != (run.get(group) or {})
+        if group in fresh and (group in keys or (changed and _class(fresh[group]) != _class(run[group]))):
+            whole[group] = _raw(fresh)[group]
     for key in keys:
-        if key.split(".")[0] in _FIXED:
-            raise InputError(f"{key} was fixed when the run was trained: leave it out, or train another run")
-    for option in _find_options(overrides) if keys else []:
-        _take_option(whole, composed, option)
-    for key in keys:
-        if key.split(".")[0] in composed:  # a profile sets the device, and nothing of its own
-            _take(whole, composed, key)
-    whole.tracking = composed.tracking
+        if key not in _SKIN:
+            _take(whole, fresh, key)
+    whole.tracking = fresh.tracking
+    for path, value in iterate_leaves({group: _raw(whole)[group] for group in _FIXED if group in whole}):
+        if OmegaConf.select(run, ".".join(path)) != value:
+            raise InputError(
+                f"{'.'.join(path)} was fixed when the run was trained: leave it out of the option that sets "
+                "it, or train another run"
+            )
     return validate_config(whole)
 
 
-def _is_steering(key: str) -> bool:
-    """Return whether an override says which run is used, or how the command runs."""
-    return key in ("run", "trust") or key.startswith("hydra")
+def _restored(stored: Config, device: Mapping[str, Any]) -> DictConfig:
+    """Return the settings of a run, with the interpolations of its device to other groups.
 
+    Stored configurations are resolved; without this ``simulator=naive`` would not reach ``device.simulator``.
 
-@dataclass(frozen=True)
-class _Option:
-    """What an option that was chosen sets, in its file and in those that the file includes.
-
-    Attributes:
-        name: as in ``body/mine``.
-        group: whose option it is.
-        settings: values in the file by their paths from the root of the configuration.
+    Args:
+        stored: the run.
+        device: settings of a composed device, with interpolations.
     """
+    run = OmegaConf.create(asdict(stored))
+    for name, value in device.items():
+        refers = isinstance(value, str) and value.startswith("${") and name in run.device
+        if refers and OmegaConf.select(run, value[2:-1]) == run.device[name]:
+            run.device[name] = value
+    return run
 
-    name: str
-    group: str
-    settings: dict[tuple[str, ...], Any]
+
+def _compose_options(run: DictConfig, options: Sequence[str]) -> DictConfig:
+    """Return the settings of a run with those of chosen options over them."""
+    settings = {key: value for key, value in _raw(run).items() if value not in (None, {})}
+    skin = {key: value for key, value in settings.items() if key in _SKIN}
+    defaults = ["stored_skin", *({group: None} for group in _SKIN), "_self_"]
+    ConfigStore.instance().store("stored_skin", skin)
+    ConfigStore.instance().store(
+        "stored_run",
+        {"defaults": defaults} | {key: value for key, value in settings.items() if key not in skin},
+    )
+    return OmegaConf.create(_raw(run) | _raw(compose("stored_run", list(options))))
 
 
-def _find_options(overrides: Sequence[str]) -> list[_Option]:
-    """Return the options that a command line chooses, and those that they choose in turn."""
-    if not GlobalHydra.instance().is_initialized():  # in Python, not in a command
-        with initialize_config_dir(str(CONF), version_base=None):
-            return _find_options(overrides)
-    loader = GlobalHydra.instance().config_loader()
-    # The loader has no public function that returns the files of a configuration.
-    parsed, files = loader._parse_overrides_and_create_caching_repo("train", list(overrides))  # type: ignore[attr-defined]
-    groups = [override for override in parsed if files.group_exists(override.key_or_group)]
-    composition = create_defaults_list(files, "train", groups, prepend_hydra=True, skip_missing=True)
-    choices = composition.overrides.override_choices.items()
-    chosen = {f"{group}/{name}": group for group, name in choices if not group.startswith("hydra/")}
-    options: list[_Option] = []
-    for element in reversed(composition.defaults):  # a file comes after the ones that it includes
-        path = element.config_path or ""
-        group = chosen.get(path) or chosen.get(element.parent or "")
-        content = files.load_config(path) if group else None
-        if group is None or content is None:
-            continue
-        chosen[path] = group
-        package = tuple(element.package.split(".")) if element.package else ()
-        options.append(_Option(path, group, dict(iterate_leaves(_raw(content.config), package))))
-    return options
+def _take(whole: DictConfig, fresh: DictConfig, key: str) -> None:
+    """Take a setting, unresolved, so that a device refers to the simulator of this run."""
+    parent, _, name = key.rpartition(".")
+    source = OmegaConf.select(fresh, parent) if parent else fresh
+    OmegaConf.update(whole, key, _raw(source)[name], merge=False)
+
+
+def _class(group: Any) -> Any:
+    """Return the name of the class that a group builds."""
+    return group.get("_target_") if group else None
 
 
 def iterate_leaves(
@@ -481,73 +489,6 @@ def iterate_leaves(
             yield from iterate_leaves(value, (*above, name))
         else:
             yield (*above, name), value
-
-
-def _take_option(whole: DictConfig, composed: DictConfig, option: _Option) -> None:
-    """Take the settings of an option.
-
-    Raises:
-        InputError: it changes a setting that the weights depend on.
-    """
-    settings = _raw(composed)
-    taken = option.group in composed and option.group not in _FIXED
-    if taken:
-        _take(whole, composed, option.group)
-    for path, value in option.settings.items():
-        group = path[0]
-        if taken and group == option.group:
-            continue
-        # What a later file or the command line replaced is not taken.
-        if _is_steering(group) or _value(settings, path) != value:
-            continue
-        if group in _FIXED:
-            if _value(_raw(whole), path) != _value(OmegaConf.to_container(composed, resolve=True), path):
-                raise InputError(
-                    f"{'.'.join(path)} in the option {option.name} was fixed when the run was trained: leave "
-                    "it out of the file, or train another run"
-                )
-        elif _value(settings, (group, "_target_")) != _value(_raw(whole), (group, "_target_")):
-            _take(whole, composed, group)
-        else:
-            _take_leaf(whole, path, value)
-
-
-def _value(settings: Any, path: tuple[str, ...]) -> Any:
-    """Return the value at a path; None where there is none."""
-    for name in path:
-        settings = settings.get(name) if isinstance(settings, dict) else None
-    return settings
-
-
-def _take(whole: DictConfig, composed: DictConfig, key: str) -> None:
-    """Take a group or a setting, unresolved, so that a device refers to the simulator of this run."""
-    parent, _, name = key.rpartition(".")
-    source = OmegaConf.select(composed, parent) if parent else composed
-    OmegaConf.update(whole, key, _raw(source)[name], merge=False)
-
-
-def _take_leaf(whole: DictConfig, path: tuple[str, ...], value: Any) -> None:
-    """Take one setting; names of materials in its path may have dots."""
-    part = whole
-    for name in path[:-1]:
-        if not isinstance(part.get(name), DictConfig):
-            part[name] = {}
-        part = part[name]
-    part[path[-1]] = value
-
-
-def _follow(whole: DictConfig, composed: DictConfig) -> None:
-    """Restore the interpolations of the device to other groups that the run had.
-
-    Stored configurations are resolved; without this ``simulator=naive`` would not reach ``device.simulator``.
-    """
-    device = _raw(whole.device)
-    for name, value in _raw(composed.device).items():
-        if not isinstance(value, str) or not value.startswith("${") or name not in device:
-            continue
-        if OmegaConf.select(whole, value[2:-1]) == device[name]:
-            device[name] = value
-    whole.device = device
 
 
 def _raw(config: DictConfig) -> dict[str, Any]:

@@ -2,8 +2,6 @@
 
 import json
 import sys
-import threading
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -11,10 +9,11 @@ from pathlib import Path
 from typing import Any
 
 from filelock import FileLock, Timeout
+from rich.console import Console
+from rich.progress import Progress
 
 from skin.body.base import require_memory
 from skin.core.files import MANIFEST
-from skin.core.messages import format_duration
 from skin.device.balance import report_balance, summary_line
 from skin.device.base import AbstractDevice, in_threads
 from skin.device.files import DataSet, Manifest, describe_recording, write_recording
@@ -22,7 +21,6 @@ from skin.device.touches import Part
 from skin.errors import InputError
 from skin.runs.configuration import Config, fingerprint, iterate_leaves, settings_of, source_tags
 
-_PAUSE = 10.0  # s between two lines of progress
 _BYTES = 40.0  # of memory for each reading of a file: with displacements, and a table of everything
 
 
@@ -114,47 +112,21 @@ def _lock_folder(folder: Path) -> Iterator[None]:
 def _write_missing(parts: list[Part], manifest: Manifest, folder: Path) -> None:
     """Draw and write the shards that a folder lacks."""
     missing, firsts = manifest.missing(folder), manifest.firsts
-    progress = _Progress(manifest.gestures, sum(parts[n].count for n in missing))
+    there = manifest.gestures - sum(parts[n].count for n in missing)
+    if there:
+        print(f"{there} of {manifest.gestures} gestures are there already", file=sys.stderr)
+    console = Console(stderr=True)
+    with Progress(console=console, disable=not console.is_terminal) as progress:
+        task = progress.add_task("gestures", total=manifest.gestures, completed=there)
 
-    def write(turn: int) -> None:
-        number = missing[turn]
-        shard = parts[number].make()
-        about = shard.metadata | {"config_hash": manifest.config_hash}
-        write_recording(replace(shard, metadata=about), manifest.path(folder, number), firsts[number])
-        progress.add(len(shard))
+        def write(turn: int) -> None:
+            number = missing[turn]
+            shard = parts[number].make()
+            metadata = shard.metadata | {"config_hash": manifest.config_hash}
+            write_recording(replace(shard, metadata=metadata), manifest.path(folder, number), firsts[number])
+            progress.advance(task, len(shard))
 
-    in_threads(write, len(missing))
-
-
-class _Progress:
-    """Prints how far a generation is, at most every ten seconds.
-
-    Args:
-        total: gestures of the data set.
-        left: those of them that are not written yet.
-    """
-
-    def __init__(self, total: int, left: int) -> None:
-        self._total, self._left, self._made = total, left, 0
-        self._began = self._said = time.monotonic()
-        self._lock = threading.Lock()
-        if left < total:
-            print(f"{total - left} of {total} gestures are there already", file=sys.stderr)
-
-    def add(self, count: int) -> None:
-        """Count written gestures; may be called from several threads."""
-        with self._lock:
-            self._made += count
-            self._left -= count
-            now = time.monotonic()
-            if now - self._said < _PAUSE:
-                return
-            self._said, rate = now, self._made / (now - self._began)
-            print(
-                f"{self._total - self._left} of {self._total} gestures, {rate:.0f} a second, about "
-                f"{format_duration(self._left / rate)} left",
-                file=sys.stderr,
-            )
+        in_threads(write, len(missing))
 
 
 def generate_file(device: AbstractDevice, config: Config, path: Path) -> str:
@@ -168,9 +140,10 @@ def generate_file(device: AbstractDevice, config: Config, path: Path) -> str:
         InputError: the touches do not fit into memory, or the file cannot be written.
     """
     if (simulation := device.simulation) is not None:
-        readings = float((config.n or 0) * simulation.window * len(simulation.sensors))
+        count = config.data.gestures if config.data else 0
+        readings = float(count * simulation.window * len(simulation.sensors))
         require_memory(
-            _BYTES * readings, f"n={config.n} in one file", "add out=FOLDER for a data set, which needs less"
+            _BYTES * readings, f"n={count} in one file", "add out=FOLDER for a data set, which needs less"
         )
     recording = device.recording()
     report_balance(device, recording)

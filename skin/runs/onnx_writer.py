@@ -24,7 +24,7 @@ from skin.core.safe_loading import KEY as CHECKSUM
 from skin.device.touches import Touches
 from skin.errors import InputError
 from skin.learning.features import SINGULAR_VALUES
-from skin.runs.exported_model import KEY, ExportedModel, ModelMetadata
+from skin.runs.model import KEY, ModelMetadata, OnnxModel
 
 TOLERANCE = 1e-5
 """Largest difference of a probability from that of torch, unless rounding makes a larger one in torch."""
@@ -53,7 +53,7 @@ def write_model(module: nn.Module, metadata: ModelMetadata, touches: Touches, pa
     with files.whole(path, "out=FILE.onnx") as partial:
         onnx_ir.save(whole, partial)
         seal(partial)
-        difference = _difference(module, ExportedModel(partial), touches)
+        difference = _difference(module, OnnxModel(partial), touches)
         if not difference <= TOLERANCE and not difference <= 2 * _rounding(module, touches):
             raise InputError(
                 f"the ONNX file would differ from the network by {difference:.2g}, more than {TOLERANCE:g}: "
@@ -108,7 +108,7 @@ def _quiet() -> Iterator[None]:
         tqdm.monitor_interval = interval
 
 
-def _difference(module: nn.Module, model: ExportedModel, touches: Touches) -> float:
+def _difference(module: nn.Module, model: OnnxModel, touches: Touches) -> float:
     with torch.inference_mode():
         expected = module(touches.readings, touches.valid).numpy()
     computed = model.probabilities(touches.readings.numpy(), touches.valid.numpy())

@@ -1,7 +1,6 @@
 """A sweep: one parent run in MLflow, one line of progress per job. The UI of MLflow compares its runs."""
 
 import atexit
-import csv
 import os
 import re
 import sys
@@ -20,10 +19,9 @@ from hydra.core.utils import JobReturn, JobStatus
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 
-from skin.core.files import ROOT
 from skin.core.messages import PARENT, format_duration, to_input_error
 from skin.errors import InputError
-from skin.runs.configuration import Config, check_server, validate_config
+from skin.runs.configuration import Config, check_server, refuse_unknown, validate_config
 
 if TYPE_CHECKING:
     from mlflow.entities import Run
@@ -125,63 +123,6 @@ def _words(config: DictConfig) -> list[str]:
     return words
 
 
-class SweepProgress:
-    """Estimates the remaining time of a sweep.
-
-    Args:
-        seconds: earlier duration of each job on some machine, in order; None if unknown.
-        finished: numbers of the jobs that have finished before, and take no time.
-        partial: numbers of the jobs that continue an interrupted run, so that the time they take says nothing
-            about the speed of the machine.
-    """
-
-    def __init__(
-        self,
-        seconds: list[float | None],
-        finished: Collection[int] = (),
-        partial: Collection[int] = (),
-    ) -> None:
-        measured = [value for value in seconds if value is not None]
-        typical = sum(measured) / len(measured) if measured else 1.0
-        self._expected = [typical if value is None else value for value in seconds]
-        for number in finished:
-            self._expected[number] = 0.0
-        self._partial = frozenset(partial)
-        self._sure = bool(measured)
-        self._spent = self._done = 0.0
-
-    def finish(self, number: int, seconds: float, skipped: bool) -> None:
-        """Record the end of a job; skipped and continued jobs do not count for the machine's speed."""
-        if not skipped and number not in self._partial:
-            self._spent += seconds
-            self._done += self._expected[number]
-        self._expected[number] = 0.0
-
-    def left(self) -> float | None:
-        """Return the estimated remaining time, s, scaled by this machine's speed so far; None if unknown."""
-        if not self._done:
-            return sum(self._expected) if self._sure else None
-        return sum(self._expected) * self._spent / self._done
-
-
-def expected_seconds(store: "Store", config: Config, tags: Mapping[str, str]) -> float | None:
-    """Return the duration of the last finished run of the same row and simulator, s.
-
-    Without one, it is estimated from the published table: 25 s for data and thresholds, and seconds per epoch
-    times epochs, plus a third for the evaluation. None if the row is not in the table.
-    """
-    same = {name: tags[name] for name in ("row", "simulator")}
-    if finished := store.find("FINISHED", **same):
-        info = finished[0].info
-        return (info.end_time - info.start_time) / 1e3
-    published = ROOT / "docs" / "results" / "study_table.csv"
-    lines = csv.DictReader(published.read_text().splitlines()) if published.is_file() else ()
-    epochs = [
-        line["seconds_per_epoch"] for line in lines if line["variant"] == f"{tags['simulator']} {tags['row']}"
-    ]
-    return 25 + 1.3 * config.trainer["max_epochs"] * float(epochs[0]) if any(epochs) else None
-
-
 class SweepCallback(Callback):
     """Hydra's callback of every command: opens and closes the parent run, prints progress.
 
@@ -206,8 +147,8 @@ class SweepCallback(Callback):
         self._fingerprints: list[str] = []
         self._own: list[int] = []
         self._swept: list[str] = []
-        self._progress = SweepProgress([])
-        self._began = 0.0
+        self._began = self._spent = 0.0  # s
+        self._trained = self._ended = 0  # jobs
 
     def on_run_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Refuse to divide a single job."""
@@ -243,7 +184,10 @@ class SweepCallback(Callback):
         if "tracking" not in config:
             self._choose(config, [""] * len(self._jobs))
             return
-        settings = validate_config(_without_hydra(config)).tracking
+        trains = config.hydra.job.config_name == "train"
+        if trains:
+            refuse_unknown(config)
+        settings = validate_config(config).tracking
         check_server(settings.uri)
         config.tracking.uri = settings.uri  # without its password, for the file that Hydra writes
         composed = [_compose_job(config, job) for job in self._jobs]
@@ -252,7 +196,7 @@ class SweepCallback(Callback):
         from skin.runs.store import Store, shorten
         from skin.runs.train import tags
 
-        identities = [tags(job) if job else {} for job in composed]
+        identities = [tags(job) if job and trains else {} for job in composed]
         self._fingerprints = [identity.get("fingerprint", "") for identity in identities]
         self._choose(config, self._fingerprints)
         self._store = store = Store.open(settings)
@@ -262,20 +206,6 @@ class SweepCallback(Callback):
         atexit.register(self._close)
         os.environ[PARENT] = self._parent.info.run_id
         _share_cores(config.hydra.launcher)
-        mine = [(composed[number], identities[number]) for number in self._own]
-        self._progress = SweepProgress(
-            [expected_seconds(store, job, identity) if job else None for job, identity in mine],
-            self._with_status("FINISHED"),
-            self._with_status("KILLED"),
-        )
-
-    def _with_status(self, status: str) -> set[int]:
-        """Return the jobs, by their places in this shard, that a run of this status did at least partly."""
-        if not self._resume or self._store is None:
-            return set()
-        prints = [self._fingerprints[number] for number in self._own]
-        done = {run.data.tags.get("fingerprint") for run in self._store.find(status)}
-        return {place for place, identity in enumerate(prints) if identity and identity in done}
 
     def _choose(self, config: DictConfig, fingerprints: Sequence[str]) -> None:
         """Choose the jobs of this shard, and tell the others that they have nothing to do."""
@@ -294,8 +224,8 @@ class SweepCallback(Callback):
         """Print which job begins."""
         self._began = time.monotonic()
         if self._has(config):
-            left = self._progress.left()
-            remainder = "" if left is None else f" about {format_duration(left)} left"
+            left = (len(self._own) - self._ended) * self._spent / self._trained if self._trained else 0.0
+            remainder = f" about {format_duration(left)} left" if left > 0 else ""
             print(f"{self._label(config)} …{remainder}", flush=True)
 
     def on_job_end(self, config: DictConfig, job_return: JobReturn, **kwargs: Any) -> None:
@@ -313,8 +243,9 @@ class SweepCallback(Callback):
             print(f"{label} was finished before", flush=True)
         else:
             print(f"{label} took {format_duration(took)}", flush=True)
-        if self._jobs:
-            self._progress.finish(self._own.index(config.hydra.job.num), took, isinstance(value, Reused))
+        self._ended += 1
+        if not isinstance(value, Reused):
+            self._trained, self._spent = self._trained + 1, self._spent + took
 
     def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
         """Close the parent run."""
@@ -371,16 +302,12 @@ def _refuse(error: InputError) -> NoReturn:
     sys.exit(2)
 
 
-def _without_hydra(config: DictConfig) -> DictConfig:
-    return OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])
-
-
 def _compose_job(config: DictConfig, job: Mapping[str, str]) -> Config | None:
     """Return the configuration of a job; None where it will be refused."""
     words = [f"{key}={value}" for key, value in job.items()]
     whole = GlobalHydra.instance().config_loader().load_sweep_config(config, words)
     try:
-        return validate_config(_without_hydra(whole))
+        return validate_config(whole)
     except InputError:
         return None
 

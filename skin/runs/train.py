@@ -8,6 +8,7 @@ import shutil
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from dataclasses import replace
 from io import StringIO
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,6 @@ import numpy as np
 import pyarrow.parquet as pq
 import torch
 from filelock import FileLock, Timeout
-from hydra import compose
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from mlflow.entities import Param, Run
@@ -32,8 +32,8 @@ from skin.core.messages import PARENT, Steps, quiet
 from skin.core.settings import import_target, option_name
 from skin.device.balance import report_balance
 from skin.errors import InputError
+from skin.evaluation.alarm import AlarmSource, choose_alarm_threshold, threshold_device
 from skin.evaluation.metrics import OUTCOMES, compute_metrics
-from skin.evaluation.operating_point import choose_operating_point
 from skin.evaluation.report import Report, evaluate, metrics_table, publish_evaluation, write_chances
 from skin.evaluation.report import print_report as show
 from skin.evaluation.settings import check_evaluation
@@ -52,10 +52,10 @@ from skin.runs.configuration import (
     settings_of,
     source_tags,
 )
-from skin.runs.finished_run import TAG, FinishedRun
-from skin.runs.model_of_run import load_model, threshold_device
+from skin.runs.run import TAG, FinishedRun
 from skin.runs.store import Store, note_reuse, shorten
 from skin.runs.sweep import Reused
+from skin.runs.torch_model import device_on_skin, load_model
 from skin.touch.labels import Task
 
 _log = logging.getLogger(__name__)
@@ -90,8 +90,11 @@ def train(config: Config) -> float:
         return Reused(_objective(config.tracking, finished.data.metrics))
     settings = check_evaluation(config.evaluation)
     device = build_device(config)
-    judged = device if settings.profile is None else threshold_device(config, config)
     data, learner = build_data(config, device), build_learner(config)
+    source = AlarmSource(
+        "this run", settings, learner, config.device, config.device, build=device_on_skin(config, config)
+    )
+    source = replace(source, device=device if settings.profile is None else threshold_device(source))
     learner.check(data)
     # refuses the name of no metric
     _objective(config.tracking, _score(data.task, data.example.known_labels, data.example.known_labels))
@@ -107,7 +110,7 @@ def train(config: Config) -> float:
             learner.unfinished.mkdir(exist_ok=True)
             log_configuration(store, run.info.run_id, config, data.hash)
             learner.fit(data, RunLogger(store, run.info.run_id, learner.unfinished))
-            point = choose_operating_point(learner, judged, settings)
+            point = choose_alarm_threshold(source, anew=True)
             report = evaluate(learner, device, settings, point)
             parts = [(learner.probabilities(p), p.known_labels) for p in data.parts("validation") if len(p)]
             scores = _score(data.task, *map(torch.cat, zip(*parts, strict=True))) if parts else {}
@@ -245,7 +248,7 @@ def _find_finished(store: Store, config: Config, identity: dict[str, str]) -> Ru
 
 
 def log_learner(store: Store, run: Run, learner: AbstractLearner) -> None:
-    """Log what a learner has learned, for :meth:`skin.runs.finished_run.FinishedRun.load_weights`."""
+    """Log what a learner has learned, for :meth:`skin.runs.run.FinishedRun.load_weights`."""
     with tempfile.TemporaryDirectory() as folder:
         path = learner.save(Path(folder))
         store.client.log_artifact(run.info.run_id, str(path))
@@ -349,7 +352,7 @@ def _holds(value: Any, name: str) -> bool:
 def log_report(store: Store, run: Run, report: Report, task: Task, values: dict[str, float]) -> None:
     """Log an evaluation, with its predictions and confusion matrices, and further values.
 
-    The operating point is stored as the tag ``TAG``; :attr:`skin.runs.finished_run.FinishedRun.point` reads
+    The operating point is stored as the tag ``TAG``; :attr:`skin.runs.run.FinishedRun.point` reads
     it.
     """
     point = report.point
@@ -388,11 +391,13 @@ _STEPS = {
 }
 
 
-def evaluate_run(config: Config, changes: Sequence[str]) -> None:
+def evaluate_run(config: Config, run: str, out: str | None, changes: Sequence[str]) -> None:
     """Evaluate a finished run on the touches that a command describes; print and log the metrics.
 
     Args:
         config: of ``skin evaluate``.
+        run: name of the run.
+        out: folder of the page; None: ``results/``.
         changes: the overrides of the command line.
 
     Raises:
@@ -400,12 +405,11 @@ def evaluate_run(config: Config, changes: Sequence[str]) -> None:
     """
     quiet()
     with Steps(_STEPS) as steps:
-        _evaluate(config, changes, steps)
+        _evaluate(FinishedRun.named(run, config), results(out), changes, steps)
 
 
-def _evaluate(config: Config, changes: Sequence[str], steps: Steps) -> None:
-    run, folder = FinishedRun.named(config), results(config.out)
-    config = run.configured(compose("evaluate", [*changes]), changes)
+def _evaluate(run: FinishedRun, folder: Path, changes: Sequence[str], steps: Steps) -> None:
+    config = run.configured(changes)
     settings = check_evaluation(config.evaluation)
     model = load_model(run, config)
     device, learner, point = model.device, model.learner, model.point

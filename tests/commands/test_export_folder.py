@@ -86,7 +86,7 @@ def test_bad_input_ends_with_a_sentence(folder, run, overrides, message):
 
 
 def test_weights_that_are_too_large_are_refused(folder, run):
-    code = "import skin.runs.model_folder as m; from skin.commands.export import main; m._LARGEST = 100\n"
+    code = "import skin.runs.card as m; from skin.commands.export import main; m._LARGEST = 100\n"
     code += "main(['format=folder', 'name=new', 'licence=MIT'{own}])"
     own = f", 'tracking.uri=sqlite:///{folder}/m.db'"
     (folder / "limited.py").write_text(code.format(own=own))

@@ -13,7 +13,8 @@ from skin.runs.configuration import validate_config
 
 def check(*overrides, name="evaluate"):
     with initialize_config_dir(str(CONF), version_base="1.3"):
-        check_quickly(validate_config(compose(name, list(overrides))), overrides)
+        config = compose(name, list(overrides))
+        check_quickly(validate_config(config), config.get("run"), overrides)
 
 
 @pytest.mark.parametrize(
@@ -41,9 +42,10 @@ def test_a_wrong_setting_is_refused(overrides, message):
         ("generate", "n=-1"),
     ],
 )
-def test_a_negative_number_of_what_is_counted_is_refused(name, override):
-    with pytest.raises(InputError, match=f"^{override} is below 0: give a number above 0"):
-        check(override, name=name)
+def test_a_negative_number_of_what_is_counted_is_refused(name, override, run, tmp_path):
+    done = run(tmp_path, name, override, store=False)
+    assert done.returncode == 2
+    assert done.stderr.startswith(f"{override} is below 0: give a number above 0")
 
 
 @pytest.mark.parametrize("name", ["train", "live", "export", "adapt", "record", "listen", "emulate", "study"])

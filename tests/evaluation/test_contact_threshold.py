@@ -6,7 +6,7 @@ from sklearn.metrics import balanced_accuracy_score
 
 from skin.device.touches import Touches
 from skin.errors import InputError
-from skin.evaluation.operating_point import ContactThreshold, gates, rise
+from skin.evaluation.streams import ContactThreshold, gates, rise
 from skin.touch.labels import TOUCH, TOUCH_OR_NOT
 
 

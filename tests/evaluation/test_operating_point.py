@@ -12,19 +12,11 @@ from scipy.stats import beta
 from skin.core.rng import Stream, generator
 from skin.device.resampling import Frame
 from skin.errors import InputError
-from skin.evaluation import operating_point
+from skin.evaluation import alarm, touch_scores
+from skin.evaluation.alarm import AlarmSource, choose_alarm_threshold, threshold_gestures
+from skin.evaluation.decisions import LiveConditions
 from skin.evaluation.metrics import compute_metrics
-from skin.evaluation.operating_point import (
-    OperatingPoint,
-    Reached,
-    Watching,
-    choose_for_touches,
-    choose_operating_point,
-    lowest_threshold,
-    parse_operating_point,
-    threshold_gestures,
-    touch_scores,
-)
+from skin.evaluation.operating_point import OperatingPoint, Reached, parse_operating_point
 from skin.evaluation.report import evaluate
 from skin.evaluation.settings import Evaluation, check_evaluation
 from skin.hardware.live.engine import Detection, Engine
@@ -38,6 +30,11 @@ POINT = OperatingPoint(0.25, 0.02, 2048, 40, 3)
 GESTURES = Task(("stroke", "dangerous", "slap"), "exclusive")
 SMALL = ["simulator=naive", "layout=grid", "layout.rows=3", "layout.columns=3", "device.tare=true"]
 CONTACT = 0.5  # N
+
+
+def choose(learner, device, settings, live=None):
+    """Return the operating point of a new learner on a device."""
+    return choose_alarm_threshold(AlarmSource("new", settings, learner, device=device), live, anew=True)
 
 
 class Peak:
@@ -64,7 +61,7 @@ def test_as_many_safe_gestures_raise_the_alarm_as_are_allowed(count, target, all
     """k = floor(target (n + 1)) - 1; 0.29 * 100 is 28.999999999999996 in floating point."""
     generator = torch.Generator().manual_seed(0)
     scores = torch.linspace(0.1, 0.9, count)[torch.randperm(count, generator=generator)]
-    threshold = lowest_threshold(scores, target)
+    threshold = alarm._lowest_threshold(scores, target)
     assert int((scores > threshold).sum()) == allowed
     assert allowed / count <= target
 
@@ -73,7 +70,7 @@ def test_a_new_safe_gesture_raises_the_alarm_as_often_as_wanted():
     """The true rate is a beta variable of mean (k + 1) / (n + 1): exact, whatever the scores are."""
     rng = np.random.default_rng(0)
     # The true rate of a threshold on uniform scores is one minus the threshold.
-    rates = [1 - lowest_threshold(torch.from_numpy(rng.random(499)), 0.02) for _ in range(400)]
+    rates = [1 - alarm._lowest_threshold(torch.from_numpy(rng.random(499)), 0.02) for _ in range(400)]
     assert np.mean(rates) == pytest.approx(10 / 500, abs=4 * beta(10, 490).std() / 20)
     assert np.std(rates) == pytest.approx(beta(10, 490).std(), rel=0.15)
 
@@ -81,24 +78,24 @@ def test_a_new_safe_gesture_raises_the_alarm_as_often_as_wanted():
 def test_equal_scores_raise_the_alarm_together_or_not_at_all():
     """A vote of five members: 3 % of the safe gestures have all of them, 10 % four or more."""
     votes = torch.tensor([1.0] * 30 + [0.8] * 70 + [0.0] * 900)
-    assert 0.8 < lowest_threshold(votes, 0.05) < 1
-    assert int((votes > lowest_threshold(votes, 0.05)).sum()) == 30
-    assert int((votes > lowest_threshold(votes, 0.2)).sum()) == 100
-    assert lowest_threshold(votes, 0.02) > 1
+    assert 0.8 < alarm._lowest_threshold(votes, 0.05) < 1
+    assert int((votes > alarm._lowest_threshold(votes, 0.05)).sum()) == 30
+    assert int((votes > alarm._lowest_threshold(votes, 0.2)).sum()) == 100
+    assert alarm._lowest_threshold(votes, 0.02) > 1
 
 
 def test_the_last_digit_of_a_score_decides_nothing():
     """Scores of another processor differ in the last digit; the same gestures raise the alarm."""
     scores = torch.rand(3000, generator=torch.Generator().manual_seed(0)).round(decimals=3)
-    threshold = lowest_threshold(scores, 0.05)
+    threshold = alarm._lowest_threshold(scores, 0.05)
     up, down = (torch.nextafter(scores, torch.tensor(end)) for end in (2.0, -1.0))
     for other in (up, down):
         assert torch.equal(other > threshold, scores > threshold)
-        assert int((scores > lowest_threshold(other, 0.05)).sum()) == int((scores > threshold).sum())
+        assert int((scores > alarm._lowest_threshold(other, 0.05)).sum()) == int((scores > threshold).sum())
 
 
 def test_one_comparison_in_single_and_double_precision():
-    threshold = lowest_threshold(torch.rand(500, generator=torch.Generator().manual_seed(1)), 0.1)
+    threshold = alarm._lowest_threshold(torch.rand(500, generator=torch.Generator().manual_seed(1)), 0.1)
     assert threshold == float(np.float32(threshold))
     near = np.nextafter(np.float32(threshold), np.float32([0, 0.5, 1]), dtype=np.float32)
     chances = torch.from_numpy(np.append(near, np.float32(threshold)))
@@ -166,17 +163,14 @@ def test_fresh_gestures_belong_to_no_split_and_enough_are_safe(device):
 
 
 def test_the_chosen_point_has_the_wanted_rate_on_its_gestures(device):
-    point = choose_operating_point(Peak(), device, SETTINGS)
+    point = choose(Peak(), device, SETTINGS)
     fresh = threshold_gestures(device, SETTINGS)
     reached = point.reached(Peak().probabilities(fresh), fresh.labels, TOUCH)
     assert (point.safe, point.raised, point.target, point.seed) == (64, 5, 0.1, 0)
     assert (reached.safe, reached.raised) == (64, 5)
     assert (point.dangerous, point.found) == (reached.dangerous, reached.found) == (64, reached.found)
     assert f"finds {100 * reached.recall:.1f} % of 64 dangerous ones" in point.sentence()
-    assert (
-        choose_operating_point(Peak(), device, replace(SETTINGS, false_alarm_rate=0.5)).threshold
-        < point.threshold
-    )
+    assert choose(Peak(), device, replace(SETTINGS, false_alarm_rate=0.5)).threshold < point.threshold
 
 
 def test_streams_are_drawn_until_enough_windows_show_a_safe_touch(device):
@@ -184,11 +178,11 @@ def test_streams_are_drawn_until_enough_windows_show_a_safe_touch(device):
     fresh = threshold_gestures(streamed, SETTINGS)
     here = fresh.labels[:, 4] > 0.5
     assert int((here & (fresh.labels[:, 3] < 0.5)).sum()) >= 64
-    assert choose_operating_point(Peak(TOUCH_OR_NOT), streamed, SETTINGS).safe >= 64
+    assert choose(Peak(TOUCH_OR_NOT), streamed, SETTINGS).safe >= 64
 
 
 def test_a_device_without_fresh_gestures_gives_its_validation_split_and_says_so(made_up_device):
-    point = choose_operating_point(Peak(), made_up_device, SETTINGS)
+    point = choose(Peak(), made_up_device, SETTINGS)
     labels = made_up_device.touches("validation").labels
     assert point.safe == int((labels[:, 3] < 0.5).sum())
     assert point.seed is None
@@ -198,7 +192,7 @@ def test_a_device_without_fresh_gestures_gives_its_validation_split_and_says_so(
 
 def test_a_task_without_dangerous_has_no_operating_point(made_up_device):
     made_up_device.task = Task(("big", "dynamic", "press", "hard"))
-    assert choose_operating_point(Peak(), made_up_device, SETTINGS) is None
+    assert choose(Peak(), made_up_device, SETTINGS) is None
     found = evaluate(Peak(), made_up_device, SETTINGS, None)
     assert found.reached is None
     assert not [name for name in found.metrics if "alarm" in name]
@@ -220,7 +214,7 @@ def test_a_threshold_that_hides_dangerous_touches_is_told():
 
 
 def test_what_is_stored_reads_back_to_the_last_digit():
-    point = replace(POINT, threshold=lowest_threshold(torch.linspace(0.1, 0.7, 500), 0.02))
+    point = replace(POINT, threshold=alarm._lowest_threshold(torch.linspace(0.1, 0.7, 500), 0.02))
     assert parse_operating_point(point.text()) == point
     assert parse_operating_point("null") is None
 
@@ -278,7 +272,7 @@ def drawn(configured):
 
 
 def watching(rate, **changes):
-    return Watching(rate, CONTACT, 2.0, **{"patience": 0.1, "column": 3, **changes})
+    return LiveConditions(rate, CONTACT, 2.0, **{"patience": 0.1, "column": 3, **changes})
 
 
 def engine_windows(drawn, readings, valid, ends, rate):
@@ -307,10 +301,10 @@ def test_the_windows_are_those_that_the_engine_decides_on(drawn, rate):
     labels = balanced(16, generator(Stream.TEST, 3))
     movie = drawn.sampler.sample(16, generator(Stream.TEST, 4), labels)
     same = [generator(Stream.ALARM, 5) for _ in range(2)]
-    windows, valid, contact = operating_point._decision_windows(drawn, movie, watching(rate), same[0])
-    readings, _ = operating_point._measure_touches(drawn, movie, watching(rate), same[1])
+    windows, valid, contact = touch_scores._decision_windows(drawn, movie, watching(rate), same[0])
+    readings, _ = touch_scores._measure_touches(drawn, movie, watching(rate), same[1])
     step = max(1.0, rate / 20)
-    ends = operating_point._draw_decisions(readings.shape, round(30 * rate / 10), step, same[1])
+    ends = touch_scores._draw_decisions(readings.shape, round(30 * rate / 10), step, same[1])
     longest = 0
     for touch in sorted(range(16), key=lambda touch: -int(contact[touch].sum()))[::3]:
         found, felt = engine_windows(
@@ -325,13 +319,14 @@ def test_the_windows_are_those_that_the_engine_decides_on(drawn, rate):
 
 @pytest.mark.parametrize("rate", [10.0, 20.0, 100.0])
 def test_the_share_of_new_safe_touches_is_the_one_that_was_asked_for(drawn, rate):
-    point = choose_for_touches(Largest(), drawn, watching(rate), 0.1, 400)
-    assert (point.safe, point.rate) == (400, None)
+    point = choose(Largest(), drawn, replace(SETTINGS, safe_gestures=400), watching(rate))
+    assert (point.safe, point.dangerous, point.rate) == (400, 400, rate)
     assert point.raised <= 40
-    assert point.dangerous == 0
     labels = balanced(1600, generator(Stream.TEST, 8))
     safe = labels[~labels[:, 3]]
-    share = float(point.alarm(touch_scores(Largest(), drawn, watching(rate), safe, 99)).float().mean())
+    share = float(
+        point.alarm(touch_scores.touch_scores(Largest(), drawn, watching(rate), safe, 99)).float().mean()
+    )
     # Both are counted: three standard deviations of 400 and 800 touches.
     assert share == pytest.approx(0.1, abs=3 * (0.09 / 400 + 0.09 / 800) ** 0.5)
 
@@ -347,7 +342,8 @@ class Onset(Largest):
 def test_one_decision_raises_more_alarms_than_two(drawn):
     labels = balanced(64, generator(Stream.TEST, 8))
     two, one = (
-        touch_scores(Onset(), drawn, watching(100.0, patience=patience), labels, 9) for patience in (0.1, 0)
+        touch_scores.touch_scores(Onset(), drawn, watching(100.0, patience=patience), labels, 9)
+        for patience in (0.1, 0)
     )
     assert (one >= two).all()
     assert (one > two).any()
@@ -361,7 +357,7 @@ def test_a_device_of_the_model_gives_its_frames(drawn):
     """The simulator sends the frames of the model; a real one of that rate reads at any phase."""
     labels = balanced(64, generator(Stream.TEST, 8))
     aligned, real = (
-        touch_scores(Largest(), drawn, watching(10.0, aligned=aligned), labels, 9)
+        touch_scores.touch_scores(Largest(), drawn, watching(10.0, aligned=aligned), labels, 9)
         for aligned in (True, False)
     )
     assert aligned.mean() > real.mean()

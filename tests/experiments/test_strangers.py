@@ -14,7 +14,7 @@ from omegaconf import OmegaConf
 from skin.errors import InputError
 from skin.runs.build import build_device, build_learner
 from skin.runs.configuration import Tracking, settings_of
-from skin.runs.finished_run import FinishedRun, find_run
+from skin.runs.run import FinishedRun, find_run
 from skin.runs.store import Store
 
 # MLflow's own business with SQLAlchemy.

@@ -13,7 +13,7 @@ from skin.errors import InputError
 from skin.runs.adaptation import FineTuning, choose_gestures, find_target, simulated_budget
 from skin.runs.build import build_device
 from skin.runs.configuration import validate_config
-from skin.runs.finished_run import FinishedRun
+from skin.runs.run import FinishedRun
 
 NAIVE = ["simulator=naive", "layout=grid", "layout.rows=2", "layout.columns=2"]
 

@@ -10,16 +10,13 @@ from hydra import compose, initialize_config_dir
 from skin.core.files import CONF
 from skin.device.calibration import Calibration, write_calibration
 from skin.errors import InputError
-from skin.evaluation.operating_point import OperatingPoint, Watching
+from skin.evaluation import alarm
+from skin.evaluation.alarm import choose_alarm_threshold, profile_settings
+from skin.evaluation.decisions import LiveConditions
+from skin.evaluation.operating_point import OperatingPoint
 from skin.runs.configuration import validate_config
-from skin.runs.finished_run import TAG, FinishedRun
-from skin.runs.model_of_run import (
-    RunModel,
-    alarm_point,
-    alarm_point_for_touches,
-    profile_settings,
-    threshold_device,
-)
+from skin.runs.run import TAG, FinishedRun
+from skin.runs.torch_model import alarm_source
 
 SMALL = ["simulator=naive", "data.gestures=40", "evaluation.safe_gestures=16"]
 
@@ -29,6 +26,11 @@ def hydra():
     """Compose configurations, as commands do."""
     with initialize_config_dir(str(CONF), version_base="1.3"):
         yield lambda *words: validate_config(compose("train", [*SMALL, *words]))
+
+
+def threshold_device(stored, config):
+    """Return the device on which the threshold of a run is chosen."""
+    return alarm.threshold_device(alarm_source(run_of(stored, STORED), None, config))
 
 
 def test_a_profile_replaces_the_imperfections_of_the_training(hydra):
@@ -104,28 +106,33 @@ class Quiet:
 STORED = OperatingPoint(0.875, 0.02, 5000, 99, 0)
 
 
+def alarm_point(stored, config, *live, **how):
+    """Return where a run of this configuration raises the alarm on the device of another."""
+    return choose_alarm_threshold(alarm_source(run_of(stored, STORED), Quiet(), config), *live, **how)
+
+
 def test_the_stored_threshold_holds_without_another_profile(hydra):
-    assert alarm_point(run_of(hydra(), STORED), None, hydra()) == STORED
+    assert alarm_point(hydra(), hydra()) == STORED
     rough = hydra("evaluation.profile=rough")
-    assert alarm_point(run_of(rough, STORED), None, rough) == STORED
+    assert alarm_point(rough, rough) == STORED
 
 
 def test_another_profile_and_one_of_many_skins_have_a_threshold_of_their_own(hydra):
     skins = hydra("device=skins", "device.count=1")
-    assert alarm_point(run_of(skins, STORED), None, skins) == STORED
+    assert alarm_point(skins, skins) == STORED
     for run, config, one_skin in (
         (hydra(), hydra("evaluation.profile=rough"), False),
         (skins, hydra(), False),
         (skins, skins, True),
     ):
-        point = alarm_point(run_of(run, STORED), Quiet(), config, one_skin)
+        point = alarm_point(run, config, one_skin=one_skin)
         assert 0.25 < point.threshold < 0.2501
 
 
 def test_a_profile_is_refused_where_the_device_draws_many_skins(hydra):
     many = hydra("device=skins", "device.count=1", "evaluation.profile=device")
     with pytest.raises(InputError, match="the threshold for one skin: add device=simulated"):
-        alarm_point(run_of(many, STORED), Quiet(), many)
+        alarm_point(many, many)
 
 
 @pytest.fixture
@@ -141,17 +148,16 @@ def device_of(tmp_path, monkeypatch):
     """Return a function that gives the device on which the threshold for touches is chosen."""
     devices = []
 
-    def choose(learner, device, watching, target, *counts):
+    def choose(device, learner, live, target, count):
         devices.append(device)
         return STORED
 
     def device_of(stored, config):
-        watching = Watching(100.0, 0.1, 2.0, 0.1, 3)
-        alarm_point_for_touches(run_of(stored, STORED), Quiet(), config, watching, print)
+        alarm_point(stored, config, LiveConditions(100.0, 0.1, 2.0, 0.1, 3), say=print)
         return devices[-1]
 
     monkeypatch.setenv("SKIN_CACHE", str(tmp_path))
-    monkeypatch.setattr("skin.runs.model_of_run.choose_for_touches", choose)
+    monkeypatch.setattr(alarm, "_on_touches_of", choose)
     return device_of
 
 
@@ -178,12 +184,10 @@ def test_touches_of_a_run_of_drawn_skins_are_measured_by_mild_devices(hydra, dev
     assert device_of(hydra("profile=rough"), hydra()).noise == profile_settings("rough")["noise"]
 
 
-def test_a_threshold_that_hides_dangerous_touches_is_refused(hydra):
-    model = RunModel.__new__(RunModel)
+def test_a_threshold_that_hides_dangerous_touches_is_refused():
     hiding = OperatingPoint(0.9996, 0.02, 2000, 39, 0, 400, 250, 100.0)
-    model.point_at = lambda *_: hiding
     with pytest.raises(InputError, match=r"finds 62\.5 % of 400 dangerous ones: it hides dangerous touches"):
-        model.threshold_at(100.0, 0.1, False, print)
+        hiding.announced(print)
 
 
 def test_more_noise_means_higher_readings_at_rest(hydra):

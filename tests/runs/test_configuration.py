@@ -139,7 +139,7 @@ def test_a_checked_configuration_cannot_be_changed(configured):
 
 @pytest.mark.parametrize(
     ("override", "reason"),
-    [("+typo=1", "typo"), ("+data.typo=1", "typo"), ("data.gestures=many", "many"), ("seed=x", "seed")],
+    [("+data.typo=1", "typo"), ("data.gestures=many", "many"), ("seed=x", "seed")],
 )
 def test_what_does_not_fit_is_refused_by_name(configured, override, reason):
     with pytest.raises(InputError, match=reason):

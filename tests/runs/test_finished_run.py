@@ -3,6 +3,7 @@
 import io
 import json
 import zipfile
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -14,13 +15,14 @@ from sklearn.linear_model import LinearRegression
 
 from skin.core.files import CONF
 from skin.errors import InputError
+from skin.evaluation.alarm import choose_alarm_threshold
 from skin.evaluation.operating_point import OperatingPoint
 from skin.evaluation.settings import Evaluation
 from skin.runs.build import build_data, build_device, build_learner
 from skin.runs.configuration import Config, Tracking, validate_config
-from skin.runs.finished_run import TAG, FinishedRun, find_run
-from skin.runs.model_of_run import stored_point
+from skin.runs.run import TAG, FinishedRun, find_run
 from skin.runs.store import Store
+from skin.runs.torch_model import alarm_source
 
 # MLflow's own business with SQLAlchemy.
 pytestmark = pytest.mark.filterwarnings("ignore:The ``noload`` loader strategy")
@@ -67,27 +69,24 @@ def test_a_name_that_means_no_single_run_is_refused(store, name, reason):
 RECORDED = Config(device={"_target_": "skin.device.recording.Recorded"})
 
 
-def tagged(text=None):
-    """Return as much of a run as its operating point is read from."""
+def stored_point(text=None, rate=0.02):
+    """Return the operating point of a run on a recording with this tag, for a false-alarm rate."""
     data = SimpleNamespace(tags={} if text is None else {TAG: text})
     run = FinishedRun(None, SimpleNamespace(data=data, info=SimpleNamespace(run_id="abc")))
     run.__dict__["stored"] = RECORDED
-    return run
-
-
-def settings(rate=0.02):
-    return Evaluation(devices=0, layouts=0, false_alarm_rate=rate)
+    settings = Evaluation(devices=0, layouts=0, false_alarm_rate=rate)
+    return choose_alarm_threshold(alarm_source(run, object(), replace(RECORDED, evaluation=settings)))
 
 
 def test_an_operating_point_comes_back_as_it_was_stored(caplog):
     point = OperatingPoint(0.8782987594604492, 0.02, 5000, 99, 0)
-    assert stored_point(tagged(point.text()), None, settings()) == point
-    assert stored_point(tagged("null"), None, settings()) is None
+    assert stored_point(point.text()) == point
+    assert stored_point("null") is None
     assert caplog.text == ""
 
 
 def test_an_old_run_on_a_recording_alarms_at_one_half_and_says_so(caplog):
-    point = stored_point(tagged(), None, settings())
+    point = stored_point()
     assert (point.threshold, point.safe) == (0.5, 0)
     said = caplog.text
     assert "run abc stores no alarm threshold for 2 % false alarms" in said
@@ -96,7 +95,7 @@ def test_an_old_run_on_a_recording_alarms_at_one_half_and_says_so(caplog):
 
 def test_another_rate_on_a_recording_keeps_the_stored_threshold_and_says_so(caplog):
     point = OperatingPoint(0.875, 0.02, 300, 5, None)
-    assert stored_point(tagged(point.text()), None, settings(0.1)) == point
+    assert stored_point(point.text(), 0.1) == point
     said = caplog.text
     assert "no alarm threshold for 10 % false alarms" in said
     assert "chosen on 300 safe validation gestures for 2 % false alarms" in said

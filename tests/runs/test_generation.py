@@ -131,7 +131,7 @@ def test_a_killed_generation_goes_on(begin, tmp_path):
     ("overrides", "message"),
     [
         (["seed=1"], r"was begun with seed=0, not 1; device.data_seed=0, not 1: repeat those settings"),
-        (["n=96"], r"was begun with n=80, not 96"),
+        (["n=96"], r"was begun with device.gestures=80, not 96"),
         (["device.noise=0.1"], r"was begun with device.noise=0.05, not 0.1: repeat"),
     ],
 )

@@ -15,7 +15,8 @@ from skin.core.files import ROOT
 from skin.core.safe_loading import load_yaml
 from skin.errors import InputError
 from skin.evaluation.operating_point import LABEL
-from skin.runs.finished_run import (
+from skin.runs.card import model_card
+from skin.runs.run import (
     CARD,
     CONFIG,
     MODELS,
@@ -26,7 +27,6 @@ from skin.runs.finished_run import (
     find_pretrained,
     is_name,
 )
-from skin.runs.model_folder import model_card
 from tests.damage import DAMAGED_FILES, damaged, mutated, opened
 
 NAMES = sorted(path.name for path in (ROOT / MODELS).iterdir())
@@ -146,6 +146,15 @@ def test_another_record_is_refused(text, copied):
 def test_what_selects_a_run_or_a_path_is_no_name(name):
     assert not is_name(name)
     assert find_pretrained(name) is None
+
+
+def test_a_model_is_given_by_its_folder(copied, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path / MODELS)
+    for name in ("./copy", str(copied)):
+        assert find_pretrained(name).info.artifact_uri == copied.as_uri()
+    (copied / CONFIG).write_text("")
+    with pytest.raises(InputError, match="differs from SHA256SUMS"):
+        find_pretrained("./copy")
 
 
 def test_sha256sum_reads_the_hashes(copied):

@@ -16,9 +16,9 @@ from skin.core.files import ROOT
 from skin.errors import InputError
 from skin.runs import store as tracking
 from skin.runs.configuration import Tracking, hide_password, reveal_password, source_tags
-from skin.runs.finished_run import FinishedRun
-from skin.runs.model_of_run import load_run
+from skin.runs.run import FinishedRun
 from skin.runs.store import TAGS, Store, print_table_link
+from skin.runs.torch_model import load_run
 from tests.budget import free
 
 # MLflow's own business with SQLAlchemy.

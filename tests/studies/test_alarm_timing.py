@@ -8,7 +8,7 @@ from skin.errors import InputError
 from skin.hardware.live.engine import DebounceSettings
 from skin.hardware.live.engine_builder import engine_settings
 from skin.runs.build import build_data, build_device, build_learner
-from skin.runs.model_of_run import RunModel
+from skin.runs.torch_model import TorchModel
 
 SMALL = ["simulator=naive", "layout=grid", "layout.rows=3", "layout.columns=3", "data.gestures=600"]
 LEARNERS = {
@@ -33,7 +33,7 @@ def trained(request, configured):
     device, learner = build_device(config), build_learner(config)
     data = build_data(config, device)
     learner.fit(data)
-    return RunModel(device, learner, data.example), device.replace(stream=False)
+    return TorchModel(device, learner, data.example), device.replace(stream=False)
 
 
 @pytest.fixture(scope="module", params=[None, 0.3], ids=["learned", "threshold"])

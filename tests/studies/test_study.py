@@ -13,7 +13,7 @@ from experiments.studies.study import chosen_studies, variants
 from experiments.studies.study_page import read_reference
 from skin.core.files import CONF
 from skin.errors import InputError
-from skin.runs.configuration import fingerprint, validate_config
+from skin.runs.configuration import fingerprint
 from tests.budget import free
 
 FILES = {path.stem: OmegaConf.load(path) for path in sorted((CONF / "study").glob("*.yaml"))}
@@ -49,8 +49,7 @@ def composing(*words):
     with initialize_config_dir(str(CONF), version_base="1.3"):
         config = compose("study", list(words), return_hydra_config=True)
         HydraConfig.instance().set_config(config)
-        own = OmegaConf.masked_copy(config, [key for key in config if key != "hydra"])
-        *_, study = chosen_studies(validate_config(own))
+        *_, study = chosen_studies(OmegaConf.to_container(config.study, resolve=True))
         yield study
 
 

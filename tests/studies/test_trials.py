@@ -6,16 +6,14 @@ from functools import partial
 import numpy as np
 import pandas as pd
 import pytest
-from hydra import compose, initialize_config_dir
 
 from experiments.studies import trials
 from experiments.studies.measures import Accuracy, Margins
 from experiments.studies.study import Study
 from experiments.studies.trials import RestoredRun, Subject, numbered_settings, read_frame, votes, write_frame
-from skin.core.files import CONF
 from skin.errors import InputError
 from skin.runs.configuration import fingerprint
-from skin.runs.finished_run import find_pretrained
+from skin.runs.run import find_pretrained
 from skin.runs.store import Store
 
 # MLflow's own business with SQLAlchemy.
@@ -67,12 +65,6 @@ def measured(configured, tmp_path, monkeypatch):
     store, count = Store.open(config.tracking), []
     monkeypatch.setattr(trials, "build_device", lambda config: None)
     monkeypatch.setattr(RestoredRun, "trained", None)
-
-    def compose_row(name, words):
-        with initialize_config_dir(str(CONF), version_base="1.3"):
-            return compose(name, ["experiment=rules", *words])
-
-    monkeypatch.setattr(trials, "compose", compose_row)
 
     def train(run=None, **settings):
         if run is None:

@@ -12,11 +12,11 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 from annotated_types import Ge, Gt, Le
-from hydra import compose
 
 from skin.core.settings import configured
 from skin.device.resampling import Frame
 from skin.errors import InputError
+from skin.evaluation.alarm import choose_alarm_threshold
 from skin.evaluation.decisions import DRIFT, least_visible
 from skin.hardware.check import verify_source
 from skin.hardware.live.contacts import Mechanics
@@ -26,8 +26,7 @@ from skin.hardware.wire.channels import RawRange, UnitConversion, unit_conversio
 from skin.hardware.wire.reader import PortSettings, SkinDisconnected, SkinTimeout
 from skin.hardware.wire.skin import SerialSource, Skin, Source
 from skin.runs.configuration import Config
-from skin.runs.exported_model import ExportedModel
-from skin.runs.trained_model import TrainedModel
+from skin.runs.model import Model, OnnxModel
 
 STRENGTH = 1.5
 """Pressure of the touches as a multiple of the limit of ``dangerous``."""
@@ -273,7 +272,7 @@ class Watched:
         nominal: those that the model brings.
     """
 
-    model: TrainedModel
+    model: Model
     source: Source
     settings: EngineSettings
     nominal: EngineSettings
@@ -337,7 +336,7 @@ class LiveSetup:
         mechanics: gives what contacts are estimated with; it raises InputError if there is nothing.
     """
 
-    model: TrainedModel
+    model: Model
     name: str
     port: Source | None
     begin: Callable[[], Source]
@@ -372,7 +371,7 @@ def watch_exported(
             f"run={path} watches a skin at a port: add device=serial device.port=/dev/ttyACM0, or give the "
             "run itself for a recording or the simulator"
         )
-    model = ExportedModel(path)
+    model = OnnxModel(path)
     source = SerialSource(PortSettings.select(device), len(model.positions), model.rate).open_source()
     opened.enter_context(source.skin)
     say(f"loaded {model.title} from {path}, exported by version {model.metadata.version}")
@@ -384,6 +383,7 @@ def _refuse_contacts() -> Mechanics:
 
 
 def watch_run(
+    name: str,
     config: Config,
     live: LiveSettings,
     say: Callable[[str], None],
@@ -394,6 +394,7 @@ def watch_run(
     """Return a finished run and the device of a configuration.
 
     Args:
+        name: of the run.
         config: of the command.
         live: settings of the live view.
         say: called with each message for the user.
@@ -408,22 +409,19 @@ def watch_run(
 
     from skin.hardware.serial import open_source
     from skin.runs.build import build_device
-    from skin.runs.finished_run import FinishedRun
-    from skin.runs.model_of_run import equation10_warning, load_model
+    from skin.runs.run import FinishedRun
+    from skin.runs.torch_model import equation10_warning, load_model
 
     torch.set_num_threads(config.tracking.threads or 1)
-    run = FinishedRun.named(config)
-    composed = compose("live", [*overrides])
-    watched = run.configured(composed, overrides)
+    run = FinishedRun.named(name, config)
+    watched = run.configured(overrides)
     device = build_device(watched)
     # A port is opened first: that it is missing must not take as long to say as a run takes to load.
     port = open_source(device) if device.real else None
     if port is not None:
         opened.enter_context(port.skin)
     # The training data stay those of the run, for any watched device.
-    trained = run.configured(
-        composed, [word for word in overrides if not word.startswith(("device=", "device."))]
-    )
+    trained = run.configured([word for word in overrides if not word.startswith(("device=", "device."))])
     say(f"loading {run.title} ({run.identity[:8]})")
     if not own_mechanics and (advice := equation10_warning(run.stored, device)):
         say(advice)
@@ -441,7 +439,7 @@ def watch_run(
 
 
 def engine_settings(
-    model: TrainedModel,
+    model: Model,
     patience: DebounceSettings,
     touch: float | None = None,
     drift: float = 600 * DRIFT,
@@ -450,14 +448,13 @@ def engine_settings(
 
     Args:
         model: that predicts.
-        patience: settings of debouncing; without a threshold of the alarm, that of the model for windows.
+        patience: settings of debouncing, with the threshold of the alarm.
         touch: contact threshold, N above the baseline; None: that of the model, and the learned label
             ``touch`` counts as touch, too.
         drift: N in ten minutes that the baseline may follow without touch.
 
     Raises:
-        InputError: ``touch`` is neither given nor known, the threshold raises no alarm, or the model
-            estimates targets.
+        InputError: ``touch`` is neither given nor known, or the model estimates targets.
     """
     if model.task.kind == "regression":
         raise InputError(
@@ -465,13 +462,6 @@ def engine_settings(
             "give a run of those"
         )
     contact = model.contact if touch is None else touch
-    if patience.above is None and model.threshold is not None:
-        if model.threshold >= 1:
-            raise InputError(
-                f"{model.title} has no threshold that raises an alarm: give live.patience.above=0.5, or "
-                "train another run"
-            )
-        patience = replace(patience, above=model.threshold)
     return EngineSettings(
         model.probabilities,
         model.task,
@@ -485,7 +475,7 @@ def engine_settings(
 
 
 def used_and_nominal(
-    model: TrainedModel, port: Source | None, live: LiveSettings, say: Callable[[str], None]
+    model: Model, port: Source | None, live: LiveSettings, say: Callable[[str], None]
 ) -> tuple[EngineSettings, EngineSettings]:
     """Return the settings of an engine: those of a live view, and those that the model brings.
 
@@ -499,22 +489,21 @@ def used_and_nominal(
     Raises:
         InputError: no contact threshold is known, or no threshold raises an alarm as seldom as wanted.
     """
-    above = live.patience.above
-    if above is not None:
-        say(f"alarm above {above:g}")
-        # A threshold of the command line is tested against the usual one.
-        usual = model.threshold
-    elif model.alarms:
+    given, usual, conditions = live.patience.above, None, None
+    if given is None and model.alarms:
         rate = model.rate if port is None else measured_rate(port.skin)
-        above = usual = model.threshold_at(rate, live.patience.alarm, port is None, say)
-        if port is not None:
-            # Frames that waited meanwhile would delay the verdicts about those of now.
-            with suppress(SkinTimeout, SkinDisconnected):
-                port.skin.read(_ALL, 0.0)
-    else:
-        usual = None
+        conditions = model.live_conditions(rate, live.patience.alarm, port is None)
+    if given is not None or model.alarms:
+        point = choose_alarm_threshold(model.alarm, conditions, given, say=say)
+        # A threshold of the command line is tested against the usual one.
+        usual = model.threshold if point is None or given is not None else point.announced(say)
+    if conditions is not None and port is not None:
+        # Frames that waited meanwhile would delay the verdicts about those of now.
+        with suppress(SkinTimeout, SkinDisconnected):
+            port.skin.read(_ALL, 0.0)
     nominal = engine_settings(model, DebounceSettings(above=usual))
     used = engine_settings(model, nominal.patience, live.touch, live.drift)
+    above = usual if given is None else given
     return replace(used, patience=replace(live.patience, above=above)), nominal
 
 

@@ -3,7 +3,7 @@
 import pytest
 
 from skin.runs.build import build_device
-from skin.runs.model_of_run import equation10_warning
+from skin.runs.torch_model import equation10_warning
 
 PORT = ("device=serial", "device.port=/dev/ttyACM0", "device.scale=0.04")
 

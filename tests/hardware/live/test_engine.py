@@ -11,7 +11,7 @@ from skin.device.touches import Touches
 from skin.errors import InputError
 from skin.hardware.live.engine import Debounce, DebounceSettings, Detection, Engine
 from skin.hardware.wire.channels import UnitConversion
-from skin.runs.model_of_run import window_classifier
+from skin.runs.torch_model import window_classifier
 from skin.touch.labels import TOUCH, Task
 
 PLAIN_PARTS = np.ones(4), np.zeros(4), np.zeros(4, bool)

@@ -44,7 +44,7 @@ finally:
 def trained(configured):
     """Return a small untrained network with six sensors, whose alarm is above 0.25, and some touches."""
     from skin.runs.build import build_data, build_device, build_learner
-    from skin.runs.model_of_run import RunModel
+    from skin.runs.torch_model import TorchModel
 
     sizes = ["layout=grid", "layout.rows=2", "layout.columns=3", "data.gestures=100"]
     config = configured("simulator=naive", *sizes, "representation=readings", "model=mlp", "fusion=early")
@@ -54,7 +54,7 @@ def trained(configured):
     learner.build(data)
     known = data.touches("train")
     point = OperatingPoint(0.25, 0.02, 5000, 100, 0)
-    return RunModel(device, learner, data.example, point, 0.3), known
+    return TorchModel(device, learner, data.example, point, 0.3), known
 
 
 @pytest.fixture(scope="module")

@@ -236,7 +236,7 @@ class Sure:
 def test_probably_dangerous_is_not_safe(above, danger):
     from torch import zeros
 
-    from skin.runs.model_of_run import window_classifier
+    from skin.runs.torch_model import window_classifier
 
     classify = window_classifier(Sure(), zeros(SENSORS, 3), 10.0)
     strict = replace(settings(), classify=classify, patience=DebounceSettings(above=above))

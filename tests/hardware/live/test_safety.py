@@ -18,7 +18,7 @@ from skin.hardware.wire.channels import RawRange, UnitConversion
 from skin.hardware.wire.protocol import Header, encode_header, encode_line
 from skin.hardware.wire.reader import PortSettings
 from skin.hardware.wire.skin import SerialSource
-from skin.runs.model_of_run import window_classifier
+from skin.runs.torch_model import window_classifier
 from skin.touch.labels import TOUCH
 from tests.hardware.live.memory_view import MemoryView
 

@@ -25,7 +25,7 @@ from skin.hardware.wire.protocol import (
     encode_line,
 )
 from skin.runs.build import build_data, build_device, build_learner
-from skin.runs.model_of_run import window_classifier
+from skin.runs.torch_model import window_classifier
 from skin.touch.labels import TOUCH
 
 SHEET = Sheet((0.16, 0.16), (32, 32), [{"material": "EcoFlex 00-30", "thickness": 0.005}])

@@ -7,7 +7,7 @@ import torch
 from filelock import FileLock
 
 from skin.runs.build import build_data, build_device, build_learner
-from skin.runs.model_of_run import RunModel
+from skin.runs.torch_model import TorchModel
 
 SMALL = ["simulator=naive", "layout=grid", "layout.rows=2", "layout.columns=3", "data.gestures=96"]
 
@@ -16,20 +16,20 @@ SMALL = ["simulator=naive", "layout=grid", "layout.rows=2", "layout.columns=3", 
 def untrained(configured):
     """Return a function that builds a run of a learner without training it."""
 
-    def build(*overrides: str) -> RunModel:
+    def build(*overrides: str) -> TorchModel:
         config = configured(*SMALL, *overrides)
         device, learner = build_device(config), build_learner(config)
         data = build_data(config, device)
         with torch.random.fork_rng():
             torch.manual_seed(0)
             learner.build(data)
-        return RunModel(device, learner, data.example, touch=0.3)
+        return TorchModel(device, learner, data.example, touch=0.3)
 
     return build
 
 
 @pytest.fixture(scope="session")
-def exported(untrained, shared) -> tuple[RunModel, Path]:
+def exported(untrained, shared) -> tuple[TorchModel, Path]:
     """Return the run with features, and its exported file, which one process writes for all."""
     pytest.importorskip("onnxruntime")
     from skin.runs.onnx_writer import write_model

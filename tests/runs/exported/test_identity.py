@@ -4,12 +4,12 @@ import json
 from dataclasses import replace
 
 import pytest
-from hydra import compose, initialize_config_dir
+from hydra import initialize_config_dir
 
 from skin.core.files import CONF
 from skin.core.safe_loading import KEY as CHECKSUM
 from skin.errors import InputError
-from skin.runs.exported_model import check_overrides, describe_skin
+from skin.runs.model import check_overrides, describe_skin
 
 onnx = pytest.importorskip("onnx")
 pytest.importorskip("onnxruntime")
@@ -33,7 +33,7 @@ def model(untrained, configured, tmp_path_factory):
 def check(path, *overrides):
     given = [f"run={path}", *overrides]
     with initialize_config_dir(str(CONF), version_base="1.3"):
-        check_overrides(str(path), compose("live", given), given)
+        check_overrides(str(path), given)
 
 
 @pytest.mark.parametrize(
@@ -76,11 +76,11 @@ def test_the_same_positions_are_accepted_from_a_file(model, tmp_path, untrained)
     path = tmp_path / "six.csv"
     path.write_text("\n".join(["x_m,y_m,depth_m", *lines]))
     with initialize_config_dir(str(CONF), version_base="1.3"):
-        composed = compose("live", ["layout=file", f"layout.path={path}"])
-        check_overrides(str(model), composed, ["layout=file"])
+        words = ["layout=file", f"layout.path={path}"]
+        check_overrides(str(model), words)
         path.write_text("\n".join(["x_m,y_m,depth_m", *lines[::-1]]))
         with pytest.raises(InputError, match="contradicts"):
-            check_overrides(str(model), composed, ["layout=file"])
+            check_overrides(str(model), words)
 
 
 def test_a_file_of_an_earlier_version_accepts_no_description(exported):

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from skin.core import safe_loading as checksum
 from skin.errors import InputError
-from skin.runs.exported_model import KEY, ExportedModel, ModelMetadata
+from skin.runs.model import KEY, ModelMetadata, OnnxModel
 from tests.damage import DAMAGED_FILES, damaged, mutated, opened
 
 onnx = pytest.importorskip("onnx")
@@ -71,7 +71,7 @@ def written(tmp_path_factory):
 
 
 def test_a_sealed_file_is_used(written):
-    assert ExportedModel(written).probabilities(*WINDOW).shape == (1, 2)
+    assert OnnxModel(written).probabilities(*WINDOW).shape == (1, 2)
 
 
 @DAMAGED_FILES
@@ -79,11 +79,9 @@ def test_a_sealed_file_is_used(written):
 def test_damage_never_passes_for_a_network(written, data):
     path = written.with_name("damaged.onnx")
     path.write_bytes(data.draw(damaged(written.read_bytes())))
-    known = opened(lambda: ExportedModel(path))
+    known = opened(lambda: OnnxModel(path))
     if known is not None:
-        np.testing.assert_array_equal(
-            known.probabilities(*WINDOW), ExportedModel(written).probabilities(*WINDOW)
-        )
+        np.testing.assert_array_equal(known.probabilities(*WINDOW), OnnxModel(written).probabilities(*WINDOW))
 
 
 @DAMAGED_FILES
@@ -170,7 +168,7 @@ def dependent():
 def test_a_hostile_file_is_refused_soon(tmp_path, made, reason):
     path, start = write(made(), tmp_path / "skin.onnx"), monotonic()
     with pytest.raises(InputError, match=reason):
-        ExportedModel(path)
+        OnnxModel(path)
     assert monotonic() - start < 20
 
 
@@ -178,7 +176,7 @@ def test_what_is_no_file_is_refused(tmp_path):
     os.mkfifo(tmp_path / "pipe.onnx")
     for path in (tmp_path / "pipe.onnx", Path("/dev/zero"), tmp_path):
         with pytest.raises(InputError, match="it is no regular file"):
-            ExportedModel(path)
+            OnnxModel(path)
 
 
 def test_outputs_that_are_no_probabilities_are_refused(tmp_path):
@@ -186,4 +184,4 @@ def test_outputs_that_are_no_probabilities_are_refused(tmp_path):
     (weights,) = [tensor for tensor in made.graph.initializer if tensor.name == "weights"]
     weights.float_data[0] = float("nan")
     with pytest.raises(InputError, match="does not give probabilities"):
-        ExportedModel(write(made, tmp_path / "skin.onnx"))
+        OnnxModel(write(made, tmp_path / "skin.onnx"))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from skin.errors import InputError
-from skin.runs.exported_model import KEY, ExportedModel, ModelMetadata
+from skin.runs.model import KEY, ModelMetadata, OnnxModel
 
 onnx = pytest.importorskip("onnx")
 pytest.importorskip("onnxruntime")
@@ -14,7 +14,7 @@ pytest.importorskip("onnxruntime")
 
 def test_it_describes_itself(exported):
     of, path = exported
-    about = ExportedModel(path).metadata
+    about = OnnxModel(path).metadata
     assert about.task == of.device.task
     assert (about.rate, about.window, len(about.positions)) == (10.0, 30, 6)
     assert (about.run, about.contact, about.saturation) == ("none", 0.3, 10.0)
@@ -28,7 +28,7 @@ def test_one_window_has_one_number_per_label(exported):
     touches = of.device.touches("test")[:1]
     window = touches.readings[0].numpy(), touches.valid[0].numpy()
     np.testing.assert_allclose(
-        ExportedModel(path).probabilities(*(part[None] for part in window))[0],
+        OnnxModel(path).probabilities(*(part[None] for part in window))[0],
         of.learner.probabilities(touches)[0].numpy(),
         atol=1e-5,
     )
@@ -58,14 +58,14 @@ def changed(path, folder, change):
 )
 def test_a_wrong_description_is_refused(exported, tmp_path, change, message):
     with pytest.raises(InputError, match=message):
-        ExportedModel(changed(exported[1], tmp_path, change))
+        OnnxModel(changed(exported[1], tmp_path, change))
 
 
 def test_other_files_are_refused(tmp_path):
     with pytest.raises(InputError, match="there is no file"):
-        ExportedModel(tmp_path / "none.onnx")
+        OnnxModel(tmp_path / "none.onnx")
     (tmp_path / "text.onnx").write_text("no model")
     with pytest.raises(InputError, match="no model that ONNX Runtime can load"):
-        ExportedModel(tmp_path / "text.onnx")
+        OnnxModel(tmp_path / "text.onnx")
     with pytest.raises(InputError, match="was not written by skin export"):
         ModelMetadata.parse({}, "x.onnx")

@@ -8,7 +8,7 @@ from skin.device.touches import Touches
 from skin.errors import InputError
 from skin.learning.graph import Graph
 from skin.learning.learner import Rules
-from skin.runs.exported_model import ExportedModel
+from skin.runs.model import OnnxModel
 
 pytest.importorskip("onnxruntime")
 from skin.runs.onnx_writer import TOLERANCE, write_model
@@ -16,7 +16,7 @@ from skin.runs.onnx_writer import TOLERANCE, write_model
 
 def difference(of, path, readings, valid):
     expected = of.learner.probabilities(Touches(readings, valid, of.places, None, of.rate))
-    found = ExportedModel(path).probabilities(readings.numpy(), valid.numpy())
+    found = OnnxModel(path).probabilities(readings.numpy(), valid.numpy())
     assert found.shape == tuple(expected.shape)
     return float(np.abs(found - expected.numpy()).max())
 

@@ -22,7 +22,6 @@ from mlflow.entities import LifecycleStage, Metric, Run, RunData, RunInfo, RunSt
 from mlflow.exceptions import MlflowException
 from mlflow.utils.file_utils import local_file_uri_to_path
 from mlflow.utils.uri import is_local_uri
-from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
 from skin.core.files import candidates
@@ -32,7 +31,7 @@ from skin.errors import InputError
 from skin.evaluation.operating_point import OperatingPoint, parse_operating_point
 from skin.learning.data import TouchData
 from skin.learning.learner import AbstractLearner
-from skin.runs.configuration import Config, apply_overrides, reveal_password, validate_config
+from skin.runs.configuration import Config, recompose, reveal_password, validate_config
 from skin.runs.store import Store
 
 TAG = "operating_point"
@@ -72,13 +71,14 @@ class FinishedRun:
     trust: bool = False
 
     @classmethod
-    def named(cls, config: Config) -> "FinishedRun":
-        """Return the run that a command names with ``run=``.
+    def named(cls, run: str, config: Config) -> "FinishedRun":
+        """Return the run that a command names with ``run=``, as :func:`find_run` does.
 
-        Raises:
-            InputError: as of :func:`find_run`.
+        Args:
+            run: its name.
+            config: of the command; its ``tracking`` and ``trust`` count.
         """
-        return find_run(Store.existing(config.tracking), str(config.run), config.trust)
+        return find_run(Store.existing(config.tracking), run, config.trust)
 
     @property
     def identity(self) -> str:
@@ -115,14 +115,9 @@ class FinishedRun:
                 f"config.yaml of run {self.identity} does not fit this version: {error}: train it again"
             ) from error
 
-    def configured(self, composed: DictConfig, overrides: Sequence[str]) -> Config:
+    def configured(self, overrides: Sequence[str]) -> Config:
         """Return the configuration with the overrides of a command line."""
-        return apply_overrides(self.stored, composed, overrides)
-
-    @property
-    def stores_point(self) -> bool:
-        """Whether it is stored where the alarm is raised, or that there is none."""
-        return TAG in self.run.data.tags
+        return recompose(self.stored, overrides)
 
     @property
     def point(self) -> OperatingPoint | None:
@@ -131,7 +126,7 @@ class FinishedRun:
         Raises:
             InputError: it cannot be read.
         """
-        return parse_operating_point(self.run.data.tags[TAG]) if self.stores_point else None
+        return parse_operating_point(self.run.data.tags.get(TAG, "null"))
 
     @contextmanager
     def described(self) -> Iterator[None]:
@@ -191,7 +186,8 @@ class FinishedRun:
 def find_run(store: Store, name: str, trust: bool = False) -> FinishedRun:
     """Return a pretrained model, or the finished training run whose id or fingerprint begins with ``name``.
 
-    ``latest`` is the last finished one that has weights. Of runs with equal fingerprints the last one counts.
+    A model is named or given by its folder, as in ``./my_skin``. ``latest`` is the last finished run that has
+    weights. Of runs with equal fingerprints the last one counts.
 
     Raises:
         InputError: no run or more than one matches, or the files of the model were altered.
@@ -244,9 +240,15 @@ def find_pretrained(name: str) -> Run | None:
 
     The artifacts of the run are the files of the folder.
 
+    Args:
+        name: of the model, or the path of its folder, which has a ``/``.
+
     Raises:
         InputError: the folder has another format, or a file of it was altered.
     """
+    path = Path(name).expanduser()
+    if "/" in name and (path / RECORD).is_file():
+        return _recorded_run(path.resolve().name, path, _record(path))
     if not is_name(name):
         return None
     folder = next((path for path in candidates(Path(MODELS) / name) if path.is_dir()), None)

@@ -1,11 +1,12 @@
-"""An exported network: the description in its ONNX file, its skin, and how ONNX Runtime runs it safely.
+"""A trained model: its interface, and the form of ``skin export``, which ONNX Runtime runs.
 
-torch is not imported."""
+torch is not imported: :class:`skin.runs.torch_model.TorchModel` is the form that needs it.
+"""
 
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from math import log
 from pathlib import Path
 from threading import Thread
 from types import ModuleType
@@ -15,7 +16,7 @@ import numpy as np
 from annotated_types import Ge, Gt, MinLen
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.utils import instantiate
-from omegaconf import DictConfig
+from numpy.typing import ArrayLike
 
 from skin.body.base import Sensors
 from skin.core.files import json_line
@@ -23,13 +24,112 @@ from skin.core.safe_loading import KEY as CHECKSUM
 from skin.core.safe_loading import ChecksumError, check_content, limited_memory, read_file
 from skin.core.settings import ONCE, check_groups, check_targets, configured
 from skin.errors import InputError
-from skin.runs.configuration import Config, apply_overrides, settings_of, validate_config
-from skin.runs.trained_model import TrainedModel
+from skin.evaluation.alarm import AlarmSource
+from skin.evaluation.decisions import LiveConditions
+from skin.evaluation.operating_point import LABEL
+from skin.runs.configuration import Config, recompose, settings_of, validate_config
 from skin.touch.labels import Task
 
 if TYPE_CHECKING:
     from onnx import ModelProto
     from onnxruntime import InferenceSession
+
+
+class Model(ABC):
+    """Predicts the labels of touches of one skin.
+
+    Attributes:
+        identity: id of the run.
+        title: name of the run.
+        task: the labels.
+        window: T, frames.
+        rate: Hz, of the frames.
+        positions: of the sensors, (S, 3), m.
+        size: extent (x, y) of the skin, m.
+        threshold: a window is dangerous where its probability is greater; None: not chosen, or no alarm.
+        contact: N above the baseline that count as touch.
+        learned: whether the label ``touch`` counts as touch, too.
+        longest: longest touch of the training, s.
+        presses: readings of a press at the limit of ``dangerous`` on each sensor, (S, S), N; None: unknown.
+        alarm: what decides where the alarm is raised.
+    """
+
+    identity: str
+    title: str
+    task: Task
+    window: int
+    rate: float
+    positions: np.ndarray
+    size: tuple[float, float]
+    threshold: float | None
+    contact: float
+    learned: bool
+    longest: float
+    presses: np.ndarray | None
+    alarm: AlarmSource
+
+    @abstractmethod
+    def probabilities(self, readings: np.ndarray, valid: np.ndarray) -> np.ndarray:
+        """Return the probability of each label, (B, L), float32.
+
+        Args:
+            readings: (B, T, S), float32, N.
+            valid: (B, T, S), bool.
+        """
+
+    def live_conditions(self, rate: float, patience: float, aligned: bool) -> LiveConditions:
+        """Return how a live view watches a device of ``rate``, Hz, with a patience in s."""
+        column = self.task.names.index(LABEL)
+        return LiveConditions(rate, self.contact, self.longest, patience, column, aligned)
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """The names of the columns of :meth:`predict`."""
+        return tuple(self.task.names)
+
+    @property
+    def alarms(self) -> bool:
+        """Whether the model predicts danger."""
+        return LABEL in self.task.names
+
+    def predict(self, readings: ArrayLike) -> np.ndarray:
+        """Return the probability of each label, (B, L), float32, for windows of readings.
+
+        Args:
+            readings: (B, T, S), N above the readings without touch, in the order of :attr:`positions`, with
+                T = :attr:`window` frames at :attr:`rate`; or one window (T, S). NaN is an invalid reading.
+
+        Returns:
+            An array whose shape is (L,) for one window.
+
+        Raises:
+            InputError: the readings are no numbers, are infinite, or have another shape.
+        """
+        windows = self._windows(readings)
+        if not windows.size:
+            return np.empty((*windows.shape[:-2], len(self.labels)), np.float32)
+        batch = windows.reshape(-1, *windows.shape[-2:])
+        return self.probabilities(np.nan_to_num(batch), ~np.isnan(batch)).reshape(*windows.shape[:-2], -1)
+
+    def _windows(self, readings: ArrayLike) -> np.ndarray:
+        """Return readings as (B, T, S) or (T, S), float32."""
+        try:
+            windows = np.array(readings, dtype=np.float32)
+        except (TypeError, ValueError) as error:
+            raise InputError(f"readings must be an array of numbers: {error}") from error
+        frames, sensors = self.window, len(self.positions)
+        if windows.ndim not in (2, 3) or windows.shape[-2:] != (frames, sensors):
+            raise InputError(
+                f"readings must be (B, {frames}, {sensors}) or ({frames}, {sensors}), windows of {frames} "
+                f"frames at {self.rate:g} Hz of {sensors} sensors, got {windows.shape}"
+            )
+        if np.isinf(windows).any():
+            raise InputError("readings must be finite: give NaN for an invalid reading")
+        return windows
+
+
+# The form of skin export.
+
 
 KEY = "tactile_skin"
 """Key of the description, JSON, in the metadata of the file."""
@@ -254,7 +354,7 @@ _SECONDS = 20.0  # s to load a file and to classify a window, which takes some m
 _MEMORY = 1 << 30  # bytes that it may take
 
 
-class ExportedModel(TrainedModel):
+class OnnxModel(Model):
     """A network that ``skin export`` wrote.
 
     Args:
@@ -271,56 +371,15 @@ class ExportedModel(TrainedModel):
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path).expanduser()
-        content, about = inspect(self.path)
-        self.metadata, self.identity, self.title, self.task = about, about.run, about.title, about.task
-        self.window, self.rate, self.size, self.threshold = (
-            about.window,
-            about.rate,
-            about.size,
-            about.threshold,
-        )
-        self.positions = np.array(about.positions)
+        content, metadata = inspect(self.path)
+        self.metadata, self.identity, self.task = metadata, metadata.run, metadata.task
+        for name in ("title", "window", "rate", "size", "threshold", "contact", "learned", "longest"):
+            setattr(self, name, getattr(metadata, name))
+        self.positions = np.array(metadata.positions)
+        self.presses = None if metadata.presses is None else np.array(metadata.presses)
+        thresholds = metadata.thresholds or {}
+        self.alarm = AlarmSource(str(self.path), threshold=self.threshold, thresholds=thresholds)
         self._try(content, self.path)
-
-    @property
-    def contact(self) -> float:
-        """N above the baseline that count as touch."""
-        return self.metadata.contact
-
-    @property
-    def learned(self) -> bool:
-        """Whether the label ``touch`` counts as touch, too."""
-        return self.metadata.learned
-
-    @property
-    def longest(self) -> float:
-        """Longest touch of the training, s."""
-        return self.metadata.longest
-
-    @property
-    def presses(self) -> np.ndarray | None:
-        """Readings of a press at the limit of ``dangerous`` on each sensor, (S, S), N; None: unknown."""
-        return None if self.metadata.presses is None else np.array(self.metadata.presses)
-
-    def threshold_at(
-        self, rate: float, patience: float, aligned: bool, say: Callable[[str], None]
-    ) -> float | None:
-        """Return the threshold in the file for the rate that is nearest; None for a model without alarm."""
-        threshold, thresholds = self.threshold, self.metadata.thresholds
-        if threshold is None:
-            return None
-        if thresholds:
-            nearest = min(thresholds, key=lambda text: abs(log(float(text) / rate)))
-            say(f"the device sends {rate:.3g} frames a second: threshold for {nearest} Hz, per touch")
-            threshold = thresholds[nearest]
-        else:
-            say("the threshold was chosen for single windows: a touch has many, and raises more false alarms")
-        if threshold >= 1:
-            raise InputError(
-                f"{self.path} has no threshold that raises an alarm: give live.patience.above=0.5"
-            )
-        say(f"alarm above {threshold:.4f}")
-        return threshold
 
     def probabilities(self, readings: np.ndarray, valid: np.ndarray) -> np.ndarray:
         """Return the probability of each label, (B, L), float32.
@@ -402,12 +461,11 @@ def describe_skin(config: Config, positions: np.ndarray) -> dict[str, Any] | Non
     return described if _at(_sensors(config), positions) else None
 
 
-def check_overrides(path: str, composed: DictConfig, overrides: Sequence[str]) -> None:
+def check_overrides(path: str, overrides: Sequence[str]) -> None:
     """Check that overrides do not contradict an exported network.
 
     Args:
         path: of its file.
-        composed: configuration with the overrides.
         overrides: of the command line.
 
     Raises:
@@ -416,24 +474,19 @@ def check_overrides(path: str, composed: DictConfig, overrides: Sequence[str]) -
     """
     parsed = OverridesParser.create().parse_overrides(list(overrides))
     groups = [override.key_or_group.split(".")[0].split("/")[0] for override in parsed]
-    named = dict(zip(overrides, groups, strict=True))
-    restricted = {override: group for override, group in named.items() if group not in _FREE}
-    for override, group in restricted.items():
-        if group not in GROUPS:
-            raise InputError(f"{override} has no effect on {path}, a network for one skin: leave it out")
-    if not restricted:
-        return
-    metadata = ExportedModel(path).metadata
-    folders = [override for override, group in named.items() if group == "hydra"]
-    for override in restricted:
-        if not _agrees(metadata, composed, [*folders, override], path):
-            raise InputError(
-                f"{override} contradicts {path}, which was exported for another skin: leave it out, or "
-                "export the run again with it"
-            )
+    restricted = [word for word, group in zip(overrides, groups, strict=True) if group not in _FREE]
+    for word, group in zip(overrides, groups, strict=True):
+        if word in restricted and group not in GROUPS:
+            raise InputError(f"{word} has no effect on {path}, a network for one skin: leave it out")
+    words = " ".join(restricted)
+    if words and not _agrees(OnnxModel(path).metadata, overrides, words, path):
+        raise InputError(
+            f"{words} contradicts {path}, which was exported for another skin: leave it out, or export the "
+            "run again with it"
+        )
 
 
-def _agrees(metadata: ModelMetadata, composed: DictConfig, overrides: list[str], path: str) -> bool:
+def _agrees(metadata: ModelMetadata, overrides: Sequence[str], words: str, path: str) -> bool:
     """Return whether overrides leave the skin of a network as it is.
 
     Raises:
@@ -441,12 +494,14 @@ def _agrees(metadata: ModelMetadata, composed: DictConfig, overrides: list[str],
     """
     if metadata.skin is None:
         raise InputError(
-            f"{overrides[-1]} cannot be compared with {path}, which does not describe its skin: leave it "
+            f"{words} cannot be compared with {path}, which does not describe its skin: leave it "
             "out, or write the file again with skin export"
         )
     check_targets({name: metadata.skin.get(name) for name in ("body", "layout")}, path)
     stored = validate_config({name: group for name in GROUPS if (group := metadata.skin.get(name))})
-    before, after = (apply_overrides(stored, composed, words) for words in ([], overrides))
+    device = ("device=", "device.")  # another one is at a port, and has no part in the skin
+    changed = [word for word in overrides if not word.startswith(device)]
+    before, after = (recompose(stored, words) for words in ([], changed))
     if any(getattr(after, group) != getattr(before, group) for group in GROUPS if group != "layout"):
         return False
     same = after.layout.get("footprint") == before.layout.get("footprint")

@@ -1,0 +1,418 @@
+"""The threshold of the alarm "dangerous": the one place where it is chosen.
+
+:func:`choose_alarm_threshold` is called once by each command. torch is imported only where touches decide.
+
+Safe touches are more easily mistaken on some skins and devices than on others, so the false-alarm rate of a
+threshold that was chosen over many of them varies from skin to skin. That for single windows is stored with a
+model. That of the live view, which judges many windows of a touch, depends on the rate of the device, too.
+"""
+
+import logging
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field, fields, replace
+from math import log
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from hydra import compose, initialize_config_dir
+from hydra.core.global_hydra import GlobalHydra
+from omegaconf import OmegaConf
+
+from skin.core import array_cache
+from skin.core.files import CONF
+from skin.core.messages import Steps
+from skin.core.rng import Stream, generator
+from skin.device.calibration import read_calibration
+from skin.errors import InputError
+from skin.evaluation.decisions import LiveConditions
+from skin.evaluation.operating_point import (
+    LABEL,
+    OperatingPoint,
+    Predictor,
+    dangerous_column,
+    parse_operating_point,
+)
+from skin.evaluation.settings import Evaluation, check_evaluation
+from skin.touch.labels import TOUCH
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from skin.device.base import AbstractDevice, AbstractSimulated
+    from skin.device.touches import Touches
+
+SAFE_TOUCHES = 2000
+"""Safe touches on which a threshold is chosen: where 2 % are wanted, the rate is then 1.4 to 2.7 % (95 %)."""
+DANGEROUS_TOUCHES = 400
+"""Dangerous touches on which a threshold of the live view is checked: 75 % are then 71 to 79 % (95 %)."""
+_APART = 1e-6  # scores closer than this may have another order on another processor
+_MOST_DRAWS = 6
+_RATIOS = (1, 2, 3, 5, 7, 10, 15, 20, 30, 50, 70, 100)  # of the rate of a device to that of the model
+_USUAL = "mild"
+_EVERY = {"without_lag": 0.0, "framed": 0.0}  # every device is as described, whatever the training mixed in
+_DEVICE = "device"  # in place of a profile: the imperfections of the device that is evaluated
+_EXPECTED = 20.0  # s
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class AlarmSource:
+    """What decides where a model raises the alarm.
+
+    Attributes:
+        name: of the model, for messages, as in ``run 3e066519``.
+        settings: ``evaluation.false_alarm_rate``, ``safe_gestures`` and ``profile``; None: exported.
+        learner: of the model, trained; None: an exported network, which brings its thresholds.
+        trained: settings of the device of its training.
+        used: settings of the device that it is used on.
+        skin: settings of the skin that it is used on.
+        build: settings of a device -> the device of the training with these, on the skin that it is used on.
+        original: -> the device of the training, on the skin of the training.
+        device: whose fresh gestures, or validation split, decide; None: that of :func:`threshold_device`.
+        stored: text of the point that the training chose for single windows; None: it has none.
+        profile: for which it was chosen.
+        threshold: of an exported network, for single windows; None: no label ``dangerous``.
+        thresholds: of an exported network: rate of a device, Hz -> threshold for touches.
+    """
+
+    name: str
+    settings: Evaluation | None = None
+    learner: Predictor | None = None
+    trained: Mapping[str, Any] = field(default_factory=dict)
+    used: Mapping[str, Any] = field(default_factory=dict)
+    skin: Mapping[str, Any] = field(default_factory=dict)
+    build: "Callable[[Mapping[str, Any]], AbstractDevice] | None" = None
+    original: "Callable[[], AbstractDevice] | None" = None
+    device: "AbstractDevice | None" = None
+    stored: str | None = None
+    profile: str | None = None
+    threshold: float | None = None
+    thresholds: Mapping[str, float] = field(default_factory=dict)
+
+
+def choose_alarm_threshold(
+    source: AlarmSource,
+    live: LiveConditions | None = None,
+    above: float | None = None,
+    anew: bool = False,
+    one_skin: bool = False,
+    say: Callable[[str], None] = _log.warning,
+) -> OperatingPoint | None:
+    """Return where a model raises the alarm; None if it has no label ``dangerous``.
+
+    The first rule that applies decides:
+
+    1. ``above`` holds, whatever the model.
+    2. An exported network brings thresholds: that of the nearest rate for touches, else that for windows.
+    3. Simulated touches on the skin in use decide for a live view (:func:`threshold_device`).
+    4. The stored threshold holds on the skins and for the profile that it was chosen for, and for models that
+       were trained on recordings. For another target it is chosen again.
+    5. Gestures on the skin in use decide, one window of each.
+
+    Args:
+        source: the model and what it is used on.
+        live: per touch, as a live view watches it; None: per window.
+        above: threshold of the command line (``live.patience.above``).
+        anew: the model is new, so nothing stored holds.
+        one_skin: the skin in use counts even if its device draws others.
+        say: called with each message for the user.
+
+    Raises:
+        InputError: the settings cannot be used, an exported network raises no alarm, a stored operating
+            point cannot be read, or a profile is set and the device draws many skins; see also
+            :func:`threshold_device`.
+    """
+    if above is not None:
+        say(f"alarm above {above:g}")
+        return OperatingPoint(above, math.nan, 0, 0, None)
+    if source.learner is None:
+        return _exported_point(source, live, say)
+    settings = check_evaluation(source.settings)
+    if live is not None and (anew or "simulator" in source.trained):
+        return _on_touches(source, settings, live, say)
+    if not anew:
+        all_skins = "skins" in source.used and not one_skin
+        if all_skins and settings.profile is not None:
+            raise InputError("evaluation.profile chooses the threshold for one skin: add device=simulated")
+        as_stored = "skins" not in source.trained and settings.profile == source.profile
+        if live is not None or all_skins or as_stored:
+            return _stored_point(source, settings)
+    return _on_gestures(source.learner, source.device or threshold_device(source), settings)
+
+
+def _exported_point(
+    source: AlarmSource, live: LiveConditions | None, say: Callable[[str], None]
+) -> OperatingPoint | None:
+    """Return the point of an exported network for the rate of a device that is nearest."""
+    threshold = source.threshold
+    if threshold is None:
+        return None
+    if live is not None and source.thresholds:
+        nearest = min(source.thresholds, key=lambda text: abs(log(float(text) / live.rate)))
+        say(f"the device sends {live.rate:.3g} frames a second: threshold for {nearest} Hz, per touch")
+        threshold = source.thresholds[nearest]
+    elif live is not None:
+        say("the threshold was chosen for single windows: a touch has many, and raises more false alarms")
+    if live is not None and threshold >= 1:
+        raise InputError(f"{source.name} has no threshold that raises an alarm: give live.patience.above=0.5")
+    if live is not None:
+        say(f"alarm above {threshold:.4f}")
+    return OperatingPoint(threshold, math.nan, 0, 0, None)
+
+
+def _stored_point(source: AlarmSource, settings: Evaluation) -> OperatingPoint | None:
+    """Return the point that is stored with a model.
+
+    If it has none for the target rate, it is chosen now if the device of its training draws fresh gestures;
+    else the threshold is 0.5. Both cases are reported on standard error.
+    """
+    point, target = None, settings.false_alarm_rate
+    if source.stored is not None:
+        point = parse_operating_point(source.stored)
+    if source.stored is not None and (point is None or point.target == target):
+        return point
+    lacks = f"{source.name} stores no alarm threshold for {100 * target:g} % false alarms"
+    if "simulator" in source.trained:
+        assert source.learner is not None
+        assert source.original is not None
+        point = _on_gestures(source.learner, source.original(), settings)
+        message = None if point is None else f"{lacks}, it is chosen now: {point.sentence()}"
+    else:
+        point = point or OperatingPoint.default(target)
+        message = (
+            f"{lacks} and its device draws no fresh gestures: {point.sentence()}; train it again to store one"
+        )
+    if message:
+        _log.warning(message)
+    return point
+
+
+# The device whose touches decide.
+
+
+def threshold_device(source: AlarmSource) -> "AbstractSimulated":
+    """Return the device whose fresh gestures determine the threshold of the alarm.
+
+    It is the device of the training on the skin in use. If ``evaluation.profile`` is set, every gesture is
+    measured by another device of this profile, sampled as by the simulated device in use; ``device``: with
+    its imperfections.
+
+    Raises:
+        InputError: the training has no simulated touches, or there is no such profile.
+    """
+    profile, device = check_evaluation(source.settings).profile, dict(source.trained)
+    if "simulator" not in device or source.build is None:
+        raise InputError(
+            f"evaluation.profile={profile} chooses the alarm's threshold on simulated touches, and this run "
+            "was trained on others: leave it out"
+        )
+    if profile is not None:
+        sampled = {name: source.used[name] for name in ("rate", "aligned") if name in source.used}
+        own = _imperfections(source.used) if profile == _DEVICE else sampled | profile_settings(profile)
+        # Drawn skins draw a device for every gesture without being told.
+        every = {} if "skins" in device else {"randomise": True, "calibration": None}
+        device |= _EVERY | own
+        device = {name: value for name, value in device.items() if name != "randomise"} | every
+    reference = source.build(device).reference
+    assert reference is not None
+    return reference
+
+
+def _imperfections(used: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the imperfections of the simulated device that a model is used on.
+
+    Raises:
+        InputError: the device is not simulated.
+    """
+    from skin.device.imperfection import ImperfectionSettings
+
+    names = {entry.name for entry in fields(ImperfectionSettings)}
+    if not names <= set(used):
+        raise InputError(
+            f"evaluation.profile={_DEVICE} takes the imperfections of a simulated device: add "
+            "device=simulated, or name a profile"
+        )
+    return {name: used[name] for name in names}
+
+
+def profile_settings(name: str) -> dict[str, Any]:
+    """Return the settings of the device in a profile (``conf/profile/``).
+
+    Raises:
+        InputError: there is no such profile.
+    """
+    if not GlobalHydra.instance().is_initialized():  # from Python
+        with initialize_config_dir(str(CONF), version_base="1.3"):
+            return profile_settings(name)
+    names = GlobalHydra.instance().config_loader().get_group_options("profile")
+    if name not in names:
+        raise InputError(f"there is no profile {name}: choose one of {', '.join(names)}, or {_DEVICE}")
+    return OmegaConf.to_container(compose(f"profile/{name}").device, resolve=True)  # type: ignore[return-value]
+
+
+def _remaining(path: str) -> dict[str, Any]:
+    """Return the imperfections that a calibrated device is left with: its gains are known to 2 %.
+
+    Readings are linear after the conversion: the limit is that of the force, and the noise is that at the
+    reading at which the curves meet.
+    """
+    calibration = read_calibration(path)
+    values, curves = calibration.values(), calibration.curves
+    if curves is not None:
+        values |= {"clip": curves.straighten(values["clip"]), "noise": values["noise"] / curves.slopes}
+    names = ("noise", "hysteresis", "time_constant")
+    left = {name: float(np.median(values[name])) for name in names}
+    clip = float(np.median(values["clip"]))
+    limit = {"clip": clip} if np.isfinite(clip) else {}
+    return _EVERY | left | limit | {"gain_spread": 0.02, "dead": 0, "tare": True}
+
+
+# The choice on gestures, one window of each.
+
+
+def _on_gestures(learner: Predictor, device: "AbstractDevice", settings: Evaluation) -> OperatingPoint | None:
+    """Return the point for single windows of the gestures of a device; None without ``dangerous``."""
+    if LABEL not in device.task.names:
+        return None
+    touches, target = threshold_gestures(device, settings), settings.false_alarm_rate
+    labels, chances = touches.known_labels, learner.probabilities(touches)
+    chance, dangerous = dangerous_column(chances, labels, device.task)
+    if dangerous.all():
+        return OperatingPoint.default(target)
+    seed = None if device.simulation is None else device.simulation.data_seed
+    point = OperatingPoint(_lowest_threshold(chance[~dangerous], target), target, 0, 0, seed)
+    return replace(point, **asdict(point.reached(chances, labels, device.task)))
+
+
+def threshold_gestures(device: "AbstractDevice", settings: Evaluation) -> "Touches":
+    """Return the gestures on which the threshold is chosen.
+
+    A simulated device draws fresh gestures until enough of them are safe; other devices give their validation
+    split.
+    """
+    check_evaluation(settings)
+    simulation = device.simulation
+    if simulation is None or LABEL not in device.task.names:
+        return device.touches("validation")
+    # Half of the sampled gestures are safe; some windows of streams show no touch.
+    count = 2 * settings.safe_gestures
+    for _ in range(_MOST_DRAWS):
+        touches = simulation.fresh_touches(count)
+        _, dangerous = dangerous_column(touches.known_labels, touches.known_labels, device.task)
+        if int((~dangerous).sum()) >= settings.safe_gestures:
+            break
+        count *= 2
+    return touches
+
+
+def _lowest_threshold(safe: "Tensor", target: float) -> float:
+    """Return the lowest threshold that keeps the false-alarm rate, a float32 number.
+
+    At most k = floor(target (n + 1)) - 1 of n safe gestures raise the alarm. A new safe gesture then raises
+    it with a probability of at most (k + 1) / (n + 1) <= target (split conformal prediction; Vovk, Gammerman
+    and Shafer 2005). If n < 1 / target - 1, the threshold is above all scores, and the target is not met.
+    Scores that differ by less than 2e-6 count as equal: either all of them raise the alarm or none.
+
+    Args:
+        safe: (n,), n > 0, probabilities of ``dangerous`` of safe gestures.
+        target: largest rate.
+    """
+    scores = np.sort(safe.detach().cpu().double().numpy())[::-1]
+    # 1e-9 keeps a product such as 0.29 * 100 from rounding below its whole number.
+    allowed = max(math.floor(target * (len(scores) + 1) + 1e-9) - 1, 0)
+    gaps = scores[:-1] - scores[1:] > 2 * _APART  # [i]: between the first i + 1 scores and the others
+    cuts = np.flatnonzero(gaps[:allowed])
+    above = int(cuts[-1]) + 1 if len(cuts) else 0
+    return float(np.float32(scores[above] + _APART))
+
+
+# The choice on touches, as the live view judges them.
+
+
+def _on_touches(
+    source: AlarmSource, settings: Evaluation, live: LiveConditions, say: Callable[[str], None]
+) -> OperatingPoint:
+    """Return the point for safe touches as the live view judges them.
+
+    It is kept on disk, unless the device is given. Without a profile, a model that was trained on drawn skins
+    takes ``mild``, and a device with a calibration what that leaves.
+    """
+    target, count = settings.false_alarm_rate, min(settings.safe_gestures, SAFE_TOUCHES)
+    if source.device is not None:
+        device = source.device.simulated("touches are simulated")
+        return _on_touches_of(device, source.learner, _snapped(live, device), target, count)
+    path = source.used.get("calibration") if source.used.get("port") else None
+    if settings.profile is None and path is None and "skins" in source.trained:
+        # Such trainings have devices so different that a threshold for all of them hides dangerous touches.
+        settings = replace(settings, profile=_USUAL)
+    device = threshold_device(replace(source, settings=settings))
+    if path and settings.profile is None:
+        device = device.replace(**_remaining(path), randomise=True, calibration=None)
+    live = _snapped(live, device)
+    content = {
+        "model": source.name,
+        "device": source.trained,
+        "skin": source.skin,
+        "positions": device.sensors.positions.round(9).tolist(),
+        "imperfections": {name: str(value) for name, value in vars(device.imperfection).items()},
+        "live": asdict(live),
+        "target": target,
+        "count": count,
+    }
+    key = array_cache.hashed(content, _sources())
+
+    def choose() -> dict[str, np.ndarray]:
+        devices = "" if settings.profile is None else f" and devices of the profile {settings.profile}"
+        say(f"choosing the alarm's threshold on {count} safe touches at {live.rate:.3g} Hz{devices}")
+        point = _on_touches_of(device, source.learner, live, target, count)
+        return {"point": np.array([point.threshold, point.raised, point.dangerous, point.found])}
+
+    file = array_cache.folder(None) / f"threshold_{key[:16]}.npz"
+    threshold, *counts = array_cache.kept(file, key, {"point": (4,)}, choose)["point"].tolist()
+    raised, dangerous, found = (int(number) for number in counts)
+    return OperatingPoint(threshold, target, count, raised, device.data_seed, dangerous, found, live.rate)
+
+
+def _snapped(live: LiveConditions, device: "AbstractSimulated") -> LiveConditions:
+    """Return the conditions at the nearest of some multiples of the model's rate.
+
+    A measured rate is never the same twice, and the threshold would be chosen anew at each start.
+    """
+    ratio = min(_RATIOS, key=lambda ratio: abs(log(ratio * device.model_rate / live.rate)))
+    return replace(live, rate=ratio * device.model_rate)
+
+
+def _sources() -> list[Path]:
+    """Return the files that the thresholds kept on disk depend on."""
+    from skin.device import imperfection, sampling
+    from skin.evaluation import decisions, touch_scores
+
+    modules = (imperfection, sampling, decisions, touch_scores)
+    return [Path(__file__), *(Path(str(module.__file__)) for module in modules)]
+
+
+def _on_touches_of(
+    device: "AbstractSimulated", learner: Predictor | None, live: LiveConditions, target: float, count: int
+) -> OperatingPoint:
+    """Return the threshold that ``target`` of ``count`` safe touches pass, checked on dangerous ones.
+
+    ``device`` measures each touch; with ``randomise``, by another device.
+    """
+    from skin.evaluation.touch_scores import touch_scores
+
+    assert learner is not None
+    seed = device.data_seed
+    labels = device.sampler.balanced(2 * max(count, DANGEROUS_TOUCHES), generator(Stream.ALARM, seed, 1))
+    danger = labels[:, TOUCH.names.index(LABEL)]
+    safe, others = labels[~danger][:count], labels[danger][:DANGEROUS_TOUCHES]
+    chosen = np.concatenate([safe, others])
+    with Steps({"choosing the threshold of the alarm": _EXPECTED}) as steps:
+        # More threads than free cores take many times as long.
+        report = lambda done: setattr(steps, "share", done / len(chosen))  # noqa: E731
+        scores = touch_scores(learner, device, live, chosen, seed, report)
+    threshold = _lowest_threshold(scores[: len(safe)], target)
+    point = OperatingPoint(threshold, target, len(safe), 0, seed, len(others), rate=live.rate)
+    alarms = point.alarm(scores)
+    return replace(point, raised=int(alarms[: len(safe)].sum()), found=int(alarms[len(safe) :].sum()))

@@ -1,0 +1,136 @@
+"""Scores of touches as the live view judges them: the highest of the decisions while a touch lasts."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from math import ceil
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import max_pool1d, pad
+
+from skin.core.rng import Stream, generator
+from skin.device.base import AbstractSimulated
+from skin.device.sampling import between_frames, draw_constants
+from skin.device.touches import Touches
+from skin.evaluation.decisions import DECISIONS, LiveConditions, as_press, held_frames, longest_shown
+from skin.evaluation.operating_point import Predictor
+from skin.touch.labels import RELEASE
+from skin.touch.movie import Movie
+
+_TOUCHES = 50  # touches
+_WINDOWS = 500  # windows that are classified at once
+_AFTER = 1.0  # s that are simulated behind the window of a touch
+
+
+@torch.inference_mode()
+def touch_scores(
+    learner: Predictor,
+    device: AbstractSimulated,
+    live: LiveConditions,
+    labels: np.ndarray,
+    seed: int,
+    report: Callable[[int], None] | None = None,
+) -> Tensor:
+    """Return the score of each touch: it raises the alarm at thresholds below.
+
+    Args:
+        learner: trained.
+        device: simulates and measures the touches; with ``randomise``, each with another device.
+        live: how they are watched.
+        labels: (B, 4), bool, of the touches.
+        seed: of the touches and their devices.
+        report: called with the number of touches that are done.
+
+    Returns:
+        (B,), the largest over the decisions of the smallest probability of ``dangerous`` among as many
+        decisions in a row as the patience needs; 0 without contact.
+    """
+    device = device.replace(padded=False, stream=False)
+    scores = list[Tensor]()
+    for first in range(0, len(labels), _TOUCHES):
+        batch, draw = labels[first : first + _TOUCHES], generator(Stream.ALARM, seed, 2, first)
+        movie = device.sampler.sample(len(batch), draw, batch)
+        readings, valid, contact = _decision_windows(device, movie, live, draw)
+        chances = torch.zeros(contact.shape)
+        chances[contact] = _classify_windows(
+            learner, device, live, readings[contact], valid[contact.nonzero()[:, 0]]
+        )
+        row = live.decisions(_round_rate(device, live))
+        least = -max_pool1d(-pad(chances, (row - 1, 0)), row, 1) if row > 1 else chances
+        scores.append(least.amax(dim=1))
+        if report is not None:
+            report(first + len(batch))
+    return torch.cat(scores)
+
+
+def _round_rate(device: AbstractSimulated, live: LiveConditions) -> float:
+    """Return the rate of the device, rounded to a multiple of the model's, Hz."""
+    return max(1, round(live.rate / device.model_rate)) * device.model_rate
+
+
+def _decision_windows(
+    device: AbstractSimulated, movie: Movie, live: LiveConditions, draw: np.random.Generator
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the windows (B, J, T, S), N, of J decisions about each touch, as the model sees them.
+
+    Returns:
+        windows; valid (B, S); contact (B, J), whether something touches the skin at each decision.
+    """
+    readings, valid = _measure_touches(device, movie, live, draw)
+    rate, window = _round_rate(device, live), device.window
+    ratio = round(rate / device.model_rate)
+    # Each place holds the maximum over the interval of the model that begins there.
+    highest = max_pool1d(readings.transpose(1, 2), ratio, 1).transpose(1, 2)
+    end = _draw_decisions(readings.shape, ratio * window, max(1.0, rate / DECISIONS), draw)
+    place = end[:, :, None] - ratio * torch.arange(window, 0, -1) + 1
+    windows = highest[torch.arange(len(end))[:, None, None], place]
+    risen = (windows >= live.contact) & valid[:, None, None]
+    recent = max(1, ceil(RELEASE * device.model_rate - 1e-9))
+    contact = risen[:, :, -recent:].flatten(2).any(dim=2)
+    held = held_frames(live.longest, device.model_rate, window)
+    begun = torch.where(contact, end, torch.iinfo(end.dtype).max).amin(dim=1, keepdim=True)
+    lasted = (end - begun) / ratio + 1
+    for touch, decision in (contact & (lasted > longest_shown(held, recent, window))).nonzero().tolist():
+        press = as_press(windows[touch, 0].numpy(), windows[touch, decision].numpy(), held)
+        windows[touch, decision] = torch.from_numpy(press)
+    return windows * valid[:, None, None], valid, contact
+
+
+def _measure_touches(
+    device: AbstractSimulated, movie: Movie, live: LiveConditions, draw: np.random.Generator
+) -> tuple[Tensor, Tensor]:
+    """Return what devices read of touches after a window of rest, (B, F, S), N, and their valid sensors."""
+    force = device.model.respond(movie, displacement=False).readings
+    before, after = device.window, ceil(_AFTER * device.model_rate)
+    padded, rate = pad(force, (0, 0, before, after)), _round_rate(device, live)
+    if rate > device.model_rate or not live.aligned:
+        padded = between_frames(padded, device.model_rate, rate, draw.random(len(padded)))
+    imperfection = replace(device.imperfection, rate=rate)
+    gestures = len(padded) if getattr(device, "randomise", False) else None
+    constants = draw_constants(imperfection, padded.shape[2], device.model_rate, draw, gestures)
+    # A drift is 0 where the touch begins, as in other gestures: the live view follows it without contact.
+    time = torch.arange(padded.shape[1]) / rate - before / device.model_rate
+    readings, valid, _ = imperfection.apply(padded, constants, draw, time)
+    return readings, valid[:, 0]
+
+
+def _draw_decisions(shape: torch.Size, first: int, step: float, draw: np.random.Generator) -> Tensor:
+    """Return the frames at which it is decided about each touch, (B, J): the ticks have any phase to it."""
+    begin = first - 1 + step * draw.random(shape[0])
+    count = int((shape[1] - first - step) / step)
+    ends = np.floor(begin[:, None] + step * np.arange(count)).astype(np.int64)
+    return torch.from_numpy(ends)
+
+
+def _classify_windows(
+    learner: Predictor, device: AbstractSimulated, live: LiveConditions, readings: Tensor, valid: Tensor
+) -> Tensor:
+    """Return the probability of ``dangerous`` of windows (W, T, S) with valid sensors (W, S), (W,)."""
+    positions = torch.from_numpy(device.sensors.positions).float()
+    mask = valid[:, None].expand_as(readings)
+    parts = [
+        learner.probabilities(Touches(*part, positions, None, device.model_rate))[:, live.column]
+        for part in zip(readings.split(_WINDOWS), mask.split(_WINDOWS), strict=True)
+    ]
+    return torch.cat(parts).nan_to_num(1.0) if parts else torch.zeros(0)

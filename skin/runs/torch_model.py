@@ -1,0 +1,340 @@
+"""The model of a finished run: it predicts, evaluates and raises the alarm on the skin that it is used on."""
+
+import warnings
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import cached_property, partial
+from typing import Any, overload
+
+import numpy as np
+import torch
+from hydra.errors import InstantiationException
+from numpy.typing import ArrayLike
+from torch import Tensor
+
+from skin import __version__
+from skin.body.base import AbstractBody
+from skin.body.layout import AbstractLayout
+from skin.core.messages import to_input_error
+from skin.core.settings import configured
+from skin.device.base import AbstractDevice
+from skin.device.touches import Touches
+from skin.errors import InputError
+from skin.evaluation.alarm import AlarmSource, choose_alarm_threshold
+from skin.evaluation.operating_point import OperatingPoint, Predictor
+from skin.evaluation.streams import ContactThreshold, rise
+from skin.learning.learner import AbstractLearner
+from skin.runs.build import build_data, build_device, build_learner, build_skin, with_skin
+from skin.runs.configuration import Config, Tracking
+from skin.runs.model import Model, ModelMetadata, OnnxModel
+from skin.runs.run import TAG, FinishedRun, find_run
+from skin.runs.store import Store
+
+_FAINT = 0.3  # N, default contact threshold
+_MANY = 4000  # windows of streams, a tenth of which tunes the contact threshold
+
+
+def alarm_source(run: FinishedRun, learner: Predictor, config: Config) -> AlarmSource:
+    """Return what decides where a run raises the alarm.
+
+    Args:
+        run: the run.
+        learner: of the run, trained.
+        config: its configuration with the skin and the device to use.
+    """
+    stored = run.stored
+    return AlarmSource(
+        f"run {run.identity}",
+        config.evaluation,
+        learner,
+        stored.device,
+        config.device,
+        {group: getattr(config, group) for group in ("body", "layout", "simulator", "touch")},
+        device_on_skin(stored, config),
+        partial(build_device, stored),
+        stored=run.run.data.tags.get(TAG),
+        profile=None if stored.evaluation is None else stored.evaluation.profile,
+    )
+
+
+def device_on_skin(stored: Config, config: Config) -> Callable[[Mapping[str, Any]], AbstractDevice]:
+    """Return a function of the settings of a device that builds it on the skin of ``config``."""
+    skin = {group: getattr(config, group) for group in ("body", "layout", "simulator")}
+    return lambda device: build_device(replace(stored, **skin, device={**device, **skin}))
+
+
+# The model.
+
+
+class TorchModel(Model):
+    """The model of a run.
+
+    Args:
+        device: of its training, or as its configuration was changed.
+        learner: trained.
+        example: touches of its window, rate and sensors.
+        point: operating point of its alarm for single windows; None: not chosen, or no label ``dangerous``.
+        touch: contact threshold, N; None: tuned on simulated streams of the device, and the learned label
+            ``touch`` counts, too.
+        run: the run; None: it was trained in this process.
+        watched: configuration of the run with the skin, the device and the profile that it is used on.
+
+    Attributes:
+        device, learner, point, run, config: as above; ``config`` is ``watched``.
+        places: :attr:`positions` as a tensor.
+    """
+
+    def __init__(
+        self,
+        device: AbstractDevice,
+        learner: AbstractLearner,
+        example: Touches,
+        point: OperatingPoint | None = None,
+        touch: float | None = None,
+        run: FinishedRun | None = None,
+        watched: Config | None = None,
+    ) -> None:
+        self.device, self.learner, self.point, self.run, self.config = device, learner, point, run, watched
+        self.identity, self.title = ("none", "untrained") if run is None else (run.identity, run.title)
+        self.task, self.size = device.task, device.size
+        self.window, self.rate = example.readings.shape[1], example.rate
+        self.places, self.positions = example.positions, example.positions.numpy()
+        self.threshold = None if point is None else point.threshold
+        self.learned, self._touch = touch is None and self.task.gate is not None, touch
+        if run is not None and watched is not None:
+            self.alarm = alarm_source(run, learner, watched)
+
+    @cached_property
+    def contact(self) -> float:  # type: ignore[override]
+        """N above the baseline that count as touch.
+
+        Raises:
+            InputError: it is neither given nor learned and the device has no streams to tune it on.
+        """
+        if self._touch is not None:
+            return self._touch
+        if self.device.reference is None:
+            if self.learned:
+                return _FAINT
+            raise InputError(
+                "this run has no contact threshold: give live.touch=0.3 (N), or train on streams"
+            )
+        streams = self.device.reference.replace(stream=True, direction=False, tare=True, gestures=_MANY)
+        touches = streams.touches("validation")
+        return ContactThreshold.tuned(rise(touches), touches.known_labels[:, -1] > 0.5).least
+
+    @cached_property
+    def longest(self) -> float:  # type: ignore[override]
+        """Longest touch of the training, s; two thirds of the window if unknown."""
+        if self.device.reference is not None:
+            return self.device.reference.sampler.settings.press[1]
+        return self.window * 2 / 3 / self.rate
+
+    @cached_property
+    def presses(self) -> np.ndarray | None:  # type: ignore[override]
+        """Readings of a press at the limit of ``dangerous`` on each sensor, (S, S), N; None: unknown."""
+        reference = self.device.reference
+        return None if reference is None else reference.press_readings().double().numpy()
+
+    @overload
+    def predict(self, readings: Touches) -> Tensor: ...
+
+    @overload
+    def predict(self, readings: ArrayLike) -> np.ndarray: ...
+
+    def predict(self, readings: Touches | ArrayLike) -> Tensor | np.ndarray:
+        """Return the probability of each label, (B, L), for touches of this window and rate.
+
+        Args:
+            readings: B touches, which may have other sensors; or an array as in
+                :meth:`skin.runs.model.Model.predict`.
+
+        Returns:
+            A tensor for touches, else an array.
+
+        Raises:
+            InputError: the touches do not fit the run.
+        """
+        return (
+            self.learner.probabilities(readings)
+            if isinstance(readings, Touches)
+            else super().predict(readings)
+        )
+
+    def probabilities(self, readings: np.ndarray, valid: np.ndarray) -> np.ndarray:
+        """Return the probability of each label, (B, L), for readings (B, T, S), N, and their validity."""
+        return window_classifier(self.learner, self.places, self.rate)(readings, valid)
+
+    def describe(self, thresholds: Mapping[str, float] | None = None) -> ModelMetadata:
+        """Return the description of the model for an exported file.
+
+        Args:
+            thresholds: rate of a device, Hz -> threshold of the alarm; None: :attr:`threshold` only.
+
+        Raises:
+            InputError: as of :attr:`contact`; or the model estimates targets.
+        """
+        if self.task.kind == "regression":
+            raise InputError(
+                f"{self.title} estimates {', '.join(self.task.names)}, and no labels: skin export "
+                "writes models of labels or classes"
+            )
+        return ModelMetadata(
+            run=self.identity,
+            title=self.title,
+            version=__version__,
+            labels=list(self.task.names),
+            kind=self.task.kind,
+            gate=self.task.gate,
+            direction=self.task.direction,
+            rate=self.rate,
+            window=self.window,
+            positions=self.positions.tolist(),
+            size=self.size,
+            saturation=None if self.device.reference is None else self.device.reference.imperfection.clip,
+            threshold=self.threshold,
+            contact=self.contact,
+            learned=self.learned,
+            longest=self.longest,
+            thresholds=dict(thresholds) if thresholds else None,
+            presses=None if self.presses is None else self.presses.round(4).tolist(),
+        )
+
+
+def window_classifier(
+    learner: Predictor, positions: Tensor, rate: float
+) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+    """Return a function of the readings and validity of windows that asks a learner.
+
+    Args:
+        learner: trained.
+        positions: (S, 3), m.
+        rate: Hz.
+    """
+
+    @torch.inference_mode()
+    def classify(readings: np.ndarray, valid: np.ndarray) -> np.ndarray:
+        windows = torch.from_numpy(readings), torch.from_numpy(valid)
+        return learner.probabilities(Touches(*windows, positions, None, rate)).numpy()
+
+    return classify
+
+
+def load_run(
+    name: str = "latest",
+    uri: str | None = None,
+    trust: bool = False,
+    body: AbstractBody | str | None = None,
+    layout: AbstractLayout | str | None = None,
+) -> Model:
+    """Return the model of a finished training run, a pretrained model, or a file of ``skin export``.
+
+    Args:
+        name: of the model, the beginning of the run's id, or the path of an ONNX file; ``latest`` is the last
+            run that finished.
+        uri: of the runs, as MLflow takes it; None: ``mlflow.db`` in the current folder.
+        trust: allow any class in its configuration, which may run any code.
+        body: the body of the skin to use it on, such as :class:`skin.body.base.Sheet`, or the name of an
+            option, such as ``arm``; None: that of the run.
+        layout: the sensors of this skin: a layout such as :class:`skin.body.layout.Grid`, the name of an
+            option, or the path of a CSV file; None: those of the run.
+
+    Raises:
+        InputError: there is no such run, it cannot be loaded, or it does not fit the skin.
+    """
+    if name.endswith(".onnx"):
+        if body is not None or layout is not None:
+            raise InputError(f"{name} is a network for one skin: leave out body and layout")
+        return OnnxModel(name)
+    run = find_run(Store.existing(Tracking(uri)), name, trust)
+    try:
+        return load_model(run, with_skin(run.stored, body, layout))
+    except InstantiationException as error:
+        raise to_input_error(error) or error from error
+
+
+def load_model(
+    run: FinishedRun,
+    config: Config | None = None,
+    watched: Config | None = None,
+    device: AbstractDevice | None = None,
+    touch: float | None = None,
+    one_skin: bool = False,
+    alarm: bool = True,
+) -> TorchModel:
+    """Return the model of a finished run.
+
+    Args:
+        run: the run.
+        config: its configuration, changed as :meth:`FinishedRun.configured` does; None: not changed.
+        watched: its configuration with the device that a live view watches; None: ``config``.
+        device: to use it on; None: that of ``config``.
+        touch: as in :class:`TorchModel`.
+        one_skin: as in :func:`alarm_point`.
+        alarm: choose the threshold of the alarm for single windows; False: it has none.
+
+    Raises:
+        InputError: its weights do not fit the configuration.
+    """
+    config = config or run.stored
+    if device is None:
+        _warn_of_unknown_skin(run.stored, config)
+    with run.described():
+        device = device or _with_labels(run.stored, build_device(config))
+        learner = build_learner(config)
+        data = build_data(config, device.blank())
+    run.load_weights(learner, data)
+    source = alarm_source(run, learner, config) if alarm else None
+    point = choose_alarm_threshold(source, one_skin=one_skin) if source else None
+    return TorchModel(device, learner, data.example, point, touch, run, watched or config)
+
+
+def _with_labels(stored: Config, device: AbstractDevice) -> AbstractDevice:
+    """Return a device whose recorded touches have the labels of a run."""
+    if device.real or device.reference is not None:
+        return device
+    try:
+        task = build_device(stored).task
+    except InputError:  # the recording of its training is gone
+        return device
+    return device.with_labels(task)
+
+
+def _warn_of_unknown_skin(stored: Config, config: Config) -> None:
+    """Warn where a run that was trained on drawn skins is used on others than those."""
+    if (distributed := stored.device.get("skins")) is None:
+        return
+    from skin.device.calibration import read_calibration
+    from skin.device.imperfection import outside
+    from skin.device.skins import SkinDistribution
+
+    distribution, skin = configured(SkinDistribution, distributed, "device.skins"), build_skin(config)
+    unlike = distribution.outside(skin.body, skin.sensors)
+    if "skins" not in config.device:
+        path = config.device.get("calibration")
+        measured = {} if path is None else read_calibration(path).values()
+        ranges = {name: (values.min(), values.max()) for name, values in measured.items()}
+        unlike += outside(config.device | ranges, stored.device)
+    if unlike:
+        warnings.warn(
+            f"this skin is unlike those that the run was trained on: {', '.join(unlike)}; its verdicts may "
+            "be worse than the run's results",
+            UserWarning,
+            stacklevel=3,
+        )
+
+
+def equation10_warning(stored: Config, device: AbstractDevice | None = None) -> str | None:
+    """Return a warning if a run trained with equation 10 is used on a real skin; else None.
+
+    Args:
+        stored: the run's configuration.
+        device: the watched device; None: a real skin.
+    """
+    reading = (stored.device.get("simulator") or {}).get("reading")
+    if reading != "equation10" or (device is not None and not device.real):
+        return None
+    return (
+        "warning: this run learned from simulator=fem and equation 10, which does not carry over to other "
+        "mechanics (docs/results.md): train one with simulator=solid for a real skin"
+    )

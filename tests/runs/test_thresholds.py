@@ -1,0 +1,134 @@
+"""Every verb raises the alarm where it did: thresholds of all paths on a model that is trained in seconds.
+
+The values were computed once. They are compared to four digits, because processors round differently.
+"""
+
+import json
+import sqlite3
+from contextlib import closing
+
+import numpy as np
+import pytest
+
+pytestmark = pytest.mark.filterwarnings("ignore:The ``noload`` loader strategy")
+
+SKIN = ("layout=grid", "layout.rows=2", "layout.columns=2", "simulator=naive")
+MODEL = ("representation=readings", "model=mlp", "fusion=early", "trainer.max_epochs=8")
+SAFE = "evaluation.safe_gestures=100"
+SMALL = ("data.gestures=400", "device.test_gestures=48", "evaluation.devices=0", "evaluation.layouts=0", SAFE)
+FEW = "evaluation.safe_gestures=60"
+ROUGH = "evaluation.profile=rough"
+EXPECTED = {
+    "train": 0.93601,
+    "evaluate": 0.93601,
+    "rate": 0.64427,
+    "profile": 0.99672,
+    "device": 0.96371,
+    "adapt": 0.93601,
+    "adapt profile": 0.74935,
+    "train profile": 0.95305,
+    "shipped": 1.0,
+    "drawn": 0.38308,
+    "live": [0.80023],
+    "live profile": [0.79224],
+    "live rate": [0.50613],
+    "export": [0.81562, 0.93116, 0.83902],
+    "export drawn": [0.97865],
+    "written": [0.93601, 1.0, 1.0, 1.0, 0.58056, 1.0],
+}
+
+
+def tags_of_training(folder):
+    """Return the stored operating points of trainings and adaptations, oldest first."""
+    query = "select value from tags join runs using (run_uuid) where key='operating_point'"
+    with closing(sqlite3.connect(folder / "m.db")) as database:
+        return [json.loads(text)["threshold"] for (text,) in database.execute(f"{query} order by start_time")]
+
+
+class Thresholds:
+    """Runs verbs in a folder and returns the thresholds that they use.
+
+    Args:
+        run: the fixture.
+        folder: of the runs.
+    """
+
+    def __init__(self, run, folder):
+        self.run, self.folder, self.count = run, folder, 0
+
+    def stored(self, *words):
+        """Return the threshold that a verb stores with its run."""
+        done = self.run(self.folder, *words)
+        assert done.returncode == 0, done.stderr
+        return tags_of_training(self.folder)[-1]
+
+    def per_touch(self, monkeypatch, *words):
+        """Return the thresholds for touches that a verb chooses, in its order."""
+        self.count += 1
+        cache = self.folder / f"cache{self.count}"
+        monkeypatch.setenv("SKIN_CACHE", str(cache))
+        done = self.run(self.folder, *words)
+        assert done.returncode in (0, 2), done.stderr
+        files = sorted(cache.glob("threshold_*.npz"), key=lambda path: path.stat().st_mtime_ns)
+        return [float(np.load(path)["point"][0]) for path in files]
+
+
+def first_run(folder):
+    """Return the id of the first run of a folder."""
+    with closing(sqlite3.connect(folder / "m.db")) as database:
+        return database.execute("select run_uuid from runs order by start_time limit 1").fetchone()[0]
+
+
+@pytest.fixture(scope="module")
+def found(run, tmp_path_factory):
+    """The thresholds of all paths by name."""
+    folder = tmp_path_factory.mktemp("thresholds")
+    out, verbs, values = f"out={folder}/out", Thresholds(run, folder), {}
+    tests = ("device.test_gestures=48", "evaluation.devices=0", "evaluation.layouts=0", SAFE)
+    adapted = ("adapt", "profile=rough", "adapt.gestures=16", "adapt.epochs=2")
+    described = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("skin.runs.onnx_writer.write_model", lambda *words: described.append(words[1]) or 0.0)
+        values["train"] = verbs.stored("train", *MODEL, *SKIN, *SMALL)
+        values["evaluate"] = verbs.stored("evaluate", out, "device.seed=3")
+        values["rate"] = verbs.stored("evaluate", out, "evaluation.false_alarm_rate=0.1")
+        values["profile"] = verbs.stored("evaluate", out, ROUGH, "layout.footprint=[0.02,0.02]")
+        words = ("evaluation.profile=device", "profile=rough", "device.dead=0", "device.rate=50")
+        values["device"] = verbs.stored("evaluate", out, *words)
+        values["adapt"] = verbs.stored(*adapted, "adapt.scratch=[]")
+        values["adapt profile"] = verbs.stored(*adapted, "adapt.scratch=[extra_trees]", ROUGH)
+        own = "run=" + first_run(folder)
+        values["train profile"] = verbs.stored("train", *MODEL, *SKIN, *SMALL, ROUGH)
+        values["shipped"] = verbs.stored(
+            "evaluate", "run=default_skin", out, SKIN[3], *tests, "evaluation.profile=mild"
+        )
+        values["drawn"] = verbs.stored("evaluate", "run=any_skin", out, "device=simulated", *SKIN, *tests)
+        live = (
+            "live.py",
+            own,
+            "live.selftest=false",
+            "live.contacts=false",
+            "seconds=0.1",
+            "live.touch=0.3",
+            FEW,
+        )
+        values["live"] = verbs.per_touch(patch, *live)
+        values["live profile"] = verbs.per_touch(patch, *live, ROUGH)
+        values["live rate"] = verbs.per_touch(
+            patch, *live, "evaluation.false_alarm_rate=0.1", "live.patience.alarm=0"
+        )
+        export = ("export", "export.touches=10", "export.touch=0.3", f"out={folder}/x.onnx")
+        values["export"] = verbs.per_touch(patch, *export, own, FEW, "export.rates=[10,47,500]")
+        values["export drawn"] = verbs.per_touch(
+            patch, *export, "run=any_skin", *SKIN, FEW, "export.rates=[100]"
+        )
+    values["written"] = [
+        threshold for model in described for threshold in (model.threshold, *model.thresholds.values())
+    ]
+    return values
+
+
+@pytest.mark.slow("trains, evaluates, adapts, exports and watches, with touches drawn for each")
+@pytest.mark.parametrize("path", EXPECTED)
+def test_every_path_uses_the_threshold_that_it_used(found, path):
+    assert json.loads(json.dumps(found[path])) == pytest.approx(EXPECTED[path], abs=1e-4)

@@ -41,7 +41,7 @@ _DEMO = (
     "layout.rows=6",
     "layout.columns=6",
     "body.layers=[{material: Dragon Skin 10 Medium, thickness: 0.01}, "
-    "{material: EcoFlex 00-30, thickness: 0.02}]",
+    "{material: EcoFlex 00-30, thickness: 0.01}]",
 )
 """Settings of a demonstration, unless others are given: fingertips, on a skin that tells them apart."""
 

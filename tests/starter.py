@@ -29,9 +29,9 @@ __all__ = ["copying", "main", "remembering"]
 WARM = (
     "alembic.command",
     "mlflow.store.tracking.sqlalchemy_store",
-    "pytorch_lightning.callbacks",
+    "scipy.stats",
     "skin.learning.boosted_trees",
-    "skin.learning.network",
+    "skin.learning.training",
     "skin.evaluation.report",
     "skin.runs.train",
 )

@@ -22,6 +22,18 @@ SMALL += ["evaluation.layouts=0", "evaluation.safe_gestures=64"]
 pytestmark = pytest.mark.filterwarnings("ignore:The ``noload`` loader strategy")
 
 HEAVY = {"hydra", "numpy", "torch", "mlflow", "pytorch_lightning"}
+TRAINING = {"mlflow", "pytorch_lightning", "torchmetrics", "sklearn", "pandas", "matplotlib"}
+POSTERIOR = """
+import skin
+body = skin.Sheet((0.08, 0.08), (8, 8), [{"material": "EcoFlex 00-30", "thickness": 0.012}])
+sensors = skin.Grid(rows=2, columns=2, depth=0.006).sensors(body)
+print(skin.Posterior(skin.Solid(body, sensors), skin.Noise(0.05), body).estimate([0.0] * 4).number)
+"""
+LIVE = """
+from skin.__main__ import main
+main(["live", "run=any_skin", "simulator=naive", "seconds=0.3", "live.patience.above=0.5", "live.touch=0.3",
+    "live.selftest=false", "live.contacts=false", "live.verdicts=stdout"])
+"""
 
 
 def test_there_are_fourteen_names_and_they_cost_nothing_yet():
@@ -86,6 +98,30 @@ def readme(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch, redirect_stdout(StringIO()) as said:
         patch.chdir(tmp_path_factory.mktemp("readme"))
         return run_example("README.md"), said.getvalue()
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        pytest.param("README.md", id="prediction"),
+        pytest.param(
+            POSTERIOR, id="posterior", marks=pytest.mark.slow("solves a skin besides the import of torch")
+        ),
+        pytest.param(LIVE, id="live", marks=pytest.mark.slow("a live view besides the import of torch")),
+    ],
+)
+def test_what_only_training_needs_is_not_imported(code, readme, tmp_path):
+    if code == "README.md":
+        (code,) = re.findall(r"^```python\n(.*?)^```", (ROOT / code).read_text(), re.DOTALL | re.MULTILINE)
+    (tmp_path / "mlflow.db").touch()  # a pretrained model opens no database
+    code += f"\nimport sys; print(*sorted({TRAINING} & set(sys.modules)))"
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    said, found = done.stdout.removesuffix("\n").rsplit("\n", 1)
+    assert said
+    assert not found
+    assert (tmp_path / "mlflow.db").stat().st_size == 0
 
 
 def test_the_example_of_the_readme_runs(readme):

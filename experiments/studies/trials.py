@@ -264,7 +264,7 @@ def find_runs(study: Study, config: Config, store: Store) -> list[Planned]:
     """
     if study.rows is None:
         assert study.run is not None
-        return [_found(find_run(store, study.run).run)]
+        return [_found(find_run(config.tracking, study.run).run)]
     newest: dict[tuple[str, str], Planned] = {}
     data = simulator(config)
     for run in store.find("FINISHED", simulator=data):

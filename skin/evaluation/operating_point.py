@@ -9,8 +9,6 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Protocol
 
-from scipy.stats import binomtest
-
 from skin.errors import InputError
 from skin.evaluation.settings import ENOUGH
 from skin.touch.labels import Task
@@ -60,6 +58,8 @@ class Reached:
     @property
     def range(self) -> tuple[float, float]:
         """95 % confidence interval of the false-alarm rate, exact (Clopper and Pearson, 1934)."""
+        from scipy.stats import binomtest
+
         if not self.safe:
             return math.nan, math.nan
         low, high = binomtest(self.raised, self.safe).proportion_ci(0.95)

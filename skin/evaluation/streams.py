@@ -7,15 +7,12 @@ from statistics import fmean
 from typing import Any
 
 import torch
-from scipy.stats import chi2
-from sklearn.metrics import roc_curve
 from torch import Tensor
-from torchmetrics.functional.classification import binary_confusion_matrix
 
 from skin.device.base import AbstractDevice, AbstractSimulated
 from skin.device.touches import Touches
 from skin.errors import InputError
-from skin.evaluation.metrics import compute_metrics
+from skin.evaluation.metrics import compute_metrics, count_confusions
 from skin.evaluation.operating_point import LABEL, OperatingPoint, Predictor
 from skin.evaluation.settings import StreamSettings
 from skin.touch.labels import TOUCH_OR_NOT, Task
@@ -72,8 +69,12 @@ class ContactThreshold:
                 f"{len(touched)} validation windows are all alike, with touch or all without: "
                 "give more with data.gestures"
             )
-        alarms, detected, levels = roc_curve(touched.numpy(), rises.numpy())
-        return cls(float(levels[int((detected - alarms).argmax())]), idle)
+        levels = torch.cat([rises.unique(), rises.new_tensor([torch.inf])]).flip(0)
+        ranked = (rises[touched].sort().values, rises[~touched].sort().values)
+        detected, alarms = (
+            (len(part) - torch.searchsorted(part, levels)).double() / len(part) for part in ranked
+        )
+        return cls(float(levels[(detected - alarms).argmax()]), idle)
 
     def touched(self, touches: Touches) -> Tensor:
         """Return which windows are touched, (B,), bool."""
@@ -123,6 +124,8 @@ class Alarms:
     @property
     def range(self) -> tuple[float, float]:
         """95 % confidence interval of the rate per hour, exact for independent events (Garwood, 1936)."""
+        from scipy.stats import chi2
+
         if not self.idle_hours:
             return float("nan"), float("nan")
         low = chi2.ppf(0.025, 2 * self.false) / 2 if self.false else 0.0
@@ -251,7 +254,7 @@ def evaluate_windows(
     answers = {name: gate(touches, chances) for name, gate in all_gates.items() if name != "none"}
     return WindowReport(
         bin_by_share(chances, labels, recording.parameters["share"], device.task),
-        {name: binary_confusion_matrix(gate.long(), labels[:, -1].long()) for name, gate in answers.items()},
+        {name: count_confusions(gate[:, None].float(), labels[:, -1:])[0] for name, gate in answers.items()},
         threshold.least,
         _listen(learner, streamed, device.task, all_gates, settings, point, track),
         settings.hours,

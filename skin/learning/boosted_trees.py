@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from pytorch_lightning.loggers import Logger
 
     from skin.learning.data import TouchData
+    from skin.learning.representation import FrameMaker
 
 Trees: TypeAlias = HistGradientBoostingClassifier | HistGradientBoostingRegressor
 _KINDS: dict[bool, type[Trees]] = {
@@ -109,7 +110,7 @@ class BoostedTrees(AbstractLearner):
         dump(self._models, path, compression=ZIP_DEFLATED)
         return path
 
-    def load(self, data: "TouchData", path: Path) -> None:
+    def load(self, data: "FrameMaker", path: Path) -> None:
         """Load the trees that :meth:`save` wrote.
 
         Raises:

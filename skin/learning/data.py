@@ -4,9 +4,8 @@ import itertools
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import partial
 from hashlib import sha256
-from typing import Any
 
 import pytorch_lightning as pl
 import torch
@@ -17,13 +16,11 @@ from skin.core.settings import checked
 from skin.device.base import AbstractDevice, Split, in_background, one_ahead
 from skin.device.touches import Touches, touches_hash
 from skin.errors import InputError
-from skin.learning.representation import AbstractRepresentation, Frames, idle_level
-from skin.touch.labels import Task
+from skin.learning.representation import Batch, FrameMaker, MakeRepresentation, idle_level
 
 # Data augmentation: changes of a touch that keep its labels.
 
 
-Batch = tuple[Frames, Tensor]
 _MARGIN = 2  # frames that a touch may last beyond what stands out
 
 
@@ -89,11 +86,8 @@ class Augmentation:
         return (chance * (early + late + 1)).floor().long() - early
 
 
-MakeRepresentation = Callable[[Tensor, tuple[float, float]], AbstractRepresentation]
-
-
 @checked("data")
-class TouchData(pl.LightningDataModule):
+class TouchData(FrameMaker, pl.LightningDataModule):
     """Data module with batches of a device's touches in a representation.
 
     Batches are slices of tensors; the representation runs on whole batches, on the accelerator where there is
@@ -129,37 +123,18 @@ class TouchData(pl.LightningDataModule):
         augmentation: Augmentation | None = None,
         geometry: Callable[[], Tensor] | None = None,
     ) -> None:
-        super().__init__()
+        super().__init__(device, representation, geometry)
         if augmentation is not None and augmentation.reverse and device.task.direction:
             raise InputError(
                 "a touch that runs backwards slides the other way: set data.augment.reverse=false where "
                 "data.direction=true"
             )
-        self.device, self.batch_size, self.seed = device, batch_size, seed
-        self._make, self._geometry = representation, geometry
+        self.batch_size, self.seed = batch_size, seed
         # An augmentation without effect must not draw random numbers.
         self.augmentation = None if augmentation == Augmentation() else augmentation
-        self._known: tuple[Tensor, AbstractRepresentation] | None = None
         self._drawn: dict[str, Touches] = {}
         self._ahead: dict[int, Future[Touches]] = {}
         self.passes = itertools.count()
-
-    @property
-    def task(self) -> Task:
-        """What the labels mean."""
-        return self.device.task
-
-    @property
-    def window(self) -> int:
-        """Number of frames per touch."""
-        return self.example.readings.shape[1]
-
-    @cached_property
-    def example(self) -> Touches:
-        """The first touch of the training split."""
-        for touches in self.parts("train"):
-            return touches[torch.tensor([0])]
-        raise InputError("there are no touches to train on: generate or record more")
 
     @property
     def hash(self) -> str:
@@ -216,45 +191,6 @@ class TouchData(pl.LightningDataModule):
     @property
     def _fresh(self) -> bool:
         return bool(getattr(self.device, "fresh", False))
-
-    def representation_for(self, positions: Tensor) -> AbstractRepresentation:
-        """Return the representation of a layout with positions (S, 3), m; that of the last layout is kept.
-
-        Raises:
-            InputError: positions that change with time, (B, T, S, 3); motion is told beside the layout.
-        """
-        if self._known is not None and self._layout_free:
-            return self._known[1]
-        if positions.ndim != 2 and not self._layout_free:
-            raise InputError(
-                "representations are built for one layout, got positions per frame: give one position "
-                "(x, y, z) per sensor, and how far it moves as Touches.motion"
-            )
-        if self._known is None or not torch.equal(self._known[0], positions):
-            self._known = (positions, self._make(positions, self.device.size).requires_grad_(False))
-        return self._known[1]
-
-    def frames(self, touches: Touches) -> Batch:
-        """Return the frames of touches and their labels (B, L), on the touches' device."""
-        return self.show(touches), touches.known_labels
-
-    def show(self, touches: Touches) -> Frames:
-        """Return the frames of touches, on the touches' device."""
-        place = touches.readings.device
-        representation = self.representation_for(touches.positions.cpu()).to(place)
-        if touches.geometry is None and self.geometry is not None:
-            touches = replace(touches, geometry=self.geometry.to(place))
-        return representation.show(touches)
-
-    @cached_property
-    def geometry(self) -> Tensor | None:
-        """The geometry of the configured skin, (S, G); None if it is unknown, or not needed."""
-        return self._geometry() if self._layout_free and self._geometry is not None else None
-
-    @property
-    def _layout_free(self) -> bool:
-        make: Any = getattr(self._make, "func", self._make)
-        return bool(make.layout_free)
 
     def teardown(self, stage: str) -> None:
         """Forget the Trainer, which has ended."""

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from pytorch_lightning.loggers import Logger
 
     from skin.learning.data import TouchData
+    from skin.learning.representation import FrameMaker
 
 Kind = Literal["binary", "exclusive", "regression"]
 _LEAST = 0.01  # a probability below which a loss grows no further
@@ -117,7 +118,7 @@ class AbstractFew(AbstractLearner):
         np.savez_compressed(path, **arrays)
         return path
 
-    def load(self, data: "TouchData", path: Path) -> None:
+    def load(self, data: "FrameMaker", path: Path) -> None:
         """Load the file that :meth:`save` wrote.
 
         Raises:
@@ -508,7 +509,7 @@ class Chosen(AbstractLearner):
         self._learner.save(whole / self._name)
         return whole
 
-    def load(self, data: "TouchData", path: Path) -> None:
+    def load(self, data: "FrameMaker", path: Path) -> None:
         """Load the folder that :meth:`save` wrote.
 
         Raises:

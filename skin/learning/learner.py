@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
     from skin.learning.data import TouchData
     from skin.learning.network import TouchClassifier
+    from skin.learning.representation import FrameMaker
 
 
 class AbstractLearner(ABC):
@@ -89,7 +90,7 @@ class AbstractLearner(ABC):
         """Write what was learned to a file in ``folder`` and return its path."""
 
     @abstractmethod
-    def load(self, data: "TouchData", path: Path) -> None:
+    def load(self, data: "FrameMaker", path: Path) -> None:
         """Load the file that :meth:`save` wrote; ``data`` gives the shapes as in :meth:`fit`."""
 
 
@@ -183,7 +184,7 @@ class Rules(AbstractLearner):
         path.write_text(json.dumps({name: asdict(rule) for name, rule in self._rules.items()}, indent=2))
         return path
 
-    def load(self, data: "TouchData", path: Path) -> None:
+    def load(self, data: "FrameMaker", path: Path) -> None:
         """Load the rules that :meth:`save` wrote."""
         stored = parse_json(read_file(Path(path), TEXT))
         rules = {name: Rule(**stored[name]) for name in data.task.names}
@@ -302,7 +303,7 @@ class Ensemble(AbstractLearner):
             member.save(place)
         return whole
 
-    def load(self, data: "TouchData", path: Path) -> None:
+    def load(self, data: "FrameMaker", path: Path) -> None:
         """Load the folder that :meth:`save` wrote."""
         for number, member in enumerate(self._members):
             (file,) = (Path(path) / str(number)).iterdir()

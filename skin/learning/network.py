@@ -1,7 +1,5 @@
-"""Networks: the module with loss and metrics, and the learner that trains it."""
+"""Networks: the module with its loss, and the learner that trains it (:mod:`skin.learning.training`)."""
 
-import os
-import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
@@ -12,28 +10,23 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import torch
 from annotated_types import Ge, Le, Lt
-from pytorch_lightning import Callback, LightningModule, Trainer
-from pytorch_lightning.callbacks import ModelCheckpoint
-from pytorch_lightning.loggers import Logger
-from pytorch_lightning.strategies.launchers import _MultiProcessingLauncher, _SubprocessScriptLauncher
-from pytorch_lightning.utilities.exceptions import MisconfigurationException
 from torch import Tensor, nn
 from torch.nn import functional as F
-from torch.optim.lr_scheduler import OneCycleLR
 
-from skin.core.messages import PARENT, one_line
+from skin.core.messages import one_line
 from skin.core.safe_loading import check_archive
 from skin.device.touches import Touches
 from skin.errors import InputError
-from skin.learning.callbacks import Clock, RandomState
 from skin.learning.fusion import AbstractFusion
 from skin.learning.learner import AbstractLearner
 from skin.learning.model import AbstractModel, make_activation
-from skin.learning.representation import AbstractRepresentation, Frames
+from skin.learning.representation import AbstractRepresentation, FrameMaker, Frames
 from skin.touch.labels import Task
 
 if TYPE_CHECKING:
-    from skin.learning.data import Batch, TouchData
+    from pytorch_lightning.loggers import Logger
+
+    from skin.learning.data import TouchData
 
 MakeOptimizer = Callable[[Iterable[nn.Parameter]], torch.optim.Optimizer]
 
@@ -51,12 +44,11 @@ def probabilities(logits: Tensor, task: Task) -> Tensor:
     return torch.cat([chances[:, :-2], 2 * chances[:, -2:] - 1], dim=1) if task.direction else chances
 
 
-class TouchClassifier(LightningModule):
+class TouchClassifier(nn.Module):
     """Classifies windows by dense layers on their embedding.
 
-    Logs ``{train,val}_loss``, ``{train,val}_accuracy`` and, of binary tasks, ``{train,val}_accuracy_<label>``
-    per epoch. Labels that are undefined, because the task's gate is 0 or a touch has no direction, are left
-    out of both. A regression has no accuracy, and its loss is the mean square error of targets that are
+    Labels that are undefined, because the task's gate is 0 or a touch has no direction, are left out of loss
+    and accuracy. A regression has no accuracy, and its loss is the mean square error of targets that are
     scaled to a deviation of 1 over the training.
 
     Numbers about the whole window, if the representation has them (``Frames.summary``), are encoded by two
@@ -67,9 +59,6 @@ class TouchClassifier(LightningModule):
         task: its length is the number of logits, its kind determines the loss.
         hidden: widths of the dense layers before the last one.
         activation: relu, elu or silu, after each of them.
-        optimizer: partial; takes the parameters.
-        warmup: share of the steps in which the learning rate rises to the optimizer's; it then falls to
-            nothing along a cosine (Smith and Topin, 2018). None keeps it constant.
         dropout: share of the embedding and of the first dense layer that is dropped in training.
         summary: number of numbers about the whole window.
     """
@@ -80,8 +69,6 @@ class TouchClassifier(LightningModule):
         task: Task,
         hidden: Sequence[int],
         activation: str,
-        optimizer: MakeOptimizer,
-        warmup: float | None = None,
         dropout: float = 0.0,
         summary: int = 0,
     ) -> None:
@@ -99,8 +86,6 @@ class TouchClassifier(LightningModule):
             layers.append(_Targets(len(task)))
         self.head = nn.Sequential(*layers)
         self.task = task
-        self._make_optimizer, self._warmup = optimizer, warmup
-        self._batches: dict[str, list[tuple[int, dict[str, Tensor]]]] = {"train": [], "val": []}
 
     @property
     def targets(self) -> "_Targets":
@@ -137,23 +122,8 @@ class TouchClassifier(LightningModule):
             return F.binary_cross_entropy_with_logits(logits, self.task.shares(labels))
         return F.binary_cross_entropy_with_logits(logits[counts], self.task.shares(labels)[counts])
 
-    def _step(self, batch: "Batch", stage: str) -> Tensor:
-        frames, labels = batch
-        logits = self(frames)
-        loss = self.loss(logits, labels)
-        values = {"loss": loss.detach()} | self._accuracy(logits.detach(), labels)
-        self._batches[stage].append((len(labels), values))
-        return loss
-
-    def _log(self, stage: str) -> None:
-        """Log the means over an epoch: Lightning's own means take longer than the step of a small network."""
-        batches, self._batches[stage] = self._batches[stage], []
-        count = sum(size for size, _ in batches)
-        for name in batches[0][1]:
-            mean = sum(size * values[name] for size, values in batches) / count
-            self.log(f"{stage}_{name}", mean, sync_dist=True)  # the mean over processes that train together
-
-    def _accuracy(self, logits: Tensor, labels: Tensor) -> dict[str, Tensor]:
+    def accuracy(self, logits: Tensor, labels: Tensor) -> dict[str, Tensor]:
+        """Return ``accuracy`` and, of binary tasks, ``accuracy_<label>`` of logits and labels (B, L)."""
         counts = self.task.counts(labels)
         if self.task.kind == "regression":
             return {}
@@ -165,39 +135,6 @@ class TouchClassifier(LightningModule):
         label_shares = dict(zip(self.task.binary, shares, strict=False))
         overall = torch.stack([label_shares[name] for name in self.task.gated]).mean()
         return {"accuracy": overall} | {f"accuracy_{name}": share for name, share in label_shares.items()}
-
-    def training_step(self, batch: "Batch", index: int) -> Tensor:
-        """Return the loss of one batch.
-
-        Raises:
-            InputError: it is not a number.
-        """
-        loss = self._step(batch, "train")
-        if not loss.isfinite():
-            raise InputError(f"the loss is {loss:g}: lower optimizer.lr, or correct the model")
-        return loss
-
-    def validation_step(self, batch: "Batch", index: int) -> None:
-        """Keep the loss and the accuracy of one batch."""
-        self._step(batch, "val")
-
-    def on_train_epoch_end(self) -> None:
-        """Log the loss and the accuracy of the epoch."""
-        self._log("train")
-
-    def on_validation_epoch_end(self) -> None:
-        """Log the loss and the accuracy on the validation split."""
-        self._log("val")
-
-    def configure_optimizers(self) -> Any:
-        """Return the optimizer over all parameters, and how its learning rate changes from step to step."""
-        optimizer = self._make_optimizer(self.parameters())
-        if self._warmup is None:
-            return optimizer
-        steps = int(self.trainer.estimated_stepping_batches)
-        rate = optimizer.defaults["lr"]
-        schedule = OneCycleLR(optimizer, rate, steps, pct_start=self._warmup, cycle_momentum=False)
-        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
 
 class _Targets(nn.Module):
@@ -280,21 +217,17 @@ class Pipeline(nn.Module):
         geometry: Tensor | None,
     ) -> None:
         super().__init__()
-        self.representation, self.task = representation, classifier.task
+        self.representation = representation
         self.register_buffer("positions", positions)
         self.register_buffer("geometry", geometry)
-        # Not the LightningModule itself, whose properties need a trainer.
-        self.fusion, self.summary, self.head = classifier.fusion, classifier.summary, classifier.head
+        self.classifier = classifier
 
     def forward(self, readings: Tensor, valid: Tensor) -> Tensor:
         """Return probabilities (B, L) of readings (B, T, S), N, and valid (B, T, S), bool."""
 
         touches = Touches(readings, valid, self.positions, None, 1.0, geometry=self.geometry)
-        frames = self.representation.show(touches)
-        embedding = self.fusion(frames)
-        if self.summary is not None:
-            embedding = torch.cat([embedding, self.summary(frames.summary)], dim=1)
-        return probabilities(self.head(embedding), self.task)
+        logits = self.classifier(self.representation.show(touches))
+        return probabilities(logits, self.classifier.task)
 
 
 class Mean(nn.Module):
@@ -350,16 +283,18 @@ class Network(AbstractLearner):
         self._optimizer, self._trainer = optimizer, dict(trainer)
         self._hidden, self._activation, self._seed = hidden, activation, seed
         self._warmup, self._dropout = None if warmup is None else float(warmup), dropout
-        self._data: TouchData | None = None
+        self._data: FrameMaker | None = None
         self._classifier: TouchClassifier | None = None
 
     def check(self, data: "TouchData") -> None:
         """Build network, optimizer and trainer once, so that errors in the settings are reported early."""
+        from skin.learning.training import make_trainer
+
         with torch.random.fork_rng():
             network = self.build(data)
         self._begin(network)
         _check_widths(network, data.frames(data.example)[0])
-        self._trainer_of(None, [])
+        make_trainer(self._trainer)
         settings = self._optimizer.keywords if isinstance(self._optimizer, partial) else {}
         if text := [name for name, value in settings.items() if isinstance(value, str)]:
             raise InputError(f"optimizer.{text[0]}={settings[text[0]]} is text, and must be a number")
@@ -368,7 +303,7 @@ class Network(AbstractLearner):
         except (TypeError, ValueError) as error:
             raise InputError(f"the optimizer refuses its settings: {error}") from error
 
-    def fit(self, data: "TouchData", logger: Logger | None = None) -> None:
+    def fit(self, data: "TouchData", logger: "Logger | None" = None) -> None:
         """Train on the training split; the validation loss chooses the epoch.
 
         With several processes, only the first has the trained weights; they continue no earlier training.
@@ -376,30 +311,19 @@ class Network(AbstractLearner):
         Raises:
             InputError: the choices do not fit each other or the data.
         """
+        # Imported here because Lightning takes seconds and a prediction does not need it.
+        from skin.learning.training import Training, train_network
+
         with torch.random.fork_rng(), self._folder() as folder:
             torch.manual_seed(self._seed)
             classifier = self.build(data)
             if data.task.kind == "regression":
                 classifier.targets.scale(torch.cat([part.known_labels for part in data.parts("train")]))
             self._begin(classifier)
-            best = ModelCheckpoint(folder, monitor="val_loss", save_weights_only=True)
-            clock, last = Clock(folder / "seconds.json"), folder / LAST
-            trainer = self._trainer_of(logger, [best, clock], folder)
-            alone = trainer.world_size == 1
-            if self.unfinished and alone:
-                # Behind `best`, whose state it saves; several processes would have to save together.
-                every = ModelCheckpoint(folder, last.stem, enable_version_counter=False)
-                trainer.callbacks += [RandomState(), every]  # type: ignore[attr-defined]
-            again = last if alone and last.is_file() else None
-            with warnings.catch_warnings():
-                # Lightning 2.6 asks torch 2.13 for a deprecated class
-                warnings.filterwarnings("ignore", ".*treespec, LeafSpec", FutureWarning)
-                trainer.fit(classifier, datamodule=data, ckpt_path=again, weights_only=True)
-            if not trainer.is_global_zero:
-                return
-            weights = torch.load(best.best_model_path, weights_only=True, map_location="cpu")
-            classifier.load_state_dict(weights["state_dict"])
-            self.seconds_per_epoch = clock.median()
+            training = Training(classifier, self._optimizer, self._warmup)
+            self.seconds_per_epoch = train_network(
+                training, data, self._trainer, logger, folder, self.unfinished is not None
+            )
 
     def _begin(self, classifier: TouchClassifier) -> None:
         """Give a network the weights of ``start``.
@@ -431,35 +355,6 @@ class Network(AbstractLearner):
             return
         with TemporaryDirectory() as folder:
             yield Path(folder)
-
-    def _trainer_of(
-        self, logger: Logger | None, callbacks: list[Callback], folder: Path | None = None
-    ) -> Trainer:
-        """Return Lightning's trainer; callbacks and loggers of its settings join ours.
-
-        Raises:
-            InputError: settings that it does not take.
-        """
-        settings = {"enable_progress_bar": False, "num_sanity_val_steps": 0} | self._trainer
-        epochs, theirs = settings.get("max_epochs"), settings.pop("logger", None)
-        if type(epochs) is not int or epochs < 1:
-            raise InputError(f"trainer.max_epochs={epochs} must be a whole number from 1 up")
-        loggers = [
-            candidate
-            for candidate in (logger, *(theirs if isinstance(theirs, list) else [theirs]))
-            if candidate
-        ]
-        try:
-            trainer = Trainer(
-                **settings | {"callbacks": [*callbacks, *(settings.get("callbacks") or [])]},
-                logger=loggers or False,
-                enable_model_summary=False,
-                default_root_dir=folder,
-            )
-        except (TypeError, ValueError, MisconfigurationException) as error:
-            raise InputError(f"pytorch_lightning.Trainer refuses trainer: {one_line(error)}") from error
-        _check(trainer)
-        return trainer
 
     def probabilities(self, touches: Touches) -> Tensor:
         """Return the probability of each label, (B, L), for touches of any layout that the model accepts."""
@@ -497,7 +392,7 @@ class Network(AbstractLearner):
         parts = []
         with torch.inference_mode():
             for start in range(0, len(touches), CHUNK):
-                part = touches[start : start + CHUNK].to(classifier.device)
+                part = touches[start : start + CHUNK].to(next(classifier.parameters()).device)
                 parts.append(function(classifier, self._data.show(part)).cpu())
         return torch.cat(parts)
 
@@ -507,12 +402,12 @@ class Network(AbstractLearner):
         torch.save(self.network.state_dict(), path)
         return path
 
-    def load(self, data: "TouchData", path: Path) -> None:
+    def load(self, data: FrameMaker, path: Path) -> None:
         """Load the weights that :meth:`save` wrote; ``data`` gives the shapes as in :meth:`fit`."""
         check_archive(path)
         self.build(data).load_state_dict(torch.load(path, weights_only=True, map_location="cpu"))
 
-    def build(self, data: "TouchData") -> TouchClassifier:
+    def build(self, data: FrameMaker) -> TouchClassifier:
         """Return the untrained network for the frames of ``data``, drawn from torch's random state.
 
         Raises:
@@ -526,8 +421,6 @@ class Network(AbstractLearner):
             data.task,
             self._hidden,
             self._activation,
-            self._optimizer,
-            self._warmup,
             self._dropout,
             0 if frames.summary is None else frames.summary.shape[1],
         )
@@ -559,27 +452,3 @@ def _check_widths(network: TouchClassifier, frames: Frames) -> None:
         network.eval()(frames)
     for hook in hooks:
         hook.remove()
-
-
-def _check(trainer: Trainer) -> None:
-    """Check for settings that Lightning accepts and this program does not support.
-
-    Raises:
-        InputError: an unsupported setting.
-    """
-    launcher = trainer.strategy.launcher
-    if isinstance(launcher, _SubprocessScriptLauncher) and PARENT in os.environ:
-        raise InputError(
-            f"trainer.devices={trainer.num_devices} would start a whole sweep again for each process: add "
-            "trainer.strategy=ddp_spawn"
-        )
-    if isinstance(launcher, _MultiProcessingLauncher) and launcher.is_interactive_compatible:
-        raise InputError(
-            "trainer.strategy starts processes as forks, which must not use the database of runs: give "
-            "trainer.strategy=ddp or ddp_spawn"
-        )
-    if trainer.precision not in ("32-true", "16-mixed", "bf16-mixed"):
-        raise InputError(
-            f"trainer.precision={trainer.precision} would change the touches too: give 32-true, 16-mixed or "
-            "bf16-mixed"
-        )

@@ -470,7 +470,7 @@ def _adapt(config: Config, name: str, overrides: Sequence[str], steps: Steps) ->
     target = find_target(parent, config, settings, overrides)
     identity = tags(target.config) | {ADAPTED: parent.identity, "target": " ".join(overrides)}
     if config.tracking.resume and (
-        earlier := parent.store.find("FINISHED", fingerprint=identity["fingerprint"])
+        earlier := Store.existing(config.tracking).find("FINISHED", fingerprint=identity["fingerprint"])
     ):
         note_reuse(earlier[0])
         print(f"run {earlier[0].info.run_id} did this before: tracking.resume=false repeats it")

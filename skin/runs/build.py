@@ -19,6 +19,7 @@ from skin.core.settings import check_groups, configured
 from skin.device.base import AbstractDevice
 from skin.errors import InputError
 from skin.learning.learner import AbstractLearner
+from skin.learning.representation import FrameMaker
 from skin.mechanics.simulator.base import AbstractSimulator
 from skin.runs.configuration import Config, iterate_leaves, validate_config
 
@@ -79,6 +80,13 @@ def build_device(config: Config) -> AbstractDevice:
     return device
 
 
+def build_frames(config: Config, device: AbstractDevice) -> FrameMaker:
+    """Return what makes the frames of touches in the configured representation: enough to predict."""
+    _check_options(config, "representation")
+    geometry = partial(_geometry, config) if device.configured else None
+    return FrameMaker(device, instantiate(config.representation), geometry)
+
+
 def build_data(config: Config, device: AbstractDevice) -> "TouchData":
     """Return the data module of a device's touches in the configured representation."""
     # Imported here because Lightning takes seconds and commands without training do not need it.
@@ -86,10 +94,8 @@ def build_data(config: Config, device: AbstractDevice) -> "TouchData":
 
     assert config.data is not None
     augmentation = configured(Augmentation, config.data.augment, "data.augment")
-    _check_options(config, "representation")
-    representation = instantiate(config.representation)
-    geometry = partial(_geometry, config) if device.configured else None
-    return TouchData(device, representation, config.data.batch_size, config.seed, augmentation, geometry)
+    made, batch_size = build_frames(config, device), config.data.batch_size
+    return TouchData(device, made.make, batch_size, config.seed, augmentation, made.make_geometry)
 
 
 def training_data(settings: Mapping[str, Any] | None = None, /, **groups: Any) -> "TouchData":

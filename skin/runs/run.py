@@ -7,21 +7,20 @@ hashes of the others, which ``sha256sum --check`` reads.
 
 import pickle
 import re
+import shutil
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Annotated, Any, cast
+from urllib.parse import urlsplit
+from urllib.request import url2pathname
 
 from annotated_types import Ge, Le
 from hydra.errors import InstantiationException
-from mlflow.artifacts import download_artifacts
-from mlflow.entities import LifecycleStage, Metric, Run, RunData, RunInfo, RunStatus, RunTag
-from mlflow.exceptions import MlflowException
-from mlflow.utils.file_utils import local_file_uri_to_path
-from mlflow.utils.uri import is_local_uri
 from omegaconf.errors import OmegaConfBaseException
 
 from skin.core.files import candidates
@@ -29,10 +28,14 @@ from skin.core.safe_loading import TEXT, file_sha256, load_yaml, parse_json, rea
 from skin.core.settings import check_settings, check_targets
 from skin.errors import InputError
 from skin.evaluation.operating_point import OperatingPoint, parse_operating_point
-from skin.learning.data import TouchData
 from skin.learning.learner import AbstractLearner
-from skin.runs.configuration import Config, recompose, reveal_password, validate_config
-from skin.runs.store import Store
+from skin.runs.configuration import Config, Tracking, recompose, reveal_password, validate_config
+
+if TYPE_CHECKING:
+    from mlflow.entities import Run
+
+    from skin.learning.representation import FrameMaker
+    from skin.runs.store import Store
 
 TAG = "operating_point"
 """Tag of a run that holds :meth:`OperatingPoint.text`; ``null`` where the task has no ``dangerous``."""
@@ -61,13 +64,13 @@ class FinishedRun:
     """A training run that finished.
 
     Attributes:
-        store: where it is.
+        store: where it is; None: a pretrained model, which needs no database.
         run: as MLflow has it; for a pretrained model, the run that it is a copy of.
         trust: its configuration may run any code.
     """
 
-    store: Store
-    run: Run
+    store: "Store | None"
+    run: "Run"
     trust: bool = False
 
     @classmethod
@@ -78,7 +81,7 @@ class FinishedRun:
             run: its name.
             config: of the command; its ``tracking`` and ``trust`` count.
         """
-        return find_run(Store.existing(config.tracking), run, config.trust)
+        return find_run(config.tracking, run, config.trust)
 
     @property
     def identity(self) -> str:
@@ -142,7 +145,7 @@ class FinishedRun:
                 f"{_reason(cause or error)}"
             ) from error
 
-    def load_weights(self, learner: AbstractLearner, data: TouchData) -> None:
+    def load_weights(self, learner: AbstractLearner, data: "FrameMaker") -> None:
         """Load the weights into a learner.
 
         Raises:
@@ -173,27 +176,32 @@ class FinishedRun:
         """
         place = self.run.info.artifact_uri
         try:
-            _check_regular(place, name)
-            # Not by its id: a pretrained model is not in the database.
-            return Path(
-                download_artifacts(f"{place}/{name}", None, None, folder, reveal_password(self.store.uri))
-            )
-        except (MlflowException, OSError, ValueError) as error:
+            if (local := _local(place)) is not None:
+                return _copied(local / name, Path(folder) / name)
+            from mlflow.artifacts import download_artifacts
+
+            assert self.store is not None
+            uri = reveal_password(self.store.uri)
+            return Path(download_artifacts(f"{place}/{name}", None, None, folder, uri))
+        except Exception as error:  # of the file system, of MLflow, or of the library of another storage
             reason = " ".join(str(error).split())
             raise InputError(f"run {self.identity} has no {name} in {place}: {reason}") from error
 
 
-def find_run(store: Store, name: str, trust: bool = False) -> FinishedRun:
+def find_run(tracking: Tracking, name: str, trust: bool = False) -> FinishedRun:
     """Return a pretrained model, or the finished training run whose id or fingerprint begins with ``name``.
 
     A model is named or given by its folder, as in ``./my_skin``. ``latest`` is the last finished run that has
-    weights. Of runs with equal fingerprints the last one counts.
+    weights. Of runs with equal fingerprints the last one counts. No database is opened for a model.
 
     Raises:
         InputError: no run or more than one matches, or the files of the model were altered.
     """
     if (pretrained := find_pretrained(name)) is not None:
-        return FinishedRun(store, pretrained, trust)
+        return FinishedRun(None, pretrained, trust)
+    from skin.runs.store import Store  # MLflow takes seconds to import
+
+    store = Store.existing(tracking)
     runs = [run for run in store.find("FINISHED") if "learned" in run.data.tags]
     if name == "latest":
         matches = runs[:1]
@@ -208,13 +216,25 @@ def find_run(store: Store, name: str, trust: bool = False) -> FinishedRun:
     return FinishedRun(store, matches[0], trust)
 
 
-def _check_regular(place: str, name: str) -> None:
-    """Raise a ValueError where a file of a local run is a device or a named pipe, which would never end."""
-    if is_local_uri(place):
-        path = Path(local_file_uri_to_path(place)) / name
-        for part in path.rglob("*") if path.is_dir() else [path]:
-            if part.exists() and not part.is_dir():
-                regular(part)
+def _local(place: str) -> Path | None:
+    """Return the folder of the artifacts of a run if it is one of this machine."""
+    parts = urlsplit(place)
+    if parts.netloc or parts.scheme not in ("", "file"):
+        return None
+    return Path(url2pathname(parts.path) if parts.scheme else place)
+
+
+def _copied(path: Path, copy: Path) -> Path:
+    """Copy a file or folder and return the copy.
+
+    Raises:
+        OSError: it does not exist or cannot be read.
+        ValueError: a file is a device or a named pipe, which would never end.
+    """
+    for part in path.rglob("*") if path.is_dir() else [path]:
+        if part.exists() and not part.is_dir():
+            regular(part)
+    return Path(shutil.copytree(path, copy) if path.is_dir() else shutil.copyfile(path, copy))
 
 
 def _reason(error: BaseException) -> str:
@@ -235,7 +255,7 @@ class _Record:
     metrics: dict[str, float]
 
 
-def find_pretrained(name: str) -> Run | None:
+def find_pretrained(name: str) -> "Run | None":
     """Return a pretrained model as the finished run that it is a copy of; None if no model has this name.
 
     The artifacts of the run are the files of the folder.
@@ -304,18 +324,14 @@ def _record(folder: Path) -> dict[str, Any]:
     return record
 
 
-def _recorded_run(name: str, folder: Path, record: dict[str, Any]) -> Run:
-    """Return a finished run with the artifacts, tags and metrics of a model."""
-    info = RunInfo(
+def _recorded_run(name: str, folder: Path, record: dict[str, Any]) -> "Run":
+    """Return what this package reads of a finished run, with the artifacts, tags and metrics of a model."""
+    info = SimpleNamespace(
         run_id=record["run"],
-        experiment_id="",
-        user_id="",
-        status=RunStatus.to_string(RunStatus.FINISHED),
         start_time=record["start_time"],
         end_time=record["start_time"],  # a record does not say when the training ended
-        lifecycle_stage=LifecycleStage.ACTIVE,
         artifact_uri=folder.resolve().as_uri(),
         run_name=name,
     )
-    metrics = [Metric(key, value, record["start_time"], 0) for key, value in record["metrics"].items()]
-    return Run(info, RunData(metrics=metrics, tags=[RunTag(*tag) for tag in record["tags"].items()]))
+    data = SimpleNamespace(metrics=record["metrics"], tags=record["tags"])
+    return cast("Run", SimpleNamespace(info=info, data=data))

@@ -24,11 +24,10 @@ from skin.evaluation.alarm import AlarmSource, choose_alarm_threshold
 from skin.evaluation.operating_point import OperatingPoint, Predictor
 from skin.evaluation.streams import ContactThreshold, rise
 from skin.learning.learner import AbstractLearner
-from skin.runs.build import build_data, build_device, build_learner, build_skin, with_skin
+from skin.runs.build import build_device, build_frames, build_learner, build_skin, with_skin
 from skin.runs.configuration import Config, Tracking
 from skin.runs.model import Model, ModelMetadata, OnnxModel
 from skin.runs.run import TAG, FinishedRun, find_run
-from skin.runs.store import Store
 
 _FAINT = 0.3  # N, default contact threshold
 _MANY = 4000  # windows of streams, a tenth of which tunes the contact threshold
@@ -246,7 +245,7 @@ def load_run(
         if body is not None or layout is not None:
             raise InputError(f"{name} is a network for one skin: leave out body and layout")
         return OnnxModel(name)
-    run = find_run(Store.existing(Tracking(uri)), name, trust)
+    run = find_run(Tracking(uri), name, trust)
     try:
         return load_model(run, with_skin(run.stored, body, layout))
     except InstantiationException as error:
@@ -282,7 +281,7 @@ def load_model(
     with run.described():
         device = device or _with_labels(run.stored, build_device(config))
         learner = build_learner(config)
-        data = build_data(config, device.blank())
+        data = build_frames(config, device.blank())
     run.load_weights(learner, data)
     source = alarm_source(run, learner, config) if alarm else None
     point = choose_alarm_threshold(source, one_skin=one_skin) if source else None

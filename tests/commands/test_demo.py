@@ -119,7 +119,7 @@ def test_what_is_killed_leaves_no_process_and_no_port(begin, tmp_path):
 
 @pytest.mark.slow("trains a run and starts the demo")
 def test_a_run_of_equation_10_says_why_it_estimates_no_contacts(begin, tmp_path):
-    words = ["run=default_skin", "live.web_port=0", "live.patience.above=0.95", "seconds=6"]
+    words = ["run=default_skin", "live.web_port=0", "live.patience.above=0.95", "seconds=10"]
     with begin(tmp_path, "live", "demo=true", *words) as demo:
         page = page_of(demo)
         with suppress(OSError):

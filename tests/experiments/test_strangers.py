@@ -119,7 +119,7 @@ def test_a_run_builds_only_parts_of_the_package(case, run, folder, put, bait, ma
 @pytest.mark.parametrize("case", CASES)
 def test_what_is_refused_would_have_run(case, store, put, bait, marker):
     """Trust proves that the payloads work."""
-    found = find_run(store, put(CASES[case][1](bait, marker)))
+    found = find_run(Tracking(store.uri), put(CASES[case][1](bait, marker)))
     with pytest.raises(InputError, match="trust=true"):
         found.stored  # noqa: B018 - raises
     assert not marker.exists()
@@ -148,14 +148,14 @@ def test_a_stored_configuration_cannot_say_that_it_is_trusted(run, folder, put, 
     ],
 )
 def test_yaml_makes_no_objects_and_does_not_grow(text, store, put, marker):
-    found = find_run(store, put(text=text.replace("MARKER", str(marker))))
+    found = find_run(Tracking(store.uri), put(text=text.replace("MARKER", str(marker))))
     with pytest.raises(InputError, match=found.identity):
         found.stored  # noqa: B018 - raises
     assert not marker.exists()
 
 
 def test_what_a_run_is_called_leads_out_of_no_folder(store, put):
-    found = find_run(store, put({"row": "x/../../marker"}))
+    found = find_run(Tracking(store.uri), put({"row": "x/../../marker"}))
     with pytest.raises(InputError, match="row"):
         found.stored  # noqa: B018 - raises
 

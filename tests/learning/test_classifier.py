@@ -13,6 +13,7 @@ from skin.learning.data import TouchData
 from skin.learning.fusion import AbstractFusion
 from skin.learning.network import TouchClassifier, probabilities
 from skin.learning.representation import Frames
+from skin.learning.training import Training
 from skin.touch.labels import TOUCH, TOUCH_OR_NOT, TOUCH_SLIDING, Task
 
 GESTURES = Task(("grab", "hit", "stroke"), "exclusive")
@@ -30,7 +31,7 @@ class Flat(AbstractFusion):
 
 def classifier(task=TOUCH, hidden=(5,)):
     torch.manual_seed(0)
-    return TouchClassifier(Flat(), task, hidden, "relu", torch.optim.Adam)
+    return TouchClassifier(Flat(), task, hidden, "relu")
 
 
 @pytest.mark.parametrize(
@@ -92,7 +93,7 @@ def test_without_touch_only_the_gate_learns():
 def test_accuracy_without_touch_is_the_gates_alone():
     logits = torch.tensor([[1.0, 1.0, -1.0, -1.0, -1.0], [1.0, 1.0, 1.0, 1.0, -1.0]])
     labels = torch.tensor([[1.0, 0.0, 0.0, 1.0, 1.0], [0.0, 0.0, 0.0, 0.0, 0.0]])
-    found = classifier(TOUCH_OR_NOT)._accuracy(logits, labels)
+    found = classifier(TOUCH_OR_NOT).accuracy(logits, labels)
     assert {name: value.item() for name, value in found.items()} == {
         "accuracy": 0.5,
         "accuracy_big": 1.0,
@@ -115,8 +116,8 @@ def test_the_head_is_as_wide_as_the_task():
 
 def test_what_an_epoch_logs(monkeypatch):
     network = classifier(hidden=())
-    logged = {}
-    monkeypatch.setattr(network, "log", lambda name, value, **_: logged.update({name: value.item()}))
+    training, logged = Training(network, torch.optim.Adam), {}
+    monkeypatch.setattr(training, "log", lambda name, value, **_: logged.update({name: value.item()}))
     with torch.no_grad():
         network.head[0].weight.zero_()
         network.head[0].bias.copy_(torch.tensor([1.0, 1.0, -1.0, -1.0]))
@@ -124,8 +125,8 @@ def test_what_an_epoch_logs(monkeypatch):
     for _ in range(2):
         # Batches count by their size; the next epoch begins anew.
         for batch in (labels[:2], labels[2:]):
-            network.validation_step((Frames(torch.randn(len(batch), 3, 2), None), batch), 0)
-        network.on_validation_epoch_end()
+            training.validation_step((Frames(torch.randn(len(batch), 3, 2), None), batch), 0)
+        training.on_validation_epoch_end()
         thirds = {"big": 2, "dynamic": 2, "press": 3, "dangerous": 1}
         assert {name: 3 * logged.pop(f"val_accuracy_{name}") for name in thirds} == pytest.approx(thirds)
         assert logged.pop("val_accuracy") == pytest.approx(8 / 12)
@@ -136,7 +137,7 @@ def test_what_an_epoch_logs(monkeypatch):
 
 def test_exclusive_accuracy_counts_the_largest(monkeypatch):
     network = classifier(GESTURES)
-    values = network._accuracy(torch.tensor([[3.0, 1, 2], [0, 1, 2]]), torch.tensor([[1.0, 0, 0], [0, 1, 0]]))
+    values = network.accuracy(torch.tensor([[3.0, 1, 2], [0, 1, 2]]), torch.tensor([[1.0, 0, 0], [0, 1, 0]]))
     assert values["accuracy"].item() == 0.5
 
 
@@ -163,7 +164,7 @@ def test_a_direction_is_learnt_as_mean_cosines():
 
 def test_a_summary_joins_the_embedding():
     torch.manual_seed(0)
-    network = TouchClassifier(Flat(), TOUCH, (5,), "relu", torch.optim.Adam, summary=3).eval()
+    network = TouchClassifier(Flat(), TOUCH, (5,), "relu", summary=3).eval()
     x, summary = torch.randn(2, 3, 2), torch.randn(2, 3)
     assert network.embed(Frames(x, None, summary)).shape == (2, 12)
     before = network(Frames(x, None, summary))
@@ -174,7 +175,7 @@ def test_a_summary_joins_the_embedding():
 
 def test_numbers_of_any_unit_are_standardised():
     torch.manual_seed(0)
-    network = TouchClassifier(Flat(), TOUCH, (5,), "relu", torch.optim.Adam, summary=3)
+    network = TouchClassifier(Flat(), TOUCH, (5,), "relu", summary=3)
     x, summary = torch.randn(64, 3, 2), torch.randn(64, 3)
     scaled = network(Frames(x, None, 1e4 * summary + 7))
     torch.testing.assert_close(scaled, network(Frames(x, None, summary)), rtol=1e-3, atol=1e-3)
@@ -182,9 +183,9 @@ def test_numbers_of_any_unit_are_standardised():
 
 @pytest.mark.parametrize(("step", "share"), [(0, 0.04), (19, 1.0), (99, 0.0)])
 def test_the_learning_rate_rises_and_falls(step, share):
-    network = TouchClassifier(Flat(), TOUCH, (5,), "relu", torch.optim.Adam, warmup=0.2)
-    network._trainer = type("Trainer", (), {"estimated_stepping_batches": 100})()
-    chosen = network.configure_optimizers()
+    training = Training(classifier(), torch.optim.Adam, warmup=0.2)
+    training._trainer = type("Trainer", (), {"estimated_stepping_batches": 100})()
+    chosen = training.configure_optimizers()
     assert chosen["lr_scheduler"]["interval"] == "step"
     for _ in range(step):
         chosen["optimizer"].step()
@@ -195,14 +196,14 @@ def test_the_learning_rate_rises_and_falls(step, share):
 
 def test_what_is_learnt_in_few_batches_holds_in_use_whatever_the_unit():
     torch.manual_seed(0)
-    network = TouchClassifier(Flat(), TOUCH, (5,), "relu", torch.optim.Adam, summary=3)
+    network = TouchClassifier(Flat(), TOUCH, (5,), "relu", summary=3)
     x, summary = torch.randn(512, 3, 2), 1e-3 * torch.randn(512, 3) + 5e-3
     learning = torch.cat([network(Frames(x[i], None, summary[i])) for i in torch.arange(512).split(128)])
     torch.testing.assert_close(network.eval()(Frames(x, None, summary)), learning, rtol=0.1, atol=0.1)
 
 
 def test_a_batch_of_one_touch_can_be_learnt_from():
-    network = TouchClassifier(Flat(), TOUCH, (5,), "relu", torch.optim.Adam, summary=3)
+    network = TouchClassifier(Flat(), TOUCH, (5,), "relu", summary=3)
     logits = network(Frames(torch.randn(1, 3, 2), None, torch.randn(1, 3)))
     network.loss(logits, torch.ones(1, 4)).backward()
     assert torch.isfinite(logits).all()
@@ -237,5 +238,5 @@ def test_unknown_labels_have_no_loss_and_no_gradient(task):
     nothing.backward()
     assert nothing.item() == 0
     assert all(not parameter.grad.any() for parameter in network.parameters())
-    shares = (network._accuracy(network(known), labels[:4]), network._accuracy(network(frames), unknown))
+    shares = (network.accuracy(network(known), labels[:4]), network.accuracy(network(frames), unknown))
     torch.testing.assert_close(shares[1], shares[0])

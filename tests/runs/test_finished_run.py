@@ -52,18 +52,18 @@ def store(tmp_path_factory):
 
 
 def test_latest_is_the_last_training_that_finished(store):
-    assert find_run(store, "latest").title == "newer"
+    assert find_run(Tracking(store.uri), "latest").title == "newer"
 
 
 def test_the_beginning_of_an_id_is_enough(store):
-    run = find_run(store, "latest")
-    assert find_run(store, run.identity[:12]).identity == run.identity
+    run = find_run(Tracking(store.uri), "latest")
+    assert find_run(Tracking(store.uri), run.identity[:12]).identity == run.identity
 
 
 @pytest.mark.parametrize(("name", "reason"), [("no such id", "no finished training run"), ("", "2 runs")])
 def test_a_name_that_means_no_single_run_is_refused(store, name, reason):
     with pytest.raises(InputError, match=reason):
-        find_run(store, name)
+        find_run(Tracking(store.uri), name)
 
 
 RECORDED = Config(device={"_target_": "skin.device.recording.Recorded"})

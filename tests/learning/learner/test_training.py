@@ -1,6 +1,6 @@
 """Callbacks of a training by themselves."""
 
-from skin.learning.callbacks import Clock
+from skin.learning.training import Clock
 
 
 def test_a_clock_from_a_checkpoint_of_a_complete_training_knows_its_epochs(tmp_path):

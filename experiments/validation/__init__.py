@@ -174,7 +174,7 @@ def _line(result: tuple[Law, CheckResult]) -> str:
     verdict = "holds" if all(finding.ok for finding in outcome.findings) else "**fails**"
     return (
         f"| [{law.name}](#{law.name}) | {law.reference} | {_error(worst)} | "
-        f"{worst.tolerance:.0e} | {verdict} |\n"
+        f"{worst.tolerance:.2g} | {verdict} |\n"
     )
 
 
@@ -194,7 +194,7 @@ def _table(results: Results) -> Iterator[Sequence[str]]:
     for law, outcome in results:
         for finding in outcome.findings:
             ours = f"{finding.ours:.5g}" if finding.reference else _error(finding)
-            numbers = f"{finding.reference:.5g}", _error(finding), f"{finding.tolerance:.0e}"
+            numbers = f"{finding.reference:.5g}", _error(finding), f"{finding.tolerance:.2g}"
             yield law.name, finding.case, ours, *numbers, "yes" if finding.ok else "no"
 
 

@@ -45,11 +45,11 @@ def test_a_miss_is_written_as_one(tmp_path):
     outcome = CheckResult(MISS.findings, MISS.remarks, [picture])
     publish_physics(tmp_path, tmp_path / "physics.json", [(LAW, outcome)])
     text = (tmp_path / "physics.md").read_text()
-    assert "| [gravity](#gravity) | an apple | 0.2 | 1e-01 | **fails** |" in text
+    assert "| [gravity](#gravity) | an apple | 0.2 | 0.1 | **fails** |" in text
     assert "- **missed**: this, error 0.2\n" in text
     assert "that, error" not in text
     table = (tmp_path / "results" / "physics" / "physics.csv").read_text().splitlines()
-    assert table[1:] == ["gravity,this,1.2,1,0.2,1e-01,no", "gravity,that,1,1,< 1e-06,1e-01,yes"]
+    assert table[1:] == ["gravity,this,1.2,1,0.2,0.1,no", "gravity,that,1,1,< 1e-06,0.1,yes"]
     assert "a remark" in text
     assert (tmp_path / "results" / "physics" / "apple.png").stat().st_size > 2000
     assert not list(tmp_path.rglob("*.part"))
@@ -80,7 +80,7 @@ def test_the_files_are_the_same_where_rounding_differs(tmp_path):
     assert all(write_files(noise) == files for noise in (-3.1, -1.0, 0.4, 1.7, 3.0))
     assert "gravity,exact,2.2359,2.2359,< 1e-10,1e-08,yes\n" in files[1]
     assert "gravity,nothing,< 1e-10,0,< 1e-10,1e-10,yes\n" in files[1]
-    assert "gravity,real,0.98362,0.98769,0.0041,5e-02,yes\n" in files[1]
+    assert "gravity,real,0.98362,0.98769,0.0041,0.05,yes\n" in files[1]
 
 
 def test_laws_are_chosen_by_name():

@@ -33,16 +33,16 @@ from skin.core.messages import quiet
 from skin.device.base import AbstractSimulated
 from skin.device.resampling import Frame
 from skin.errors import InputError
-from skin.hardware.live.engine import Detection, Engine
-from skin.hardware.wire.channels import UnitConversion
-from skin.hardware.wire.decoder import Decoder
-from skin.hardware.wire.protocol import encode_line
 from skin.learning.data import TouchData
 from skin.learning.network import Network
+from skin.live.engine import Detection, Engine
 from skin.runs.build import build_data, build_device, build_learner
 from skin.runs.configuration import Config, validate_config
 from skin.runs.model import Model
 from skin.runs.torch_model import TorchModel
+from skin.wire.channels import UnitConversion
+from skin.wire.decoder import Decoder
+from skin.wire.protocol import encode_line
 
 Figures = dict[str, float]
 Benchmark = tuple[str, tuple[object, ...]]

@@ -13,7 +13,6 @@ if TYPE_CHECKING:
     from skin.body.layout import Grid as Grid
     from skin.device.files import read_recording as read_recording
     from skin.errors import InputError as InputError
-    from skin.hardware.wire.skin import open_skin as open_skin
     from skin.inference.candidates import FingertipPrior as FingertipPrior
     from skin.inference.noise import Noise as Noise
     from skin.inference.posterior import Posterior as Posterior
@@ -21,6 +20,7 @@ if TYPE_CHECKING:
     from skin.mechanics.simulator.solid import Solid as Solid
     from skin.runs.build import training_data as data
     from skin.runs.torch_model import load_run as load_run
+    from skin.wire.skin import open_skin as open_skin
 
 __version__ = "0.2.0"
 __all__ = ["Arm", "Grid", "InputError", "LayoutFile", "PlatesAndBeams", "Sheet", "Solid"]
@@ -39,7 +39,7 @@ _PLACES = {
     "Solid": "skin.mechanics.simulator.solid",
     "data": "skin.runs.build:training_data",
     "load_run": "skin.runs.torch_model",
-    "open_skin": "skin.hardware.wire.skin",
+    "open_skin": "skin.wire.skin",
     "read_recording": "skin.device.files",
 }
 

@@ -60,7 +60,7 @@ def test_the_wheel_has_the_package_and_its_files(unpacked):
             name = path.relative_to(ROOT / folder)
             assert (package / inside / name).read_bytes() == path.read_bytes(), path
     assert (package / "py.typed").exists()
-    assert (package / "hardware" / "live" / "page.html").exists()
+    assert (package / "live" / "page.html").exists()
 
 
 def test_the_repository_is_not_on_the_path(installed, unpacked):

@@ -12,9 +12,9 @@ from skin.core.rng import Stream, generator
 from skin.device.base import AbstractSimulated
 from skin.device.resampling import Frame
 from skin.errors import InputError
-from skin.hardware.emulator import gestures_with_labels, upsample
-from skin.hardware.live.engine import Engine
-from skin.hardware.wire.channels import UnitConversion
+from skin.live.engine import Engine
+from skin.wire.channels import UnitConversion
+from skin.wire.emulator import gestures_with_labels, upsample
 
 _IDLE = 4.0  # s without touch before each one
 _AFTER = 5.0  # s behind it

@@ -17,12 +17,12 @@ from matplotlib.figure import Figure
 from scipy.ndimage import gaussian_filter
 
 from experiments.studies.pages import Page
+from skin.calibration.bench import BenchSession
+from skin.calibration.bench_protocol import Protocol
+from skin.calibration.known_loads import KnownLoad, emulate_placements, fit_known_load
 from skin.device.simulated import Simulated
 from skin.evaluation.alarm import AlarmSource, choose_alarm_threshold
 from skin.evaluation.metrics import compute_metrics
-from skin.hardware.bench import BenchSession
-from skin.hardware.bench_protocol import Protocol
-from skin.hardware.known_loads import KnownLoad, emulate_placements, fit_known_load
 from skin.plot.figures import COLOURS
 from skin.touch.shapes import Shapes
 

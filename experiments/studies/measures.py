@@ -122,8 +122,8 @@ class Holds:
         from rich.progress import track
 
         from experiments.studies.alarm_timing import time_courses
-        from skin.hardware.live import engine_builder
-        from skin.hardware.live.engine import DebounceSettings
+        from skin.live import engine_builder
+        from skin.live.engine import DebounceSettings
 
         model = subject.reloaded
         engine = engine_builder.engine_settings(
@@ -158,7 +158,7 @@ class TouchAlarms:
         from skin.evaluation.alarm import SAFE_TOUCHES, AlarmSource, choose_alarm_threshold
         from skin.evaluation.operating_point import LABEL, Reached
         from skin.evaluation.touch_scores import touch_scores
-        from skin.hardware.live.engine import DebounceSettings
+        from skin.live.engine import DebounceSettings
         from skin.touch.labels import TOUCH
 
         trained, settings = subject.trained, check_evaluation(subject.config.evaluation)

@@ -153,7 +153,7 @@ def check_quickly(config: Config, run: str | None, overrides: Sequence[str]) -> 
     check_plausibility(groups)
     device = groups.get("device", {})
     if isinstance(port := device.get("port"), str):
-        from skin.hardware.wire.reader import PortSettings, check_port
+        from skin.wire.reader import PortSettings, check_port
 
         PortSettings.select({name: value for name, value in device.items() if value is not None})
         check_port(port)

@@ -51,11 +51,11 @@ def _calibrate_by_load(
     config: Config, settings: dict[str, Any], weight: float | None, base: float | None, path: str, out: str
 ) -> None:
     """Calibrate from placements of a weight."""
+    from skin.calibration.bench import Units, read_bench_session, write_bench_session
+    from skin.calibration.known_loads import KnownLoad, emulate_known_load, fit_known_load, print_known_load
+    from skin.calibration.wiring import Confirmed, device_channels
     from skin.core.settings import configured
     from skin.device.calibration import write_calibration
-    from skin.hardware.bench import Units, read_bench_session, write_bench_session
-    from skin.hardware.known_loads import KnownLoad, emulate_known_load, fit_known_load, print_known_load
-    from skin.hardware.wiring import Confirmed, device_channels
     from skin.runs.build import build_device
 
     confirmed = configured(Confirmed, {name: settings[name] for name in _CONFIRMED}, "calibrate")
@@ -80,18 +80,18 @@ def _calibrate_by_gauge(
     """Calibrate from presses of a force gauge."""
     from rich.console import Console
 
-    from skin.core.settings import configured
-    from skin.device.calibration import write_calibration
-    from skin.hardware.bench import Units, read_bench_session, read_gauge
-    from skin.hardware.bench_protocol import write_demo_session
-    from skin.hardware.calibration import (
+    from skin.calibration.bench import Units, read_bench_session, read_gauge
+    from skin.calibration.bench_protocol import write_demo_session
+    from skin.calibration.fit import (
         check_force,
         evaluate_held_out,
         fit_calibration,
         print_calibration,
     )
-    from skin.hardware.gauge_drift import check_gauge
-    from skin.hardware.wiring import Confirmed, check_usable, device_channels, wired_bench
+    from skin.calibration.gauge_drift import check_gauge
+    from skin.calibration.wiring import Confirmed, check_usable, device_channels, wired_bench
+    from skin.core.settings import configured
+    from skin.device.calibration import write_calibration
     from skin.runs.build import build_device
 
     confirmed = configured(Confirmed, {name: settings[name] for name in _CONFIRMED}, "calibrate")

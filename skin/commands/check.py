@@ -18,11 +18,11 @@ from skin.runs.configuration import Config
 @command("check")
 def main(config: Config, weight: float | None, base: float | None, seconds: float | None) -> None:
     """Compare readings under the load with predicted ones, and store the result."""
-    from skin.hardware.check import Check, describe_setup, store_check
-    from skin.hardware.known_loads import KnownLoad, base_readings, measure_ratios
-    from skin.hardware.serial import require_port
-    from skin.hardware.wire.reader import SkinDisconnected, SkinTimeout
+    from skin.calibration.check import Check, describe_setup, store_check
+    from skin.calibration.known_loads import KnownLoad, base_readings, measure_ratios
+    from skin.record.serial import require_port
     from skin.runs.build import build_device, build_skin
+    from skin.wire.reader import SkinDisconnected, SkinTimeout
 
     device = require_port(build_device(config))
     load = KnownLoad.of(weight, base, device.size)

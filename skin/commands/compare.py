@@ -17,7 +17,7 @@ from skin.runs.configuration import Config
 
 if TYPE_CHECKING:
     from skin.device.base import AbstractSimulated
-    from skin.hardware.comparison import Agreement, SessionComparison
+    from skin.record.comparison import Agreement, SessionComparison
 
 
 @command("compare")
@@ -34,7 +34,7 @@ def main(
         raise InputError("which session? add session=session.csv, of skin record or a bench")
 
     from skin.core.messages import quiet
-    from skin.hardware.comparison import compare_session, publish_comparison
+    from skin.record.comparison import compare_session, publish_comparison
     from skin.runs.build import build_device
 
     quiet()
@@ -56,7 +56,7 @@ def _compare_predictions(
     import numpy as np
 
     from skin.device.base import Blank
-    from skin.hardware.comparison import Agreement
+    from skin.record.comparison import Agreement
     from skin.runs.run import FinishedRun
     from skin.runs.torch_model import load_model
 

@@ -32,8 +32,8 @@ def main(
         raise InputError(f"format must be one of {', '.join(_FORMATS)}, got {format}")
 
     from skin.core.settings import configured
-    from skin.hardware.emulator import Emulator, EmulatorSettings, Faults, open_port
     from skin.runs.build import build_device
+    from skin.wire.emulator import Emulator, EmulatorSettings, Faults, open_port
 
     settings = configured(EmulatorSettings, emulate, "emulate")
     failures = configured(Faults, faults, "faults")

@@ -103,7 +103,7 @@ def _export_file(
 
     from skin.core.messages import quiet
     from skin.evaluation.alarm import choose_alarm_threshold
-    from skin.hardware.live.engine import DebounceSettings
+    from skin.live.engine import DebounceSettings
     from skin.runs.model import describe_skin
     from skin.runs.run import FinishedRun
     from skin.runs.torch_model import equation10_warning, load_model

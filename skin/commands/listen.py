@@ -17,7 +17,7 @@ from skin.errors import InputError
 from skin.runs.configuration import Config
 
 if TYPE_CHECKING:
-    from skin.hardware.wire.reader import PortSettings
+    from skin.wire.reader import PortSettings
 
 _ENOUGH = 5.0  # s of a stream that show what a board sends
 
@@ -31,10 +31,10 @@ def main(config: Config, n: int | None, seconds: float | None, adapter: Any) -> 
             "device.port is missing: add device.port=/dev/ttyACM0 or device.port=socket://HOST:NUMBER"
         )
 
-    from skin.hardware.wire.formats import SensorCountError
-    from skin.hardware.wire.monitor import PortMonitor
-    from skin.hardware.wire.reader import PortSettings, SkinDisconnected, SkinTimeout
-    from skin.hardware.wire.skin import open_skin
+    from skin.wire.formats import SensorCountError
+    from skin.wire.monitor import PortMonitor
+    from skin.wire.reader import PortSettings, SkinDisconnected, SkinTimeout
+    from skin.wire.skin import open_skin
 
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     settings = PortSettings.select(device)
@@ -60,8 +60,8 @@ def main(config: Config, n: int | None, seconds: float | None, adapter: Any) -> 
 
 def _propose(settings: "PortSettings", seconds: float | None) -> None:
     """Print an adapter that reads the board, as YAML to paste; what it makes of it goes to standard error."""
-    from skin.hardware.wire.proposal import listen_raw, propose
-    from skin.hardware.wire.reader import open_stream
+    from skin.wire.proposal import listen_raw, propose
+    from skin.wire.reader import open_stream
 
     with closing(open_stream(str(settings.port), settings.baudrate)) as stream:
         pieces = listen_raw(stream, _ENOUGH if seconds is None else min(seconds, _ENOUGH))

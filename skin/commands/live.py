@@ -27,9 +27,9 @@ from skin.errors import InputError
 from skin.runs.configuration import Config, overrides, validate_config
 
 if TYPE_CHECKING:
-    from skin.hardware.live.contacts import LiveContacts
-    from skin.hardware.live.engine_builder import LiveSettings, LiveSetup
-    from skin.hardware.live.loop import Display
+    from skin.live.contacts import LiveContacts
+    from skin.live.engine_builder import LiveSettings, LiveSetup
+    from skin.live.loop import Display
 
 
 _DEMO = (
@@ -80,9 +80,9 @@ def emulated_skin(words: Sequence[str]) -> Iterator[list[str]]:
     from threading import Thread
 
     from skin.core.messages import quiet
-    from skin.hardware.emulator import Emulator, EmulatorSettings, Faults, open_port
     from skin.runs.build import build_device
     from skin.runs.run import FinishedRun
+    from skin.wire.emulator import Emulator, EmulatorSettings, Faults, open_port
 
     quiet()
     if devices := [word for word in words if word.startswith("device=")]:
@@ -141,9 +141,9 @@ def show(
     from rich.console import Console
 
     from skin.core.interrupt import ends_on_signal
-    from skin.hardware.live.contacts import LiveContacts
-    from skin.hardware.live.engine_builder import LiveSettings
-    from skin.hardware.live.loop import LiveLoop
+    from skin.live.contacts import LiveContacts
+    from skin.live.engine_builder import LiveSettings
+    from skin.live.loop import LiveLoop
 
     live, say = LiveSettings.of(settings), Console(stderr=True, highlight=False).print
     try:
@@ -155,7 +155,7 @@ def show(
             display = _open_views(setup, contacts, web, live, say, opened)
             watched = setup.watch(live, say)
             if live.verdicts is None:
-                from skin.hardware.live.terminal import show_in_terminal
+                from skin.live.terminal import show_in_terminal
 
                 opened.enter_context(show_in_terminal(display, Console()))
             source, engine = watched.source, watched.settings.build()
@@ -181,7 +181,7 @@ def _load(
 ) -> "LiveSetup":
     """Return the model and its device; the arguments are those of ``watch_run``."""
     from skin.core.messages import quiet
-    from skin.hardware.live.engine_builder import watch_exported, watch_run
+    from skin.live.engine_builder import watch_exported, watch_run
     from skin.runs.model import check_overrides
 
     if not run.endswith(".onnx"):
@@ -193,7 +193,7 @@ def _load(
 
 def _start_contacts(setup: "LiveSetup", say: Say) -> "LiveContacts":
     """Return estimates of contacts, whose process is started if the mechanics are known."""
-    from skin.hardware.live.contacts import LiveContacts
+    from skin.live.contacts import LiveContacts
 
     contacts = LiveContacts()
     try:
@@ -213,8 +213,8 @@ def _open_views(
     opened: ExitStack,
 ) -> "Display":
     """Open what shows the verdicts but the terminal; return what they show."""
-    from skin.hardware.live.loop import Display, DisplayInfo, watch_age
-    from skin.hardware.live.verdicts import log_alarms, print_verdicts
+    from skin.live.loop import Display, DisplayInfo, watch_age
+    from skin.live.verdicts import log_alarms, print_verdicts
 
     model = setup.model
     span = model.window / model.rate
@@ -226,7 +226,7 @@ def _open_views(
     if live.verdicts is not None:
         opened.enter_context(print_verdicts(display))
     if web:
-        from skin.hardware.live.web import serve_page
+        from skin.live.web import serve_page
 
         say(f"page: {opened.enter_context(serve_page(display, live.web_port))}")
     opened.enter_context(watch_age(display))

@@ -8,10 +8,10 @@ import pytest
 
 pytest.importorskip("termios", reason="pseudo-terminals need a POSIX system")
 
-from skin.hardware.known_loads import GRAVITY, base_readings
-from skin.hardware.wire.protocol import Header, encode_header, encode_line
+from skin.calibration.known_loads import GRAVITY, base_readings
 from skin.runs.build import build_skin
-from tests.hardware.wire.conftest import Plug
+from skin.wire.protocol import Header, encode_header, encode_line
+from tests.wire.conftest import Plug
 
 SKIN = ["layout=grid", "layout.rows=2", "layout.columns=2", "simulator=naive"]
 LOAD, PERIOD = 2.8, 4.2  # s

@@ -10,7 +10,7 @@ import tty
 import pytest
 
 from skin.core.files import ROOT
-from skin.hardware.wire.protocol import Header, encode_header, encode_line
+from skin.wire.protocol import Header, encode_header, encode_line
 
 LISTEN = "-m", "skin", "listen"
 

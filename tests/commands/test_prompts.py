@@ -12,8 +12,8 @@ import pytest
 pytest.importorskip("termios", reason="pseudo-terminals need a POSIX system")
 
 from skin.device.files import read_recording
-from skin.hardware.session import read_session
-from skin.hardware.wire.protocol import Header, encode_header, encode_line
+from skin.record.session import read_session
+from skin.wire.protocol import Header, encode_header, encode_line
 
 SKIN = ["layout=grid", "layout.rows=2", "layout.columns=2", "simulator=naive", "touch.window=0.5"]
 PACE = 0.002  # s of the wall for 10 ms of the device

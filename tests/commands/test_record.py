@@ -14,9 +14,9 @@ import pytest
 pytest.importorskip("fcntl", reason="file limits need a POSIX system")
 
 from skin.device.files import read_recording
-from skin.hardware.recorder import locked
-from skin.hardware.session import read_session
-from skin.hardware.wire.protocol import Header, encode_header, encode_line
+from skin.record.recorder import locked
+from skin.record.session import read_session
+from skin.wire.protocol import Header, encode_header, encode_line
 
 SKIN = ["layout=grid", "layout.rows=2", "layout.columns=2", "simulator=naive", "touch.window=0.5"]
 FREE = [*SKIN, "record.free=true", "device.tare=1", "device.backoff=[0.05,0.1]"]

@@ -8,7 +8,7 @@ from annotated_types import Ge, Gt, Le
 
 from skin.core.settings import ONCE, RISING, check_groups, check_settings, checked, configured
 from skin.errors import InputError
-from skin.hardware.live.engine_builder import LiveSettings
+from skin.live.engine_builder import LiveSettings
 from skin.runs.build import build_data, build_device, build_learner
 
 

@@ -17,7 +17,7 @@ from skin.evaluation.operating_point import OperatingPoint
 from skin.evaluation.report import touch_sets
 from skin.evaluation.settings import Evaluation
 from skin.evaluation.streams import evaluate_windows
-from skin.hardware.serial import Serial, open_source
+from skin.record.serial import Serial, open_source
 from skin.runs.build import build_device
 from skin.runs.configuration import validate_config
 
@@ -46,7 +46,7 @@ def device(request, tmp_path_factory) -> AbstractDevice:
 def test_other_devices_have_tests_of_their_own():
     others = {path.stem for path in (CONF / "device").glob("*.yaml")} - set(EVERYWHERE)
     assert others == {"cost", "serial", "skins"}
-    rooms = [Path(__file__).parent, Path(__file__).parents[1] / "hardware"]
+    rooms = [Path(__file__).parent, Path(__file__).parents[1] / "record"]
     assert all(any((room / f"test_{name}.py").is_file() for room in rooms) for name in others)
 
 

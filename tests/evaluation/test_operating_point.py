@@ -19,11 +19,11 @@ from skin.evaluation.metrics import compute_metrics
 from skin.evaluation.operating_point import OperatingPoint, Reached, parse_operating_point
 from skin.evaluation.report import evaluate
 from skin.evaluation.settings import Evaluation, check_evaluation
-from skin.hardware.live.engine import Detection, Engine
-from skin.hardware.wire.channels import UnitConversion
+from skin.live.engine import Detection, Engine
 from skin.runs.build import build_device
 from skin.touch.labels import TOUCH, TOUCH_OR_NOT, Task
 from skin.touch.sampler import balanced
+from skin.wire.channels import UnitConversion
 
 SETTINGS = Evaluation(devices=0, layouts=0, false_alarm_rate=0.1, safe_gestures=64)
 POINT = OperatingPoint(0.25, 0.02, 2048, 40, 3)

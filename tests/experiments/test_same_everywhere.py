@@ -11,7 +11,7 @@ import torch
 from skin.body.base import Sheet
 from skin.body.layout import Grid
 from skin.device.files import read_recording
-from skin.hardware.serial import Serial
+from skin.record.serial import Serial
 
 SKIN = ["layout=grid", "layout.rows=3", "layout.columns=3", "simulator=naive"]
 SMALL = ["data.gestures=1000", "device.test_gestures=96", "evaluation.devices=1"]

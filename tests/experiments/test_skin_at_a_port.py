@@ -9,7 +9,7 @@ import pytest
 pytest.importorskip("termios", reason="pseudo-terminals need a POSIX system")
 
 from skin.device.files import read_recording
-from skin.hardware.session import read_session
+from skin.record.session import read_session
 
 SMALL = ["layout=grid", "layout.rows=2", "layout.columns=2", "simulator=naive"]
 PATIENCE = 300  # s: machines are busy at times

@@ -5,8 +5,8 @@ import pytest
 
 from experiments.studies.alarm_timing import COURSES, dangerous_touches, play_touch
 from skin.errors import InputError
-from skin.hardware.live.engine import DebounceSettings
-from skin.hardware.live.engine_builder import engine_settings
+from skin.live.engine import DebounceSettings
+from skin.live.engine_builder import engine_settings
 from skin.runs.build import build_data, build_device, build_learner
 from skin.runs.torch_model import TorchModel
 

@@ -1,0 +1,370 @@
+"""Calibrate without a gauge: by a weight on a round base on every sensor.
+
+The gain of a channel is its reading over the simulated one. A wide base hardly cares where the sensor lies
+below it.
+"""
+
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import islice
+from typing import Any
+
+import numpy as np
+
+from skin.body.base import AbstractBody, Sensors
+from skin.calibration.bench import BenchSession, Gauge, per_newton
+from skin.calibration.bench_protocol import Protocol, sent_session
+from skin.calibration.placements import Placements, find_placements
+from skin.calibration.wiring import find_quantum, list_numbers, measure_idle
+from skin.core.settings import configured
+from skin.device.base import AbstractSimulated
+from skin.device.calibration import Calibration
+from skin.device.resampling import Frame, StreamClock
+from skin.errors import InputError
+from skin.mechanics.simulator.base import AbstractSimulator
+from skin.wire.channels import UnitConversion
+
+GRAVITY = 9.80665  # m/s2
+_HEAVIEST = 50.0  # kg: nobody puts more on a skin by hand
+_SPREAD = 0.35  # of gains and model together, in assigning placements to sensors
+_FLOOR = 0.03  # of the largest reading: what a model leaves beside a base
+_QUIETER = 200.0  # times that the noise of sensors may be below that of the simulated device
+_MISSED = 0.25  # share of the sensors that may have no gain
+_PATIENCE = 60.0  # s in which a further load must be put down
+
+
+@dataclass(frozen=True)
+class KnownLoad:
+    """What is put on the skin.
+
+    Attributes:
+        weight: kg.
+        base: radius of the weight's round base, m.
+    """
+
+    weight: float
+    base: float
+
+    @classmethod
+    def of(cls, weight: float | None, base: float | None, size: tuple[float, float]) -> "KnownLoad":
+        """Return a load that a skin of this size, m, can carry.
+
+        Raises:
+            InputError: no mass or no base, or one that is too large or not above 0.
+        """
+        if weight is None or base is None:
+            raise InputError(
+                "a known load is a mass in kg on a round base of a radius in m: give weight=2.0 base=0.02"
+            )
+        if not 0 < weight <= _HEAVIEST:
+            in_grams = f"; for {weight:g} g give weight={weight / 1000:g}" * (weight >= 100)
+            raise InputError(f"weight={weight:g} is a mass in kg above 0 and up to {_HEAVIEST:g}{in_grams}")
+        widest = min(size) / 2
+        if not 0 < base <= widest:
+            in_mm = f"; for {base:g} mm give base={base / 1000:g}" * (base >= 1)
+            raise InputError(
+                f"base={base:g} is a radius in m above 0 that fits on the skin of {size[0]:g} x "
+                f"{size[1]:g} m, so at most {widest:g}{in_mm}"
+            )
+        return cls(weight, base)
+
+    @property
+    def force(self) -> float:
+        """N."""
+        return GRAVITY * self.weight
+
+
+@dataclass(frozen=True)
+class LoadResult:
+    """A calibration by known loads, and how well it is determined.
+
+    Attributes:
+        calibration: of the skin.
+        placements: number of placements of every sensor, (S,).
+        differ: median difference between placements of the same sensor, share; NaN where every sensor has
+            one.
+        never: sensors that were never loaded: their gain is the median.
+    """
+
+    calibration: Calibration
+    placements: np.ndarray
+    differ: float
+    never: list[int]
+
+
+def fit_known_load(device: AbstractSimulated, session: BenchSession, load: KnownLoad) -> LoadResult:
+    """Fit offsets and noise to idle frames, and gains to placements of a load.
+
+    Args:
+        device: with the skin as designed.
+        session: idle, and placements in any order, with the skin untouched between them.
+        load: what was put on it.
+
+    Raises:
+        InputError: another number of channels, no placement, or sensors without one.
+    """
+    channels, sensors = session.raw.shape[1], len(device.sensors)
+    if channels != sensors:
+        raise InputError(
+            f"the session has {channels} channels, the layout {sensors} sensors: give the layout it was "
+            "recorded with, as in layout=file layout.path=FILE.csv"
+        )
+    placements = find_placements(session)
+    if not len(placements.change):
+        touched = f" ({placements.unsteady} changed while they lay, or were touched)"
+        raise InputError(
+            f"no placement in the session{touched * bool(placements.unsteady)}: leave the skin untouched for "
+            "3 s, put the load down, let go of it for 2 s, lift it for 2 s, and so on"
+        )
+    gains, counts, differ = _fit_weight(device, placements, load)
+    return _build(session, placements, load, gains, counts, differ, float(device.constants.noise.median()))
+
+
+def base_readings(model: AbstractSimulator, body: AbstractBody, sensors: Sensors, base: float) -> np.ndarray:
+    """Return the readings (S, S), N, under 1 N on a round base over each sensor.
+
+    Near the rim the base is as far inside as it needs to be to lie on the skin.
+    """
+    places = np.clip(sensors.positions[:, :2], base, np.array(body.size) - base)
+    count = len(places)
+    zeros, names = np.zeros(count), np.full(count, "disc")
+    presses = np.arange(count)
+    rows = Gauge(presses.astype(float), zeros + 1, places, zeros + base, zeros, names, presses)
+    return per_newton(model, body, rows)
+
+
+def _fit_weight(
+    device: AbstractSimulated, placements: Placements, load: KnownLoad
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Return gains (S,), in the session's unit per N, NaN if unknown; placements (S,); their difference."""
+    expected = load.force * base_readings(device.model, device.body, device.sensors, load.base)
+    sensor = _assign(expected, placements)
+    gains, counts = np.full(len(expected), np.nan), np.bincount(sensor, minlength=len(expected))
+    differences = []
+    for number in np.flatnonzero((counts > 0) & placements.reached):
+        ratios = placements.change[sensor == number, number] / expected[number, number]
+        gains[number] = np.median(ratios) if len(ratios) > 2 else ratios.mean()
+        if len(ratios) > 1:
+            differences.append(np.abs(ratios / gains[number] - 1).mean() * 2)
+    return gains, counts, float(np.median(differences)) if differences else math.nan
+
+
+def _assign(expected: np.ndarray, placements: Placements) -> np.ndarray:
+    """Return the sensor (P,) below each placement: that whose pattern of readings is the most likely.
+
+    Gains are unknown, so a reading is its expectation within a third. A dead sensor is found by the readings
+    of its neighbours.
+    """
+    size = np.abs(placements.change)
+    typical = float(np.median(size.max(axis=1)) / np.median(np.diagonal(expected)))
+    measured = placements.change[:, None, :] * np.sign(_sign(placements)) / typical
+    noise = placements.noise / typical
+    variance = (_SPREAD * expected) ** 2 + noise**2 + (_FLOOR * expected.max()) ** 2
+    cost = (measured - expected) ** 2 / variance + np.log(variance)
+    return np.asarray(cost[..., placements.reached].sum(axis=-1).argmin(axis=1))
+
+
+def _sign(placements: Placements) -> np.ndarray:
+    """Return 1 or -1 per channel, (S,): whether it rises under load; as most others, if it is silent."""
+    strongest = np.abs(placements.change).argmax(axis=0)
+    signs = np.sign(placements.change[strongest, np.arange(placements.change.shape[1])])
+    most = -1.0 if signs[placements.reached].sum() < 0 else 1.0
+    return np.where(placements.reached & (signs != 0), signs, most)
+
+
+def _build(
+    session: BenchSession,
+    placements: Placements,
+    load: KnownLoad,
+    gains: np.ndarray,
+    counts: np.ndarray,
+    differ: float,
+    usual: float,
+) -> LoadResult:
+    """Return the calibration of gains (S,), in the session's unit per N, NaN if unknown.
+
+    A load in another unit makes the noise, N, that of no sensor; ``usual`` is that of the simulated device.
+    """
+    signs = _sign(placements)
+    dead = [int(n) for n in np.flatnonzero(~placements.reached)]
+    never = [int(n) for n in np.flatnonzero(placements.reached & ~(gains * signs > 0))]
+    if len(dead) + len(never) > _MISSED * len(gains):
+        raise InputError(
+            f"sensors {list_numbers(sorted(dead + never))} were never loaded, or do not respond: put the "
+            "load on every sensor and record again, or check the wiring"
+        )
+    idle = placements.idle
+    rests = []
+    for channel in session.raw.T:
+        quiet = idle & np.isfinite(channel)
+        rest = channel[np.isfinite(channel)]
+        step = find_quantum(rest) if len(rest) else 0.0
+        # Slow drift is left to the tare: placements move the rest a little, too.
+        rests.append((*_rest(session.time[quiet], channel[quiet], step), step))
+    offset, noise, step_sizes = np.array(rests).T
+    absolute = np.where(np.isfinite(gains), gains * signs, np.nan)
+    typical = float(np.nanmedian(absolute))
+    quiet = float(np.median(np.maximum(noise, step_sizes / math.sqrt(12)))) / typical
+    if quiet < usual / _QUIETER:
+        raise InputError(
+            f"weight={load.weight:g} (kg) would mean a noise of {quiet:.2g} N, device.noise is {usual:g}: "
+            "give the load in this unit, or device.noise= if the sensors are so quiet"
+        )
+    in_newton = session.unit == "N"
+    scale = 1.0 if in_newton else 1 / typical
+    zero = 0.0 if in_newton else float(np.median(offset[placements.reached]))
+    sensors: dict[str, list[float | None]] = {
+        "offset": _rounded(signs * (offset - zero) * scale),
+        "noise": _rounded(noise * scale),
+        "quantum": _rounded(step_sizes * scale),
+        "gain": _rounded(absolute * scale),
+    }
+    ranges: dict[str, list[float]] = {"dead": [0, len(dead)]}
+    for name, values in sensors.items():
+        working = [value for n, value in enumerate(values) if value is not None and n not in dead]
+        ranges[name] = [min(working), max(working)]
+    about: dict[str, Any] = {
+        "unit": session.unit,
+        "placements": len(placements.change),
+        "weight": load.weight,
+        "base": load.base,
+    }
+    polarity = tuple(int(sign) for sign in signs) if signs.min() < 0 else ()
+    calibration = Calibration(sensors, {"dead": dead}, ranges, scale, zero, about, polarity)
+    return LoadResult(calibration, counts, differ, never)
+
+
+def _rest(time: np.ndarray, values: np.ndarray, step: float) -> tuple[float, float]:
+    """Return the level at rest and the noise of a channel, in the session's unit; 0 without frames."""
+    if len(values) < 2 * 10 or np.ptp(values) == 0:
+        return (float(np.median(values)) if len(values) else 0.0), 0.0
+    idle = measure_idle(time - time.mean(), values, step)
+    return idle.offset, idle.noise
+
+
+def _rounded(values: np.ndarray) -> list[float | None]:
+    return [float(f"{value:.6g}") + 0.0 if np.isfinite(value) else None for value in values]
+
+
+def print_known_load(result: LoadResult) -> None:
+    """Print gains, placements, and the sensors without a gain."""
+    calibration = result.calibration
+    gains = [gain for gain in calibration.sensors["gain"] if gain is not None]
+    print(
+        f"{calibration.about['placements']} placements, {len(gains)} of {len(calibration)} sensors have a "
+        f"gain: median {np.median(gains):.4g}, {min(gains):.4g} to {max(gains):.4g}"
+    )
+    if math.isfinite(result.differ):
+        print(f"placements of the same sensor differ by {result.differ:.1%} (median)")
+    if dead := calibration.broken["dead"]:
+        print(f"dead, or never loaded: sensors {list_numbers(dead)} (from 0) never left their noise")
+    if result.never:
+        print(f"never loaded, so of median gain: sensors {list_numbers(result.never)}")
+    if inverse := np.flatnonzero(calibration.signs < 0).tolist():
+        print(f"inverse, values fall with force: sensors {list_numbers(inverse)}")
+
+
+# A second load, measured while it is put on three sensors.
+
+
+def measure_ratios(
+    frames: Iterable[Frame],
+    first: Sequence[Frame],
+    conversion: UnitConversion,
+    expected: np.ndarray,
+    seconds: float,
+    say: Callable[[str], None],
+) -> dict[str, float]:
+    """Return measured over predicted reading of three loaded sensors, or of all if there are fewer.
+
+    Args:
+        frames: of the skin, from now on.
+        first: frames of the untouched skin before.
+        conversion: of values to N.
+        expected: readings (S, S), N, under the load on each sensor.
+        seconds: for which each load must lie.
+        say: called with each message for the user.
+
+    Raises:
+        InputError: no load lies so long, or its reading changes: the device may follow its own baseline.
+    """
+    clock, stream, ratios, enough = StreamClock(), iter(frames), dict[str, float](), min(3, len(expected))
+    rate = (len(first) - 1) / np.ptp([clock(frame) for frame in first])
+    rows = [conversion.newtons(frame.values) for frame in first]
+    shapes = expected / np.linalg.norm(expected, axis=1, keepdims=True)
+    while further := [conversion.newtons(frame.values) for frame in islice(stream, math.ceil(rate))]:
+        rows += further
+        time = np.arange(len(rows)) / rate
+        found = find_placements(BenchSession(time, np.array(rows), "N"))
+        lying = time[-1] - time[found.idle][-1]
+        # A load that has just been put down may still change.
+        if found.unsteady and not 0 < lying < 2 * seconds:
+            raise InputError(
+                "readings changed while a load lay: the device seems to follow its own baseline, so that a "
+                "long press disappears: switch that off in its firmware; or the load moved: check again"
+            )
+        counted = found.end - found.begin >= seconds
+        for change in found.change[counted]:
+            # The pattern tells the sensor, whatever the scale and its sign.
+            sensor = int(np.abs(shapes @ change).argmax())
+            if str(sensor) not in ratios:
+                say(
+                    f"sensor {sensor}: {change[sensor]:.3g} N, predicted {expected[sensor, sensor]:.3g} N; "
+                    f"{len(ratios) + 1} of {enough}, lift it"
+                )
+            ratios[str(sensor)] = float(change[sensor] / expected[sensor, sensor])
+        if len(ratios) >= enough and lying == 0:
+            return ratios
+        if time[-1] - found.begin[counted].max(initial=0.0) > _PATIENCE + seconds:
+            break
+    raise InputError(
+        f"no further load lay for {seconds:g} s within {_PATIENCE:g} s: give a heavier one, as in weight=1, "
+        "or let the device keep its baseline"
+    )
+
+
+# A session of an emulated skin under the load.
+
+
+def emulate_placements(
+    device: AbstractSimulated,
+    readings: np.ndarray,
+    protocol: Protocol,
+    generator: np.random.Generator,
+    bits: int | None = None,
+) -> BenchSession:
+    """Simulate placements of a load one after the other, 2 s each, with pauses of ``protocol.rest``.
+
+    Args:
+        device: the skin.
+        readings: true readings of each placement, (P, S), N.
+        protocol: its ``idle``, ``rest``, ``ramp`` and ``rate``.
+        generator: of the noise.
+        bits: of the converter; None: N are sent.
+    """
+    period = 2 * protocol.ramp + 2.0 + protocol.rest
+    time = np.arange(round((protocol.idle + len(readings) * period) * protocol.rate)) / protocol.rate
+    number = np.floor((time - protocol.idle) / period).astype(int)
+    inside = (time - protocol.idle) % period
+    corners = [0.0, protocol.ramp, protocol.ramp + 2.0, 2 * protocol.ramp + 2.0]
+    share = np.where(number >= 0, np.interp(inside, corners, [0.0, 1.0, 1.0, 0.0]), 0.0)
+    true = share[:, None] * readings[np.maximum(number, 0)]
+    return sent_session(device, true, time, generator, bits)
+
+
+def emulate_known_load(
+    device: AbstractSimulated, load: KnownLoad, settings: Mapping[str, Any]
+) -> BenchSession:
+    """Simulate a session of a load on an emulated skin: on every sensor twice, in any order.
+
+    Args:
+        device: the skin.
+        load: what is put on it.
+        settings: ``conf/calibrate.yaml`` under ``calibrate``.
+    """
+    protocol = configured(Protocol, settings["protocol"], "calibrate.protocol")
+    randomness = np.random.default_rng(device.seed)
+    order = np.concatenate([randomness.permutation(len(device.sensors)) for _ in range(2)])
+    readings = load.force * base_readings(device.model, device.body, device.sensors, load.base)[order]
+    return emulate_placements(device, readings, protocol, randomness, settings["bits"])

@@ -1,0 +1,555 @@
+"""Find out which channel belongs to which sensor, from idle frames and the responses to presses.
+
+A channel that responds at other presses than its sensor should is not dead. The session is compared with what
+it would be if the places of the presses were mirrored or turned, or the channels in another order.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal, get_args
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+from scipy.stats import theilslopes
+
+from skin.calibration.bench import BenchData, BenchSession, Gauge, build_bench_data, per_newton
+from skin.core.settings import checked
+from skin.device.base import AbstractSimulated
+from skin.device.calibration import Calibration
+from skin.errors import InputError
+
+_BLOCKS = 200  # of the frames: Theil's line of a drift takes all pairs of their medians
+_MAD = 1.4826  # standard deviation over the median absolute deviation, of normal noise
+_MEDIAN = math.sqrt(math.pi / 2)  # standard error of a median over that of a mean
+_STEPS = 8  # means over the loading of a press
+_BEFORE = 20  # idle frames before a press, from which its rest is taken
+_FEW = 5
+_SURE, _VISIBLE, _STEP = 5.0, 1.0, 1.5  # standard errors, noise and steps above which a channel responds
+_LIMITS = np.geomspace(0.9, 30.0, 40)  # largest prediction over the limit; at 300 any shape fits a step
+_TINY = 1e-6  # of the largest prediction: less is 0
+_INVERSE = 4.5  # factor on the residual of a channel whose polarity is not that of most
+_STRONGER = 20.0  # times the predicted share of the strongest response: more has another cause
+
+
+@dataclass(frozen=True)
+class Idle:
+    """Statistics of an untouched channel, in the session's unit.
+
+    Attributes:
+        offset: median, at time 0 where it drifts.
+        drift: per s; 0 if its 95 % confidence interval contains 0.
+        noise: 1.4826 times the median absolute deviation; with steps of similar size, the standard
+            deviation without outliers.
+    """
+
+    offset: float
+    drift: float
+    noise: float
+
+
+def find_quantum(values: np.ndarray) -> float:
+    """Return the smallest step between values; 0 if they are continuous.
+
+    Values are quantised if fewer than a fifth of them are distinct.
+    """
+    distinct = np.unique(values)
+    if len(distinct) < 2 or len(distinct) > 0.2 * len(values):
+        return 0.0
+    steps = np.diff(distinct)
+    # Single precision splits a step into two that differ in the last digit.
+    steps = steps[steps > 1e-5 * np.abs(distinct).max()]
+    return float(steps.min(initial=np.inf)) if len(steps) else 0.0
+
+
+def measure_idle(time: np.ndarray, values: np.ndarray, step: float) -> Idle:
+    """Return the statistics of idle frames.
+
+    Args:
+        time: s.
+        values: in the session's unit, steps of ``step`` apart (0: continuous).
+        step: of the converter.
+    """
+    values = _spread(values, step)
+    blocks = np.array_split(np.arange(len(values)), min(_BLOCKS, max(2, len(values) // 10)))
+    middles = np.array([[time[block].mean(), np.median(values[block])] for block in blocks])
+    slope, _, low, high = theilslopes(middles[:, 1], middles[:, 0])
+    drift = 0.0 if low <= 0 <= high else float(slope)
+    steady = values - drift * time
+    offset = float(np.median(steady))
+    spread = _MAD * float(np.median(np.abs(steady - offset)))
+    if step > 0.8 * spread:
+        # The steps are too coarse for a median.
+        spread = float(np.std(steady[np.abs(steady - offset) <= 3 * max(spread, step)]))
+    # Rounding and spreading each add the variance of a step (Sheppard's correction).
+    return Idle(offset, drift, math.sqrt(max(spread**2 - step**2 / 6, 0.0)))
+
+
+def _spread(values: np.ndarray, step: float) -> np.ndarray:
+    """Spread equal values evenly over their rounding step, so that medians resolve less than a step."""
+    if step == 0:
+        return values
+    _, group, count = np.unique(values, return_inverse=True, return_counts=True)
+    order = np.argsort(group, kind="stable")
+    rank = np.empty(len(values))
+    rank[order] = np.arange(len(values)) - np.repeat(np.cumsum(count) - count, count)
+    # Ranks follow time; a fixed shuffle keeps them from distorting a drift.
+    place = (rank * 0.6180339887498949) % 1
+    return values + step * (place - 0.5)
+
+
+@dataclass(frozen=True)
+class Responses:
+    """Responses of all channels, medians over the steps of a press while its force rises.
+
+    Attributes:
+        measured: (F, S), change against the rest before the press, in the session's unit.
+        force: (F,), of the gauge, N.
+        press: (F,), number of the press.
+        error: (S,), standard error of ``measured``.
+        responding: (S,), bool: the channel leaves its noise in at least one press.
+    """
+
+    measured: np.ndarray
+    force: np.ndarray
+    press: np.ndarray
+    error: np.ndarray
+    responding: np.ndarray
+
+
+@dataclass(frozen=True)
+class Match:
+    """How well every channel is explained by the prediction for every sensor.
+
+    Attributes:
+        residual: (channels, sensors), share of a channel's energy that the prediction does not explain with
+            any gain and limit, without that of the noise: 0 to 1.
+        sign: (channels, sensors), 1 or -1: whether the channel rises or falls with force.
+        expected: (sensors,), largest prediction, share of the largest of all.
+    """
+
+    residual: np.ndarray
+    sign: np.ndarray
+    expected: np.ndarray
+
+
+def collect_responses(bench: BenchData) -> Responses:
+    """Return the responses of all channels of a session, which do not depend on places or layout."""
+    raw, (force, press) = bench.session.raw, bench.applied
+    idle = np.flatnonzero(bench.idle)
+    rows, forces, numbers, counts, rests = [], [], [], [], []
+    resting = find_medians(raw[idle])
+    for number in range(len(bench.gauge)):
+        frames = np.flatnonzero((press == number) & bench.loading)
+        if not len(frames):
+            continue
+        before = idle[idle < frames[0]][-_BEFORE:]
+        level = find_medians(raw[before]) if len(before) >= _FEW else resting
+        level = np.where(np.isfinite(level), level, resting)
+        rests.append(level)
+        for step in np.array_split(frames, min(_STEPS, len(frames))):
+            rows.append(find_medians(raw[step]) - level)
+            forces.append(np.median(force[step]))  # as the readings: a part may hold two levels
+            numbers.append(number)
+            counts.append(len(step))
+    measured = np.nan_to_num(np.array(rows))
+    noise, step = _noise(bench, idle)
+    error = noise * _MEDIAN * math.sqrt(1 / float(np.median(counts)) + 1 / _BEFORE)
+    if len(rests) > 2:  # slow noise, which no mean reduces
+        error = np.maximum(error, _MAD * np.nan_to_num(find_medians(np.abs(np.diff(rests, axis=0)))))
+    floor = np.maximum(np.maximum(_SURE * error, _VISIBLE * noise), _STEP * step)
+    responding = np.abs(measured).max(axis=0) > floor
+    return Responses(measured, np.array(forces), np.array(numbers), error, responding)
+
+
+def match_channels(responses: Responses, per_newton: np.ndarray) -> Match:
+    """Compare every channel with the prediction for every sensor.
+
+    A channel reads gain times the prediction up to a limit. Both are free, and the gain may be negative. But
+    a channel that responds strongly is not explained by a sensor that no press reaches.
+
+    Args:
+        responses: of the session.
+        per_newton: (P, S), true readings per N of every press.
+    """
+    prediction = responses.force[:, None] * per_newton[responses.press]  # N, (F, S)
+    largest = np.abs(prediction).max(axis=0)
+    reached = largest > _TINY * largest.max(initial=0.0)
+    shape = prediction / np.where(reached, largest, 1.0)
+    energy = (responses.measured**2).sum(axis=0)
+    unit = responses.measured / np.sqrt(np.where(energy > 0, energy, 1.0))
+    best = np.zeros((unit.shape[1], shape.shape[1]))
+    for limit in _LIMITS:
+        clipped = np.clip(limit * shape, -1.0, 1.0)
+        size = np.sqrt((clipped**2).sum(axis=0))
+        likeness = unit.T @ clipped / np.where(size > 0, size, 1.0)
+        best = np.where(np.abs(likeness) > np.abs(best), likeness, best)
+    noise = len(responses.measured) * responses.error**2 / np.where(energy > 0, energy, np.inf)
+    residual = np.clip((1 - best**2 - noise[:, None]) / np.clip(1 - noise[:, None], 0.1, 1.0), 0.0, 1.0)
+    strength = np.abs(responses.measured).max(axis=0)
+    expected = largest / max(largest.max(initial=0.0), 1e-300)
+    impossible = (strength / max(strength.max(initial=0.0), 1e-300))[:, None] > _STRONGER * expected
+    residual = np.where(impossible | ~reached, 1.0, residual)
+    sign = np.where(best < 0, -1.0, 1.0)
+    # Beside a press the surface may rise: a channel that is inverse alone has to fit better.
+    nearest = sign[np.arange(len(sign)), residual.argmin(axis=1)][responses.responding]
+    most = -1.0 if nearest.sum() < 0 else 1.0
+    residual = np.where(sign == most, residual, np.minimum(_INVERSE * residual, 1.0))
+    return Match(residual, sign, expected)
+
+
+def find_polarity(responses: Responses, per_newton: np.ndarray) -> np.ndarray:
+    """Return 1 or -1 for every channel, (S,): -1 where it falls with force at its own sensor.
+
+    A channel that does not respond has the polarity of most others.
+    """
+    signs = np.diagonal(match_channels(responses, per_newton).sign)
+    most = -1.0 if signs[responses.responding].sum() < 0 else 1.0
+    return np.where(responses.responding, signs, most)
+
+
+def find_medians(values: np.ndarray) -> np.ndarray:
+    """Return the median of each column, (S,); NaN where a column has no number."""
+    measured = np.isfinite(values).any(axis=0) if len(values) else np.zeros(values.shape[1], dtype=bool)
+    middle = np.full(values.shape[1], np.nan)
+    if measured.any():
+        middle[measured] = np.nanmedian(values[:, measured], axis=0)
+    return middle
+
+
+def _noise(bench: BenchData, idle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the noise of a frame and the step of the converter, (S,) each; 0 where there is no number."""
+    noise, step = np.zeros(bench.session.raw.shape[1]), np.zeros(bench.session.raw.shape[1])
+    for channel, values in enumerate(bench.session.raw.T):
+        quiet = idle[np.isfinite(values[idle])]
+        if np.isfinite(values).any():
+            step[channel] = find_quantum(values[np.isfinite(values)])
+        if len(quiet) < 10 or np.ptp(values[quiet]) == 0:
+            continue
+        noise[channel] = measure_idle(bench.session.time[quiet], values[quiet], step[channel]).noise
+    return noise, step
+
+
+Turn = Literal[
+    "as_given",
+    "mirror_x",
+    "mirror_y",
+    "rotate_180",
+    "transpose",
+    "rotate_90",
+    "rotate_270",
+    "transpose_other",
+]
+TURNS: tuple[Turn, ...] = get_args(Turn)
+"""What ``calibrate.places`` takes, the simplest first."""
+WORDS: dict[Turn, str] = {
+    "as_given": "as given",
+    "mirror_x": "mirrored in x (the x axis counts to the left)",
+    "mirror_y": "mirrored in y (the y axis counts upwards)",
+    "rotate_180": "turned by 180 degrees (both axes count backwards)",
+    "transpose": "transposed (x and y are exchanged)",
+    "rotate_90": "turned by 90 degrees",
+    "rotate_270": "turned by 270 degrees",
+    "transpose_other": "mirrored at the other diagonal (x and y are exchanged, and both count backwards)",
+}
+_MATRICES: dict[Turn, tuple[tuple[int, int], tuple[int, int]]] = {
+    "as_given": ((1, 0), (0, 1)),
+    "mirror_x": ((-1, 0), (0, 1)),
+    "mirror_y": ((1, 0), (0, -1)),
+    "rotate_180": ((-1, 0), (0, -1)),
+    "transpose": ((0, 1), (1, 0)),
+    "rotate_90": ((0, -1), (1, 0)),
+    "rotate_270": ((0, 1), (-1, 0)),
+    "transpose_other": ((0, -1), (-1, 0)),
+}
+"""From the direction in the gauge's frame to that on the sheet, x right and y down."""
+_PLAIN = 0.05  # residual: channels that are explained at least as well need no turn to be tried
+_FITS = 0.45  # residual: sensors misplaced by 5 mm leave 0.25, another sensor 0.6 and more
+_WELL = 0.15  # residual: a channel that is called exchanged has to fit its new place at least as well
+_CLEARER = 2.0, 0.1  # another explanation leaves less than half of the residual, less 0.1 of a channel's
+_MOST = 0.25  # share of the responding channels that an explanation may leave, and of unusable sensors
+_PRESSED = 0.2  # of the largest prediction: a sensor with less was not pressed, so it identifies no channel
+_LISTED = 12  # channels in a message
+_FEWEST = 3  # channels that a turn must explain, because two exchanged channels look like a mirrored axis
+
+
+def turn_gauge(gauge: Gauge, turn: Turn, size: Sequence[float]) -> Gauge:
+    """Return a gauge with its places and angles in the frame of the sheet.
+
+    Args:
+        gauge: with places in a frame of other axes.
+        turn: from this frame to that of the sheet.
+        size: of the sheet, x and y, m.
+    """
+    matrix = np.array(_MATRICES[turn], dtype=float)
+    middle = np.array(size) / 2
+    centred = gauge.place - np.abs(matrix).T @ middle
+    direction = matrix @ np.stack([np.cos(gauge.angle), np.sin(gauge.angle)])
+    angle = gauge.angle if turn == "as_given" else np.arctan2(direction[1], direction[0])
+    return replace(gauge, place=centred @ matrix.T + middle, angle=angle)
+
+
+def lies_on_sheet(gauge: Gauge, size: Sequence[float]) -> bool:
+    """Return whether all places of a gauge are on a sheet of this size, x and y, m."""
+    return bool((gauge.place >= 0).all() and (gauge.place <= np.array(size)).all())
+
+
+def compose_turns(first: Turn, then: Turn) -> Turn:
+    """Return the turn that is the same as one turn after another."""
+    product = np.array(_MATRICES[then]) @ np.array(_MATRICES[first])
+    return next(turn for turn in TURNS if (np.array(_MATRICES[turn]) == product).all())
+
+
+@checked("calibrate")
+@dataclass(frozen=True)
+class Confirmed:
+    """What the user confirms about a session.
+
+    Attributes:
+        places: how the places of the presses are turned to be those of the sheet.
+        channels: column of the session, from 0, of every sensor; None: the same order.
+        broken: sensors, from 0, that count as dead.
+
+    Raises:
+        InputError: an unknown turn, or no lists of numbers.
+    """
+
+    places: Turn = "as_given"
+    channels: Sequence[int] | None = None
+    broken: Sequence[int] = ()
+
+    def order(self, sensors: int) -> list[int]:
+        """Return the column of the session of every sensor."""
+        return list(range(sensors) if self.channels is None else self.channels)
+
+    def ordered(self, session: BenchSession) -> BenchSession:
+        """Return a session with its columns in the order of the layout, broken ones without values.
+
+        Raises:
+            InputError: channels or sensors that it does not have.
+        """
+        sensors = session.raw.shape[1]
+        channels = self.order(sensors)
+        if sorted(channels) != list(range(sensors)):
+            raise InputError(f"calibrate.channels must hold each of 0 to {sensors - 1} once, got {channels}")
+        if wrong := [number for number in self.broken if not 0 <= number < sensors]:
+            raise InputError(f"calibrate.broken takes sensors from 0 to {sensors - 1}, got {wrong[0]}")
+        ordered = session.raw[:, channels].astype(float)
+        ordered[:, list(self.broken)] = np.nan
+        return replace(session, raw=ordered)
+
+
+@dataclass(frozen=True)
+class _Explanation:
+    """A turn of the places and the sensor of every channel, with what they leave unexplained.
+
+    Attributes:
+        turn: of the places.
+        sensors: (S,), sensor of every channel.
+        residual: (S,), of every channel at its sensor, 0 to 1; 0 where it does not respond.
+        sure: whether no other sensor explains a channel that is not at its own sensor about as well.
+    """
+
+    turn: Turn
+    sensors: np.ndarray
+    residual: np.ndarray
+    sure: bool = True
+
+    @property
+    def moved(self) -> np.ndarray:
+        """Channels that are not at their own sensor."""
+        return np.flatnonzero(self.sensors != np.arange(len(self.sensors)))
+
+    @property
+    def unexplained(self) -> np.ndarray:
+        """Channels that respond, but not to the presses near their sensor."""
+        return np.flatnonzero(self.residual > _FITS)
+
+    @property
+    def parts(self) -> int:
+        """How much the explanation supposes."""
+        return (self.turn != "as_given") + len(self.moved)
+
+    def clearly_worse(self, rival: "_Explanation") -> bool:
+        """Return whether another explanation leaves clearly less."""
+        differs = (self.sensors != rival.sensors) | (self.turn != rival.turn)
+        factor, least = _CLEARER
+        leaves_more = len(self.unexplained) > len(rival.unexplained)
+        return leaves_more or self.residual[differs].sum() > factor * rival.residual[differs].sum() + least
+
+
+def wired_bench(
+    device: AbstractSimulated, session: BenchSession, rows: Gauge | None, confirmed: Confirmed
+) -> BenchData:
+    """Return the bench data of a session whose channels and places fit the layout.
+
+    Args:
+        device: with the skin as designed.
+        session: as recorded.
+        rows: of the gauge; None: those in the session.
+        confirmed: what the user says about channels and places.
+
+    Raises:
+        InputError: channels respond, but not to the presses near their sensors. The message names the
+            explanation, where the session has a clear one, and the setting that confirms it.
+    """
+    rows = session.gauge if rows is None else rows
+    if session.raw.shape[1] == len(device.sensors):
+        session = confirmed.ordered(session)
+    if rows is None:
+        return build_bench_data(device, session, rows)
+    gauge = turn_gauge(rows, confirmed.places, device.size)
+    turned = {turn: turn_gauge(gauge, turn, device.size) for turn in TURNS}
+    allowed = {turn: places for turn, places in turned.items() if lies_on_sheet(places, device.size)}
+    # Where no turn brings all places onto the sheet, they are refused here.
+    bench = build_bench_data(device, session, next(iter(allowed.values()), gauge))
+    responses = collect_responses(bench)
+    straight, best = _compare_turns(device, bench, responses, allowed)
+    clear = [entry for entry in best if _is_conclusive(entry, straight, responses.responding)]
+    explained = straight is not None and not len(straight.unexplained)
+    if explained and (not clear or any(entry is straight for entry in best)):
+        return bench
+    raise InputError(_phrase_refusal(straight, best[0], clear, confirmed, responses.responding))
+
+
+def _compare_turns(
+    device: AbstractSimulated, bench: BenchData, responses: Responses, allowed: Mapping[Turn, Gauge]
+) -> tuple[_Explanation | None, list[_Explanation]]:
+    """Return the explanation by the layout as it is, and those about as good as the best, simplest first.
+
+    The first is None where the places as given are not on the sheet.
+    """
+    explanations = list[_Explanation]()
+    for turn, gauge in allowed.items():
+        rows = bench.each if gauge is bench.gauge else per_newton(device.model, device.body, gauge)
+        straight, permuted = _explain(match_channels(responses, rows), responses.responding, turn)
+        plain = straight.residual.max(initial=0.0) < _PLAIN and not straight.clearly_worse(permuted)
+        if turn == "as_given" and plain:
+            return straight, [straight]
+        explanations += [straight, permuted] if len(permuted.moved) else [straight]
+    best = min(explanations, key=lambda entry: (len(entry.unexplained), entry.residual.sum()))
+    good = [entry for entry in explanations if not entry.clearly_worse(best)]
+    designed = explanations[0] if "as_given" in allowed else None
+    return designed, sorted(good, key=lambda entry: entry.parts)
+
+
+def _explain(match: Match, responding: np.ndarray, turn: Turn) -> tuple[_Explanation, _Explanation]:
+    """Return the explanation that leaves channels at their sensors, and the one that permutes them best."""
+    channels = np.arange(len(responding))
+    cost = np.where(responding[:, None], match.residual, 0.5)
+    # Among equal places a channel stays at its own.
+    _, sensors = linear_sum_assignment(cost - 1e-6 * np.eye(len(cost)))
+    settled = responding & (cost[channels, sensors] <= _FITS)
+    # Unsettled channels stay at their own sensors, where these are free.
+    sensors = np.where(settled, sensors, -1)
+    for channel in np.flatnonzero(~settled):
+        sensors[channel] = -1 if channel in sensors else channel
+    sensors[sensors < 0] = np.setdiff1d(channels, sensors)
+    straight, permuted = (np.where(responding, cost[channels, place], 0.0) for place in (channels, sensors))
+    factor, least = _CLEARER
+    moved = np.flatnonzero(settled & (sensors != channels))
+    seconds = [
+        np.delete(cost[channel], sensors[channel]).min(initial=1.0) > factor * permuted[channel] + least
+        for channel in moved
+    ]
+    seconds += list((match.expected[sensors[moved]] >= _PRESSED) & (permuted[moved] <= _WELL))
+    # Of two silent channels, nothing says which is where.
+    seconds.append(int((~settled & (sensors != channels)).sum()) <= 1)
+    return _Explanation(turn, channels, straight), _Explanation(turn, sensors, permuted, all(seconds))
+
+
+def _phrase_refusal(
+    straight: _Explanation | None,
+    best: _Explanation,
+    clear: Sequence[_Explanation],
+    confirmed: Confirmed,
+    responding: np.ndarray,
+) -> str:
+    """Return the sentence that refuses a session, with the settings that confirm its explanations."""
+    order = np.array(confirmed.order(len(responding)))
+    if straight is None:
+        wrong = np.flatnonzero(responding)
+        trouble = "the places of some presses are outside the sheet"
+    else:
+        wrong = np.flatnonzero(straight.residual > _CLEARER[0] * best.residual + _CLEARER[1])
+        wrong = np.union1d(wrong, straight.unexplained).astype(int)
+        noun, verb, place = ("channels", "respond", "their sensors") if len(wrong) > 1 else (
+            "channel", "responds", "its sensor"
+        )  # fmt: skip
+        trouble = f"{noun} {list_numbers(sorted(order[wrong]))} {verb}, but not to the presses near {place}"
+    if not clear and 2 * len(wrong) > responding.sum():
+        return (
+            f"{trouble}: neither another order of the channels nor other axes explain the session; check the "
+            "wiring, the layout, the places of the presses and the clock (calibrate.delay)"
+        )
+    if not clear:
+        return (
+            f"{trouble}: check the wiring, and the position of the sensor in the layout; "
+            f"to leave it out, add 'calibrate.broken=[{','.join(map(str, wrong))}]'"
+        )
+    sentences = [f"{trouble}: the session fits if {_phrase_explanation(clear[0], confirmed, order)}"]
+    # A turn that is made up for by another order says nothing new.
+    others = [entry for entry in clear[1:] if entry.turn == "as_given" or not len(entry.moved)]
+    sentences += [
+        f"it fits as well if {_phrase_explanation(entry, confirmed, order)}" for entry in others[:2]
+    ]
+    if len(left := clear[0].unexplained):
+        sentences.append(f"channel {list_numbers(sorted(order[left]))} fits nowhere: check the wiring")
+    return ". ".join(text[0].upper() * bool(n) + text[bool(n) :] for n, text in enumerate(sentences))
+
+
+def _is_conclusive(explanation: _Explanation, straight: _Explanation | None, responding: np.ndarray) -> bool:
+    """Return whether an explanation is sure and explains enough to be named."""
+    few = len(explanation.unexplained) <= _MOST * responding.sum()
+    if not (explanation.parts and explanation.sure and few):
+        return False
+    if straight is None:
+        return True
+    if len(np.setdiff1d(explanation.unexplained, straight.unexplained)):
+        return False
+    if explanation.turn == "as_given":
+        return True
+    return int((straight.residual > _CLEARER[0] * explanation.residual + _CLEARER[1]).sum()) >= _FEWEST
+
+
+def _phrase_explanation(explanation: _Explanation, confirmed: Confirmed, order: np.ndarray) -> str:
+    """Return an explanation in words, with its settings."""
+    words, settings = list[str](), list[str]()
+    if explanation.turn != "as_given":
+        words.append(f"the places of the presses are {WORDS[explanation.turn]}")
+        settings.append(f"calibrate.places={compose_turns(confirmed.places, explanation.turn)}")
+    if len(explanation.moved):
+        moved = sorted(order[explanation.moved])
+        verb = "exchanged" if len(moved) == 2 else "in another order"
+        words.append(f"channels {list_numbers(moved)} are {verb}")
+        channels = ",".join(str(channel) for channel in order[np.argsort(explanation.sensors)])
+        settings.append(f"'calibrate.channels=[{channels}]'")
+    return f"{' and '.join(words)}; to confirm that, add {' '.join(settings)}"
+
+
+def device_channels(session: BenchSession, confirmed: Confirmed) -> list[int]:
+    """Return the device's channel of every sensor; empty if channels have the order of the layout."""
+    order = confirmed.order(session.raw.shape[1])
+    channels = [channel if session.channels is None else session.channels[channel] for channel in order]
+    return [] if channels == sorted(channels) else channels
+
+
+def check_usable(calibration: Calibration) -> None:
+    """Raise InputError if a calibration leaves more than a quarter of its sensors unusable."""
+    kinds = {kind: numbers for kind, numbers in calibration.broken.items() if numbers}
+    count = len({number for numbers in kinds.values() for number in numbers})
+    if count <= _MOST * len(calibration):
+        return
+    words = "; ".join(f"{kind}: {list_numbers(numbers)}" for kind, numbers in kinds.items())
+    raise InputError(
+        f"{count} of {len(calibration)} sensors would be unusable ({words}), and at most a quarter may be: "
+        "press near every sensor, check the supply and the cables of these channels, and record again"
+    )
+
+
+def list_numbers(numbers: Sequence[int] | np.ndarray) -> str:
+    """Return numbers in words, as ``2``, ``2 and 5`` or ``2, 5 and 7``; of many, the first ones."""
+    words = [str(number) for number in numbers]
+    if len(words) > _LISTED:
+        words = [*words[: _LISTED - 1], f"{len(words) - _LISTED + 1} others"]
+    return " and ".join([", ".join(words[:-1]), words[-1]]) if len(words) > 1 else "".join(words)

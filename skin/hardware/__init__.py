@@ -1,1 +1,0 @@
-"""Real skins: reading, recording, calibrating, emulating and watching them."""

@@ -1,0 +1,436 @@
+"""Contacts in the live view: where, how hard and how sure, estimated in a process of their own.
+
+No verdict waits for them: the loop leaves the newest readings behind and goes on. The process ends with its
+present estimate when the pipe to it is closed, however the command ends. torch is not imported here, but in
+that process.
+"""
+
+import os
+import pickle
+import signal
+import subprocess
+import sys
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import partial
+from threading import Event, Lock, Thread
+from time import monotonic
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from skin.device.resampling import Frame
+from skin.errors import InputError
+from skin.live.verdict import Verdict
+from skin.wire.channels import UnitConversion
+
+if TYPE_CHECKING:
+    from skin.body.base import AbstractBody, Sensors
+    from skin.device.base import AbstractSimulated
+    from skin.inference.noise import Noise
+    from skin.inference.posterior import ContactEstimate, FrameEstimate, Posterior
+    from skin.mechanics.simulator.base import AbstractSimulator
+
+STALE = 0.5
+"""s after its readings from which an estimate is unknown."""
+SPAN = 0.1
+"""s of which the readings are averaged."""
+PREPARING = "being prepared"
+
+_SHARE = 0.9  # probability of a region
+_CELL = 0.002  # m, least width of its cells: a region of the default skin would have a thousand smaller ones
+_IDLE_FITS = 1e-4  # predictive probability below which the readings of an untouched skin are not noise alone
+_CALIBRATED = 0.02  # standard deviation of the gains of a calibrated device
+_PLACED = 0.001  # m, standard deviation of the positions of sensors, as made by hand
+_QUIET = 1e-3  # N, least noise
+_NICE = 5
+_MOST = 1000  # frames
+_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+
+
+# What is known of contacts, as JSON data.
+
+
+def unknown_contacts(reason: str) -> dict[str, Any]:
+    """Return the message that nothing is known of contacts, with the reason."""
+    empty = dict.fromkeys(("device_time", "number", "probability", "probabilities", "fit", "large"))
+    return {"state": "unknown", "reason": reason, **empty, "contacts": []}
+
+
+def contact_message(estimate: "FrameEstimate", time: float) -> dict[str, Any]:
+    """Return an estimate as JSON data, the fields of ``docs/export.md``.
+
+    Args:
+        estimate: of the readings.
+        time: s, the device's clock at their latest frame.
+    """
+    none = estimate.number == 0 and estimate.fit >= _IDLE_FITS and estimate.large < 0.5
+    base = {
+        "reason": estimate.unknown or "",
+        "device_time": time,
+        "fit": round(estimate.fit, 6),
+        "large": round(estimate.large, 6),
+    }
+    if not (estimate.fingertip or none):
+        # The strongest of the fingertips that fit best: a reader must find where a hard touch is.
+        return (
+            unknown_contacts("")
+            | base
+            | {"state": "not a fingertip", "contacts": [*map(_contact, estimate.contacts[:1])]}
+        )
+    return {
+        "state": "no contact" if none else "contacts",
+        **base,
+        "number": estimate.number,
+        "probability": round(float(estimate.probabilities[estimate.number]), 6),
+        "probabilities": estimate.probabilities.round(6).tolist(),
+        "contacts": [_contact(contact) for contact in estimate.contacts],
+    }
+
+
+def _contact(contact: "ContactEstimate") -> dict[str, Any]:
+    region = contact.region(_SHARE, _CELL)
+    origin = region.cells.min(axis=0)
+    place, spread = contact.place.round(5).tolist(), contact.place_deviation.round(5).tolist()
+    return {
+        "x": place[0],
+        "y": place[1],
+        "x_deviation": spread[0],
+        "y_deviation": spread[1],
+        "force": round(contact.force, 4),
+        "force_deviation": round(contact.force_deviation, 4),
+        "radius": round(contact.radius, 5),
+        "radius_deviation": round(contact.radius_deviation, 5),
+        "peak": round(contact.peak),
+        "peak_interval": [round(limit) for limit in contact.peak_interval],
+        "region": {
+            "share": round(region.share, 4),
+            "origin": origin.round(6).tolist(),
+            "cell": region.width.round(6).tolist(),
+            "cells": ((region.cells - origin) / region.width).round().astype(int).tolist(),
+        },
+    }
+
+
+def contact_text_lines(message: dict[str, Any]) -> list[str]:
+    """Return what is known of contacts in words, a line for each."""
+    state, number = message["state"], message["number"]
+    if state == "unknown":
+        return [f"contacts unknown: {message['reason']}"]
+    if state == "not a fingertip":
+        head = f"{state} (fit {message['fit']:.2g}, a larger contact {100 * message['large']:.0f} %)"
+        return [head, *(f"best: {_words(contact)}" for contact in message["contacts"])]
+    head = f"{number or 'no'} contact{'s' * (number > 1)} ({100 * message['probability']:.0f} %)"
+    return [head, *map(_words, message["contacts"])]
+
+
+def _words(contact: dict[str, Any]) -> str:
+    x, y, near = (1000 * contact[name] for name in ("x", "y", "x_deviation"))
+    near = max(near, 1000 * contact["y_deviation"])
+    force = f"{contact['force']:.1f} ± {contact['force_deviation']:.1f}"
+    low, high = (pressure / 1000 for pressure in contact["peak_interval"])
+    return f"({x:.0f}, {y:.0f}) ± {near:.0f} mm, {force} N, {low:.0f} to {high:.0f} kPa"
+
+
+# What is sent to the process.
+
+
+@dataclass(frozen=True)
+class Mechanics:
+    """What contacts are estimated with.
+
+    Attributes:
+        simulator: ``simulator(body, sensors)`` gives readings that add up. The process builds it, from the
+            cache on the disk: its factors cannot be sent.
+        body, sensors: the skin.
+        noise: of a device of this kind, as far as it is known before its tare.
+    """
+
+    simulator: "Callable[[AbstractBody, Sensors], AbstractSimulator]"
+    body: "AbstractBody"
+    sensors: "Sensors"
+    noise: "Noise"
+
+    @classmethod
+    def of(cls, device: "AbstractSimulated | None", calibrated: bool) -> "Mechanics":
+        """Return the mechanics of a run's skin.
+
+        Args:
+            device: that simulates the skin; None: it has no mechanics.
+            calibrated: the gains of the watched device are known to 2 %; otherwise they vary as those of
+                the training do.
+
+        Raises:
+            InputError: there are no mechanics, or readings of contacts do not add up.
+        """
+        from skin.inference.noise import Noise
+
+        advice = "use run=any_skin, or a run of simulator=solid"
+        if device is None:
+            raise InputError(f"this run has no simulated skin: {advice}")
+        if getattr(device.model, "reading", None) == "equation10":
+            raise InputError(f"readings of equation 10 do not add up: {advice}")
+        settings = device.imperfection
+        noise = max(float(np.mean(settings.noise)), _QUIET)
+        gain = _CALIBRATED if calibrated else float(np.mean(settings.gain_spread))
+        offset = 0.0 if settings.tare else settings.offset
+        nominal = Noise(noise, gain=gain, offset=offset, position=_PLACED)
+        return cls(device.simulator, device.body, device.sensors, nominal)
+
+    def posterior(self) -> "Posterior":
+        """Return the estimator, for a skin that is watched all the time and therefore idle most of it.
+
+        Touches are ten times less frequent than by default, in the same proportions. By default the prior
+        expects a touch, which few sensors that feel nothing cannot rule out between them.
+
+        Raises:
+            InputError: readings of the simulator do not add up.
+        """
+        from skin.inference.candidates import FingertipPrior
+        from skin.inference.posterior import Posterior
+
+        return Posterior(
+            self.simulator(self.body, self.sensors),
+            self.noise,
+            self.body,
+            FingertipPrior(numbers=(0.93, 0.04, 0.015, 0.005), large=0.01),
+        )
+
+
+class MeanReadings(NamedTuple):
+    """The mean readings of a moment.
+
+    Attributes:
+        values: (S,), N above the untouched skin: the mean of some frames.
+        valid, saturated: (S,), bool.
+        noise: standard deviation of a frame, N; None: unknown.
+        frames: number of frames.
+        step: of the converter, N; 0: none.
+        time, host: s, the clocks of the device and of the host at the latest frame.
+    """
+
+    values: np.ndarray
+    valid: np.ndarray
+    saturated: np.ndarray
+    noise: float | None
+    frames: int
+    step: float
+    time: float
+    host: float
+
+
+def average_frames(
+    frames: Sequence[Frame],
+    conversion: UnitConversion,
+    masked: Sequence[int],
+    baseline: np.ndarray,
+    whole: bool,
+) -> MeanReadings:
+    """Return the readings of frames, the latest one last.
+
+    Args:
+        frames: as the device sent them.
+        conversion: of their values to N.
+        masked: sensors without a valid reading.
+        baseline: (S,), N, what the untouched skin reads by now.
+        whole: the device sends whole numbers.
+    """
+    newtons, valid = conversion(
+        np.stack([frame.values for frame in frames]), np.stack([frame.valid for frame in frames])
+    )
+    marks = [frame.saturated for frame in frames if frame.saturated is not None]
+    saturated = np.any(marks, axis=0) if marks else np.zeros(newtons.shape[1], dtype=bool)
+    works = np.logical_and.reduce(valid)
+    works[list(masked)] = False
+    # The zero is that of largest values of intervals, which noise raises above the mean.
+    rest = baseline if conversion.rest is None else baseline + conversion.rest
+    noise = None if conversion.noise is None or not works.any() else conversion.noise[works]
+    return MeanReadings(
+        newtons.mean(axis=0, dtype=float) - rest,
+        works,
+        saturated & works,
+        None if noise is None else float(np.sqrt(np.mean(noise**2))),
+        len(frames),
+        float(np.median(np.abs(conversion.scale))) if whole else 0.0,
+        frames[-1].t,
+        frames[-1].t_host,
+    )
+
+
+def estimate_contacts(posterior: "Posterior", nominal: "Noise", readings: MeanReadings) -> dict[str, Any]:
+    """Return what readings tell of contacts, as JSON data.
+
+    Args:
+        posterior: of the skin.
+        nominal: noise of such devices: its gains and positions hold for this one, too.
+        readings: of a moment.
+    """
+    rounding = readings.step / 12**0.5
+    # Without a tare, the device's offsets are unknown, too.
+    frame, offset = (nominal.frame, nominal.offset) if readings.noise is None else (readings.noise, rounding)
+    limits = readings.values[readings.saturated]
+    # A sensor at its limit says that it would read more: than the least of them, if there are several.
+    clip = max(float(limits.min()), _QUIET) if len(limits) else np.inf
+    posterior.noise = replace(
+        nominal, frame=max(frame, rounding, _QUIET), frames=readings.frames, offset=offset, clip=clip
+    )
+    estimate = posterior.estimate(readings.values, readings.valid, readings.saturated)
+    assert not isinstance(estimate, list)
+    if not readings.valid.any():
+        return unknown_contacts("no sensor has a valid reading")
+    return contact_message(estimate, readings.time)
+
+
+# The process.
+
+
+def serve() -> None:
+    """Estimate contacts: mechanics, then readings on standard input, answers on standard output.
+
+    The first answer is why nothing can be estimated, or empty; then follows a message for each reading.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    if hasattr(os, "nice"):
+        os.nice(_NICE)
+    answers = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)  # what a library prints is no answer
+    with suppress(EOFError, OSError, pickle.UnpicklingError):  # the command has ended
+        for answer in _answers(partial(pickle.load, sys.stdin.buffer)):
+            pickle.dump(answer, answers)
+            answers.flush()
+
+
+def _answers(receive: Callable[[], Any]) -> Iterator[Any]:
+    """Yield an empty text once everything is prepared, then a message for each reading; or why not."""
+    import torch
+
+    torch.set_num_threads(1)
+    mechanics = receive()
+    try:
+        posterior = mechanics.posterior()
+    except InputError as error:
+        yield str(error)
+        return
+    yield ""
+    while True:
+        readings = receive()
+        try:
+            yield estimate_contacts(posterior, mechanics.noise, readings)
+        except (ArithmeticError, ValueError, AssertionError, InputError) as error:
+            yield unknown_contacts(f"the estimate failed: {error}")
+
+
+class LiveContacts:
+    """The latest estimate of the contacts, and the process that makes it.
+
+    Args:
+        reason: why nothing is known before :meth:`start`.
+    """
+
+    def __init__(self, reason: str = "this view estimates none") -> None:
+        self._lock, self._wake, self._closed = Lock(), Event(), False
+        self._frames: deque[Frame] = deque(maxlen=_MOST)
+        self._newest: MeanReadings | None = None
+        self._process: subprocess.Popen[bytes] | None = None
+        self._thread: Thread | None = None
+        self._whole: Callable[[], bool] = bool
+        self.explain(reason)
+
+    def explain(self, reason: str) -> None:
+        """Set why nothing is known, until there is an estimate."""
+        self._set(unknown_contacts(reason), np.inf)
+
+    def _set(self, message: dict[str, Any], host: float) -> None:
+        """Set what is known of the readings at ``host``, s; infinite: it does not become old."""
+        with self._lock:
+            self._latest, self._host = message, host
+
+    def start(self, mechanics: Mechanics, whole: Callable[[], bool]) -> None:
+        """Start the process, which needs some seconds.
+
+        Args:
+            mechanics: of the skin.
+            whole: tells whether the device sends whole numbers.
+        """
+        places = os.pathsep.join(path for path in sys.path if path)
+        self._whole = whole
+        self.explain(PREPARING)
+        # In a group of its own, Ctrl-C does not reach it. In a session of its own, its priority would not
+        # count: Linux shares the processor among sessions first.
+        self._process = subprocess.Popen(
+            [sys.executable, "-c", f"from {__name__} import serve; serve()"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            env=os.environ | dict.fromkeys(_THREADS, "1") | {"PYTHONPATH": places},
+            process_group=0,
+        )
+        self._thread = Thread(target=self._run, args=(mechanics,), name="skin-contacts", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """End the process."""
+        if self._process is not None and self._thread is not None:
+            self._closed = True
+            self._process.kill()
+            self._wake.set()
+            self._thread.join()
+            self._process.communicate()  # closes the pipes
+
+    def look(
+        self,
+        frames: Sequence[Frame],
+        conversion: UnitConversion,
+        verdicts: Sequence[Verdict],
+        baseline: np.ndarray,
+    ) -> None:
+        """Take new frames; leave their readings for the process if there is a verdict. It returns at once.
+
+        Args:
+            frames: as the device sent them.
+            conversion: of their values to N.
+            verdicts: on them.
+            baseline: (S,), N, what the untouched skin reads by now.
+        """
+        if self._process is None:
+            return
+        self._frames.extend(frames)
+        last = self._frames[-1]
+        while self._frames[0].segment != last.segment or not 0 <= last.t - self._frames[0].t < SPAN - 1e-6:
+            self._frames.popleft()
+        if verdicts:
+            masked = verdicts[-1].masked
+            self._newest = average_frames(self._frames, conversion, masked, baseline, self._whole())
+            self._wake.set()
+
+    def state(self) -> dict[str, Any]:
+        """Return what is known now, as JSON data."""
+        with self._lock:
+            latest, host = self._latest, self._host
+        return latest if monotonic() - host <= STALE else unknown_contacts("no estimate for half a second")
+
+    def _run(self, mechanics: Mechanics) -> None:
+        """Pass the newest readings to the process, and keep its answers."""
+        try:
+            if refused := self._ask(mechanics):
+                self.explain(refused)
+                return
+            while not self._closed:
+                self._wake.wait()
+                self._wake.clear()
+                readings, self._newest = self._newest, None
+                if readings is not None:
+                    self._set(self._ask(readings), readings.host)
+        except (OSError, EOFError, ValueError, TypeError, AttributeError, pickle.PickleError):
+            self.explain("the process that estimates them has ended")
+
+    def _ask(self, question: Mechanics | MeanReadings) -> Any:
+        """Return what the process answers."""
+        assert self._process is not None
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        pickle.dump(question, self._process.stdin)
+        self._process.stdin.flush()
+        return pickle.load(self._process.stdout)

@@ -1,0 +1,241 @@
+"""Write the verdicts of a live view as JSON lines for other programs, and log alarms."""
+
+import sys
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from datetime import UTC, datetime, timedelta
+from functools import partial
+from math import isfinite
+from pathlib import Path
+from threading import Condition, Thread
+from time import monotonic
+from typing import IO, Any
+
+from skin.core.files import json_line, unwritable
+from skin.live.loop import Display, Told
+from skin.live.verdict import Note, Verdict, summarize_notes
+
+SCHEMA = 1
+"""Version of the messages. A field may be added without a new version; a reader ignores unknown ones."""
+
+
+def verdict_message(
+    verdict: Verdict | None, alarm: bool, notes: Sequence[Note], contacts: dict[str, Any]
+) -> dict[str, Any]:
+    """Return a verdict, or the reason why there is none, as JSON data.
+
+    Args:
+        verdict: the present one; None if there is none.
+        alarm: including one that continues without a verdict.
+        notes: on the verdict or its absence, the gravest first.
+        contacts: what is known of them.
+
+    Returns:
+        The fields of ``docs/export.md`` but ``number`` and ``event``.
+    """
+    shared = {
+        "schema": SCHEMA,
+        "stale": verdict is None,
+        "reason": summarize_notes(notes),
+        "state": "unknown" if verdict is None else verdict.state,
+        "alarm": alarm,
+        "dangerous": True if alarm else None if verdict is None else verdict.danger,
+        "notes": [note.message for note in notes],
+        "time": _utc(0.0 if verdict is None else monotonic() - verdict.t_host),
+        "contacts": contacts,
+    }
+    if verdict is None:
+        return shared
+    return shared | {
+        "device_time": verdict.t,
+        "touched": verdict.touched,
+        "labels": verdict.known,
+        # JSON has no NaN, and the probabilities of an untouched skin mean nothing.
+        "probabilities": {
+            name: round(value, 6) if isfinite(value) and verdict.state == "touch" else None
+            for name, value in verdict.chances.items()
+        },
+        "contact": verdict.contact,
+        "gap": verdict.gap,
+        "masked": list(verdict.masked),
+        "unknown": list(verdict.unknown),
+    }
+
+
+def _utc(ago: float) -> str:
+    """Return the time some seconds ago, ISO 8601 in UTC."""
+    moment = datetime.now(UTC) - timedelta(seconds=ago)
+    return moment.isoformat(timespec="milliseconds").replace("+00:00", "Z")
+
+
+HEARTBEAT = 0.5  # s without a line after which the state is repeated
+_WAITING = 256  # lines for a slow reader; then the oldest is dropped
+_ENDING = 1.0  # s in which a slow reader may take the last lines
+
+
+class LineQueue:
+    """Writes lines in a thread of its own, flushed one by one: a slow reader or disk delays no verdict.
+
+    Args:
+        file: open for writing.
+        failed: called with the error when the file cannot be written any more, as its reader is gone.
+        idle: makes a line of its number when there was none for ``HEARTBEAT`` s; None: there is no such line.
+    """
+
+    def __init__(
+        self,
+        file: IO[str],
+        failed: Callable[[Exception], object],
+        idle: Callable[[int], str] | None = None,
+    ) -> None:
+        self._file, self._failed, self._idle = file, failed, idle
+        self._changed, self._over, self._number = Condition(), False, 0
+        self._waiting: deque[str] = deque(maxlen=_WAITING)
+        self._thread = Thread(target=self._run, name="skin-lines", daemon=True)
+
+    def __enter__(self) -> "LineQueue":
+        self._thread.start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        """Write the lines that wait, and end."""
+        with self._changed:
+            self._over = True
+            self._changed.notify()
+        self._thread.join(_ENDING)
+
+    def add(self, line: Callable[[int], str]) -> None:
+        """Add the line that a function makes of its number, from 1 up; return at once."""
+        with self._changed:
+            self._number += 1
+            self._waiting.append(line(self._number))
+            self._changed.notify()
+
+    def _run(self) -> None:
+        try:
+            while line := self._next():
+                self._file.write(f"{line}\n")
+                self._file.flush()
+        except (OSError, ValueError) as error:
+            self._failed(error)
+
+    def _next(self) -> str:
+        """Return the next line; empty at the end."""
+        with self._changed:
+            wait = None if self._idle is None else HEARTBEAT
+            if not self._changed.wait_for(lambda: self._waiting or self._over, wait) and self._idle:
+                self.add(self._idle)
+            return self._waiting.popleft() if self._waiting else ""
+
+
+def _line(display: Display, told: Told, event: str, number: int) -> str:
+    verdict, reason, alarm = told
+    message = verdict_message(verdict, alarm, *display.describe(verdict, reason))
+    return json_line({"number": number, "event": event, **message})
+
+
+@contextmanager
+def write_verdicts(display: Display, file: IO[str]) -> Iterator[None]:
+    """Write the verdicts of a display to a file while the block runs.
+
+    Each verdict is a line. Without verdicts, a line is written when the reason changes and every
+    ``HEARTBEAT`` seconds, with ``stale`` true.
+
+    Args:
+        display: its ``closed`` is set when the reader closes the file.
+        file: of a pipe or standard output.
+    """
+    latest = display.told()
+
+    def observe(*told: *Told) -> None:
+        nonlocal latest
+        before, latest = latest, told
+        if told[0] is not None or told != before:
+            lines.add(partial(_line, display, told, "change" if told[0] is None else "verdict"))
+
+    def repeat(number: int) -> str:
+        nonlocal latest
+        before, latest = latest, display.told()  # the age is judged here, too
+        event = "change" if latest[0] is None and latest != before else "heartbeat"
+        return _line(display, latest, event, number)
+
+    with LineQueue(file, lambda _: display.closed.set(), repeat) as lines:
+        display.observers.append(observe)
+        yield
+
+
+@contextmanager
+def print_verdicts(display: Display) -> Iterator[None]:
+    """Write the verdicts to standard output while the block runs; the display closes with its reader."""
+    # A file of its own, and never closed: lines that a reader did not take would fail once more.
+    with write_verdicts(display, open(sys.stdout.fileno(), "w", closefd=False)):
+        yield
+
+
+_EVENTS = ("stale", "resumed"), ("alarm", "cleared"), ("unknown", "known")
+
+
+@contextmanager
+def write_changes(
+    display: Display, file: IO[str], failed: Callable[[Exception], object], reasons: bool = False
+) -> Iterator[None]:
+    """Write a line to a file for each change of alarm, state and baseline while the block runs.
+
+    The events are ``started``, ``alarm``, ``cleared``, ``stale``, ``resumed``, ``unknown`` (of a place: its
+    sensors have no valid reading), ``known``, ``tare``, ``tare_refused``, ``tare_forced`` and ``ended``.
+
+    Args:
+        display: gives the verdicts.
+        file: open for writing.
+        failed: called with the error when the file cannot be written any more; the live view continues.
+        reasons: write a line with the event ``change``, too, when there is another reason for no verdict.
+    """
+    states, latest = (True, False, False), display.told()
+
+    def observe(verdict: Verdict | None, reason: str, alarm: bool) -> None:
+        nonlocal states, latest
+        before, former_reason = states, latest[1]
+        # Places stay as they were while nothing is known of the skin.
+        states = verdict is None, alarm, before[2] if verdict is None else bool(verdict.unknown)
+        latest = verdict, reason, alarm
+        for events, former, state in zip(_EVENTS, before, states, strict=True):
+            if state != former:
+                write(events[not state])
+        if reasons and states == before and reason != former_reason:
+            write("change")
+
+    def write(event: str) -> None:
+        lines.add(partial(_line, display, latest, event))
+
+    with LineQueue(file, failed) as lines:
+        write("started")
+        display.observers.append(observe)
+        display.listeners.append(write)
+        try:
+            yield
+        finally:
+            write("ended")
+
+
+@contextmanager
+def log_alarms(display: Display, path: Path) -> Iterator[None]:
+    """Append the lines of :func:`write_changes` to a file while the block runs.
+
+    If it becomes unwritable, a message says so once.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        file = path.open("a", encoding="utf-8")
+    except OSError as error:
+        raise unwritable(path, error, "live.log=FILE.jsonl") from error
+    warn = partial(print, "the alarm log ends here:", file=sys.stderr)
+    try:
+        with write_changes(display, file, warn):
+            yield
+    finally:
+        with suppress(OSError):  # of a full disk: the message has told of it
+            file.close()

@@ -1,0 +1,490 @@
+"""Read a port: its settings, streams of bytes, feeds of frames, and the thread that fills a queue."""
+
+import errno
+import logging
+import os
+import socket
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, fields, replace
+from itertools import count
+from math import inf
+from time import monotonic, sleep
+from typing import TYPE_CHECKING, Annotated, Any, Protocol
+from urllib.parse import urlsplit
+
+from pydantic import AfterValidator, NonNegativeFloat, PositiveFloat, PositiveInt
+
+from skin.core.settings import RISING, check_settings
+from skin.device.resampling import After, Frame
+from skin.errors import InputError
+from skin.wire.adapter import Adapter, read_adapter
+from skin.wire.channels import ChannelHealth, ChannelState, Limits
+from skin.wire.decoder import Decoder
+from skin.wire.protocol import Format
+
+_log = logging.getLogger(__name__)
+
+
+def _check_order(limits: Limits) -> Limits:
+    numbers = [limit for limit in limits if limit is not None]
+    if sorted(set(numbers)) != numbers:
+        raise ValueError("must be [smallest, largest]")
+    return limits
+
+
+@dataclass(kw_only=True, eq=False)
+class PortSettings:
+    """Where a skin is and how to read it.
+
+    Args:
+        port: ``/dev/ttyACM0``, ``COM3`` or ``socket://host:number``.
+        baudrate: bits per second, for serial ports.
+        adapter: describes what the board sends: an option of ``conf/adapter/``, a YAML file, or the settings
+            of :class:`skin.wire.adapter.Adapter`.
+        limits: smallest and largest value of a channel, as in
+            :class:`skin.wire.channels.ChannelHealth`; None: the largest count, if the header gives
+            the bits.
+        timeout: s without a frame after which iterating and reading raise ``SkinTimeout``: longer than
+            between two headers, because after a reconnection frames count only after one.
+        backoff: s before the first attempt to reconnect, and the longest between two.
+        silence: s without a byte after which a socket is closed and opened again, if it is to be reconnected;
+            None or 0: never. A computer that lost its power closes no connection. Serial ports are left open:
+            the system reports when one is unplugged, and opening one restarts many boards.
+        tare: duration of the tare, s.
+        scale: N per unit of the device; negative if values fall with force.
+        calibration: calibration file.
+        sensitivity: N per unit of a sensor by its data sheet; the conversion to N must agree with it.
+
+    Raises:
+        InputError: a setting is invalid.
+    """
+
+    port: str | None = None
+    baudrate: PositiveInt = 115200
+    format: Format = "auto"
+    adapter: str | Mapping[str, Any] = "protocol"
+    limits: Annotated[Limits, AfterValidator(_check_order)] | None = None
+    timeout: PositiveFloat = 6.0
+    backoff: Annotated[tuple[PositiveFloat, PositiveFloat], RISING] = (1.0, 10.0)
+    silence: NonNegativeFloat | None = 5.0
+    tare: float = 2.0
+    scale: float | None = None
+    calibration: str | None = None
+    sensitivity: PositiveFloat | None = None
+
+    def __post_init__(self) -> None:
+        # To open the port shows whether it is one.
+        settings = {entry.name: getattr(self, entry.name) for entry in fields(PortSettings)[1:]}
+        changed = {name: value for name, value in settings.items() if value != getattr(PortSettings, name)}
+        check_settings(PortSettings, changed, "device")
+        if self.tare < 0:
+            raise InputError(f"device.tare is s without touch and must be 0 or more, got {self.tare}")
+        self.frames = read_adapter(self.adapter)
+        if self.frames.kind == "protocol" and self.frames.format == "auto":
+            self.frames = replace(self.frames, format=self.format)
+
+    @classmethod
+    def select(cls, device: Mapping[str, Any]) -> "PortSettings":
+        """Return those of the settings of ``device=serial`` that describe the port."""
+        return cls(**{entry.name: device[entry.name] for entry in fields(cls) if entry.name in device})
+
+
+class _TooFewFramesError(Exception):
+    """Fewer frames arrived than requested.
+
+    Attributes:
+        frames: those that arrived.
+    """
+
+    def __init__(self, message: str, frames: Sequence[Frame] = ()) -> None:
+        super().__init__(message)
+        self.frames = list(frames)
+
+
+class SkinTimeout(_TooFewFramesError, TimeoutError):  # noqa: N818 - named as TimeoutError is
+    """The frames did not arrive in time."""
+
+
+class SkinDisconnected(_TooFewFramesError, ConnectionError):  # noqa: N818
+    """The skin was unplugged, or a recording has ended."""
+
+
+if TYPE_CHECKING:
+    from skin.device.touches import Touches
+
+try:
+    import termios
+except ImportError:  # Windows
+    _Gone: type[Exception] = OSError
+else:
+    _Gone = termios.error
+
+_WAIT = 0.1  # s
+_CONNECT = 5.0  # s
+# A reader does not notice that the other side lost its power; by default the system checks after two hours.
+_KEEPALIVE = {"TCP_KEEPIDLE": 10, "TCP_KEEPINTVL": 5, "TCP_KEEPCNT": 3}  # s, s, attempts
+_MOST = 65536  # bytes at once
+
+
+class ByteStream(Protocol):
+    """A source of bytes; a custom ``opener`` returns such an object."""
+
+    def read(self) -> bytes:
+        """Return the received bytes, possibly none, within 0.1 s; OSError once the stream is closed."""
+
+    def write(self, data: bytes) -> None:
+        """Send bytes; needed only for an adapter with a start, poll or stop string."""
+
+    def close(self) -> None:
+        """Close the port."""
+
+
+def open_stream(port: str, baudrate: int) -> ByteStream:
+    """Open a serial port, or ``socket://host:number``.
+
+    Raises:
+        InputError: there is no such port, it cannot be opened, or it is in use.
+    """
+    return _Socket(port) if port.startswith("socket://") else _Serial(port, baudrate)
+
+
+def check_port(port: str) -> None:
+    """Check that there is something at a port, without opening it: that would restart many boards.
+
+    Args:
+        port: as of :func:`open_stream`. Names of Windows and hosts elsewhere cannot be checked.
+
+    Raises:
+        InputError: there is no such device, or nothing on this machine listens at the address.
+    """
+    if port.startswith("socket://"):
+        try:
+            *kind, _, address = socket.getaddrinfo(*_address(port), type=socket.SOCK_STREAM)[0]
+            with socket.socket(*kind) as probe:
+                probe.bind(address)  # an address of this machine that could be taken
+        except OSError:
+            return  # something listens, or it is another machine
+        raise InputError(f"cannot reach {port}: nothing listens there; start what sends the frames first")
+    if os.name == "posix" and "/" in port and "://" not in port and not os.path.exists(port):
+        raise InputError(f"no port {port}: {_existing()}")
+
+
+class _Serial:
+    def __init__(self, port: str, baudrate: int) -> None:
+        import serial
+
+        try:
+            # Exclusive, or two readers would get half the bytes each.
+            self._port = serial.Serial(port, baudrate, timeout=_WAIT, write_timeout=_CONNECT, exclusive=True)
+        except (OSError, _Gone, ValueError, OverflowError) as error:
+            raise _refused(port, baudrate, error) from error
+
+    def read(self) -> bytes:
+        try:
+            return self._port.read(max(1, min(self._port.in_waiting, _MOST)))
+        except (OSError, _Gone) as error:
+            raise OSError(str(error)) from error
+
+    def write(self, data: bytes) -> None:
+        try:
+            self._port.write(data)
+        except (OSError, _Gone) as error:
+            raise OSError(str(error)) from error
+
+    def close(self) -> None:
+        self._port.close()
+
+
+class _Socket:
+    def __init__(self, port: str) -> None:
+        host, number = _address(port)
+        try:
+            self._socket = socket.create_connection((host, number), timeout=_CONNECT)
+        except OSError as error:
+            raise InputError(f"cannot reach {port}: {error}; does anything listen there?") from error
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+        for name, value in _KEEPALIVE.items():
+            if hasattr(socket, name):
+                self._socket.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
+        self._socket.settimeout(_WAIT)
+
+    def read(self) -> bytes:
+        try:
+            data = self._socket.recv(_MOST)
+        except TimeoutError as error:
+            if error.errno is not None:  # ETIMEDOUT: no answer to keepalive
+                raise
+            return b""
+        if not data:
+            raise ConnectionResetError("the other side closed the connection")
+        return data
+
+    def write(self, data: bytes) -> None:
+        self._socket.sendall(data)
+
+    def close(self) -> None:
+        self._socket.close()
+
+
+def _address(port: str) -> tuple[str, int]:
+    """Return host and number of ``socket://host:number``."""
+    try:
+        address = urlsplit(port)
+        host, number = address.hostname, address.port
+    except ValueError:
+        host = number = None
+    if not host or not number:
+        raise InputError(f"{port} is no address: give device.port=socket://HOST:NUMBER")
+    return host, number
+
+
+def _refused(port: str, baudrate: int, error: Exception) -> InputError:
+    number, text = getattr(error, "errno", None), str(error)
+    if number in (errno.ENOENT, errno.ENODEV, errno.ENXIO) or "FileNotFoundError" in text:
+        return InputError(f"no port {port}: {_existing()}")
+    # Windows reports "access is denied" for a port in use.
+    if number in (errno.EBUSY, errno.EAGAIN, errno.EWOULDBLOCK) or "PermissionError" in text:
+        return InputError(f"{port} is in use: close the serial monitor or any other program that reads it")
+    if number in (errno.EACCES, errno.EPERM):
+        return InputError(
+            f"{port} may not be opened: add your user to dialout with "
+            "sudo usermod -a -G dialout $USER, and log in again"
+        )
+    if number in (errno.ENOTTY, errno.EINVAL, errno.EISDIR) or "configure port" in text:
+        return InputError(f"{port} is no serial port: {_existing()}")
+    return InputError(f"cannot open {port} with device.baudrate={baudrate}: {text}")
+
+
+def _existing() -> str:
+    from serial.tools import list_ports
+
+    ports = ", ".join(sorted(entry.device for entry in list_ports.comports()))
+    return (
+        f"there are {ports}; give device.port=PORT" if ports else "there is no serial port; is it plugged in?"
+    )
+
+
+_AT_ONCE = 256  # frames, where time does not matter
+_WEAK = {
+    "none": "no checksum: a wrong value passes in 29 % of flipped bits and 76 % of lost bytes",
+    "xor": "a weak checksum (*HH): 2 % of double flipped bits and 6 % of double lost bytes pass",
+}
+
+
+_AGAIN = 1.0  # s between two attempts to start a board, which may take seconds to boot
+_UNPOLLED = 0.25  # s without an answer after which a board is polled again
+
+
+class Prompter:
+    """Sends a board what it waits for: a start string, a string for each frame, and a stop string.
+
+    Args:
+        adapter: with the strings.
+        stream: to the board.
+    """
+
+    def __init__(self, adapter: Adapter, stream: ByteStream) -> None:
+        self._stream = stream
+        self._start, self._poll, self._stop = (
+            (text or "").encode() for text in (adapter.start, adapter.poll, adapter.stop)
+        )
+        self._asked_at = self._polled_at = -inf
+        self._attempts, self._started, self._answered = 0, False, True
+
+    def ask(self, now: float) -> None:
+        """Send what is due at ``now``, s."""
+        if self._start and not self._started and now - self._asked_at >= _AGAIN:
+            self._stream.write(self._start)
+            self._asked_at = now
+            self._attempts += 1
+        if self._poll and (self._answered or now - self._polled_at >= _UNPOLLED):
+            self._stream.write(self._poll)
+            self._polled_at, self._answered = now, False
+            self._attempts += not self._start
+
+    def answer(self, received: bool, frames: bool) -> None:
+        """Note whether bytes and frames arrived; before the first frame any bytes answer a poll."""
+        self._started |= frames
+        self._answered |= frames or (received and not self._started)
+
+    @property
+    def unanswered(self) -> str:
+        """What was sent without any frame in return, in words; empty if nothing."""
+        if self._started or not self._attempts:
+            return ""
+        name, text = ("start", self._start) if self._start else ("poll", self._poll)
+        return (
+            f"the {name} string {text.decode()!r} of the adapter was sent {self._attempts} times without an "
+            "answer"
+        )
+
+    def stop(self) -> None:
+        """Send the stop string."""
+        if self._stop:
+            self._stream.write(self._stop)
+
+
+class WireFeed:
+    """Frames decoded from bytes, with checked channels; logs bad frames once a second.
+
+    Args:
+        opener: opens the stream of bytes.
+        decoder: turns them into frames.
+        limits: smallest and largest value of a channel.
+        silence: s without a byte after which the stream counts as gone.
+
+    Attributes:
+        patient: the feed can wait, so no frame needs to be dropped.
+    """
+
+    patient = False
+
+    def __init__(
+        self, opener: Callable[[], ByteStream], decoder: Decoder, limits: Limits | None, silence: float = inf
+    ) -> None:
+        self._opener, self._decoder, self._limits, self._silence = opener, decoder, limits, silence
+        self._health = ChannelHealth(limits or (None, None))
+        self._stream = opener()
+        self._begin()
+
+    def open(self) -> None:
+        """Open the stream again after a disconnection.
+
+        The known ranges of channels are kept: a cable may be unplugged under a press that saturates channels.
+        """
+        self._stream = self._opener()
+        self._decoder.restart()
+        self._health.restart()
+        self._begin()
+
+    def _begin(self) -> None:
+        self._warned = False
+        self._prompter = Prompter(self._decoder.adapter, self._stream)
+        self._reported = Counter(self._decoder.stats.bad)
+        self._reported_at = self._heard_at = monotonic()
+        self._clock_told = ""
+
+    def poll(self) -> list[Frame]:
+        """Return the frames received since the last call.
+
+        Raises:
+            InputError: no format is detected, or another device is connected.
+            OSError: the stream is closed, or silent for too long.
+        """
+        self._prompter.ask(monotonic())
+        data, now = self._stream.read(), monotonic()
+        if data:
+            self._heard_at = now
+        elif now - self._heard_at >= self._silence:
+            raise TimeoutError(f"nothing received for {self._silence:g} s")
+        frames = self.decode(data, now) if data else []
+        self._prompter.answer(bool(data), bool(frames))
+        stats = self._decoder.stats
+        if now - self._reported_at >= 1:
+            fresh, self._reported, self._reported_at = stats.bad - self._reported, Counter(stats.bad), now
+            if fresh:
+                reasons = ", ".join(f"{count} {reason}" for reason, count in fresh.most_common())
+                trouble = f"; {stats.trouble}" if stats.trouble else ""
+                _log.warning("%d bad frames (%s)%s", fresh.total(), reasons, trouble)
+        return frames
+
+    def decode(self, data: bytes, now: float) -> list[Frame]:
+        """Return the frames that end in bytes received at ``now``, s, with checked channels.
+
+        Raises:
+            InputError: no format is detected, or another device is connected.
+        """
+        frames = self._decoder.feed(data, now)
+        if error := self._decoder.error():
+            raise error
+        if frames:
+            self._prepare()
+        return [self._judge(frame) for frame in frames]
+
+    def states(self) -> tuple[ChannelState, ...]:
+        """Return the state of each channel."""
+        return self._health.states()
+
+    @property
+    def unanswered(self) -> str:
+        """What the board was told without an answer, in words; empty if it answered or was told nothing."""
+        return self._prompter.unanswered
+
+    def close(self) -> None:
+        """Tell the board to stop, and close the port."""
+        with suppress(OSError):
+            self._prompter.stop()
+        self._stream.close()
+
+    def _prepare(self) -> None:
+        """Warn once of a weak checksum; set limits from the header as soon as it arrives."""
+        check, header, clock = self._decoder.stats.check, self._decoder.header, self._decoder.stats.clock
+        if clock != self._clock_told:
+            (_log.info if self._decoder.stats.clock_trusted else _log.warning)("%s", clock)
+            self._clock_told = clock
+        if not self._warned and check in _WEAK:
+            _log.warning("frames carry %s; let the firmware send *HHHH", _WEAK[check])
+        self._warned = True
+        if header is not None and header.bits:
+            self._health.largest = 2**header.bits - 1
+            self._health.limits = self._limits or (None, self._health.largest)
+
+    def _judge(self, frame: Frame) -> Frame:
+        if frame.after not in ("", "gap"):
+            self._health.restart()
+        valid, saturated = self._health.check(frame.values, frame.t)
+        if frame.saturated is not None:
+            saturated = saturated | frame.saturated
+        return frame._replace(valid=valid & frame.valid, saturated=saturated & frame.valid)
+
+
+class PlaybackFeed:
+    """Frames from memory, in real time or as fast as they are read.
+
+    Args:
+        strips: touches in N, all with one rate; a window should not span two of them.
+        realtime: False: as fast as they are read.
+    """
+
+    def __init__(self, strips: "Iterable[Touches]", realtime: bool = True) -> None:
+        self.patient, self._start = not realtime, monotonic()
+        self._frames = self._play(strips)
+        self._next = next(self._frames, None)
+
+    def _play(self, strips: "Iterable[Touches]") -> Iterator[Frame]:
+        number, segments = count(), count()
+        for strip in strips:
+            saturated = strip.valid & False if strip.saturated is None else strip.saturated
+            masks = strip.valid.numpy(), saturated.numpy()
+            for touch in zip(strip.readings.double().numpy(), *masks, strict=True):
+                segment = next(segments)
+                after: After = "cut" if segment else ""
+                for values, valid, limited in zip(*touch, strict=True):
+                    seq = next(number)
+                    t = seq / strip.rate
+                    yield Frame(seq, t, self._start + t, values, valid, segment, 0, after, limited)
+                    after = ""
+
+    def poll(self) -> list[Frame]:
+        """Return the frames that are due."""
+        if self._next is None:
+            raise EOFError("the recording has ended")
+        if not self.patient:
+            sleep(min(_WAIT, max(0.0, self._next.t_host - monotonic())))
+        frames, now = list[Frame](), monotonic()
+        while self._next and len(frames) < _AT_ONCE and (self.patient or self._next.t_host <= now):
+            frames.append(self._next)
+            self._next = next(self._frames, None)
+        return frames
+
+    def states(self) -> tuple[ChannelState, ...]:
+        """Return nothing: the frames of a file already have masks of valid values."""
+        return ()
+
+    def open(self) -> None:
+        """Do nothing: memory is never disconnected."""
+
+    def close(self) -> None:
+        """Do nothing: there is no port."""

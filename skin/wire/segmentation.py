@@ -1,0 +1,309 @@
+"""Segment a stream into gestures, with labels announced, prompted or unknown."""
+
+import os
+import sys
+from abc import ABC, abstractmethod
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from queue import SimpleQueue
+from threading import Thread
+
+import numpy as np
+
+from skin.core.rng import Stream, generator
+from skin.device.resampling import Frame, Resampled, Window
+from skin.errors import InputError
+from skin.touch.labels import OPPOSITE, Task
+from skin.wire.contact_lines import ContactLine, join_contact_lines, parse_contact_line
+from skin.wire.protocol import Announcement, parse_announcement
+from skin.wire.reader import ByteStream
+
+_LONGEST = 4096  # bytes
+_KEPT = 64  # announcements that are kept unread
+
+
+Labels = Mapping[str, int]
+
+_LATE = 0.25  # share of an announced window that may be missed at its beginning
+_INTERRUPTED = "the gesture was interrupted: the skin was unplugged or restarted"
+_UNFELT = "nothing was felt, so the gesture does not count: no working sensor read more than its noise"
+
+
+@dataclass
+class RecordedGesture:
+    """The frames of one gesture.
+
+    Attributes:
+        number: of the gesture.
+        labels: name -> 0 or 1; None if unknown.
+        begin: start of the window, s, by the device's clock.
+        segment: of the device's clock.
+        frames: of the window.
+        lost: number of frames known to be missing.
+        broken: it cannot be used: the device restarted within the window, or felt nothing.
+        resampled: the window at the model's rate, in the device's unit; None until it is complete.
+        contacts: (T, K, 5) at the model's rate, as of :class:`skin.device.touches.Touches`; None if unknown.
+    """
+
+    number: int
+    labels: Labels | None
+    begin: float
+    segment: int
+    frames: list[Frame] = field(default_factory=list)
+    lost: int = 0
+    broken: bool = False
+    resampled: Resampled | None = None
+    contacts: np.ndarray | None = None
+
+
+def label_plan(names: Sequence[str], repetitions: int, seed: int) -> Iterator[Labels]:
+    """Yield every combination of the labels, in another random order each repetition."""
+    for repetition in range(repetitions):
+        order = generator(Stream.SPLIT, 2, seed, repetition).permutation(2 ** len(names))
+        for code in order:
+            yield {name: int(code) >> place & 1 for place, name in enumerate(names)}
+
+
+def label_text(labels: Labels) -> str:
+    """Return labels in words, as ``small, dynamic, press, safe``."""
+    return ", ".join(name if on else OPPOSITE.get(name, f"not {name}") for name, on in labels.items())
+
+
+def typed_lines(file: int) -> Iterator[str]:
+    """Yield the lines typed into an open file."""
+    partial = b""
+    # Not sys.stdin: a thread that blocks there would keep the program from ending.
+    while data := os.read(file, 1024):
+        *lines, partial = (partial + data).split(b"\n")
+        yield from (line.decode(errors="replace") for line in lines)
+
+
+class AnnouncementListener:
+    """An opener for ``open_skin`` that passes bytes through and collects the announcements among them.
+
+    Args:
+        opener: opens the stream of bytes.
+
+    Attributes:
+        announcements: announcements that have not been read yet.
+        contacts: lines of contacts that have not been read yet.
+    """
+
+    def __init__(self, opener: Callable[[], ByteStream]) -> None:
+        self._opener = opener
+        self.announcements: deque[Announcement] = deque(maxlen=_KEPT)
+        self.contacts: deque[ContactLine] = deque(maxlen=_KEPT * _LONGEST)
+
+    def __call__(self) -> ByteStream:
+        """Open the stream; called again after each disconnection."""
+        self._stream, self._rest = self._opener(), b""
+        self.announcements.clear()
+        self.contacts.clear()
+        return self
+
+    def read(self) -> bytes:
+        """Return the received bytes."""
+        data = self._stream.read()
+        *lines, self._rest = (self._rest + data).split(b"\n")
+        self._rest = self._rest[-_LONGEST:]
+        self.announcements.extend(filter(None, map(parse_announcement, lines)))
+        self.contacts.extend(filter(None, map(parse_contact_line, lines)))
+        return data
+
+    def write(self, data: bytes) -> None:
+        """Send bytes."""
+        self._stream.write(data)
+
+    def close(self) -> None:
+        """Close the stream."""
+        self._stream.close()
+
+
+class AbstractSegmenter(ABC):
+    """Segments a stream of frames into gestures.
+
+    Args:
+        window: of the model; it may already contain earlier frames.
+
+    Attributes:
+        window: as given.
+        gesture: the gesture that is being recorded; None between two.
+        over: no more gestures follow.
+    """
+
+    def __init__(self, window: Window) -> None:
+        self.window, self._length = window, window.frames / window.rate
+        self.gesture: RecordedGesture | None = None
+        self.over = False
+
+    def add(self, frame: Frame) -> RecordedGesture | None:
+        """Add a frame; return the gesture whose window ended before it, complete or broken; else None."""
+        done = self._close(frame)
+        if done is not None and not done.broken:
+            done.resampled = self.window.since(done.begin)
+        self.window.add(frame)
+        if self.gesture is None:
+            self.gesture = self._begin(frame)
+        if self.gesture is not None:
+            # The first frame's loss lies before the window.
+            self.gesture.lost += frame.lost if self.gesture.frames else 0
+            self.gesture.frames.append(frame)
+        return done
+
+    def _close(self, frame: Frame) -> RecordedGesture | None:
+        gesture = self.gesture
+        if gesture is None:
+            return None
+        gesture.broken = frame.segment != gesture.segment
+        if not gesture.broken and frame.t < gesture.begin + self._length - 1e-7:
+            return None
+        self.gesture = None
+        return gesture
+
+    @abstractmethod
+    def _begin(self, frame: Frame) -> RecordedGesture | None:
+        """Return the gesture that begins with this frame, or None."""
+
+
+class AnnouncedSegmenter(AbstractSegmenter):
+    """Segments by the windows and labels that an emulated skin announces.
+
+    Args:
+        window: as in :class:`AbstractSegmenter`.
+        listener: collects the announcements.
+        task: the required labels; ``touch`` is always 1.
+
+    Raises:
+        InputError: a frame without a number, or an announcement without a required label.
+    """
+
+    def __init__(self, window: Window, listener: AnnouncementListener, task: Task) -> None:
+        super().__init__(window)
+        self._announcements, self._task, self._contacts = listener.announcements, task, listener.contacts
+
+    def _begin(self, frame: Frame) -> RecordedGesture | None:
+        if frame.seq is None:
+            raise InputError("announcements need frames with numbers: give device.labels=prompted")
+        while self._announcements:
+            announced = self._announcements[0]
+            if frame.seq < announced.seq:
+                return None
+            self._announcements.popleft()
+            # Most of a gesture that began long before the port was opened is missing.
+            if frame.seq <= announced.seq + _LATE * announced.frames:
+                late = frame.seq - announced.seq
+                begin = frame.t - late * self._length / announced.frames
+                labels = {"touch": 1} | dict(announced.labels)
+                if missing := [name for name in self._task.names if name not in labels]:
+                    raise InputError(f"the skin announces no {missing[0]}: give device.labels=prompted")
+                task_labels = {name: labels[name] for name in self._task.names}
+                return RecordedGesture(
+                    announced.number,
+                    task_labels,
+                    begin,
+                    frame.segment,
+                    lost=late,
+                    contacts=self._take_contacts(announced.number),
+                )
+        return None
+
+    def _take_contacts(self, number: int) -> np.ndarray | None:
+        """Return the contacts of a gesture, and forget those of the gestures before it."""
+        lines = [line for line in self._contacts if line.number == number]
+        self._contacts.clear()
+        return join_contact_lines(lines, self.window.frames, self.window.rate)
+
+
+class PromptedSegmenter(AbstractSegmenter):
+    """Prompts for each gesture, which begins when Enter is pressed: s skips one, q ends.
+
+    It prompts again where the skin was interrupted, or felt nothing although the labels say a touch.
+
+    Args:
+        window: as in :class:`AbstractSegmenter`.
+        plan: (number, labels) of the gestures.
+        notify: called with each message for the user.
+        felt: tells whether the skin has felt something in a window.
+        lines: typed lines; None: standard input. Lines typed before a prompt count, unless they come from a
+            keyboard.
+    """
+
+    def __init__(
+        self,
+        window: Window,
+        plan: Iterator[tuple[int, Labels]],
+        notify: Callable[[str], None],
+        felt: Callable[[Resampled], bool],
+        lines: Iterator[str] | None = None,
+    ) -> None:
+        super().__init__(window)
+        self._wanted, self._notify, self._felt = plan, notify, felt
+        self._typed: SimpleQueue[str] = SimpleQueue()
+        self._asked: tuple[int, Labels] | None = None
+        self._hasty = lines is None and sys.stdin.isatty()
+        # A thread, because frames arrive while the program waits for a line.
+        Thread(target=self._listen, args=(lines or typed_lines(sys.stdin.fileno()),), daemon=True).start()
+
+    def _listen(self, lines: Iterator[str]) -> None:
+        for line in lines:
+            self._typed.put(line.strip().lower())
+        self._hasty = False
+        self._typed.put("q")
+
+    def add(self, frame: Frame) -> RecordedGesture | None:
+        """As in the base class; a gesture that was not felt is broken, too."""
+        done = super().add(frame)
+        if done is not None and done.labels is not None:
+            done.broken = done.resampled is None or (
+                done.labels.get("touch") != 0 and not self._felt(done.resampled)
+            )
+            if done.broken:
+                self._notify(_INTERRUPTED if done.resampled is None else _UNFELT)
+                self._ask((done.number, done.labels))
+        elif self.gesture is None and self._asked is None and not self.over:
+            # A frame after a gesture, so that the message about that is printed first.
+            following = next(self._wanted, None)
+            self.over = following is None
+            if following is not None:
+                self._ask(following)
+        return done
+
+    def _begin(self, frame: Frame) -> RecordedGesture | None:
+        if self._asked is None or self._typed.empty():
+            return None
+        line, asked, self._asked = self._typed.get(), self._asked, None
+        self.over = line == "q"
+        if line in ("q", "s"):
+            return None
+        self._notify(f"  now: {self._length:g} s")
+        return RecordedGesture(*asked, frame.t, frame.segment)
+
+    def _ask(self, gesture: tuple[int, Labels]) -> None:
+        self._asked = gesture
+        # Pressing Enter twice must not start the next gesture.
+        while self._hasty and not self._typed.empty():
+            self._typed.get_nowait()
+        self._notify(f"next: {label_text(gesture[1])} - press Enter, then touch; s skips it, q ends")
+
+
+class ContinuousSegmenter(AbstractSegmenter):
+    """Segments into consecutive windows without labels.
+
+    Args:
+        window: as in :class:`AbstractSegmenter`.
+        first: number of the first.
+        wanted: whether a frame's values may begin a window; None: any frame may.
+    """
+
+    def __init__(
+        self, window: Window, first: int = 0, begins: Callable[[np.ndarray], bool] | None = None
+    ) -> None:
+        super().__init__(window)
+        self._number, self._wanted = first, begins
+
+    def _begin(self, frame: Frame) -> RecordedGesture | None:
+        if self._wanted is not None and not self._wanted(frame.values):
+            return None
+        self._number += 1
+        return RecordedGesture(self._number - 1, None, frame.t, frame.segment)

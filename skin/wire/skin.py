@@ -1,0 +1,545 @@
+"""An open skin: ``with open_skin("/dev/ttyACM0", layout=sensors) as skin: ...``; its tare and its newtons.
+
+torch is not imported.
+"""
+
+import logging
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Iterator, Sequence, Sized
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import partial
+from math import inf
+from threading import Condition, Event, Thread
+from time import monotonic
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from skin.device.calibration import read_calibration
+from skin.device.resampling import Frame, check_rate
+from skin.errors import InputError
+from skin.wire.channels import (
+    HEADER,
+    PATIENCE,
+    ChannelState,
+    Limits,
+    RawRange,
+    SkinTouched,
+    Tare,
+    UnitConversion,
+    check_sensitivity,
+    take_baseline,
+    unit_conversion,
+)
+from skin.wire.decoder import Decoder, Stats
+from skin.wire.protocol import Header
+from skin.wire.reader import (
+    ByteStream,
+    PlaybackFeed,
+    PortSettings,
+    SkinDisconnected,
+    SkinTimeout,
+    WireFeed,
+    open_stream,
+)
+from skin.wire.segmentation import AnnouncementListener
+
+if TYPE_CHECKING:
+    from skin.body.base import Layer
+    from skin.device.base import AbstractDevice
+    from skin.device.touches import Touches
+
+
+_log = logging.getLogger(__name__)
+_PAUSE = 0.002  # s between two reads of the port: fewer and larger pieces cost a tenth of the time
+_RATE = 256  # frames over which the rate is taken
+_WAKE = 0.2  # s: longer waits for a lock would block Ctrl-C on Windows
+
+
+class Skin:
+    """Frames from an open skin; iterate over it, or :meth:`read` a block.
+
+    Values are in the device's unit; ``frame.values - skin.baseline`` is the change due to touch. A thread
+    reads them until the skin is closed. A full queue drops its oldest frame; the next one counts it as lost.
+
+    Args:
+        feed: open.
+        decoder: of the feed; None: it needs none.
+        settings: timeout and backoff.
+        baseline: from an earlier tare.
+        queue: largest number of frames in the queue.
+        reconnect: try to open the feed again after a disconnection.
+
+    Attributes:
+        baseline: (S,), values of the untouched skin, in the device's unit; None before the first tare.
+        away: the skin is unplugged and being reopened.
+    """
+
+    def __init__(
+        self,
+        feed: WireFeed | PlaybackFeed,
+        decoder: Decoder | None,
+        settings: PortSettings,
+        baseline: np.ndarray | None,
+        queue: int,
+        reconnect: bool = False,
+    ) -> None:
+        self._feed, self._decoder = feed, decoder
+        self._stats = Stats() if decoder is None else decoder.stats
+        self._timeout, self._backoff, self._wait = settings.timeout, settings.backoff, settings.backoff[0]
+        self.baseline = baseline
+        self._most, self._reconnect, self.away = queue, reconnect, False
+        self._error: Exception | None = None  # why the thread ended; EOFError at the end of a recording
+        self._frames: deque[Frame] = deque()
+        self._times: deque[float] = deque(maxlen=_RATE)
+        self._stop, self._fresh = Event(), Condition()
+        self._thread = Thread(target=self._run, name="skin-reader", daemon=True)
+        self._thread.start()
+
+    def __enter__(self) -> "Skin":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End the thread and close the port."""
+        self._stop.set()
+        with self._fresh:
+            self._fresh.notify_all()
+        self._thread.join(timeout=5)
+        with suppress(OSError):
+            self._feed.close()
+
+    def __iter__(self) -> Iterator[Frame]:
+        """Yield frames as they arrive, to the end of a recording.
+
+        Raises:
+            SkinTimeout: no frame arrived within the timeout, though the skin was not disconnected.
+            SkinDisconnected: it was unplugged, and ``reconnect`` is not set.
+        """
+        while True:
+            back = self._stats.reconnects
+            frame = next(self._take(1, self._timeout), None)
+            if frame is not None:
+                yield frame
+            elif isinstance(self._error, EOFError):
+                return
+            elif self._error is not None or (not self.away and self._stats.reconnects == back):
+                self._explain(1, self._timeout, [])
+
+    def read(self, count: int, timeout: float | None = None) -> list[Frame]:
+        """Return exactly ``count`` frames.
+
+        Args:
+            count: how many.
+            timeout: s for all of them; None: the timeout that the skin was opened with.
+
+        Raises:
+            SkinTimeout: fewer arrived; they are in its ``frames``.
+            SkinDisconnected: it was unplugged, or the recording has ended; likewise.
+            InputError: nothing can be read: another format, baud rate or number of sensors.
+        """
+        timeout = self._timeout if timeout is None else timeout
+        frames = list(self._take(count, timeout))
+        if len(frames) < count:
+            self._explain(count, timeout, frames)
+        return frames
+
+    def tare(self, seconds: float = 1.0, force: bool = False, touch: float | None = None) -> np.ndarray:
+        """Set the baseline to the readings of the untouched skin, and return it, (S,).
+
+        Args:
+            seconds: of frames from now on.
+            force: set it even if the skin seems touched.
+            touch: smallest shift against the old baseline that is a touch, in the device's units; None: 2 %
+                of the range, if the header gives the bits.
+
+        Raises:
+            InputError: the skin is touched or was restarted meanwhile, or too few frames arrived; the old
+                baseline is kept.
+        """
+        frames, start = list[Frame](), monotonic()
+        while not frames or frames[-1].t_host < start + seconds:
+            frame = self.read(1)[0]
+            if frame.t_host >= start:
+                frames.append(frame)
+        if len({frame.segment for frame in frames}) > 1:
+            raise InputError("the skin was restarted meanwhile: tare again; the old baseline is kept")
+        if touch is None:
+            touch = 0.02 * 2**self.header.bits if self.header and self.header.bits else 0.0
+        values, valid = (np.stack([getattr(frame, name) for frame in frames]) for name in ("values", "valid"))
+        self.baseline = take_baseline(values, valid, self.baseline, touch, force)
+        return self.baseline
+
+    @property
+    def header(self) -> Header | None:
+        """The header that the device sent; None if it sent none."""
+        return self._decoder.header if self._decoder else None
+
+    @property
+    def channels(self) -> tuple[ChannelState, ...]:
+        """State of each channel at the last frame; empty if channels are not checked."""
+        return self._feed.states()
+
+    @property
+    def stats(self) -> Stats:
+        """Statistics of what was received so far."""
+        with self._fresh:
+            times = self._times
+            passed = times[-1] - times[0] if len(times) > 1 else 0.0
+            # By the device's clock, over the last frames of a segment.
+            rate = (len(times) - 1) / passed if passed > 0 else 0.0
+        return replace(self._stats, bad=Counter(self._stats.bad), rate_hz=rate)
+
+    def _explain(self, count: int, timeout: float, frames: list[Frame]) -> None:
+        """Raise the error that explains why ``count`` frames are not available."""
+        error, stats = self._error, self._stats
+        if isinstance(error, SkinDisconnected | EOFError):
+            raise SkinDisconnected(str(error), frames) from error
+        if error is not None:
+            raise error
+        message = f"{len(frames)} of {count} frames arrived within {timeout:g} s"
+        if self.away:
+            raise SkinTimeout(f"{message}: the skin is unplugged; trying again", frames)
+        if isinstance(self._feed, WireFeed) and (unanswered := self._feed.unanswered):
+            raise SkinTimeout(f"{message}: {unanswered}", frames)
+        if not stats.bytes and not stats.frames:
+            raise SkinTimeout(f"{message}: port open, nothing received; is the device sending?", frames)
+        if not stats.frames and self._decoder is not None and self._decoder.adapter.kind != "protocol":
+            raise SkinTimeout(f"{message}: {self._decoder.explain()}", frames)
+        if not stats.frames:
+            reason = stats.trouble or "no format shows yet; wrong baud rate?"
+            raise SkinTimeout(f"{message}: {stats.bytes} bytes but no frame: {reason}", frames)
+        raise SkinTimeout(f"{message}: {stats.trouble or 'the device stopped sending'}", frames)
+
+    def _take(self, count: int, timeout: float) -> Iterator[Frame]:
+        """Yield frames as they arrive: ``count``, or fewer if ``timeout`` s pass or the thread ends."""
+        deadline = monotonic() + timeout
+        for _ in range(count):
+            with self._fresh:
+                while not self._frames:
+                    left = deadline - monotonic()
+                    if self._error is not None or left <= 0:
+                        return
+                    self._fresh.wait(min(left, _WAKE))
+                frame = self._frames.popleft()
+                self._fresh.notify_all()
+            self._stats.frames += self._decoder is None
+            yield frame
+
+    def _run(self) -> None:
+        try:
+            while not self._stop.is_set():
+                self._step()
+        except Exception as error:
+            with self._fresh:
+                self._error = error
+                self._fresh.notify_all()
+
+    def _step(self) -> None:
+        try:
+            frames = self._feed.poll()
+        except OSError as error:
+            with suppress(OSError):
+                self._feed.close()
+            if not self._reconnect:
+                raise SkinDisconnected(f"the skin was unplugged: {error}") from error
+            _log.warning("the skin was unplugged (%s); trying again", error)
+            self._reopen()
+            return
+        if frames:
+            self._wait = self._backoff[0]
+            self._push(frames)
+            if not self._feed.patient:
+                self._stop.wait(_PAUSE)
+
+    def _reopen(self) -> None:
+        """Open the feed again; the wait between two attempts doubles until frames arrive."""
+        self.away = True
+        while self.away and not self._stop.wait(self._wait):
+            self._wait = min(2 * self._wait, self._backoff[1])
+            with suppress(OSError, InputError):
+                self._feed.open()
+                self._stats.reconnects += 1
+                self.away = False
+
+    def _push(self, frames: list[Frame]) -> None:
+        with self._fresh:
+            for frame in frames:
+                if frame.after not in ("", "gap"):
+                    self._times.clear()
+                self._times.append(frame.t)
+                while self._feed.patient and len(self._frames) >= self._most and not self._stop.is_set():
+                    self._fresh.wait(_WAKE)
+                self._frames.append(frame)
+                if len(self._frames) > self._most:
+                    dropped = self._frames.popleft()
+                    self._frames[0] = self._frames[0].behind(dropped)
+                    self._stats.dropped += 1
+                self._fresh.notify_all()
+
+
+def open_skin(
+    port: str | PortSettings,
+    layout: Sized | None = None,
+    *,
+    opener: Callable[[], ByteStream] | None = None,
+    device: "AbstractDevice | None" = None,
+    baseline: np.ndarray | None = None,
+    channels: Sequence[int] = (),
+    polarity: Sequence[int] = (),
+    queue: int = 4096,
+    reconnect: bool = False,
+    realtime: bool = True,
+    **settings: Any,
+) -> Skin:
+    """Open a skin; use it in a ``with`` statement.
+
+    Args:
+        port: ``/dev/ttyACM0``, ``COM3``, ``socket://host:number``, a recording (``x.parquet``, ``x.csv``) or
+            ``simulated``; or the settings of a port.
+        layout: the sensors (anything with a length); None: their number is detected.
+        opener: opens the stream of bytes instead of ``port``, and again after each disconnection.
+        device: the device that ``simulated`` plays.
+        baseline: (S,), from an earlier tare.
+        channels: the device's channel of every sensor, as in a calibration; empty: the same order.
+        polarity: 1 or -1 per sensor, -1 where values fall with force; empty: 1 for all.
+        queue: number of frames that are buffered.
+        reconnect: wait for an unplugged skin; its next frame has ``after="reconnect"``.
+        realtime: False plays a recording or the simulator as fast as frames are read.
+        settings: baudrate, adapter, limits, timeout, backoff and silence, as in :class:`PortSettings`.
+
+    Raises:
+        InputError: there is nothing at ``port``, it may not be opened or is in use, or a setting is wrong.
+    """
+    if unused := sorted({"tare", "scale", "calibration"} & settings.keys()):
+        raise InputError(f"open_skin gives values as the device sends them: leave out {unused[0]}")
+    about = port if isinstance(port, PortSettings) else PortSettings(port=port, **settings)
+    if not (isinstance(queue, int) and queue > 0):
+        raise InputError(f"queue={queue} must be a whole number above 0: leave it out for 4096")
+    address, sensors = str(about.port), None if layout is None else len(layout)
+    if opener is None and address == "simulated":
+        if device is None:
+            raise InputError("simulated needs a device: open_skin('simulated', device=build_device(config))")
+        return play(device.strips(), baseline, queue, realtime, about)
+    if opener is None and address.endswith((".parquet", ".csv")):
+        return play([_read_touches(address, sensors)], baseline, queue, realtime, about)
+    if about.frames.kind == "auto":
+        raise InputError("skin listen adapter=auto proposes an adapter: give device.adapter=FILE.yaml of it")
+    decoder = Decoder(sensors, channels=channels, polarity=polarity, adapter=about.frames)
+    watched = reconnect and address.startswith("socket://")
+    opener = opener or partial(open_stream, address, about.baudrate)
+    try:
+        feed = WireFeed(opener, decoder, about.limits, (about.silence if watched else None) or inf)
+    except OSError as error:
+        raise InputError(f"cannot open {address}: {error}") from error
+    return Skin(feed, decoder, about, baseline, queue, reconnect)
+
+
+def play(
+    strips: "Iterable[Touches]",
+    baseline: np.ndarray | None = None,
+    queue: int = 4096,
+    realtime: bool = True,
+    settings: PortSettings | None = None,
+) -> Skin:
+    """Return touches in N, all with one rate, as the frames of an open skin.
+
+    Args:
+        strips: the touches; each is a segment.
+        baseline, queue, realtime: as in :func:`open_skin`.
+        settings: with the timeout.
+    """
+    return Skin(PlaybackFeed(strips, realtime), None, settings or PortSettings(), baseline, queue)
+
+
+def _read_touches(path: str, sensors: int | None) -> "Touches":
+    """Return the touches of a recording, which must have as many sensors as the layout."""
+    # Imported here because it imports torch, which reading a port does not need.
+    from skin.device.files import read_recording
+
+    touches = read_recording(path).touches
+    count = touches.readings.shape[2]
+    if sensors not in (None, count):
+        raise InputError(
+            f"{path} has {count} sensors, the layout has {sensors}: give the layout it was recorded with, "
+            "as in layout=file layout.path=FILE.csv"
+        )
+    return touches
+
+
+_LEAST = 1.0  # s over which the rate is measured
+
+
+@dataclass(frozen=True)
+class Source:
+    """An open stream of frames and its tare.
+
+    Attributes:
+        name: shown in the live view.
+        skin: open.
+        tare: gives the conversion of values to N.
+        limits: smallest and largest value of a channel, as given by the user.
+        port: that the frames come from; None: a recording or the simulator.
+    """
+
+    name: str
+    skin: Skin
+    tare: Tare
+    limits: Limits | None = None
+    port: "SerialSource | None" = None
+
+    @property
+    def raw_range(self) -> RawRange:
+        """The values that the device can send, as far as it declares them."""
+        header, limits = self.skin.header, self.limits or (None, None)
+        if header is not None and header.bits:
+            largest = 2.0**header.bits - 1
+            return RawRange(0.0, largest, header.unit != "N", self.limits or (None, largest))
+        return RawRange(limits[0], limits[1], False, limits)
+
+    @property
+    def calibrated_rest(self) -> np.ndarray | None:
+        """Values of the untouched sensors, (S,), when the device was calibrated; None: it was not."""
+        if self.port is None or self.port.settings.calibration is None:
+            return None
+        return self.port.convert(None, self.skin.header).zero
+
+    @classmethod
+    def in_newtons(cls, name: str, skin: Skin, sensors: int) -> "Source":
+        """Return a source whose values are already in N."""
+        # No baseline is taken: a run trained on such values expects their offsets.
+        conversion = unit_conversion(sensors, None, 1.0, None, None)
+        return cls(name, skin, Tare(lambda baseline, header: conversion, 0.0, 1.0))
+
+
+class SerialSource:
+    """A skin at a port, with its conversion to N.
+
+    Args:
+        settings: of the port.
+        sensors: S.
+        rate: of the model, Hz.
+        layers: of the body; empty: unknown.
+
+    Raises:
+        InputError: an invalid setting, a calibration of another number of sensors, or a conversion that
+            contradicts ``device.sensitivity``.
+    """
+
+    def __init__(
+        self, settings: PortSettings, sensors: int, rate: float, layers: "Sequence[Layer]" = ()
+    ) -> None:
+        self.settings, self._sensors, self._rate, self.layers = settings, sensors, rate, layers
+        path = settings.calibration
+        self._calibration = None if path is None else read_calibration(path)
+        if settings.scale is not None or self._calibration is not None:
+            self.convert(None, None)
+
+    @property
+    def channels(self) -> Sequence[int]:
+        """The device's channel of every sensor; empty: the same order."""
+        return self._calibration.channels if self._calibration else ()
+
+    @property
+    def polarity(self) -> Sequence[int]:
+        """1 or -1 per sensor, -1 where the value falls with force; empty: 1 for all."""
+        if self._calibration is not None:
+            return self._calibration.polarity
+        scale = self.settings.scale
+        return [-1] * self._sensors if scale is not None and scale < 0 else ()
+
+    def open(self, reconnect: bool = False) -> tuple[Skin, AnnouncementListener]:
+        """Open the port and collect its announcements; ``reconnect`` waits for an unplugged skin."""
+        port = self.settings.port
+        if port is None:
+            raise InputError("device=serial needs a port, device.port=/dev/ttyACM0; skin emulate makes one")
+        listener = AnnouncementListener(partial(open_stream, port, self.settings.baudrate))
+        skin = open_skin(
+            self.settings,
+            range(self._sensors),
+            opener=listener,
+            reconnect=reconnect,
+            channels=self.channels,
+            polarity=self.polarity,
+        )
+        return skin, listener
+
+    def open_source(self) -> Source:
+        """Open the port as a stream of frames; wait for an unplugged skin."""
+        skin, _ = self.open(reconnect=True)
+        return Source(str(self.settings.port), skin, self.tare(skin), self.settings.limits, self)
+
+    def tare(self, skin: Skin) -> Tare:
+        """Return the tare of an open skin."""
+        return Tare(self.convert, self.settings.tare, self._rate, lambda: skin.header)
+
+    def convert(self, baseline: np.ndarray | None, header: Header | None) -> UnitConversion:
+        """Return the conversion of values to N, given a baseline (S,) and the header of the device.
+
+        Raises:
+            InputError: the scale is unknown, or contradicts ``device.sensitivity``.
+        """
+        conversion = unit_conversion(self._sensors, baseline, self.settings.scale, self._calibration, header)
+        check_sensitivity(conversion, self.settings.sensitivity)
+        return conversion
+
+    def warm_up(self, skin: Skin, notify: Callable[[str], None]) -> tuple[list[Frame], UnitConversion]:
+        """Read frames until rate, conversion and device are known; return all of them, and the conversion.
+
+        Raises:
+            InputError: no frames arrive, the device is too slow, or the scale is unknown.
+            SkinTouched: the skin was still touched after a minute.
+        """
+        try:
+            frames, conversion = warm_up(skin, self.tare(skin), self._rate, self.settings.tare, notify)
+            while (
+                skin.header is None
+                and self.settings.frames.kind == "protocol"  # other formats have no header
+                and frames[-1].t_host - frames[0].t_host < HEADER
+            ):
+                frames += skin.read(1)
+            return frames, conversion
+        except (SkinTimeout, SkinDisconnected) as error:
+            raise InputError(f"{self.settings.port}: {error}") from error
+
+
+def warm_up(
+    skin: Skin, tare: Tare, rate: float, seconds: float, notify: Callable[[str], None]
+) -> tuple[list[Frame], UnitConversion]:
+    """Read frames until rate and conversion are known; return all frames read, and the conversion.
+
+    Args:
+        skin: just opened.
+        tare: gets every frame.
+        rate: of the model, Hz: a slower device is refused.
+        seconds: of the tare.
+        notify: called with each message for the user.
+
+    Raises:
+        InputError: the device is too slow, or the scale is unknown.
+        SkinTouched: the skin was still touched after a minute.
+    """
+    notify("reading the untouched skin: keep off" if seconds else "reading the rate")
+    frames, least, measured = list[Frame](), max(seconds, _LEAST), False
+    while True:
+        frames += skin.read(1)
+        if frames[-1].segment != frames[0].segment:
+            del frames[:-1]
+        tare.add(frames[-1])
+        passed = frames[-1].t - frames[0].t
+        if len(frames) < 3 or passed < least:
+            continue
+        if not measured:
+            # By the device's clock, with lost frames.
+            count = len(frames) - 1 + sum(frame.lost for frame in frames[1:])
+            check_rate(count / passed, rate)
+        if tare.conversion is not None:
+            return frames, tare.conversion
+        if not measured and tare.status.startswith("no baseline"):
+            notify("the skin is touched: let go")
+        measured = True
+        if passed > least + PATIENCE:
+            raise SkinTouched(tare.status)

@@ -1,0 +1,153 @@
+"""Gauge rows: presses, forces at the session's times, and the true readings that belong to them."""
+
+import numpy as np
+import pyarrow as pa
+import pytest
+
+from skin.body.base import Sheet
+from skin.body.layout import Grid
+from skin.calibration import bench
+from skin.calibration.bench import BenchSession
+from skin.errors import InputError
+from skin.mechanics.simulator.naive import Naive
+
+BODY = Sheet([0.16, 0.16], [32, 32], [{"material": "EcoFlex 00-30", "thickness": 0.005}])
+
+
+def rows(**changes) -> pa.Table:
+    columns = {
+        "time": [1.0, 1.5, 2.0, 2.5, 6.0, 6.5],
+        "force": [0.0, 10.0, 20.0, 0.0, 5.0, 5.0],
+        "x_m": [0.05] * 6,
+        "y_m": [0.06] * 6,
+    }
+    return pa.table(columns | changes)
+
+
+def test_a_pause_or_another_place_begins_a_press():
+    assert bench.gauge_from_table(rows(), "x", "disc", 0.01).press.tolist() == [
+        0,
+        0,
+        0,
+        0,
+        1,
+        1,
+    ]
+    moved = rows(x_m=[0.05, 0.05, 0.06, 0.06, 0.06, 0.06])
+    assert bench.gauge_from_table(moved, "x", "disc", 0.01).press.tolist() == [
+        0,
+        0,
+        1,
+        1,
+        2,
+        2,
+    ]
+    named = rows(indenter=["disc"] * 3 + ["square"] * 3)
+    assert len(bench.gauge_from_table(named, "x", "disc", 0.01)) == 3
+
+
+def test_forces_are_interpolated_within_a_press_only():
+    found = bench.gauge_from_table(rows(), "x", "disc", 0.01, delay=1.0)
+    force, press = found.at(np.array([0.0, 2.25, 2.5, 3.25, 5.0, 7.25, 7.5, 9.0]))
+    np.testing.assert_allclose(force, [0, 5, 10, 10, 0, 5, 5, 0])
+    assert press.tolist() == [-1, 0, 0, 0, -1, 1, 1, -1]
+
+
+def test_a_press_of_a_newton_on_the_naive_skin_is_force_over_area():
+    """A square of 40 mm over a footprint of 10 mm: a sixteenth of the force, whoever computes it."""
+    sensors = Grid(1, 1).sensors(BODY)
+    table = rows(x_m=[0.08] * 6, y_m=[0.08] * 6)
+    found = bench.gauge_from_table(table, "x", "square", 0.02)
+    each = bench.per_newton(Naive(BODY, sensors), BODY, found)
+    np.testing.assert_allclose(each, 0.01**2 / 0.04**2, rtol=0.1)
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"time": [1.0, 1.5, 1.2, 2.5, 6.0, 6.5]}, "time must grow"),
+        ({"force": [0.0, -10.0, 20.0, 0.0, 5.0, 5.0]}, "zero the gauge"),
+        ({"force": ["a"] * 6}, "column force must hold numbers"),
+        ({"x_m": [None] * 6}, "no row has a time"),
+    ],
+)
+def test_bad_rows_are_refused(changes, reason):
+    with pytest.raises(InputError, match=reason):
+        bench.gauge_from_table(rows(**changes), "gauge.csv", "disc", 0.01)
+
+
+def test_places_outside_the_sheet_are_refused():
+    found = bench.gauge_from_table(rows(x_m=[50.0] * 6), "x", "disc", 0.01)
+    with pytest.raises(InputError, match=r"outside the sheet of \[0.16, 0.16\] m: x_m and y_m are metres"):
+        bench.per_newton(Naive(BODY, Grid(2, 2).sensors(BODY)), BODY, found)
+
+
+@pytest.mark.parametrize("name", ["x.csv", "x.parquet"])
+@pytest.mark.parametrize("unit", ["N", "adc"])
+def test_a_session_is_read_as_it_was_written(tmp_path, name, unit):
+    found = bench.gauge_from_table(rows(), "x", "disc", 0.01)
+    raw = np.random.default_rng(0).integers(0, 1023, (700, 3)).astype(float)
+    written = BenchSession(np.arange(700) / 100, raw, unit, found, 10 if unit == "adc" else None)
+    bench.write_bench_session(written, tmp_path / name)
+    again = bench.read_bench_session(tmp_path / name, "none", 1.0)
+    np.testing.assert_array_equal(again.raw, raw)
+    np.testing.assert_array_equal(again.time, written.time)
+    assert (again.unit, again.bits) == (unit, written.bits)
+    for one, other in zip(again.gauge.at(again.time), found.at(written.time), strict=True):
+        np.testing.assert_allclose(one, other)
+    assert set(again.gauge.indenter) == {"disc"}
+
+
+def test_a_log_of_a_microcontroller_is_a_session(tmp_path):
+    path = tmp_path / "log.csv"
+    path.write_text("# skin proto=1 n=2\nseq,t_us,v0,v1\n0,0,1,2\n1,10000,,4\n")
+    found = bench.read_bench_session(path, "disc", 0.01, "adc")
+    np.testing.assert_allclose(found.time, [0, 0.01])
+    np.testing.assert_array_equal(found.raw, [[1, 2], [np.nan, 4]])
+    assert found.gauge is None
+
+
+def test_a_recorded_session_is_read_without_its_damaged_lines(tmp_path, caplog):
+    path = tmp_path / "s.csv"
+    frames = [b"%.2f,%d,5,%d" % (number / 100, number, number % 9) for number in range(100)]
+    for number, damage in (
+        (10, b"0.1\xff,10,5,1"),
+        (20, b"0.20,2"),
+        (30, b"0.30,30,5,x"),
+        (40, b"\0" * 4096),
+    ):
+        frames[number] = damage
+    path.write_bytes(b"\n".join([b"time,seq,raw_00,raw_01", b"# {\xff", *frames, b"\0" * 99]))
+    found = bench.read_bench_session(path, "disc", 0.01, "adc")
+    assert len(found.time) == 96
+    np.testing.assert_array_equal(found.raw[10], [5, 2])
+    assert caplog.messages == [f"{path}: 5 damaged lines skipped, the first is line 13"]
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("time,a\n", "no rows"),
+        ("time\n1\n2\n", "no column of a sensor"),
+        ("a,b\n1,2\n3,4\n", "the column time must hold numbers, found a, b"),
+        ("time,a\n1,2\n", "at least two frames, this one has 1"),
+        ("time,a\n1,2\n1,3\n", "clock stood still: all 2 frames of the session have the time 1 s"),
+        ("t_us,a\n5,2\n5,3\n5,2\n", "clock stood still: all 3 frames of the session have the time 5e-06 s"),
+        ("time,a\n1,2\n2,2\n1.5,3\n", "after frame 1 it goes from 2 to 1.5 s"),
+        ("time,a\n1,2\n1,2,3\n", "cannot read"),
+    ],
+)
+def test_bad_sessions_are_refused(tmp_path, text, reason):
+    path = tmp_path / "log.csv"
+    path.write_text(text)
+    with pytest.raises(InputError, match=reason):
+        bench.read_bench_session(path, "disc", 0.01)
+
+
+@pytest.mark.parametrize("about", ["[]", "3", "{", "[" * 5000, '{"unit": ["N"]}', '{"bits": "many"}'])
+def test_what_a_session_says_of_itself_is_checked(tmp_path, about):
+    path = tmp_path / "log.csv"
+    path.write_text("time,a\n1,2\n2,3\n")
+    (tmp_path / "log.csv.json").write_text(about)
+    with pytest.raises(InputError, match=r"log\.csv"):
+        bench.read_bench_session(path, "disc", 0.01)

@@ -1,0 +1,116 @@
+"""Calibration without a gauge: sessions of hidden devices, found placements, and what is refused."""
+
+import numpy as np
+import pytest
+import torch
+
+from skin.calibration.bench import BenchSession
+from skin.calibration.bench_protocol import Protocol
+from skin.calibration.known_loads import (
+    KnownLoad,
+    base_readings,
+    emulate_placements,
+    fit_known_load,
+    print_known_load,
+)
+from skin.errors import InputError
+from tests.calibration.test_fit import device, solid
+
+WEIGHT = KnownLoad(2.0, 0.02)
+PROTOCOL = Protocol(idle=5.0)
+ORDER = [3, 0, 5, 1, 4, 2]
+
+
+def weight_readings(skin) -> np.ndarray:
+    return WEIGHT.force * base_readings(skin.model, skin.body, skin.sensors, WEIGHT.base)
+
+
+def weighed(skin, order, bits=None) -> BenchSession:
+    readings = weight_readings(skin)[order]
+    return emulate_placements(skin, readings, PROTOCOL, np.random.default_rng(0), bits)
+
+
+@pytest.mark.parametrize("hidden", [{}, {"polarity": -1, "quantum": 0.01}, {"time_constant": 0.1}])
+def test_a_weight_in_any_order_gives_the_gains(hidden):
+    skin = device(**hidden)
+    result = fit_known_load(device(), weighed(skin, ORDER + ORDER[::-1]), WEIGHT)
+    assert result.placements.tolist() == [2] * 6
+    np.testing.assert_allclose(result.calibration.known("gain"), skin.constants.gain, rtol=0.08)
+    assert (result.calibration.signs == skin.imperfection.polarity).all()
+
+
+def test_counts_are_converted_to_newtons_of_the_same_force():
+    skin = device(noise=0.02)
+    calibration = fit_known_load(device(), weighed(skin, ORDER, bits=12), WEIGHT).calibration
+    true = weight_readings(skin)[0]
+    raw = np.round(
+        2**11 + (true * skin.constants.gain.numpy() + skin.constants.offset.numpy()) / (20 / 2**11)
+    )
+    np.testing.assert_allclose(calibration.corrected(raw)[0], true[0], rtol=0.05)
+
+
+def test_dead_sensors_and_sensors_never_loaded_are_named(capsys):
+    skin = solid(dead=1, noise=0.002, offset=0.0)
+    dead = int(np.flatnonzero(skin.constants.dead)[0])
+    left_out = (dead + 5) % 16
+    order = [n for n in range(16) if n != left_out]
+    result = fit_known_load(solid(), weighed(skin, order), WEIGHT)
+    assert result.calibration.broken["dead"] == [dead]
+    assert result.never == [left_out]
+    print_known_load(result)
+    text = capsys.readouterr().out
+    assert f"never loaded, so of median gain: sensors {left_out}" in text
+    assert f"sensors {dead} (from 0) never left their noise" in text
+
+
+def test_half_a_session_is_refused_and_names_the_sensors():
+    skin = solid()
+    with pytest.raises(InputError, match="sensors 8, 9, 10, 11, 12, 13, 14 and 15 were never loaded"):
+        fit_known_load(solid(), weighed(skin, list(range(8))), WEIGHT)
+
+
+def test_an_untouched_session_has_no_placement():
+    skin = device()
+    noise = skin.imperfection.raw(torch.zeros(1, 3000, 6), skin.constants, np.random.default_rng(0))[
+        0
+    ].numpy()
+    session = BenchSession(np.arange(3000) / 100, noise, "N")
+    with pytest.raises(InputError, match="no placement in the session"):
+        fit_known_load(device(), session, WEIGHT)
+
+
+def test_a_touch_or_a_sliding_load_is_no_placement():
+    skin = device(noise=0.01)
+    readings = weight_readings(skin)[[0]]
+    session = emulate_placements(skin, readings, PROTOCOL, np.random.default_rng(0))
+    time = session.time
+    ramp = np.where((time > 5.0) & (time < 7.0), (time - 5.0) / 2, 0.0)
+    session.raw[:, 0] += 3 * ramp  # a hand that leans on the weight more and more
+    with pytest.raises(InputError, match="1 changed while they lay"):
+        fit_known_load(skin, session, WEIGHT)
+
+
+@pytest.mark.parametrize("bits", [None, 12])
+def test_a_load_in_another_unit_shows_in_the_noise(bits):
+    session = weighed(device(), ORDER, bits)
+    with pytest.raises(
+        InputError, match=r"^weight=0\.002 \(kg\) would mean a noise of \S+ N, device.noise is 0.05"
+    ):
+        fit_known_load(device(), session, KnownLoad(0.002, 0.02))
+    fit_known_load(device(), session, KnownLoad(0.1, 0.02))
+    fit_known_load(device(noise=0.0), session, KnownLoad(0.002, 0.02))
+
+
+@pytest.mark.parametrize(
+    ("load", "reason"),
+    [
+        ((2000.0, 0.02), "for 2000 g give weight=2"),
+        ((2.0, 20.0), "for 20 mm give base=0.02"),
+        ((2.0, 0.2), "fits on the skin"),
+        ((2.0, None), "give weight=2.0 base=0.02"),
+        ((None, 0.02), "give weight=2.0 base=0.02"),
+    ],
+)
+def test_impossible_loads_are_refused(load, reason):
+    with pytest.raises(InputError, match=reason):
+        KnownLoad.of(*load, (0.16, 0.16))

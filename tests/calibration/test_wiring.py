@@ -1,0 +1,303 @@
+"""Sessions whose places or channels are not those of the layout: named, and right once confirmed."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from skin.body.base import Sheet
+from skin.body.layout import File, Grid
+from skin.calibration.bench import BenchData, BenchSession, Gauge
+from skin.calibration.bench_protocol import Protocol, emulate_session
+from skin.calibration.fit import fit_calibration
+from skin.calibration.wiring import (
+    TURNS,
+    Confirmed,
+    check_usable,
+    compose_turns,
+    lies_on_sheet,
+    turn_gauge,
+    wired_bench,
+)
+from skin.device.calibration import Calibration
+from skin.device.simulated import Simulated
+from skin.errors import InputError
+from skin.mechanics.simulator.fem import PlatesAndBeams
+from skin.mechanics.simulator.solid import Solid
+
+LAYERS = [
+    {"material": "Dragon Skin 10 Medium", "thickness": 0.010},
+    {"material": "EcoFlex 00-30", "thickness": 0.005},
+]
+GEL = [{"material": "EcoFlex 00-30", "thickness": 0.015}]
+EIGHT = "x_m,y_m\n.020,.018\n.075,.022\n.130,.016\n.045,.052\n.101,.049\n.022,.083\n.078,.080\n.131,.086\n"
+PROTOCOL = Protocol(idle=5.0)
+BACK = {"rotate_90": "rotate_270", "rotate_270": "rotate_90"}
+SKINS = ("fem", "long", "irregular")
+
+
+@pytest.fixture(scope="module")
+def skins(tmp_path_factory):
+    path = tmp_path_factory.mktemp("layout") / "eight.csv"
+    path.write_text(EIGHT)
+    settings = {
+        "fem": (Sheet([0.16, 0.16], [16, 16], LAYERS), Grid(3, 3), PlatesAndBeams),
+        "long": (Sheet([0.24, 0.08], [24, 8], GEL), Grid(3, 3), Solid),
+        "irregular": (Sheet([0.15, 0.10], [15, 10], GEL), File(str(path)), Solid),
+    }
+
+    @cache
+    def make(name: str) -> tuple[Simulated, BenchSession]:
+        body, layout, simulator = settings[name]
+        skin = Simulated(body=body, layout=layout, simulator=simulator, gain_spread=0.2)
+        return skin, session_of(skin)
+
+    return make
+
+
+def session_of(skin: Simulated, places: np.ndarray | None = None, bits: int | None = None) -> BenchSession:
+    randomness = np.random.default_rng(0)
+    places = PROTOCOL.places(skin, randomness) if places is None else places
+    return emulate_session(skin, PROTOCOL.gauge(places), PROTOCOL, randomness, bits)
+
+
+def in_frame(gauge: Gauge, turn: str, size: tuple[float, float]) -> Gauge:
+    """Return a gauge whose places are in a frame that ``turn`` brings back to the sheet's."""
+    swapped = turn in ("transpose", "transpose_other", "rotate_90", "rotate_270")
+    return turn_gauge(gauge, BACK.get(turn, turn), tuple(size)[::-1] if swapped else size)
+
+
+def changed(session: BenchSession, order=None, inverse=(), dead=()) -> BenchSession:
+    """Return a session whose column k is that of sensor ``order[k]``; then some are inverse or dead."""
+    raw = session.raw[:, list(range(session.raw.shape[1])) if order is None else order].copy()
+    raw[:, list(inverse)] *= -1
+    rng = np.random.default_rng(1)
+    raw[:, list(dead)] = 0.1 + 0.05 * rng.standard_normal((len(raw), len(dead)))
+    return replace(session, raw=raw)
+
+
+def exchanged(count: int, *pair: int) -> list[int]:
+    order = list(range(count))
+    order[pair[0]], order[pair[1]] = order[pair[1]], order[pair[0]]
+    return order
+
+
+def refused(skin, session, **confirmed) -> str:
+    with pytest.raises(InputError) as caught:
+        wired_bench(skin, session, None, Confirmed(**confirmed))
+    return str(caught.value)
+
+
+def gains(bench: BenchData) -> np.ndarray:
+    return fit_calibration(bench).values()["gain"]
+
+
+@pytest.mark.parametrize("turn", TURNS)
+def test_turns_come_back_and_compose(turn):
+    size, rng = (0.24, 0.08), np.random.default_rng(0)
+    gauge = PROTOCOL.gauge(rng.uniform(0.0, 0.08, (4, 2)))
+    back = turn_gauge(in_frame(gauge, turn, size), turn, size)
+    np.testing.assert_allclose(back.place, gauge.place, atol=1e-12)
+    np.testing.assert_allclose(np.cos(back.angle), np.cos(gauge.angle), atol=1e-12)
+    assert compose_turns(BACK.get(turn, turn), turn) == compose_turns("as_given", "as_given") == "as_given"
+    assert compose_turns("as_given", turn) == compose_turns(turn, "as_given") == turn
+    assert compose_turns("mirror_x", "mirror_y") == "rotate_180"
+    assert lies_on_sheet(gauge, size)
+
+
+@pytest.mark.parametrize("name", SKINS)
+def test_a_session_that_fits_passes(skins, name):
+    skin, session = skins(name)
+    np.testing.assert_allclose(
+        gains(wired_bench(skin, session, None, Confirmed())), skin.constants.gain, rtol=0.02
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "turn", "dead"),
+    [
+        *((name, turn, ()) for name in SKINS for turn in ("mirror_x", "mirror_y", "rotate_180")),
+        *((name, "mirror_y", (0,)) for name in SKINS),
+    ],
+)
+def test_mirrored_places_are_named_and_right_once_confirmed(skins, name, turn, dead):
+    skin, session = skins(name)
+    session = changed(replace(session, gauge=in_frame(session.gauge, turn, skin.size)), dead=dead)
+    said = refused(skin, session)
+    words = {"mirror_x": "the x axis", "mirror_y": "the y axis counts upwards", "rotate_180": "180 degrees"}
+    assert "respond, but not to the presses near their sensors: the session fits if the places" in said
+    assert words[turn] in said
+    assert f"add calibrate.places={turn}" in said.split(". ")[0]
+    calibration = fit_calibration(wired_bench(skin, session, None, Confirmed(places=turn)))
+    assert calibration.broken["dead"] == list(dead)
+    alive = np.setdiff1d(np.arange(len(calibration)), dead)
+    np.testing.assert_allclose(calibration.values()["gain"][alive], skin.constants.gain[alive], rtol=0.02)
+
+
+@pytest.mark.parametrize("name", SKINS)
+@pytest.mark.parametrize("turn", ["transpose", "rotate_90", "rotate_270"])
+def test_turned_places_are_named_even_where_they_are_outside_the_sheet(skins, name, turn):
+    skin, session = skins(name)
+    session = replace(session, gauge=in_frame(session.gauge, turn, skin.size))
+    assert f"add calibrate.places={turn}" in refused(skin, session).split(". ")[0]
+    found = gains(wired_bench(skin, session, None, Confirmed(places=turn)))
+    np.testing.assert_allclose(found, skin.constants.gain, rtol=0.02)
+
+
+def test_places_that_no_turn_brings_onto_the_sheet_are_refused_with_one(skins):
+    skin, session = skins("long")
+    gauge = replace(session.gauge, place=session.gauge.place * 1000)
+    assert "is outside the sheet" in refused(skin, replace(session, gauge=gauge))
+
+
+@pytest.mark.parametrize("name", SKINS)
+@pytest.mark.parametrize("dead", [(), (3,), (1,)])
+def test_exchanged_channels_are_named_and_right_once_confirmed(skins, name, dead):
+    skin, session = skins(name)
+    order = exchanged(len(skin.sensors), 1, 6)
+    session = changed(session, order, dead=dead)
+    setting = f"calibrate.channels=[{','.join(map(str, order))}]"
+    said = refused(skin, session)
+    assert "channels 1 and 6 are exchanged" in said
+    assert said.endswith(f"add '{setting}'")
+    calibration = fit_calibration(wired_bench(skin, session, None, Confirmed(channels=order)))
+    assert calibration.broken["dead"] == [order.index(channel) for channel in dead]
+    alive = np.flatnonzero(~calibration.values()["dead"])
+    np.testing.assert_allclose(calibration.values()["gain"][alive], skin.constants.gain[alive], rtol=0.02)
+
+
+@pytest.mark.parametrize("name", SKINS)
+def test_any_order_of_the_channels_is_found(skins, name):
+    skin, session = skins(name)
+    order = np.random.default_rng(7).permutation(len(skin.sensors))
+    said = refused(skin, changed(session, order))
+    channels = np.argsort(order).tolist()
+    assert f"'calibrate.channels=[{','.join(map(str, channels))}]'" in said
+    found = gains(wired_bench(skin, changed(session, order), None, Confirmed(channels=channels)))
+    np.testing.assert_allclose(found, skin.constants.gain, rtol=0.02)
+
+
+def test_axes_and_channels_may_both_be_wrong(skins):
+    skin, session = skins("irregular")
+    order = exchanged(8, 0, 4)
+    session = changed(
+        replace(session, gauge=in_frame(session.gauge, "mirror_y", skin.size)), order, inverse=[2]
+    )
+    said = refused(skin, session)
+    assert "add calibrate.places=mirror_y 'calibrate.channels=[4,1,2,3,0,5,6,7]'" in said
+    bench = wired_bench(skin, session, None, Confirmed(places="mirror_y", channels=order))
+    np.testing.assert_allclose(gains(bench), skin.constants.gain, rtol=0.02)
+    assert fit_calibration(bench).polarity == [1, 1, -1, 1, 1, 1, 1, 1]
+
+
+def test_a_confirmation_that_is_wrong_is_refused_with_the_right_one(skins):
+    skin, session = skins("long")
+    assert "calibrate.places=as_given" in refused(skin, session, places="mirror_y")
+    order = exchanged(9, 1, 6)
+    assert "calibrate.channels=[0,1,2,3,4,5,6,7,8]" in refused(skin, session, channels=order)
+    mirrored = replace(session, gauge=in_frame(session.gauge, "mirror_y", skin.size))
+    assert "calibrate.places=mirror_y" in refused(skin, mirrored, places="mirror_x")
+
+
+@pytest.mark.parametrize("inverse", [[4], [0, 2, 7], list(range(8))])
+def test_inverse_channels_are_found_and_need_no_confirmation(skins, inverse):
+    skin, session = skins("irregular")
+    session = changed(session, inverse=inverse)
+    calibration = fit_calibration(wired_bench(skin, session, None, Confirmed()))
+    assert [n for n, sign in enumerate(calibration.polarity) if sign < 0] == inverse
+    np.testing.assert_allclose(calibration.values()["gain"], skin.constants.gain, rtol=0.02)
+    true = np.nan_to_num(calibration.corrected(session.raw))
+    np.testing.assert_allclose(true.max(axis=0), 10 / skin.constants.gain, rtol=0.1)
+    assert true.min() > -1
+
+
+def test_counts_that_fall_with_force_become_newtons(skins):
+    skin, _ = skins("long")
+    session = session_of(skin, bits=10)
+    normal = fit_calibration(wired_bench(skin, session, None, Confirmed()))
+    inverse = replace(session, raw=1023 - session.raw)
+    falling = fit_calibration(wired_bench(skin, inverse, None, Confirmed()))
+    assert falling.polarity == [-1] * 9
+    np.testing.assert_allclose(falling.values()["gain"], normal.values()["gain"], rtol=1e-3)
+    np.testing.assert_allclose(falling.newtons(inverse.raw), normal.newtons(session.raw), atol=0.02)
+
+
+MIXES = {
+    "crosstalk": lambda raw: 0.05 * (raw[:, 3] + raw[:, 5]),
+    "two at once": lambda raw: 0.5 * (raw[:, 1] + raw[:, 7]),
+    "bridged": lambda raw: raw[:, 3],
+}
+
+
+@pytest.mark.parametrize("mix", MIXES)
+def test_a_channel_that_no_place_explains_is_not_called_dead(skins, mix):
+    skin, session = skins("long")
+    noise = 0.05 * np.random.default_rng(1).standard_normal(len(session.time))
+    raw = session.raw.copy()
+    raw[:, 4] = MIXES[mix](raw) + noise
+    said = refused(skin, replace(session, raw=raw))
+    assert said.startswith("channel 4 responds, but not to the presses near its sensor: check the wiring")
+    assert "calibrate.broken=[4]" in said
+    bench = wired_bench(skin, replace(session, raw=raw), None, Confirmed(broken=[4]))
+    assert fit_calibration(bench).broken["dead"] == [4]
+
+
+@pytest.mark.parametrize("level", [0.05, 0.5])
+def test_noise_of_any_kind_is_dead(skins, level):
+    skin, session = skins("long")
+    rng, raw = np.random.default_rng(2), session.raw.copy()
+    raw[:, 4] = level * rng.standard_normal(len(raw))
+    raw[:, 7] = np.cumsum(0.2 * level * rng.standard_normal(len(raw)))
+    assert fit_calibration(wired_bench(skin, replace(session, raw=raw), None, Confirmed())).broken[
+        "dead"
+    ] == [4, 7]
+
+
+def test_a_weak_channel_is_not_dead(skins):
+    skin, session = skins("long")
+    rng, raw = np.random.default_rng(2), session.raw.copy()
+    raw[:, 4] = 0.03 * raw[:, 4] + 0.05 * rng.standard_normal(len(raw))
+    calibration = fit_calibration(wired_bench(skin, replace(session, raw=raw), None, Confirmed()))
+    assert calibration.broken["dead"] == []
+    assert calibration.sensors["gain"][4] < 0.05
+
+
+def test_few_presses_name_nothing(skins):
+    skin, _ = skins("long")
+    places = skin.sensors.positions[[0, 8], :2]
+    session = session_of(skin, np.concatenate([places, places + 0.001]))
+    wired_bench(skin, session, None, Confirmed())
+    mirrored = replace(session, gauge=in_frame(session.gauge, "mirror_y", skin.size))
+    said = refused(skin, mirrored)
+    assert "channels 0 and 8 respond, but not to the presses near their sensors: check the wiring" in said
+    assert "calibrate.places" not in said
+
+
+def test_sensors_out_of_place_by_some_millimetres_pass(skins):
+    skin, _ = skins("long")
+    moved = skin.replace(position_error=0.003)
+    wired_bench(skin, session_of(moved), None, Confirmed())
+
+
+@pytest.mark.parametrize(
+    ("confirmed", "reason"),
+    [
+        ({"places": "upside_down"}, "calibrate.places=upside_down must be 'as_given', 'mirror_x'"),
+        ({"channels": [0, 1]}, "calibrate.channels must hold each of 0 to 8 once"),
+        ({"channels": [0] * 9}, "calibrate.channels must hold each of 0 to 8 once"),
+        ({"broken": [9]}, "calibrate.broken takes sensors from 0 to 8, got 9"),
+    ],
+)
+def test_what_confirms_nothing_is_refused(skins, confirmed, reason):
+    skin, session = skins("long")
+    with pytest.raises(InputError) as caught:
+        wired_bench(skin, session, None, Confirmed(**confirmed))
+    assert reason in str(caught.value)
+
+
+def test_more_than_a_quarter_of_unusable_sensors_is_refused():
+    sensors = {"gain": [1.0] * 8}
+    check_usable(Calibration(sensors, {"dead": [1], "stuck": [2]}))
+    with pytest.raises(InputError, match=r"3 of 8 sensors would be unusable \(dead: 1 and 3; stuck: 2\)"):
+        check_usable(Calibration(sensors, {"dead": [1, 3], "stuck": [2]}))

@@ -1,0 +1,93 @@
+"""A live view of bytes in memory: decoder, tare, engine, loop and display, with the time as an argument."""
+
+from types import SimpleNamespace
+
+import numpy as np
+
+from skin.live.loop import Display, DisplayInfo, LiveLoop
+from skin.wire.channels import Tare
+from skin.wire.decoder import Decoder
+from skin.wire.reader import PortSettings, WireFeed
+from skin.wire.skin import SerialSource
+
+LOOK = 0.05  # s between two looks at the display
+
+
+class Look:
+    """What the display shows at ``t``, s."""
+
+    def __init__(self, t, state):
+        verdict = state.verdict
+        self.t, self.alarm, self.reason = t, state.alarm, state.reason
+        self.notes = [note.code for note in state.notes]
+        self.state = "unknown" if verdict is None else verdict.state
+        self.danger = True if state.alarm else None if verdict is None else verdict.danger
+        self.words = [] if verdict is None else [word for word, _ in verdict.words()]
+
+
+class MemoryView:
+    """A live view of a stream.
+
+    Args:
+        stream: (s of the host's clock, bytes that arrive then).
+        settings: of the engine.
+        before: called with the conversion before the first decision.
+        port: settings of the port.
+
+    Attributes:
+        looks: what the display shows, every ``LOOK`` s.
+        said: (s, verdict or None, reason, alarm) of everything that the observers are told.
+    """
+
+    def __init__(self, stream, settings, before=None, **port):
+        self.looks, self.said, self.now = [], [], 0.0
+        port = PortSettings(**port)
+        source = SerialSource(port, settings.sensors, settings.rate)
+        decoder = Decoder(settings.sensors, adapter=port.frames, polarity=source.polarity)
+        feed = WireFeed(SimpleNamespace, decoder, port.limits)  # opens a stream that nobody reads
+        skin = SimpleNamespace(stats=decoder.stats)
+        tare = Tare(source.convert, 2.0, settings.rate, lambda: decoder.header)
+        places = np.zeros((settings.sensors, 3))
+        self.display = Display(DisplayInfo("memory", "memory", places, (0.1, 0.1), 4.0))
+        self.display.observers.append(lambda *told: self.said.append((self.now, *told)))
+        self.loop = LiveLoop(skin, tare, settings.build(), self.display, before)
+        for arrival, data in stream:
+            self.look(arrival)
+            frames, self.now = feed.decode(data, arrival), arrival
+            skin.channels = feed.states()
+            if frames:
+                self.loop.take(frames, arrival)
+            self.loop.update_status(arrival)
+
+    def look(self, end):
+        """Look at the display until ``end``, s."""
+        while len(self.looks) * LOOK <= end:
+            t = len(self.looks) * LOOK
+            self.display.refresh(t)
+            self.looks.append(Look(t, self.display.state(now=t)))
+
+    def states(self, begin, end):
+        """Return the states that were shown between two times, s."""
+        return {look.state for look in self.looks if begin < look.t < end}
+
+    def notes(self, begin, end):
+        """Return the codes of the notes that were shown between two times, s."""
+        return {code for look in self.looks if begin < look.t < end for code in look.notes}
+
+    def first(self, after):
+        """Return when the first alarm was told, s."""
+        return next((t for t, _, _, alarm in self.said if alarm and t >= after), np.inf)
+
+    def kept(self, begin, end):
+        """Return whether the alarm was shown all the time."""
+        inside = [look.alarm for look in self.looks if begin < look.t < end]
+        return bool(inside) and all(inside)
+
+    def hidden(self, begin, end):
+        """Return the longest time, s, for which touches were shown as no touch, or as safe."""
+        spans, longest = 0, 0
+        for look in self.looks:
+            wrong = begin <= look.t < end and (look.state == "no touch" or look.danger is False)
+            spans = spans + 1 if wrong else 0
+            longest = max(longest, spans)
+        return longest * LOOK

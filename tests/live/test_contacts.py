@@ -1,0 +1,364 @@
+"""Contacts in the live view: what is said of them, and the process that estimates them."""
+
+import json
+import os
+import pickle
+import signal
+import subprocess
+import sys
+from contextlib import contextmanager
+from dataclasses import replace
+from time import monotonic, sleep
+
+import numpy as np
+import psutil
+import pytest
+
+from skin.body.base import Sheet
+from skin.body.layout import Grid
+from skin.device.resampling import Frame
+from skin.errors import InputError
+from skin.inference.candidates import disc_readings
+from skin.inference.noise import Noise
+from skin.live.contacts import (
+    PREPARING,
+    SPAN,
+    STALE,
+    LiveContacts,
+    MeanReadings,
+    Mechanics,
+    average_frames,
+    contact_message,
+    contact_text_lines,
+    estimate_contacts,
+    unknown_contacts,
+)
+from skin.live.engine import Detection, Engine, Verdict
+from skin.mechanics.simulator.naive import Naive
+from skin.mechanics.simulator.solid import Solid
+from skin.runs.build import build_device
+from skin.touch.labels import TOUCH
+from skin.wire.channels import UnitConversion
+
+PATIENCE = 100
+SENSORS = 9
+BODY = Sheet((0.06, 0.06), (12, 12), [{"material": "EcoFlex 00-30", "thickness": 0.02}])
+NOISE = Noise(0.05, gain=0.05)
+CONVERSION = UnitConversion(np.ones(SENSORS), np.zeros(SENSORS), np.zeros(SENSORS, dtype=bool))
+TOUCHED = Verdict(0.0, 0.0, {"dangerous": 0.1}, True, {}, False, False)
+TRUTH = np.array([[0.022, 0.035, 0.008]])
+
+
+PLACES = Grid(3, 3, (0.01, 0.01), depth=0.005).sensors(BODY)
+MECHANICS = Mechanics(Solid, BODY, PLACES, NOISE)
+
+
+@pytest.fixture(scope="module")
+def simulator():
+    return Solid(BODY, PLACES)
+
+
+@pytest.fixture(scope="module")
+def posterior():
+    return MECHANICS.posterior()
+
+
+@pytest.fixture(scope="module")
+def felt(simulator):
+    """Return the readings of a fingertip of 5 N."""
+    return 5 * disc_readings(simulator, BODY, TRUTH, 0.0015)[0]
+
+
+AGAIN = pytest.mark.slow("starts a process that imports anew, once more")
+
+
+@contextmanager
+def started():
+    """Return contacts whose process is started."""
+    contacts = LiveContacts()
+    contacts.start(MECHANICS, bool)
+    try:
+        yield contacts
+    finally:
+        contacts.close()
+
+
+@pytest.fixture(scope="module")
+def running():
+    """Return contacts whose process is ready; it takes seconds to begin."""
+    with started() as contacts:
+        assert contacts.state()["reason"] == PREPARING
+        yield contacts
+
+
+def frames(values, count=10, end=1.0, **changes):
+    """Return the frames of 0.1 s that end now."""
+    times = end - SPAN + (np.arange(count) + 1) * SPAN / count
+    valid = np.ones(SENSORS, dtype=bool)
+    return [
+        Frame(None, t, monotonic(), np.asarray(values, dtype=float), valid)._replace(**changes) for t in times
+    ]
+
+
+def moment(values, **changes):
+    """Return readings of now."""
+    valid, none = np.ones(SENSORS, dtype=bool), np.zeros(SENSORS, dtype=bool)
+    readings = MeanReadings(np.asarray(values, dtype=float), valid, none, 0.05, 10, 0.0, 1.0, monotonic())
+    return readings._replace(**changes)
+
+
+def state_of(contacts, wanted, values):
+    """Offer the same readings until the state is another one, and return it."""
+    deadline = monotonic() + PATIENCE
+    while (state := contacts.state())["state"] != wanted:
+        assert monotonic() < deadline, state
+        contacts.look(frames(values, end=monotonic()), CONVERSION, [TOUCHED], np.zeros(SENSORS))
+        sleep(0.02)
+    return state
+
+
+def test_the_message_says_where_and_how_hard(posterior, felt):
+    message = estimate_contacts(posterior, NOISE, moment(felt))
+    assert json.loads(json.dumps(message)) == message
+    assert (message["state"], message["number"], message["device_time"]) == ("contacts", 1, 1.0)
+    assert message["probability"] == message["probabilities"][1] > 0.9
+    (contact,) = message["contacts"]
+    assert np.hypot(contact["x"] - TRUTH[0, 0], contact["y"] - TRUTH[0, 1]) < 0.003
+    assert contact["force"] == pytest.approx(5, abs=3 * contact["force_deviation"])
+    assert contact["radius_deviation"] > 0
+    low, high = contact["peak_interval"]
+    assert low < contact["peak"] < high
+    region = contact["region"]
+    assert region["share"] == pytest.approx(0.9, abs=0.08)
+    assert min(region["cell"]) > 0.001
+    places = np.array(region["origin"]) + np.array(region["cells"]) * region["cell"]
+    assert (np.abs(places - TRUTH[0, :2]) <= np.array(region["cell"])).all(axis=1).any()
+    head, line = contact_text_lines(message)
+    assert head.startswith("1 contact (")
+    assert " N, " in line
+    assert line.endswith(" kPa")
+
+
+def test_an_untouched_skin_has_no_contact(posterior):
+    message = estimate_contacts(posterior, NOISE, moment(np.zeros(SENSORS)))
+    assert (message["state"], message["number"], message["contacts"]) == ("no contact", 0, [])
+    assert contact_text_lines(message)[0].startswith("no contact (")
+
+
+def test_few_sensors_that_feel_nothing_show_no_contact_but_a_light_touch():
+    """They cannot rule out a contact between them, which is no reason to show one."""
+    body, count = Sheet((0.15, 0.15), (24, 24), BODY.layers), 12
+    mechanics = Mechanics(Naive, body, Grid(3, 4).sensors(body), NOISE)
+    posterior, rng = mechanics.posterior(), np.random.default_rng(0)
+    # 0.3 N at the first sensor, which reads 0.1 N.
+    place = np.array([[0.0218, 0.025, 0.008]])
+    light = 0.3 * disc_readings(Naive(body, mechanics.sensors), body, place, 0.0015)[0]
+    works = {"valid": np.ones(count, dtype=bool), "saturated": np.zeros(count, dtype=bool)}
+    for _ in range(3):
+        noise = rng.normal(scale=NOISE.frame / 10**0.5, size=count)
+        idle, touched = (
+            estimate_contacts(posterior, NOISE, moment(noise + felt, **works)) for felt in (0.0, light)
+        )
+        assert (idle["state"], touched["state"]) == ("no contact", "contacts")
+        assert touched["probabilities"][0] < 0.1 < 0.8 < idle["probabilities"][0]
+
+
+@pytest.mark.parametrize("values", [np.full(SENSORS, 3.0), [0, 0, 0, 0, -3.0, 0, 0, 0, 0]])
+def test_what_no_fingertip_gives_is_none_and_not_no_contact(posterior, values):
+    message = estimate_contacts(posterior, NOISE, moment(values))
+    assert (message["state"], message["number"], message["probability"]) == ("not a fingertip", None, None)
+    assert contact_text_lines(message)[0].startswith("not a fingertip (fit ")
+
+
+def test_where_a_hard_touch_is_is_shown_though_no_fingertip_fits_it(posterior, felt):
+    """On many sensors, gains that differ by more than was assumed show only there, where they are large."""
+    estimate = replace(posterior.estimate(5 * felt), fingertip=False, fit=0.00213, large=0.3)
+    message = contact_message(estimate, 0.0)
+    assert (message["state"], message["number"], message["fit"]) == ("not a fingertip", None, 0.00213)
+    (best,) = message["contacts"]
+    assert np.hypot(best["x"] - TRUTH[0, 0], best["y"] - TRUTH[0, 1]) < 0.005
+    assert best["force"] == pytest.approx(25, rel=0.2)
+    head, line = contact_text_lines(message)
+    assert head == "not a fingertip (fit 0.0021, a larger contact 30 %)"
+    assert line.startswith("best: (")
+    assert " N, " in line
+
+
+def test_broken_sensors_do_not_look_like_no_contact(posterior, felt):
+    none = np.zeros(SENSORS, dtype=bool)
+    message = estimate_contacts(posterior, NOISE, moment(felt, valid=none))
+    assert message == unknown_contacts("no sensor has a valid reading")
+    few = none.copy()
+    few[4] = True
+    assert "1 valid sensor" in estimate_contacts(posterior, NOISE, moment(felt, valid=few))["reason"]
+    # The strongest sensor is at its limit: the force is more than it could say.
+    limited, strongest = np.minimum(felt, 0.3 * felt.max()), felt == felt.max()
+    clipped = estimate_contacts(posterior, NOISE, moment(limited, saturated=strongest))
+    assert clipped["state"] == "contacts"
+    assert clipped["contacts"][0]["force"] > 3
+
+
+def test_a_bad_estimate_is_unknown():
+    message = unknown_contacts("why")
+    assert set(message) == set(contact_fields())
+    assert (message["state"], message["number"], message["contacts"]) == ("unknown", None, [])
+    assert contact_text_lines(message) == ["contacts unknown: why"]
+
+
+def contact_fields():
+    return (
+        "state",
+        "reason",
+        "device_time",
+        "number",
+        "probability",
+        "probabilities",
+        "fit",
+        "large",
+        "contacts",
+    )
+
+
+def test_messages_of_every_state_have_the_same_fields(posterior, felt):
+    estimate = posterior.estimate(felt)
+    for changed in (
+        estimate,
+        replace(estimate, fingertip=False),
+        replace(estimate, number=0, contacts=(), fingertip=False, fit=1.0),
+    ):
+        assert set(contact_message(changed, 0.0)) == set(contact_fields())
+
+
+def test_readings_are_means_above_the_rest_of_the_sensors_that_work():
+    values = np.arange(SENSORS, dtype=float)
+    noise, rest, baseline = np.full(SENSORS, 0.2), np.full(SENSORS, -0.3), np.full(SENSORS, 0.1)
+    conversion = replace(CONVERSION, scale=np.full(SENSORS, 0.5), noise=noise, rest=rest)
+    sent = frames(values, saturated=np.arange(SENSORS) == 8)
+    sent[3] = sent[3]._replace(values=values + 10, valid=np.arange(SENSORS) != 7)
+    readings = average_frames(sent, conversion, (2,), baseline, True)
+    assert readings.values[[0, 8]] == pytest.approx([0.5 + 0.2, 4 + 0.5 + 0.2])
+    assert np.flatnonzero(~readings.valid).tolist() == [2, 7]
+    assert np.flatnonzero(readings.saturated).tolist() == [8]
+    assert (readings.frames, readings.step) == (10, 0.5)
+    assert readings.noise == pytest.approx(0.2)
+    assert average_frames(sent, CONVERSION, (), baseline, False).noise is None
+
+
+def test_the_process_estimates_what_is_left_for_it(running, posterior, felt):
+    state_of(running, "contacts", felt)
+    running._newest = moment(felt, time=-1.0)
+    running._wake.set()
+    deadline = monotonic() + PATIENCE
+    while (state := running.state())["device_time"] != -1.0:
+        assert monotonic() < deadline
+        sleep(0.001)
+    # The same bits as in this process, with whatever frame before.
+    assert state == estimate_contacts(posterior, NOISE, moment(felt, time=-1.0))
+    sleep(1.5 * STALE)
+    assert running.state()["state"] == "unknown"
+    assert state_of(running, "no contact", np.zeros(SENSORS))["number"] == 0
+
+
+def test_looking_never_waits_and_only_the_newest_counts(running, felt):
+    state_of(running, "contacts", felt)
+    os.kill(running._process.pid, signal.SIGSTOP)
+    longest = 0.0
+    for number in range(200):
+        began = monotonic()
+        end = 1e6 + 0.05 * number
+        running.look(frames(felt, end=end), CONVERSION, [TOUCHED], np.zeros(SENSORS))
+        longest = max(longest, monotonic() - began)
+        sleep(0.005)
+    assert longest < 5  # waiting for the stopped process would never end
+    assert running.state()["state"] == "unknown"
+    os.kill(running._process.pid, signal.SIGCONT)
+    deadline, times = monotonic() + PATIENCE, set()
+    while not any(t > 1e6 + 0.05 * 198.5 for t in times):
+        assert monotonic() < deadline, times
+        times.add(running._latest["device_time"])
+        sleep(0.002)
+    assert len([t for t in times if t > 1e6]) <= 3
+
+
+@pytest.mark.slow("starts a process that imports anew")
+def test_a_process_that_dies_is_said_and_stops_nothing(felt):
+    with started() as contacts:
+        state_of(contacts, "contacts", felt)
+        os.kill(contacts._process.pid, signal.SIGKILL)
+        deadline = monotonic() + PATIENCE
+        while "has ended" not in contacts.state()["reason"]:
+            assert monotonic() < deadline
+            contacts.look(frames(felt, end=monotonic()), CONVERSION, [TOUCHED], np.zeros(SENSORS))
+            sleep(0.01)
+        assert contacts.state()["state"] == "unknown"
+
+
+@pytest.mark.parametrize(
+    ("number", "wait"),
+    [
+        (signal.SIGKILL, 0.0),
+        pytest.param(signal.SIGTERM, 1.0, marks=AGAIN),
+        pytest.param(signal.SIGKILL, 4.0, marks=AGAIN),
+    ],
+)
+def test_the_process_ends_with_the_command_however_it_ends(tmp_path, number, wait):
+    (tmp_path / "mechanics").write_bytes(pickle.dumps(MECHANICS))
+    script = (
+        "import pickle, time; from skin.live.contacts import LiveContacts;"
+        "contacts = LiveContacts();"
+        "contacts.start(pickle.load(open('mechanics', 'rb')), bool);"
+        "print(contacts._process.pid, flush=True); time.sleep(600)"
+    )
+    begin = [sys.executable, "-c", script]
+    with subprocess.Popen(begin, cwd=tmp_path, stdout=subprocess.PIPE) as command:
+        child = psutil.Process(int(command.stdout.readline()))
+        sleep(wait)
+        assert child.is_running()
+        command.send_signal(number)
+    child.wait(PATIENCE)
+
+
+def test_the_process_does_not_hear_ctrl_c(running, felt):
+    state_of(running, "contacts", felt)
+    pid = running._process.pid
+    assert os.getpgid(pid) != os.getpgid(0)
+    os.kill(pid, signal.SIGINT)
+    sleep(0.2)
+    assert state_of(running, "no contact", np.zeros(SENSORS))
+
+
+def test_where_no_contacts_can_be_estimated_a_sentence_says_why(configured):
+    with pytest.raises(InputError, match="has no simulated skin: use run=any_skin"):
+        Mechanics.of(None, False)
+    device = build_device(configured("simulator=fem")).reference
+    with pytest.raises(InputError, match="equation 10 do not add up: use run=any_skin"):
+        Mechanics.of(device, False)
+    device = build_device(configured("simulator=naive", "device.gain_spread=[0.1,0.3]")).reference
+    assert Mechanics.of(device, False).noise.gain == pytest.approx(0.2)
+    assert Mechanics.of(device, True).noise.gain == pytest.approx(0.02)
+
+
+def test_verdicts_are_the_same_to_the_bit_with_contacts(running, felt):
+    """Each verdict comes from the same frames; contacts are asked for in between."""
+    rng = np.random.default_rng(0)
+    load = np.interp(np.arange(600) / 100, [1, 2, 4, 5], [0, 1, 1, 0])[:, None] * felt
+    valid = np.ones(SENSORS, dtype=bool)
+    stream = [
+        Frame(None, number / 100, 0.0, row, valid)
+        for number, row in enumerate(load + rng.normal(scale=0.02, size=load.shape))
+    ]
+
+    def classify(readings, valid):
+        return 1 / (1 + np.exp(-readings.sum(axis=(1, 2))[:, None] * np.linspace(-0.1, 0.1, 4)))
+
+    def watch(contacts):
+        engine, verdicts = Engine(classify, TOUCH, SENSORS, 30, 10.0, Detection(0.3)), []
+        for first in range(0, len(stream), 5):
+            verdicts += (fresh := engine.push(stream[first : first + 5], CONVERSION))
+            contacts.look(stream[first : first + 5], CONVERSION, fresh, engine.baseline)
+        return verdicts
+
+    alone, beside = watch(LiveContacts()), watch(running)
+    assert len(alone) > 100
+    assert alone == beside
+    assert any(verdict.touched for verdict in alone)

@@ -1,0 +1,302 @@
+"""The live view of an exported model: in a process of its own, without torch."""
+
+import json
+import os
+import re
+import socket
+import subprocess
+import sys
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import replace
+from threading import Event, Thread
+from time import monotonic, sleep
+
+import numpy as np
+import pytest
+
+from skin.core.files import ROOT
+from skin.errors import InputError
+from skin.evaluation.operating_point import OperatingPoint
+from skin.learning.network import Network
+from skin.live.engine import DebounceSettings
+from skin.live.engine_builder import LiveSettings, measured_rate, watch_exported
+from skin.runs.onnx_writer import write_model
+from skin.wire.protocol import Header, encode_header, encode_line
+from skin.wire.reader import PortSettings
+from skin.wire.skin import SerialSource
+
+pytest.importorskip("onnxruntime")
+RATE = 100.0  # Hz, of the device
+PATIENCE = 300  # s
+EXAMPLE = ROOT / "docs" / "examples" / "onnx_only.py"
+LIVE = LiveSettings(0, 4.0, None, 0.2, None, None, False, True, DebounceSettings())
+WATCH = """
+import sys
+from skin.__main__ import main
+try:
+    main(["live", *sys.argv[1:]])
+finally:
+    print("torch" in sys.modules, "mlflow" in sys.modules, file=sys.stderr)
+"""
+
+
+@pytest.fixture(scope="module")
+def trained(configured):
+    """Return a small untrained network with six sensors, whose alarm is above 0.25, and some touches."""
+    from skin.runs.build import build_data, build_device, build_learner
+    from skin.runs.torch_model import TorchModel
+
+    sizes = ["layout=grid", "layout.rows=2", "layout.columns=3", "data.gestures=100"]
+    config = configured("simulator=naive", *sizes, "representation=readings", "model=mlp", "fusion=early")
+    device, learner = build_device(config), build_learner(config)
+    assert isinstance(learner, Network)
+    data = build_data(config, device)
+    learner.build(data)
+    known = data.touches("train")
+    point = OperatingPoint(0.25, 0.02, 5000, 100, 0)
+    return TorchModel(device, learner, data.example, point, 0.3), known
+
+
+@pytest.fixture(scope="module")
+def model(trained, tmp_path_factory):
+    """Return the file of the network."""
+    of, known = trained
+    path = tmp_path_factory.mktemp("model") / "skin.onnx"
+    write_model(of.learner.pipeline(of.places), of.describe(), known, path)
+    return path
+
+
+@pytest.fixture
+def skin():
+    """Return the address of a skin of six sensors that is touched for one of five seconds, without end."""
+    stop = Event()
+
+    def serve():
+        rng, peer = np.random.default_rng(0), server.accept()[0]
+        peer.sendall(encode_header(Header(n=6, rate=RATE, unit="N")))
+        with peer, suppress(OSError):  # the reader has ended
+            for number in range(10**6):
+                touched = 3.0 * (number / RATE % 5.0 > 4.0)
+                values = rng.normal(touched, 0.02, size=6).round(4)
+                peer.sendall(encode_line(values, number, round(1e6 * number / RATE)))
+                if stop.wait(1 / RATE):
+                    return
+
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        server.settimeout(PATIENCE)
+        thread = Thread(target=serve)
+        thread.start()
+        yield f"socket://127.0.0.1:{server.getsockname()[1]}"
+        stop.set()
+        thread.join(PATIENCE)
+
+
+@pytest.mark.slow("starts a process that imports anew")
+def test_it_runs_without_torch_and_writes_json_lines(model, skin, tmp_path):
+    words = [f"run={model}", "device=serial", f"device.port={skin}", "device.tare=1", "live.verdicts=stdout"]
+    words += ["seconds=15", "live.log=alarms.jsonl", "live.selftest=false"]  # untrained
+    done = subprocess.run(
+        [sys.executable, "-c", WATCH, *words],
+        cwd=tmp_path,
+        env={"PYTHONPATH": str(ROOT), "PATH": ""},
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE,
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stderr.splitlines()[-1] == "False False"
+    lines = [json.loads(line) for line in done.stdout.splitlines()]
+    assert [line["number"] for line in lines] == list(range(lines[0]["number"], lines[-1]["number"] + 1))
+    said = [line for line in lines if not line["stale"]]
+    assert {line["touched"] for line in said} == {False, True}
+    assert set(said[-1]["probabilities"]) == {"big", "dynamic", "press", "dangerous"}
+    logged = [json.loads(line)["event"] for line in (tmp_path / "alarms.jsonl").read_text().splitlines()]
+    assert logged[0] == "started"
+    assert "alarm" in logged
+    assert logged[-1] == "ended"
+
+
+def test_only_a_skin_at_a_port_is_watched(model):
+    with pytest.raises(InputError, match="add device=serial"), ExitStack() as opened:
+        watch_exported(str(model), {"seed": 0}, print, opened)
+
+
+@pytest.fixture(scope="module", params=[None, {"20": 0.3, "100": 0.35, "500": 0.4}], ids=["one", "rates"])
+def with_thresholds(request, trained, tmp_path_factory):
+    """Return the file of a network with thresholds for rates or without, and the one at 100 Hz."""
+    of, touches = trained
+    path = tmp_path_factory.mktemp("thresholds") / "skin.onnx"
+    write_model(of.learner.pipeline(of.places), of.describe(request.param), touches, path)
+    return path, (request.param or {"100": 0.25})["100"]
+
+
+def test_the_settings_of_the_file_and_of_the_command(with_thresholds, skin):
+    """The threshold is the one for the rate of the device, which sends 100 frames a second."""
+    path, threshold = with_thresholds
+    said = []
+    with ExitStack() as opened:
+        device = {"port": skin, "labels": "announced"}
+        setup = watch_exported(str(path), device, said.append, opened)
+        assert not any("alarm above" in text for text in said)  # the views open before
+        watched = setup.watch(LIVE, said.append)
+    assert (watched.model.title, len(watched.model.positions)) == ("untrained", 6)
+    assert (setup.model.title, setup.name) == ("untrained", watched.source.name)
+    assert said[-1] == f"alarm above {threshold:.4f}"
+    assert ("single windows" in said[-2]) == (threshold == 0.25)
+    assert watched.nominal.presses.shape == (6, 6)
+    assert (watched.nominal.presses.argmax(axis=1) == np.arange(6)).all()
+
+
+@pytest.mark.parametrize("at_once", [1, 25])
+def test_the_rate_of_a_device_is_that_of_its_arrivals_until_its_clock_is_known(at_once):
+    """A clock in ms without a header counts as one in us at first: 100 Hz would be 100,000 Hz."""
+
+    def serve():
+        peer, begin = server.accept()[0], monotonic()
+        with peer, suppress(OSError):  # the reader has ended
+            for number in range(10**6):
+                peer.sendall(
+                    f"{number},{1000 + 10 * number},{','.join(['100', '101', '99'] * 3)}\r\n".encode()
+                )
+                if (number + 1) % at_once == 0:
+                    sleep(max(0.0, begin + (number + 1) / RATE - monotonic()))
+
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        Thread(target=serve, daemon=True).start()
+        settings = PortSettings(port=f"socket://127.0.0.1:{server.getsockname()[1]}")
+        with SerialSource(settings, 9, 10.0).open_source().skin as skin:
+            assert measured_rate(skin) == pytest.approx(RATE, rel=0.3)
+
+
+def test_no_frame_that_waited_while_the_threshold_was_chosen_is_judged(model, skin):
+    """The first verdicts would tell of touches of some seconds ago, and those of now would be late."""
+    with ExitStack() as opened:
+        setup = watch_exported(str(model), {"port": skin}, print, opened)
+        sleep(1.5)
+        watched = setup.watch(LIVE, print)
+        (frame,) = watched.source.skin.read(1)
+        assert monotonic() - frame.t_host < 0.5
+
+
+def test_the_command_replaces_settings_of_the_file(model, skin):
+    said, other = [], replace(LIVE, touch=0.5, patience=DebounceSettings(above=0.75))
+    with ExitStack() as opened:
+        watched = watch_exported(str(model), {"port": skin}, said.append, opened).watch(other, said.append)
+    assert said[-1] == "alarm above 0.75"
+    assert (watched.settings.detection.threshold, watched.nominal.detection.threshold) == (0.5, 0.3)
+
+
+@pytest.mark.slow("starts a process that imports anew")
+def test_the_example_without_this_package(model, begin, tmp_path):
+    sizes = ["layout=grid", "layout.rows=2", "layout.columns=3"]
+    with begin(tmp_path, "emulate", "simulator=naive", *sizes, "link=skin", "emulate.idle=4") as emulator:
+        while "device.scale=" not in emulator.out:
+            assert emulator.poll() is None, emulator.err
+        scale = emulator.out.partition("device.scale=")[2].split()[0]
+        with subprocess.Popen(
+            [sys.executable, "-I", EXAMPLE, model, tmp_path / "skin", scale],
+            stdout=subprocess.PIPE,
+            text=True,
+            cwd=tmp_path,
+        ) as reader:
+            lines = [json.loads(reader.stdout.readline()) for _ in range(100)]
+            reader.terminate()
+    assert {line["touched"] for line in lines} == {False, True}
+    assert all(0 <= line[name] <= 1 for line in lines for name in ("big", "dynamic", "press", "dangerous"))
+    assert all(line["alarm"] == (line["touched"] and line["dangerous"] > 0.25) for line in lines)
+
+
+@contextmanager
+def board(line):
+    """Yield the port of a board that sends ``line(number)`` without end."""
+    tty = pytest.importorskip("tty", reason="pseudo-terminals need a POSIX system")
+    controller, follower = os.openpty()
+    tty.setraw(controller)
+    stop = Event()
+
+    def send():
+        for number in range(10**6):
+            os.write(controller, line(number))
+            if stop.wait(0.002):
+                return
+
+    thread = Thread(target=send)
+    thread.start()
+    yield os.ttyname(follower)
+    stop.set()
+    thread.join(PATIENCE)
+    os.close(controller)
+    os.close(follower)
+
+
+@contextmanager
+def example(model, port, *files):
+    """Yield the example as a process that reads the port."""
+    line = [sys.executable, "-I", EXAMPLE, model, port, *files]
+    with subprocess.Popen(line, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as reader:
+        yield reader
+        reader.kill()
+
+
+ADAPTER = """
+kind: text
+separator: ;
+decimal: ","
+names: [ms, a, b, c, d, e, f, heat]
+drop: [heat]
+time: ms
+time_unit: ms
+invalid: ["off"]
+"""
+GAINS = """
+format: 1
+count: 6
+scale: 0.01
+polarity: -1
+channels: [1, 0, 2, 3, 4, 5]
+sensors: {gain: [0.05, 0.05, 0.05, 0.05, null, 0.05]}
+broken: {dead: [2]}
+"""
+
+
+def test_the_example_reads_an_adapter_and_a_calibration(model, tmp_path):
+    """A touch of 10 counts is 2 N, and 0.1 N without the gains; one of the broken sensor is none."""
+    (tmp_path / "board.yaml").write_text(ADAPTER)
+    (tmp_path / "gains.yaml").write_text(GAINS)
+
+    def line(number):
+        if number % 20 == 7:
+            return b"what is this\n"
+        phase = number % 1000
+        values = [500, 500, 500 - 500 * (250 <= phase < 500), 500, 500, 500 - 10 * (phase >= 500)]
+        words = [50 * number, *(f"{value},0" for value in values), "21,5"]
+        words[5] = "off" if number % 3 else words[5]
+        return ";".join(map(str, words)).encode() + b"\r\n"
+
+    with (
+        board(line) as port,
+        example(model, port, tmp_path / "gains.yaml", tmp_path / "board.yaml") as reader,
+    ):
+        said = [json.loads(reader.stdout.readline()) for _ in range(600)]
+        # 1.2 cycles from any phase on: half a cycle and the window behind it, and a fifth; the broken sensor
+        # would add a quarter.
+        assert 250 < sum(one["touched"] for one in said) < 400
+        assert re.match(r"[1-9] of 50 lines cannot be read: ", reader.stderr.readline())
+
+
+@pytest.mark.parametrize(
+    ("setting", "said"),
+    [
+        ("kind: json", "device.adapter.kind=json: this example reads text; use skin live\n"),
+        ("kind: text\nlabel: ':'", "device.adapter.label: this example reads only"),
+        ("kind: text\ndecimal: ','", r"\d+ of 50 lines cannot be read: .*; give an adapter"),
+    ],
+)
+def test_what_the_example_cannot_read_it_refuses_in_a_sentence(model, tmp_path, setting, said):
+    (tmp_path / "board.yaml").write_text(setting)
+    with (
+        board(lambda number: b"%d,1,2,3,4,5,6\n" % number) as port,
+        example(model, port, "0.01", tmp_path / "board.yaml") as reader,
+    ):
+        assert re.match(said, reader.stderr.read())
+        assert reader.wait() == 2

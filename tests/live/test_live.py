@@ -1,0 +1,193 @@
+"""The command, with an emulated skin before it and a browser behind it."""
+
+import json
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+from contextlib import ExitStack, suppress
+from threading import Event, Thread
+from time import monotonic, sleep
+
+import numpy as np
+import pytest
+
+from skin.core.files import ROOT
+from skin.wire.protocol import Header, encode_header, encode_line
+
+SMALL = [
+    "experiment=rules",
+    "simulator=naive",
+    "data.gestures=1000",
+    "device.test_gestures=96",
+    "evaluation.devices=1",
+    "evaluation.layouts=1",
+    "evaluation.safe_gestures=64",
+]
+PATIENCE = 240  # s, on a machine that is busy with other things
+
+WATCH = """
+window.log = [];
+const note = () => log.push([document.body.dataset.state, document.getElementById("head").textContent,
+                             getComputedStyle(document.body).backgroundColor]);
+new MutationObserver(note).observe(document.getElementById("head"), {childList: true, subtree: true});
+note();
+"""
+
+
+def until(found, process, what):
+    """Wait until a function gives something true, and return it."""
+    deadline = monotonic() + PATIENCE
+    while monotonic() < deadline:
+        assert process.poll() is None, f"ended while waiting for {what}"
+        if result := found():
+            return result
+        sleep(0.2)
+    raise AssertionError(f"waited in vain for {what}")
+
+
+@pytest.fixture(scope="module")
+def store(run, tmp_path_factory):
+    """The overrides that lead to a store with one run of rules."""
+    folder = tmp_path_factory.mktemp("live")
+    own = [f"tracking.uri=sqlite:///{folder}/m.db", f"tracking.artifacts={folder}/a"]
+    done = run(folder, "train.py", *SMALL)
+    assert done.returncode == 0, done.stderr
+    return own
+
+
+@pytest.mark.slow("starts a live view and a browser")
+def test_a_dangerous_press_turns_the_page_red_and_a_replugged_skin_heals_it(begin, store, browser, tmp_path):
+    link = tmp_path / "skin"
+    faults = ["faults.unplug=[10]", "faults.away=2"]
+    pace = ["emulate.rate=50", "emulate.gap=1.5"]
+    with ExitStack() as both:
+        emulator = both.enter_context(
+            begin(tmp_path, "emulate", "simulator=naive", f"link={link}", *pace, *faults)
+        )
+        scale = until(lambda: re.search(r"device\.scale=(\S+)\n", emulator.out), emulator, "the port")[1]
+        reader = ["device=serial", f"device.port={link}", f"device.scale={scale}", "device.backoff=[0.2,0.5]"]
+        live = both.enter_context(begin(tmp_path, "live.py", *reader, "web=true", "live.web_port=0", *store))
+        page = until(lambda: re.search(r"page: (http\S+)", live.err), live, "the page")[1]
+        browser.open(page)
+        browser.run(WATCH)
+        log = lambda: browser.run("return log")  # noqa: E731
+        red = until(lambda: [entry for entry in log() if entry[0] == "danger"], live, "an alarm")
+        assert "DANGEROUS" in red[0][1]
+        assert red[-1][2] == "rgb(163, 13, 29)"
+        away = until(
+            lambda: [n for n, entry in enumerate(log()) if "unplugged" in entry[1]], live, "unplugging"
+        )
+        # An alarm stays while the skin is away.
+        assert log()[away[0]][0] in ("unknown", "danger")
+        after = lambda: [entry[0] for entry in log()[away[0] :] if "unplugged" not in entry[1]]  # noqa: E731
+        healed = lambda: {*after()} & {"idle", "touch", "danger"}  # noqa: E731
+        until(healed, live, "healing")
+        assert browser.run("return pictures") > 20
+        line = lambda: browser.run("return document.getElementById('line').textContent")  # noqa: E731
+        until(lambda: "1 reconnected" in line(), live, "the line")  # it is updated twice a second
+        live.send_signal(signal.SIGINT)
+        assert live.wait(60) == 0, live.err
+    assert '"alarm": true' in live.out
+    assert "unplugged" in live.out
+    assert "Traceback" not in live.err
+    assert re.search(r"gesture \d+: .*(?<!not )dangerous", emulator.out), emulator.out
+
+
+@pytest.mark.slow("starts a live view of the simulator")
+def test_the_simulator_is_watched_without_hardware(run, store, tmp_path):
+    live = run(tmp_path, "live.py", "seconds=5", *store, store=False)
+    assert live.returncode == 0, live.stderr
+    assert re.search(r"\d+ verdicts, 10\.0 Hz", live.stderr)
+    assert json.loads(live.stdout.splitlines()[0])["event"] == "started"
+
+
+@pytest.mark.parametrize(
+    ("override", "needed"),
+    [
+        ("live.patience.alarm=0.2", "must be less than or equal to 0.1"),
+        ("run=none", "no finished training run none"),
+    ],
+)
+def test_bad_input_is_one_sentence(run, tmp_path, override, needed):
+    done = run(tmp_path, "live.py", override)
+    assert done.returncode == 2
+    assert needed in done.stderr
+    assert done.stderr.count("\n") == 1
+
+
+@pytest.mark.slow("waits for a skin to come back")
+def test_a_skin_that_lost_its_power_is_found_again(begin, store, tmp_path):
+    peers, stop = [], Event()
+
+    def serve():
+        """Send for three seconds and fall silent without closing; send on in the next connection."""
+        rng = np.random.default_rng(0)
+        for frames in (300, 10**6):
+            peers.append(server.accept()[0])
+            peers[-1].sendall(encode_header(Header(n=25, rate=100.0, unit="N")))
+            for number in range(frames):
+                values = rng.normal(scale=0.02, size=25).round(4)
+                with suppress(OSError):  # live.py has ended
+                    peers[-1].sendall(encode_line(values, number, 10_000 * number))
+                if stop.wait(0.01):
+                    return
+
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        server.settimeout(PATIENCE)
+        thread = Thread(target=serve, daemon=True)
+        thread.start()
+        port = f"device.port=socket://127.0.0.1:{server.getsockname()[1]}"
+        reader = ["device=serial", port, "device.silence=3", "device.backoff=[0.2,0.5]", "device.tare=1"]
+        try:
+            with begin(tmp_path, "live.py", *reader, *store) as live:
+                until(lambda: "stopped sending" in live.out, live, "silence")
+                after = lambda: live.out.rpartition("stopped sending")[2]  # noqa: E731
+                until(lambda: "no touch" in after(), live, "a verdict")
+                live.send_signal(signal.SIGINT)
+                assert live.wait(60) == 0
+        finally:
+            stop.set()
+            thread.join(60)
+            for peer in peers:
+                peer.close()
+    assert "Traceback" not in live.err
+    assert "1 reconnected" in live.err
+
+
+COLLECTING = """
+import gc, runpy, sys, time
+from skin.live.loop import LiveLoop
+
+def take(loop, frames, now, take=LiveLoop.take):
+    take(loop, frames, now)
+    began = time.perf_counter()
+    gc.collect()
+    pauses.append(time.perf_counter() - began)
+
+pauses, LiveLoop.take = [], take
+try:
+    runpy.run_module("skin", run_name="__main__")
+finally:
+    print(len(pauses), sorted(pauses)[len(pauses) // 2], file=sys.stderr)
+"""
+
+
+@pytest.mark.slow("imports all libraries anew and waits")
+def test_a_search_for_garbage_does_not_delay_a_verdict(tmp_path):
+    """Among all that torch loads it takes 0.3 s, every few seconds."""
+    settings = ["run=any_skin", "seconds=3", "live.patience.above=0.5", "live.contacts=false"]
+    done = subprocess.run(
+        [sys.executable, "-c", COLLECTING, "live", *settings, f"tracking.uri=sqlite:///{tmp_path}/m.db"],
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    count, pause = done.stderr.split()[-2:]
+    assert int(count) > 10
+    assert float(pause) < 0.05

@@ -1,0 +1,340 @@
+"""Streams of boards that restart, freeze, break or come in bursts: no dangerous touch is hidden or late."""
+
+import socket
+from contextlib import nullcontext, suppress
+from dataclasses import replace
+from threading import Event, Thread
+from time import monotonic, sleep
+
+import numpy as np
+import pytest
+import torch
+
+from skin.errors import InputError
+from skin.live.engine import DebounceSettings, Detection, EngineSettings
+from skin.live.engine_builder import SelfTest
+from skin.live.loop import STALE, Display, DisplayInfo, LiveLoop
+from skin.runs.torch_model import window_classifier
+from skin.touch.labels import TOUCH
+from skin.wire.channels import RawRange, UnitConversion
+from skin.wire.protocol import Header, encode_header, encode_line
+from skin.wire.reader import PortSettings
+from skin.wire.skin import SerialSource
+from tests.live.memory_view import MemoryView
+
+RATE, SENSORS = 100, 9
+HEADER = encode_header(Header(n=SENSORS, rate=RATE, unit="N"))
+COUNTS = encode_header(Header(n=SENSORS, rate=RATE, unit="adc", bits=10))
+SCALE = 0.02  # N per count
+
+
+class Loud:
+    """A touch is dangerous where a reading exceeds 4 N."""
+
+    def probabilities(self, touches):
+        danger = (touches.readings.flatten(1).amax(1) > 4).float()
+        return torch.stack([danger] * 4, dim=1)
+
+
+def settings(**changes):
+    classify = window_classifier(Loud(), torch.zeros(SENSORS, 3), 10.0)
+    shape = SENSORS, 30, 10.0
+    presses = 5.0 * np.eye(SENSORS)
+    return EngineSettings(classify, TOUCH, *shape, Detection(0.3), DebounceSettings(), presses)
+
+
+def force(seconds, *touches):
+    """Return readings (F, S), N, with noise; touches are (begin s, end s, sensor, N)."""
+    values = np.random.default_rng(0).normal(scale=0.02, size=(round(seconds * RATE), SENSORS))
+    for begin, end, sensor, newtons in touches:
+        values[round(begin * RATE) : round(end * RATE), sensor] += newtons
+    return values
+
+
+def lines(values, restart=None, header=HEADER, encode=lambda row: row.round(4)):
+    """Yield the bytes of each frame; the device restarts every ``restart`` s, with its counter and clock."""
+    every = len(values) if restart is None else round(restart * RATE)
+    for number, row in enumerate(values):
+        first = number % every
+        data = b"" if first else header
+        yield data + encode_line(encode(row), first, 10_000 * first)
+
+
+def arriving(stream, each=1):
+    """Yield (s, bytes) of the bytes of frames, some at a time; a number is a pause, s."""
+    now, waiting, number = 0.0, b"", 0
+    for data in stream:
+        if isinstance(data, float):
+            now += data
+            continue
+        number, waiting, now = number + 1, waiting + data, now + 1 / RATE
+        if number % each == 0:
+            yield now, waiting
+            waiting = b""
+
+
+def watch(stream, each=1, before=None, **port):
+    """Return the live view of the bytes of frames."""
+    return MemoryView(arriving(stream, each), settings(), before, **port)
+
+
+def served(stream):
+    """Return what the observers of a live view of a socket are told, as (verdict, reason, alarm)."""
+    told, opened = [], Event()
+    server = socket.create_server(("127.0.0.1", 0))
+
+    def serve():
+        client, _ = server.accept()
+        opened.wait(20)
+        begin = monotonic()
+        with client, suppress(ConnectionError):  # the live view may end first
+            for now, data in arriving(stream):
+                sleep(max(0.0, begin + now - monotonic()))
+                client.sendall(data)
+
+    thread = Thread(target=serve, daemon=True)
+    thread.start()
+    port = f"socket://127.0.0.1:{server.getsockname()[1]}"
+    source = SerialSource(PortSettings(port=port, timeout=10.0), SENSORS, 10.0)
+    skin, _ = source.open()
+    opened.set()
+    display = Display(DisplayInfo("loud", port, np.zeros((SENSORS, 3)), (0.1, 0.1), 4.0))
+    display.observers.append(lambda *state: told.append(state))
+    with skin, server:
+        LiveLoop(skin, source.tare(skin), settings().build(), display).run()
+        thread.join(20)
+    return told
+
+
+LATE = 0.02  # s: a frame, and the interval between decisions is in the limits
+
+
+def test_a_press_is_found_though_the_device_restarts_every_two_and_a_half_seconds():
+    seen = watch(lines(force(22, (8, 18, 4, 6.0)), restart=2.5))
+    assert seen.first(4) <= 8 + 0.5 + LATE
+    assert seen.kept(8 + 0.5 + LATE, 18)
+    assert seen.first(4) >= 8
+
+
+def test_a_tap_after_a_restart_is_found():
+    seen = watch(lines(force(12, (7.8, 7.9, 4, 6.0)), restart=2.5))
+    assert 7.8 <= seen.first(3) <= 7.8 + 0.3 + LATE
+
+
+def test_frozen_readings_are_unknown():
+    values = force(24)
+    values[600:2100] = values[600]
+    seen = watch(lines(values))
+    assert seen.states(3, 6) == {"no touch"}
+    assert seen.states(11 + LATE, 21) == {"unknown"}
+    assert seen.states(22.5, 24) == {"no touch"}
+
+
+def test_a_channel_at_its_limit_is_not_tared():
+    """All at the limit: there is no baseline. One: its place is unknown, and a press on others is found."""
+    counts = lambda row: np.clip(np.round(200 + row / SCALE), 0, 1023).astype(int)  # noqa: E731
+    full = np.full((600, SENSORS), 1023.0)
+    seen = watch(lines(full, header=COUNTS, encode=lambda row: row.astype(int)), scale=SCALE)
+    assert {reason for _, _, reason, _ in seen.said} >= {
+        "no baseline: all channels at the limit or without a value"
+    }
+    assert seen.states(0, 6) == {"unknown"}
+    values = force(12, (6, 7, 4, 6.0))
+    values[:, 2] = 50.0
+    seen = watch(lines(values, header=COUNTS, encode=counts), scale=SCALE)
+    assert seen.states(4, 5.9) == {"unknown"}
+    assert {verdict.unknown for at, verdict, _, _ in seen.said if verdict and at > 4} == {(2,)}
+    assert "channel 2 at the limit" in seen.loop.line
+    assert 6 <= seen.first(3) <= 6.5 + LATE
+
+
+@pytest.mark.parametrize("broken", [-20.0, -1.5])
+def test_a_broken_wire_does_not_clear_the_alarm(broken):
+    values = force(24, (6, 14, 7, 6.0), (20, 21, 7, 6.0))
+    values[900:1500, 7] = broken
+    seen = watch(lines(values))
+    assert seen.first(3) <= 6.5 + LATE
+    assert seen.kept(6.5 + LATE, 14)
+    assert "no touch" not in seen.states(6.2 + LATE, 15)
+    assert not seen.kept(19, 20)
+    assert 20 <= seen.first(19.5) <= 20.5 + LATE
+
+
+def test_values_that_fall_with_force_are_unknown_and_told():
+    values = force(12, (6, 8, 4, -6.0), (6, 8, 5, -3.0))
+    seen = watch(lines(values))
+    assert seen.states(6.2, 7.95) == {"unknown"}
+    verdict = next(verdict for at, verdict, _, _ in seen.said if verdict and at > 7)
+    assert "device.scale" in verdict.notes[0].text
+
+
+def test_bursts_without_a_clock_are_decided_like_single_frames():
+    """A radio bridge: only values, in bursts. The delay of delivery is all that is added."""
+    rows = force(8, (6, 7, 4, 6.0))
+    stream = [(",".join(f"{value:.4f}" for value in row) + "\n").encode() for row in rows]
+    for burst in (0.25, 0.5, 1.0):
+        seen = watch(stream, each=round(burst * RATE), scale=1.0)
+        assert 6 <= seen.first(3) <= 6 + burst + 0.1 + 0.25
+        assert "no touch" in seen.states(4, 6)
+        assert not seen.kept(3, 6)
+
+
+def test_silence_is_unknown_after_a_second_and_a_half():
+    told = served([*lines(force(4)), 3.0, *lines(force(1))])
+    silent = [verdict for verdict, reason, _ in told if "stopped sending" in reason]
+    assert silent
+    assert all(verdict is None for verdict in silent)
+
+
+def test_what_came_before_a_silence_is_no_verdict_of_now():
+    """A press of the last two frames, which nothing has decided: its alarm is kept, and is stale."""
+    seen = watch([*lines(force(4.03, (4.01, 4.03, 4, 6.0))), STALE + 1, *lines(force(6, (0, 1, 4, 6.0)))])
+    assert all(t - verdict.t_host < STALE for t, verdict, _, _ in seen.said if verdict)
+    told = [(verdict, on) for _, verdict, reason, on in seen.said if "1.5 s old" in reason]
+    assert told == [(None, True)]
+    assert seen.states(4.8, 6.5) == {"unknown"}
+    assert seen.kept(6.6, 7.5)
+
+
+def test_an_alarm_of_frames_that_came_late_is_shown_as_long_as_others():
+    """The touch was over before anybody could see it."""
+    values = force(12, (5, 5.5, 4, 6.0))
+    stream = [(data, n / RATE) for n, data in enumerate(lines(values))]
+    late = ((max(t, 8.5) if t > 4.9 else t, data) for data, t in stream)
+    seen = MemoryView(late, settings())
+    assert seen.first(4) == 8.5
+    assert seen.kept(8.5, 10.45)
+    during = [look for look in seen.looks if 8.6 < look.t < 10.4]
+    assert {look.danger for look in during} == {True}
+    assert "safe" not in {word for look in during for word in look.words}
+    assert not seen.kept(10.6, 12)
+
+
+def test_a_touch_is_never_shown_as_no_touch():
+    """Not even before it has lasted long enough for its labels."""
+    seen = watch(lines(force(12, (6, 8, 4, 2.0))))
+    touching = [verdict.state for _, verdict, _, _ in seen.said if verdict and verdict.contact is not None]
+    assert set(touching) == {"touch"}
+
+
+@pytest.mark.parametrize("dead", [2, 3])
+def test_sensors_that_prove_dead_after_the_self_test_are_counted(dead):
+    """More than a quarter of nine: refused, after the five seconds that show it."""
+    values = force(12)
+    values[:, :dead] = 0.0
+    refused = pytest.raises(InputError, match=r"sensors 0, 1, 2 .* dead, more than 2 of 9.*selftest=false")
+    with refused if dead > 2 else nullcontext():
+        watch(lines(values), before=lambda conversion: (2, None))
+
+
+def test_sensors_that_break_later_end_no_live_view():
+    values = force(15)
+    values[700:, :6] = values[700, :6]
+    seen = watch(lines(values), before=lambda conversion: (2, None))
+    assert seen.states(13, 15) == {"unknown"}
+
+
+class TestSelfTest:
+    """The settings of a live view against simulated presses."""
+
+    COUNTED = RawRange(0.0, 1023.0, True, (None, 1023.0))
+
+    def run(self, used=None, conversion=None, device=COUNTED, nominal=None):
+        nominal = nominal or settings()
+        conversion = conversion or UnitConversion(
+            np.full(SENSORS, SCALE), np.full(SENSORS, 200.0), np.zeros(SENSORS, bool)
+        )
+        said = []
+        SelfTest(4.0 * np.eye(SENSORS), used or nominal, nominal).run(conversion, device, said.append)
+        return said
+
+    def test_nominal_settings_pass(self):
+        assert self.run() == [
+            "self-test: 14 of 14 dangerous presses raise the alarm, 14 with nominal settings; only its range "
+            "tests the scale"
+        ]
+        assert "its scale is not checked" in self.run(device=RawRange())[0]
+
+    @pytest.mark.parametrize(
+        ("change", "named"),
+        [
+            (lambda s: replace_detection(s, threshold=1000.0), "live.touch"),
+            (lambda s: replace_detection(s, drift=1e9 / 600), "live.drift"),
+            (lambda s: replace_patience(s, above=0.9999999), None),
+        ],
+    )
+    def test_settings_that_blind_are_named(self, change, named):
+        used = change(settings())
+        if named is None:
+            self.run(used)
+        else:
+            with pytest.raises(InputError, match=rf"{named} is most likely wrong.*live\.selftest=false"):
+                self.run(used)
+
+    def test_a_threshold_that_only_strong_touches_exceed_is_named(self):
+        """A network is nearly certain of touches far above the limit, and less so of those just above it."""
+
+        class Soft(Loud):
+            def probabilities(self, touches):
+                danger = torch.sigmoid(8 * (touches.readings.flatten(1).amax(1) - 4))
+                return torch.stack([danger] * 4, dim=1)
+
+        classify = window_classifier(Soft(), torch.zeros(SENSORS, 3), 10.0)
+        nominal = replace(settings(), classify=classify)
+        for above in (0.1, 0.99):
+            self.run(replace_patience(nominal, above=above), nominal=nominal)
+        with pytest.raises(InputError, match=r"0 of 14 .* 14 with .* live\.patience\.above=0\.9999 is most"):
+            self.run(replace_patience(nominal, above=0.9999), nominal=nominal)
+
+    def test_a_model_that_finds_less_than_half_of_the_presses_is_refused(self):
+        felt = np.where(np.arange(SENSORS) < SENSORS // 3, 4.0, 1e-3)
+        conversion = UnitConversion(np.full(SENSORS, SCALE), np.full(SENSORS, 200.0), np.zeros(SENSORS, bool))
+        test = SelfTest(np.diag(felt), settings(), settings())
+        with pytest.raises(InputError, match="even with nominal settings: train another run"):
+            test.run(conversion, self.COUNTED, print)
+
+    @pytest.mark.parametrize("scale", [1e-9, 1e-300, 1e9, 0.02 / 1e6])
+    def test_a_scale_that_blinds_is_named(self, scale, monkeypatch):
+        monkeypatch.setattr("skin.live.engine_builder._SLOWLY", 1)  # slow presses take most of the time
+        conversion = UnitConversion(np.full(SENSORS, scale), np.full(SENSORS, 200.0), np.zeros(SENSORS, bool))
+        with pytest.raises(InputError, match=r"device\.scale or device\.calibration is most likely"):
+            self.run(conversion=conversion)
+
+    def test_one_sensor_that_can_never_alarm_is_named(self):
+        scale = np.full(SENSORS, SCALE)
+        scale[3] = 1e-9
+        conversion = UnitConversion(scale, np.full(SENSORS, 200.0), np.zeros(SENSORS, bool))
+        with pytest.raises(InputError, match="sensor 3 cannot raise it"):
+            self.run(conversion=conversion)
+
+    def test_masked_sensors_are_counted(self):
+        broken = np.arange(SENSORS) < 3
+        conversion = UnitConversion(np.full(SENSORS, SCALE), np.full(SENSORS, 200.0), broken)
+        with pytest.raises(InputError, match=r"9 of 14 .* the mask of broken sensors"):
+            self.run(conversion=conversion)
+
+    def test_sensors_that_are_really_dead_are_counted(self):
+        conversion = UnitConversion(np.full(SENSORS, SCALE), np.full(SENSORS, 200.0), np.arange(SENSORS) < 3)
+        with pytest.raises(
+            InputError, match=r"3 of 9 sensors have no valid reading .*: they are dead, or the"
+        ):
+            self.run(conversion=conversion)
+
+    def test_one_dead_sensor_of_nine_is_no_reason_to_stop(self):
+        """Its place is shown as unknown."""
+        broken = np.arange(SENSORS) == 4
+        conversion = UnitConversion(np.full(SENSORS, SCALE), np.full(SENSORS, 200.0), broken)
+        assert "not on sensor 4" in self.run(conversion=conversion)[0]
+
+    def test_a_model_that_finds_nothing_is_refused(self):
+        nominal = replace_detection(settings(), threshold=1e308)
+        with pytest.raises(InputError, match="the contact threshold of the model"):
+            self.run(nominal=nominal)
+
+
+def replace_detection(of, **changes):
+    return replace(of, detection=replace(of.detection, **changes))
+
+
+def replace_patience(of, **changes):
+    return replace(of, patience=replace(of.patience, **changes))

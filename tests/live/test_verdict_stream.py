@@ -1,0 +1,254 @@
+"""JSON lines: what they say, who gets them, and what happens to a reader that is gone."""
+
+import importlib.util
+import json
+import os
+import subprocess
+import sys
+from contextlib import contextmanager, suppress
+from time import monotonic, sleep
+from types import ModuleType
+
+import numpy as np
+
+from skin.core.files import ROOT
+from skin.live.loop import Display, DisplayInfo, watch_age
+from skin.live.verdict import Verdict
+from skin.live.verdicts import HEARTBEAT, write_verdicts
+
+PATIENCE = 60  # s
+
+
+def display():
+    return Display(DisplayInfo("run", "port", np.zeros((4, 3)), (0.1, 0.1), 4.0))
+
+
+def verdict(dangerous=False, chance=0.25):
+    labels = {"big": True, "dangerous": dangerous}
+    chances = {"big": chance, "dangerous": float(dangerous)}
+    return Verdict(1.5, monotonic(), chances, True, labels, dangerous, False, (2,), 0.4)
+
+
+@contextmanager
+def piped(shown):
+    """Yield the reading end of the pipe to which verdicts are written."""
+    reading, writing = os.pipe()
+    with (
+        os.fdopen(reading, "rb") as lines,
+        os.fdopen(writing, "w", buffering=1) as file,
+        write_verdicts(shown, file),
+    ):
+        yield lines
+
+
+@contextmanager
+def connected(shown):
+    """Yield a function that returns the next message of a pipe."""
+    with piped(shown) as lines:
+        yield lambda: json.loads(lines.readline())
+
+
+def wait_for(take, accepted):
+    """Return the first message that is accepted."""
+    deadline = monotonic() + PATIENCE
+    while monotonic() < deadline:
+        if accepted(message := take()):
+            return message
+    raise AssertionError("waited in vain")
+
+
+def test_a_verdict_is_a_line():
+    shown = display()
+    with connected(shown) as take:
+        shown.set_verdict(verdict(dangerous=True, chance=float("nan")))
+        found = wait_for(take, lambda message: message["event"] == "verdict")
+    assert found["schema"] == 1
+    assert (found["alarm"], found["stale"], found["touched"], found["reason"]) == (True, False, True, "")
+    assert found["labels"] == {"big": True, "dangerous": True}
+    assert found["probabilities"] == {"big": None, "dangerous": 1.0}
+    assert (found["device_time"], found["contact"], found["gap"], found["masked"]) == (1.5, 0.4, False, [2])
+    assert found["time"].endswith("Z")
+
+
+def test_a_verdict_that_is_too_old_is_stale_and_keeps_its_alarm():
+    """Also where the engine hangs, which would tell nothing itself."""
+    shown = display()
+    with watch_age(shown), connected(shown) as take:
+        shown.set_verdict(verdict(dangerous=True))
+        began = monotonic()
+        fresh = wait_for(take, lambda message: message["event"] == "verdict")
+        old = wait_for(take, lambda message: message["stale"])
+        assert 0.5 < monotonic() - began < PATIENCE
+        assert (old["event"], old["alarm"], old["dangerous"], old["state"]) == (
+            "change",
+            True,
+            True,
+            "unknown",
+        )
+        assert old["notes"] == [{"code": "stale", "text": "no decision for longer than usual", "sensors": []}]
+        assert old["number"] <= fresh["number"] + 2
+        assert "labels" not in old
+
+
+def test_the_first_line_tells_what_is_waited_for():
+    shown = display()
+    shown.set_verdict(None, "the threshold of the alarm is being chosen")
+    with connected(shown) as take:
+        message = take()
+    assert (message["event"], message["stale"], message["state"]) == ("heartbeat", True, "unknown")
+    assert message["reason"] == "the threshold of the alarm is being chosen"
+
+
+def test_a_reason_is_sent_once_and_then_with_each_heartbeat():
+    shown = display()
+    with connected(shown) as take:
+        for _ in range(3):
+            shown.set_verdict(None, "unplugged", True)
+        events = [take() for _ in range(3)]
+    assert [one["event"] for one in events if one["reason"] == "unplugged"] == [
+        "change",
+        "heartbeat",
+        "heartbeat",
+    ]
+    assert all(one["alarm"] for one in events)
+
+
+def test_each_line_is_there_at_once():
+    """A reader that waits for a full buffer would show an alarm seconds late."""
+    shown = display()
+    with connected(shown) as take:
+        for chance in (0.25, 0.5, 0.75):
+            shown.set_verdict(verdict(chance=chance))
+            found = wait_for(take, lambda message: message["event"] == "verdict")
+            assert found["probabilities"]["big"] == chance
+
+
+def test_a_reader_that_is_slow_delays_nothing_and_misses_the_oldest():
+    shown = display()
+    with piped(shown) as lines:
+        began = monotonic()
+        for _ in range(5_000):
+            shown.set_verdict(verdict())
+        assert monotonic() - began < PATIENCE
+        numbers = [json.loads(lines.readline())["number"]]
+        while numbers[-1] < 5_000:
+            numbers.append(json.loads(lines.readline())["number"])
+    assert numbers == sorted(numbers)
+    assert len(numbers) < 4_000
+
+
+def test_the_view_closes_with_the_reader_of_its_lines():
+    shown = display()
+    with suppress(BrokenPipeError), piped(shown) as lines:
+        lines.readline()
+        lines.close()
+        assert shown.closed.wait(PATIENCE)
+
+
+def test_what_waits_is_written_before_the_end():
+    shown = display()
+    reading, writing = os.pipe()
+    with os.fdopen(reading, "rb") as lines:
+        with os.fdopen(writing, "w", buffering=1) as file, write_verdicts(shown, file):
+            for _ in range(20):
+                shown.set_verdict(verdict())
+        assert [json.loads(line)["number"] for line in lines] == [*range(1, 21)]
+
+
+LIVE = """
+import sys
+import numpy as np
+from skin.live.loop import Display, DisplayInfo, watch_age
+from skin.live.verdict import Verdict
+from skin.live.verdicts import print_verdicts
+from time import monotonic
+
+assert sys.argv[-1] == "live.verdicts=stdout"
+shown = Display(DisplayInfo("run", "port", np.zeros((4, 3)), (0.1, 0.1), 4.0))
+with watch_age(shown), print_verdicts(shown):
+    shown.closed.wait(1)
+    for _ in range(40):
+        chances = {"big": 0.3, "dangerous": 1.0}
+        shown.set_verdict(Verdict(1.5, monotonic(), chances, True, {"dangerous": True}, True, False, (), 0.4))
+        if shown.closed.wait(0.05):
+            break
+print("ended", file=sys.stderr)
+sys.exit(0)
+"""
+"""What stands for ``skin live``: a heartbeat, and dangerous verdicts for two seconds."""
+
+
+def test_a_command_whose_reader_leaves_ends_with_code_0():
+    command = [sys.executable, "-c", LIVE, "live.verdicts=stdout"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as live:
+        assert json.loads(live.stdout.readline())["stale"] is True
+        live.stdout.close()
+        assert live.stderr.read() == b"ended\n"
+    assert live.returncode == 0
+
+
+def stand_in(published):
+    """Return modules with the part of rclpy and std_msgs that the node uses."""
+    rclpy, node, std_msgs, msg = map(ModuleType, ("rclpy", "rclpy.node", "std_msgs", "std_msgs.msg"))
+
+    class Message:
+        def __init__(self, data):
+            self.data = data
+
+    class Node:
+        def __init__(self, name):
+            self.name = name
+
+        def declare_parameter(self, name, default):
+            return type("Parameter", (), {"value": rclpy.parameters.get(name, default)})
+
+        def create_publisher(self, kind, topic, depth):
+            send = lambda message: published.append((topic, message.data))  # noqa: E731
+            return type("Publisher", (), {"publish": staticmethod(send)})
+
+        def get_logger(self):
+            return type("Logger", (), {"warning": staticmethod(lambda text: None)})
+
+        def destroy_node(self):
+            published.append(("destroyed", self.name))
+
+    node.Node, msg.Bool, msg.String, rclpy.parameters = Node, Message, Message, {}
+    return {"rclpy": rclpy, "rclpy.node": node, "std_msgs": std_msgs, "std_msgs.msg": msg}
+
+
+def test_the_ros_node_publishes_verdicts_and_marks_their_loss(monkeypatch):
+    published = []
+    modules = stand_in(published)
+    for name, module in modules.items():
+        monkeypatch.setitem(sys.modules, name, module)
+    path = ROOT / "docs" / "examples" / "ros2_node.py"
+    assert len(path.read_text().splitlines()) <= 90
+    spec = importlib.util.spec_from_file_location("ros2_node", path)
+    example = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(example)
+    monkeypatch.setattr(example, "SILENCE", 2 * HEARTBEAT)
+
+    def until(entry):
+        deadline = monotonic() + PATIENCE
+        while entry not in published:
+            assert monotonic() < deadline, published[-3:]
+            sleep(0.02)
+
+    modules["rclpy"].parameters = {"command": [sys.executable, "-c", LIVE]}
+    node = example.SkinNode()
+    for entry in (("~/stale", True), ("~/danger", False), ("~/danger", True), ("~/stale", False)):
+        until(entry)
+    node._live.wait(PATIENCE)
+    lines = [json.loads(data) for topic, data in published if topic == "~/verdict"]
+    assert any(line["event"] == "verdict" for line in lines)
+    contacts = [json.loads(data) for topic, data in published if topic == "~/contacts"]
+    assert [told for told in contacts if len(told) > 3] == [line["contacts"] for line in lines]
+    sleep(2 * HEARTBEAT)
+    published.clear()
+    until(("~/stale", True))
+    lost = [json.loads(data) for topic, data in published if topic == "~/contacts"]
+    assert {contacts["state"] for contacts in lost} <= {"unknown"}
+    assert "exit code of skin live: 0" in lost[-1]["reason"]
+    assert ("~/danger", False) not in published  # that no line comes clears no alarm
+    node.destroy_node()
+    assert published[-1] == ("destroyed", "skin")

@@ -1,0 +1,522 @@
+"""The board, the terminal and the page, without a model behind them."""
+
+import json
+import os
+import re
+import urllib.error
+import urllib.request
+from base64 import b64decode
+from contextlib import contextmanager
+from dataclasses import replace
+from io import StringIO
+from threading import Event, Thread
+from time import monotonic, sleep
+
+import numpy as np
+import pytest
+from rich.console import Console
+from scipy.interpolate import LinearNDInterpolator
+
+from skin.device.resampling import Frame
+from skin.errors import InputError
+from skin.live import loop, terminal, web
+from skin.live.loop import Display, DisplayInfo
+from skin.live.verdict import Note, Verdict
+from skin.live.web import SkinPicture
+from skin.wire.channels import UnitConversion
+
+PLACES = np.array([[0.02, 0.02, 0], [0.14, 0.03, 0], [0.03, 0.1, 0], [0.13, 0.11, 0], [0.08, 0.06, 0]])
+SIZE = 0.16, 0.12
+AT = """
+const map = document.getElementById("map"), pen = map.getContext("2d");
+return [...pen.getImageData({} * map.width + 7, {} * map.height, 1, 1).data];
+"""
+PLAIN = UnitConversion(np.ones(5), np.zeros(5), np.zeros(5, bool))
+PRESSED = Verdict(0, 0, {"big": 0.2, "dangerous": 0.9}, True, {"big": False, "dangerous": True}, True, False)
+
+
+def display():
+    return Display(DisplayInfo("rules naive 0", "/dev/skin", PLACES, SIZE, 4.0))
+
+
+def frame(values, valid=None):
+    valid = np.ones(5, bool) if valid is None else valid
+    return Frame(None, 0.0, 0.0, np.asarray(values, float), valid)
+
+
+def shown(subject):
+    """Return the text in the terminal."""
+    console = Console(width=120, record=True, force_terminal=True, file=StringIO())
+    console.print(terminal.screen(subject))
+    return console.export_text()
+
+
+def fetch(address, **headers):
+    """Return status, headers and the beginning of what an address gives."""
+    try:
+        with urllib.request.urlopen(urllib.request.Request(address, headers=headers), timeout=30) as answer:
+            return answer.status, answer.read().decode()
+    except urllib.error.HTTPError as error:
+        with error:
+            return error.code, ""
+
+
+def posted(address, **headers):
+    """Return the status of a request that sends nothing."""
+    headers = {name.replace("_", "-"): value for name, value in headers.items()}
+    try:
+        with urllib.request.urlopen(urllib.request.Request(address, b"", headers), timeout=30) as answer:
+            return answer.status
+    except urllib.error.HTTPError as error:
+        with error:
+            return error.code
+
+
+def test_no_peak_between_two_looks_is_missed():
+    subject = display()
+    subject.add_frame(frame(np.zeros(5)), PLAIN)
+    seen = subject.state().number
+    for height in (1, 7, 2):
+        subject.add_frame(frame(height * np.eye(5)[3]), PLAIN)
+    state = subject.state(seen)
+    assert state.values.tolist() == [0, 0, 0, 7, 0]
+    assert subject.state(state.number).values[3] == 2
+
+
+def test_the_picture_interpolates_between_the_sensors():
+    values = np.array([1.0, 2.0, 0.5, 3.0, 1.5])
+    image = SkinPicture(PLACES, SIZE, 32, 4.0)(values)
+    row, column = 17, 15
+    place = (column + 0.5) / 32 * SIZE[0], (row + 0.5) / 32 * SIZE[1]
+    expected = LinearNDInterpolator(PLACES[:, :2], values)(*place)
+    assert image[row, column] == pytest.approx(255 * expected / 4, abs=1.01)
+    assert SkinPicture(PLACES[:1], SIZE, 8, 4.0)(values[:1]).tolist() == [[63] * 8] * 8
+
+
+def test_the_picture_has_no_edge_outside_the_sensors():
+    values = np.array([0.0, 4.0, 1.0, 3.0, 2.0])
+    image = SkinPicture(PLACES, SIZE, 64, 4.0)(values).astype(int)
+    slopes = [
+        4 * abs(values[a] - values[b]) / np.linalg.norm(PLACES[a] - PLACES[b])
+        for a in range(5)
+        for b in range(a)
+    ]
+    pixel = max(SIZE) / 64
+    for axis in (0, 1):
+        assert np.abs(np.diff(image, axis=axis)).max() <= 255 / 4 * max(slopes) * pixel + 1
+    # Beyond a corner of the hull, as at the corner.
+    assert image[0, 0] == 0
+    assert abs(image[-1, -1] - 255 * 3 / 4) <= 1
+
+
+def test_where_output_is_no_terminal_a_line_tells_each_change(tmp_path):
+    subject = display()
+    with (
+        (tmp_path / "said").open("w") as file,
+        terminal.show_in_terminal(subject, Console(file=file, width=60)),
+    ):
+        for verdict in (None, None, PRESSED, PRESSED):
+            subject.set_verdict(verdict, "" if verdict else "taking the baseline: do not touch")
+            sleep(0.2)
+    said = [json.loads(line) for line in (tmp_path / "said").read_text().splitlines()]
+    assert [line["event"] for line in said] == ["started", "change", "resumed", "alarm", "ended"]
+    assert [said[n]["reason"] for n in (0, 1)] == [
+        "waiting for the first frame",
+        "taking the baseline: do not touch",
+    ]
+    assert (said[3]["alarm"], said[3]["labels"]) == (True, {"big": False, "dangerous": True})
+
+
+def test_the_terminal_shows_the_alarm_and_the_probability():
+    subject = display()
+    subject.set_verdict(replace(PRESSED, dangerous=False, contact=0.1))
+    subject.add_frame(frame([0, 0, 6.25, 0, 0]), PLAIN)
+    subject.set_verdict(PRESSED)
+    subject.set_status("99.9 Hz")
+    text = shown(subject)
+    assert "DANGEROUS" in text
+    assert re.search(r"small .* 80 %", text)
+    assert "strongest reading 6.2 N, sensor 2" in text
+    assert "contacts unknown: this view estimates none" in text
+    assert "99.9 Hz" in text
+
+
+def test_the_page_gets_pictures_and_needs_nothing_from_elsewhere():
+    subject = display()
+    subject.add_frame(frame([0, 0, 2.0, 0, 0], np.array([True, True, True, True, False])), PLAIN)
+    with web.serve_page(subject, 0) as address:
+        code, page = fetch(address)
+        assert code == 200
+        assert not re.search(r"(src|href)\s*=|https?://|@import|url\(", page)
+        info = json.loads(fetch(f"{address}/skin.json")[1])
+        assert info["positions"] == PLACES.tolist()
+        subject.set_verdict(PRESSED)
+        with urllib.request.urlopen(f"{address}/pictures", timeout=30) as answer:
+            line = answer.readline().decode()
+        picture = json.loads(line.removeprefix("data: "))
+    assert (picture["schema"], picture["dangerous"], picture["stale"]) == (1, True, False)
+    assert picture["words"] == [["small", 0.8], ["dangerous", 0.9]]
+    assert picture["values"][2] == 2.0
+    assert picture["valid"] == [True, True, True, True, False]
+    assert len(b64decode(picture["picture"])) == info["pixels"] ** 2
+
+
+@pytest.mark.parametrize("value", [1e300, -1e300, 1e10])
+def test_the_page_gets_valid_json_whatever_the_device_sends(value):
+    subject = display()
+    subject.add_frame(frame([0, value, 2.0, 0, 0]), PLAIN)
+    subject.set_verdict(Verdict(0, 0, {"big": float("inf")}, True, {"big": True}, False, False))
+    with web.serve_page(subject, 0) as address, urllib.request.urlopen(f"{address}/pictures") as answer:
+        line = answer.readline().decode().removeprefix("data: ")
+    picture = json.loads(line, parse_constant=pytest.fail)
+    assert (picture["values"], picture["valid"][1]) == ([0, 0, 2, 0, 0], False)
+
+
+def test_a_saturated_sensor_shows_its_limit_and_an_unknown_one_nothing():
+    """A dark hole at the sensor that is pressed hardest would hide the press."""
+    subject = display()
+    valid, saturated = np.array([True, True, True, True, False]), np.array([False, False, True, False, False])
+    subject.add_frame(frame([1.0, 1.0, 4.0, 1.0, 9.0], valid)._replace(saturated=saturated), PLAIN)
+    state = subject.state()
+    assert state.values.tolist() == [1, 1, 4, 1, 0]
+    assert state.saturated.tolist() == saturated.tolist()
+    picture = SkinPicture(PLACES, SIZE, 64, 4.0)
+    image = picture(state.values, state.valid)
+    # Where the unknown sensor is, the picture shows what lies around it; the saturated one is brightest.
+    row, column = (round(PLACES[4, axis] / SIZE[axis] * 64) for axis in (1, 0))
+    assert image[row, column] > 60
+    row, column = (round(PLACES[2, axis] / SIZE[axis] * 64) for axis in (1, 0))
+    assert image[row - 2 : row + 3, column - 2 : column + 3].max() > 235
+    sent = web.message(state, picture)
+    assert (sent["saturated"][2], sent["valid"][4], sent["values"][2]) == (True, False, 4.0)
+    assert picture(np.zeros(5), np.zeros(5, dtype=bool)).max() == 0
+
+
+def test_an_alarm_outlives_silence_in_every_view():
+    subject = display()
+    subject.set_verdict(PRESSED)
+    subject.set_verdict(None, "the device has stopped sending", alarm=True)
+    state = subject.state()
+    assert (state.verdict, state.alarm) == (None, True)
+    assert web.message(state, SkinPicture(PLACES, SIZE, 8, 4.0))["alarm"] is True
+    text = shown(subject)
+    assert "DANGEROUS" in text
+    assert "stopped sending" in text
+
+
+def test_the_views_say_since_when_something_touches():
+    assert terminal.contact_text(None) == terminal.contact_text(1.0) == ""
+    assert re.fullmatch(r"contact since \d\d:\d\d:\d\d \(12 s\)", terminal.contact_text(12.0))
+    assert "take a new tare" in terminal.contact_text(75.0)
+
+
+def test_the_page_asks_for_a_tare_and_another_site_cannot():
+    subject = display()
+    with web.serve_page(subject, 0) as address:
+        for headers, code in (({}, 403), ({"Origin": "http://evil.example"}, 403), ({"X-Skin": "tare"}, 204)):
+            assert subject.take_tare() == ""
+            assert posted(f"{address}/tare", **headers) == code
+        assert subject.take_tare() == "tare"
+        assert fetch(f"{address}/tare")[0] == 405
+
+
+def test_the_operator_types_t_for_a_tare(monkeypatch, tmp_path):
+    pty = pytest.importorskip("pty", reason="pseudo-terminals need a POSIX system")
+    master, slave = pty.openpty()
+    subject = display()
+    with os.fdopen(slave) as typed, (tmp_path / "said").open("w") as file:
+        monkeypatch.setattr("sys.stdin", typed)
+        with terminal.show_in_terminal(subject, Console(file=file)):
+            os.write(master, b"x\n")
+            sleep(0.3)
+            assert subject.take_tare() == ""
+            os.write(master, b"t\n")
+            assert requested(subject) == "tare"
+            subject.set_verdict(PRESSED)
+            os.write(master, b"t\n")
+            until(lambda: "tare refused" in subject.state().line)
+            assert subject.take_tare() == ""
+            os.write(master, b"force\n")
+            assert requested(subject) == "forced"
+            os.write(master, b"\x04")
+            sleep(0.1)
+    os.close(master)
+
+
+def until(reached):
+    deadline = monotonic() + 60
+    while not (result := reached()):
+        assert monotonic() < deadline
+        sleep(0.05)
+    return result
+
+
+def requested(subject):
+    return until(subject.take_tare)
+
+
+def test_a_tare_is_refused_under_a_touch_until_it_is_confirmed():
+    subject, events = display(), []
+    subject.listeners.append(events.append)
+    assert subject.request_tare(force=True) != ""  # there is nothing to confirm
+    for verdict in (PRESSED, replace(PRESSED, dangerous=False, contact=0.5)):
+        subject.set_verdict(verdict)
+        assert "something touches the skin" in subject.request_tare()
+        assert subject.take_tare() == ""
+        assert subject.request_tare(force=True) == ""
+        assert subject.take_tare() == "forced"
+    subject.set_verdict(None, "the device has stopped sending", alarm=True)
+    assert subject.request_tare() != ""
+    subject.set_verdict(replace(PRESSED, dangerous=False, touched=False))
+    assert subject.request_tare() == ""
+    refused = "tare_refused"
+    assert events == [refused, refused, "tare_forced", refused, "tare_forced", refused, "tare"]
+
+
+def test_a_refused_tare_is_said_while_it_may_be_forced(monkeypatch):
+    subject, now = display(), [100.0]
+    monkeypatch.setattr(loop, "monotonic", lambda: now[0])
+    subject.set_status("99.9 Hz")
+    subject.set_verdict(PRESSED)
+    assert subject.request_tare() == loop.REFUSALS["touched"]
+    assert subject.request_tare(force=True) == ""
+    assert subject.state().line == "99.9 Hz"  # it was forced
+    assert subject.request_tare(force=True) == loop.REFUSALS["touched"]  # a refusal is for one
+    now[0] += 59.0
+    assert subject.state().line == f"{loop.REFUSALS['touched']}, 99.9 Hz"
+    now[0] += 2.0
+    assert subject.state().line == "99.9 Hz"
+    subject.set_verdict(replace(PRESSED, touched=False, dangerous=False))
+    assert "nothing to force" in subject.request_tare(force=True)
+    assert subject.state().line == "there is nothing to force, 99.9 Hz"
+    now[0] += 61.0
+    assert subject.state().line == "99.9 Hz"
+    subject.set_verdict(PRESSED)
+    subject.request_tare()
+    subject.set_verdict(replace(PRESSED, touched=False, dangerous=False))
+    assert subject.request_tare() == ""
+    assert subject.state().line == "99.9 Hz"
+
+
+def test_the_map_of_an_alarm_is_held_and_goes_with_the_touch():
+    subject = display()
+    idle = replace(PRESSED, touched=False, dangerous=False)
+    subject.set_verdict(idle)
+    subject.add_frame(frame([0, 0, 6.0, 0, 0]), PLAIN)
+    subject.set_verdict(replace(PRESSED, dangerous=False, contact=0.1))
+    state = subject.state()
+    assert (state.held, state.map[2]) == (False, 6.0)
+    subject.add_frame(frame([0, 0, 0.1, 0, 0]), PLAIN)
+    for verdict in (PRESSED, replace(PRESSED, dangerous=False, contact=None)):
+        subject.set_verdict(verdict)
+        state = subject.state(state.number)
+        assert (state.held, state.map[2], state.values[2]) == (True, 6.0, 0.1)
+    # The next touch follows before the prediction is over: its map is its own.
+    for _ in range(20):
+        subject.add_frame(frame(np.zeros(5)), PLAIN)
+    subject.add_frame(frame([0, 1.0, 0, 0, 0]), PLAIN)
+    subject.set_verdict(replace(PRESSED, dangerous=False, contact=0.05))
+    assert subject.state().peak.tolist() == [0, 1, 0, 0, 0]
+    subject.set_verdict(idle)
+    assert subject.state().peak.max() == 0
+
+
+def test_an_unknown_place_is_not_shown_as_no_touch():
+    subject = display()
+    masked = {"unknown": (2,), "masked": (2,), "notes": (Note("masked", (2,)), Note("pause", seconds=0.7))}
+    subject.set_verdict(replace(PRESSED, touched=False, labels={}, dangerous=False, **masked))
+    sent = web.message(subject.state(), SkinPicture(PLACES, SIZE, 8, 4.0))
+    assert (sent["state"], sent["unknown"]) == ("unknown", [2])
+    text = shown(subject)
+    assert "no touch" not in text
+    assert "near sensor 2 could not be felt" in text
+    assert "(and 1 more note)" in text
+    subject.set_verdict(None, "readings are frozen")
+    assert web.message(subject.state(), SkinPicture(PLACES, SIZE, 8, 4.0))["unknown"] == [0, 1, 2, 3, 4]
+    assert "unknown: readings are frozen" in shown(subject)
+
+
+def test_pictures_come_a_little_more_than_thirty_times_a_second():
+    with (
+        web.serve_page(display(), 0) as address,
+        urllib.request.urlopen(f"{address}/pictures", timeout=30) as answer,
+    ):
+        began = monotonic()
+        for _ in range(2 * 60):  # and an empty line after each
+            answer.readline()
+        passed = monotonic() - began
+    assert passed > 0.9 * 60 / web.HERTZ
+    assert 30 < web.HERTZ < 40
+    # A machine that is busy with other things must not fail this.
+    assert passed < 10 * 60 / web.HERTZ
+
+
+def test_other_sites_and_ports_in_use_are_refused():
+    with web.serve_page(display(), 0) as address:
+        assert fetch(f"{address}/skin.json", Host="evil.example")[0] == 400
+        with pytest.raises(InputError, match=r"live\.web_port="):
+            web.serve_page(display(), int(address.rsplit(":", 1)[1])).__enter__()
+
+
+def test_the_page_goes_when_the_watching_ends():
+    subject = display()
+    with web.serve_page(subject, 0) as address:
+        answer = urllib.request.urlopen(f"{address}/pictures", timeout=30)
+        answer.readline()
+        reader = Thread(target=answer.read)
+        reader.start()
+    reader.join(10)
+    assert not reader.is_alive()
+    answer.close()
+    assert subject.closed.is_set()
+
+
+@contextmanager
+def repeated(subject, verdict):
+    """Set a verdict again and again while the block runs, as decisions come: one alone becomes old."""
+    over = Event()
+
+    def repeat():
+        while not over.wait(0.1):
+            subject.set_verdict(verdict)
+
+    subject.set_verdict(verdict)
+    thread = Thread(target=repeat)
+    thread.start()
+    yield
+    over.set()
+    thread.join()
+
+
+def test_the_page_draws_what_it_is_sent(browser):
+    subject = display()
+    subject.add_frame(frame([0, 0, 2.0, 0, 0], np.array([True, True, True, True, False])), PLAIN)
+    subject.set_status("99.9 Hz")
+    with web.serve_page(subject, 0) as address, repeated(subject, PRESSED):
+        browser.open(address)
+        deadline = monotonic() + 300
+        while browser.run("return pictures") < 5:
+            assert monotonic() < deadline
+            sleep(0.1)
+        text = browser.run("return document.body.innerText")
+        colour = browser.run(AT.format(*(place / size for place, size in zip(PLACES[2], SIZE, strict=False))))
+        assert browser.run("return document.body.dataset.state") == "danger"
+        shows(browser, "document.documentElement.scrollHeight <= innerHeight", True)
+    for said in ("DANGEROUS", "80 %", "90 %", "about the last 3 s", "99.9 Hz", "/dev/skin"):
+        assert said in text
+    # Half of the scale: between teal and yellow, and not the darkness of no force.
+    assert min(colour[:2]) > 60
+
+
+ANNOUNCED = "return [...document.querySelectorAll('[role=alert]')].map(one => one.textContent)"
+
+
+def test_the_page_announces_an_alarm_and_its_end_once(browser):
+    subject = display()
+    subject.add_frame(frame([0, 0, 2.0, 0, 0]), PLAIN)
+    subject.set_verdict(None, "taking the baseline")
+    with web.serve_page(subject, 0) as address:
+        browser.open(address)
+
+        def until(texts):
+            deadline = monotonic() + 300
+            while browser.run("return pictures") < 1 or browser.run(ANNOUNCED) != texts:
+                assert monotonic() < deadline, browser.run(ANNOUNCED)
+                sleep(0.1)
+
+        until([""])
+        browser.run(
+            "window.changes = 0; new MutationObserver(() => changes++)"
+            ".observe(document.querySelector('[role=alert]'), {childList: true, characterData: true})"
+        )
+        subject.set_verdict(PRESSED)
+        until(["Alarm: dangerous touch"])
+        subject.set_verdict(None, "the device has stopped sending", alarm=True)
+        while "stopped sending" not in browser.run("return document.body.innerText"):
+            sleep(0.1)
+        assert browser.run("return changes") == 1
+        assert browser.run("return document.getElementById('head').getAttribute('role')") == "status"
+        subject.set_verdict(None, "the device has stopped sending")
+        until([""])
+
+
+def shows(browser, script, wanted):
+    """Wait until a script gives what is wanted."""
+    deadline = monotonic() + 300
+    while (given := browser.run(f"return {script}")) != wanted:
+        assert monotonic() < deadline, given
+        sleep(0.1)
+
+
+CROSSED = "latest && latest.values.length + ' of ' + skin.positions.length + ' on ' + $('port').textContent"
+
+
+def test_the_page_goes_on_after_a_restart_with_more_sensors(browser):
+    subject, now = display(), "performance.now() - drawn < 1000"
+    subject.add_frame(frame([0, 0, 2.0, 0, 0]), PLAIN)
+    with web.serve_page(subject, 0) as address:
+        browser.open(address)
+        shows(browser, CROSSED, "5 of 5 on /dev/skin")
+    places = np.concatenate([PLACES, PLACES + np.array([0.01, 0.01, 0])])
+    other = Display(DisplayInfo("any_skin", "/dev/other", places, SIZE, 4.0))
+    verdict = replace(PRESSED, touched=False, dangerous=False, unknown=(7, 9), masked=(7, 9))
+    with web.serve_page(other, int(address.rsplit(":", 1)[1])), repeated(other, verdict):
+        shows(browser, CROSSED, "10 of 10 on /dev/other")
+        before = browser.run("return pictures")
+        shows(browser, f"pictures > {before + 5} && {now}", True)
+        shows(browser, "$('title').textContent + ': ' + $('time').textContent", "any_skin: Map: now")
+
+
+def test_the_map_of_a_program_that_has_ended_is_outdated(browser):
+    subject = display()
+    subject.add_frame(frame([0, 0, 2.0, 0, 0]), PLAIN)
+    subject.set_status("99.9 Hz")
+    bright = "getComputedStyle($('map')).filter"
+    with web.serve_page(subject, 0) as address:
+        browser.open(address)
+        with repeated(subject, replace(PRESSED, touched=False, dangerous=False)):
+            shows(browser, "$('time').textContent", "Map: now")
+            assert browser.run(f"return {bright}") == "none"
+        shows(browser, "$('head').textContent", "unknown: no decision for longer than usual")
+        subject.set_verdict(None, "the device has stopped sending")
+        shows(browser, "$('time').textContent", "Map: last readings")
+    shows(browser, "$('time').textContent", "Map: outdated, no answer from the program")
+    assert "grayscale" in browser.run(f"return {bright}")
+    assert browser.run("return $('line').textContent") == ""
+    assert browser.run("return document.body.dataset.state") == "unknown"
+
+
+def test_a_page_without_an_answer_says_unknown_and_keeps_the_alarm(browser, monkeypatch):
+    """The program hangs, though its connection stays open."""
+    subject, over = display(), Event()
+    subject.add_frame(frame([0, 0, 6.0, 0, 0]), PLAIN)
+    with web.serve_page(subject, 0) as address:
+        browser.open(address)
+        with repeated(subject, PRESSED):
+            shows(browser, "$('head').textContent", "⚠ DANGEROUS")
+        hangs = monkeypatch.context()
+        with hangs as patch:
+            patch.setattr(subject, "state", lambda *_: over.wait(60))
+            shows(
+                browser,
+                "$('head').textContent",
+                "⚠ DANGEROUS; unknown: no answer from the program for 1.5 s",
+            )
+        over.set()
+
+
+def test_the_page_shows_the_gravest_note_and_no_probability_beside_an_alarm_of_late_frames(browser):
+    subject = display()
+    subject.add_frame(frame([0, 0, 6.0, 0, 0]), PLAIN)
+    notes = (Note("over_range", (2,)), Note("masked", (4,)))
+    safe = replace(PRESSED, dangerous=False, labels={"big": False, "dangerous": False}, notes=notes)
+    with web.serve_page(subject, 0) as address:
+        browser.open(address)
+        with repeated(subject, safe):
+            shows(browser, "$('bars').innerText.includes('dangerous?')", True)
+            note = browser.run("return $('note').textContent")
+            assert "no value of sensor 2 since the force rose" in note
+            assert note.endswith("(and 1 more note)")
+            subject.set_verdict(PRESSED)
+            shows(browser, "document.body.dataset.state", "danger")
+            assert "safe" not in browser.run("return $('bars').innerText")

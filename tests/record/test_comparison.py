@@ -1,0 +1,157 @@
+"""Touches of a session beside their simulation: what was put in comes out."""
+
+import time
+from dataclasses import replace
+from itertools import islice
+
+import numpy as np
+import pytest
+
+from skin.body.base import Sheet
+from skin.body.layout import Grid
+from skin.calibration.bench import write_bench_session
+from skin.calibration.bench_protocol import Protocol, emulate_session
+from skin.core.files import CONF
+from skin.core.safe_loading import load_yaml
+from skin.device.resampling import Frame
+from skin.device.simulated import Simulated
+from skin.errors import InputError
+from skin.mechanics.simulator.naive import Naive
+from skin.record.comparison import (
+    Agreement,
+    compare_gestures,
+    compare_session,
+    comparison_markdown,
+    holds_gestures,
+    publish_comparison,
+)
+from skin.record.recorder import SessionLog
+from skin.touch.labels import TOUCH
+from skin.wire.channels import UnitConversion
+from skin.wire.emulator import emulated_gestures, upsample
+from skin.wire.segmentation import RecordedGesture
+
+SHEET = Sheet((0.16, 0.16), (32, 32), [{"material": "EcoFlex 00-30", "thickness": 0.005}])
+RATE, COUNT, GAIN = 50.0, 6, 0.8
+
+
+@pytest.fixture(scope="module")
+def device():
+    perfect = {"gain_spread": 0.0, "offset": 0.3, "noise": 0.0, "clip": 100.0}
+    return Simulated(body=SHEET, layout=Grid(3, 3), simulator=Naive, gestures=10, **perfect)
+
+
+def session(device, path, labels):
+    """Write what a skin of another gain says of the emulator's gestures, in counts above 500."""
+    about = {"positions": device.sensors.positions.tolist(), "unit": "adc", "labels": labels}
+    log = SessionLog(path, about | {"window": device.window, "rate": device.model_rate}, 9)
+    log.conversion(UnitConversion(np.full(9, 0.01), np.full(9, 500.0), np.zeros(9, dtype=bool)))
+    number, now = 0, time.monotonic()
+    for one, gesture in enumerate(islice(emulated_gestures(device), COUNT)):
+        rows = 500 + GAIN * upsample(gesture.force, device.model_rate, RATE) / 0.01
+        gesture = RecordedGesture(one, gesture.labels, number / RATE, 0)
+        for place, row in enumerate(rows):
+            t = number / RATE
+            frame = Frame(number, t, now + t, row, np.ones(9, dtype=bool))
+            if not place:
+                log.begin(gesture, frame)
+            log.frame(frame)
+            number += 1
+        log.end(gesture)
+    log.close()
+    return str(path)
+
+
+def test_a_gain_between_session_and_simulation_is_found(device, tmp_path):
+    path = session(device, tmp_path / "s.csv", "announced")
+    assert holds_gestures(path)
+    comparison = compare_gestures(device, path, 0)
+    assert (comparison.same, len(comparison.pairs)) == (True, COUNT)
+    for pair, played in zip(comparison.pairs, emulated_gestures(device), strict=False):
+        assert pair.slope == pytest.approx(GAIN, rel=1e-3)
+        assert pair.rmse == pytest.approx((1 - GAIN) * np.sqrt((played.force**2).mean()), rel=2e-3)
+        # The applied force is the sum of the pressure, told by the movie and not by any sensor.
+        assert pair.applied.max() > pair.peaks[0]
+    page = comparison_markdown(comparison, None, "Here.")
+    assert "gain ratio of readings (recorded over simulated), median: 0.800" in page
+    path, picture = publish_comparison(comparison, None, "Here.", 2, tmp_path)
+    assert path.read_text() == page
+    assert picture.stat().st_size > 10_000
+    simulated, recorded = comparison.touches
+    assert recorded.readings.numpy() == pytest.approx(GAIN * simulated.readings.numpy(), abs=2e-3)
+
+
+def test_agreements_are_counted(device, tmp_path):
+    comparison = compare_gestures(device, session(device, tmp_path / "s.csv", "announced"), 0)
+    truth = np.array([[bool(pair.labels[name]) for name in TOUCH.names] for pair in comparison.pairs])
+    wrong = truth.copy()
+    wrong[:2, 1] ^= True
+    page = comparison_markdown(comparison, Agreement(TOUCH.names, truth, wrong, truth), "Here.")
+    assert "the same of `big` on 6 of 6 gestures, and is right on 6 simulated and 6 recorded ones" in page
+    assert "the same of `dynamic` on 4 of 6 gestures, and is right on 6 simulated and 4 recorded" in page
+
+
+def test_what_a_person_did_is_compared_with_gestures_of_the_same_labels(device, tmp_path):
+    comparison = compare_gestures(device, session(device, tmp_path / "s.csv", "prompted"), 0)
+    assert not comparison.same
+    played = list(islice(emulated_gestures(device), COUNT))
+    assert [pair.labels for pair in comparison.pairs] == [one.labels for one in played]
+    assert not np.allclose(comparison.pairs[0].simulated, played[0].force)
+    page = comparison_markdown(comparison, None, "Here.")
+    assert page.startswith("# Gestures of the same labels")
+    assert "RMSE of readings" not in page
+    assert publish_comparison(comparison, None, "Here.", 2, tmp_path)[1].stat().st_size > 10_000
+
+
+def test_other_gestures_layouts_and_windows_are_refused(device, tmp_path):
+    path = session(device, tmp_path / "s.csv", "announced")
+    with pytest.raises(InputError, match=r"emulate\.seed as compare\.seed"):
+        compare_gestures(device, path, 1)
+    with pytest.raises(InputError, match="another layout"):
+        compare_gestures(device.replace(layout=Grid(1, 9)), path, 0)
+    with pytest.raises(InputError, match=r"30 frames at 10 Hz, .* at 5 Hz: give .*touch\.rate=10"):
+        compare_gestures(device.replace(touch={"rate": 5.0, "tap": [0.2, 0.4], "press": [0.6, 2.0]}), path, 0)
+
+
+def test_gestures_without_labels_are_refused(device, tmp_path):
+    path = session(device, tmp_path / "s.csv", "none")
+    lines = (tmp_path / "s.csv").read_text().splitlines()
+    kept = [line.split(', "labels"')[0] + ', "labels": null}' if "begin" in line else line for line in lines]
+    (tmp_path / "s.csv").write_text("\n".join(kept) + "\n")
+    with pytest.raises(InputError, match=r"no gesture with labels.*device\.labels=prompted"):
+        compare_gestures(device, path, 0)
+
+
+def test_a_bench_session_marks_no_gestures(tmp_path):
+    (tmp_path / "bench.csv.json").write_text('{"unit": "adc", "bits": 10}')
+    assert not holds_gestures(str(tmp_path / "bench.csv"))
+    assert not holds_gestures(str(tmp_path / "nothing.csv"))
+
+
+def test_presses_are_compared_as_gestures_are(device, tmp_path):
+    """A skin reads 80 % of what the device does; a lost frame and a silent channel do not count."""
+    protocol, randomness = Protocol(rate=50.0), np.random.default_rng(0)
+    rows = protocol.gauge(protocol.places(device, randomness))
+    session = emulate_session(device, rows, protocol, randomness, None)
+    raw = GAIN * session.raw
+    force, press = rows.at(session.time)
+    raw[np.flatnonzero(press == 1)[5]] = np.nan
+    raw[:, 8] = np.nan
+    path = write_bench_session(replace(session, raw=raw), tmp_path / "bench.csv")
+    settings = load_yaml(CONF / "compare.yaml")["compare"]
+    comparison = compare_session(device, str(path), None, settings)
+    assert comparison.things == "presses"
+    assert [pair.number for pair in comparison.pairs] == [
+        number for number in range(len(rows)) if number % 9 != 8
+    ]
+    first = comparison.pairs[0]
+    assert first.slope == pytest.approx(GAIN, rel=1e-3)
+    assert first.peaks[1] == pytest.approx(GAIN * first.peaks[0], rel=1e-3)
+    assert first.force == pytest.approx(force[press == 0].max())
+    assert comparison.pairs[1].valid.sum() == comparison.pairs[1].valid.any(axis=1).sum() * 8
+    simulated, measured = comparison.touches
+    assert measured.readings.numpy() == pytest.approx(GAIN * simulated.readings.numpy(), abs=2e-2)
+    assert not measured.valid[:, :, 8].any()
+    path, picture = publish_comparison(comparison, None, "Here.", 2, tmp_path)
+    assert "gain ratio of readings (recorded over simulated), median: 0.800" in path.read_text()
+    assert picture.stat().st_size > 10_000

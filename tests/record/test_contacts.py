@@ -1,0 +1,183 @@
+"""The contacts of an emulated skin reach a recorded session whole, or not at all; a gauge tells its own."""
+
+from itertools import islice
+from threading import Thread
+
+import numpy as np
+import pyarrow as pa
+import pytest
+import torch
+
+from skin.body.base import Sheet
+from skin.body.layout import Grid
+from skin.calibration import bench, bench_protocol
+from skin.core.files import CONF
+from skin.core.safe_loading import load_yaml
+from skin.device.files import read_recording
+from skin.device.simulated import Simulated
+from skin.mechanics.simulator.naive import Naive
+from skin.record.comparison import compare_session
+from skin.record.recorder import convert_session, record_session
+from skin.record.serial import Serial
+from skin.record.session import read_session
+from skin.wire.contact_lines import (
+    contact_lines,
+    encode_contact_line,
+    join_contact_lines,
+    parse_contact_line,
+)
+from skin.wire.decoder import Decoder
+from skin.wire.emulator import Emulator, EmulatorSettings, Faults, emulated_gestures, open_port
+from skin.wire.protocol import encode_line
+
+SHEET = Sheet((0.16, 0.16), (32, 32), [{"material": "EcoFlex 00-30", "thickness": 0.005}])
+COUNT = 3
+
+
+@pytest.fixture(scope="module")
+def device():
+    tips = {"radius": [0.006, 0.012], "window": 1.0, "press": [0.4, 0.8]}
+    return Simulated(body=SHEET, layout=Grid(3, 3), simulator=Naive, gestures=10, touch=tips)
+
+
+@pytest.fixture(scope="module")
+def played(device):
+    return list(islice(emulated_gestures(device), COUNT))
+
+
+def same(one, other):
+    return np.array_equal(np.asarray(one, np.float32), np.asarray(other, np.float32), equal_nan=True)
+
+
+def test_lines_bring_the_contacts_back_to_single_precision(played):
+    for number, gesture in enumerate(played):
+        lines = contact_lines(number, gesture.contacts, 10.0)
+        back = [parse_contact_line(encode_contact_line(line).rstrip(b"\n")) for line in lines]
+        assert same(join_contact_lines(back, 10, 10.0), gesture.contacts)
+        assert join_contact_lines(back[1:], 10, 10.0) is None
+        assert join_contact_lines(back, 20, 10.0) is None
+        assert join_contact_lines(back, 10, 20.0) is None
+    assert join_contact_lines([], 10, 10.0) is None
+
+
+def test_a_changed_byte_is_noticed(played):
+    line = encode_contact_line(contact_lines(0, played[0].contacts, 10.0)[0]).rstrip(b"\n")
+    assert line.startswith(b"# contacts v=1 ")
+    for place in range(len(line)):
+        changed = bytearray(line)
+        changed[place] ^= 1
+        assert parse_contact_line(bytes(changed)) is None
+
+
+def test_a_reader_takes_them_for_comments(played):
+    lines = [encode_contact_line(line) for line in contact_lines(0, played[0].contacts, 10.0)]
+    frames = [encode_line([1, number], number, 10_000 * number) for number in range(6)]
+    decoder = Decoder(2)
+    assert len(decoder.feed(b"".join([*frames[:3], *lines, *frames[3:]]))) == 6
+    assert not decoder.stats.bad
+
+
+@pytest.fixture
+def recorded(device, tmp_path):
+    """Return a function that records an emulated skin over a port, with faults, and gives the session."""
+
+    def record(faults=Faults()):  # noqa: B008
+        port = open_port("tcp:0", None)
+        settings = EmulatorSettings(rate=100.0, speed=5.0, idle=4.0, gap=0.1)
+        emulator = Emulator(device, port, settings, faults)
+        thread = Thread(target=emulator.run, kwargs={"count": COUNT + 1})
+        thread.start()
+        settings = {"touch": {"window": 1.0}, "tare": 1.0, "scale": emulator.converter.scale}
+        reader = Serial(
+            body=SHEET, layout=Grid(3, 3), port=port.address, gestures=COUNT, timeout=20.0, **settings
+        )
+        try:
+            record_session(reader, tmp_path / "s.csv", None, False, lambda text: None)
+        finally:
+            emulator.stop()
+            thread.join(20)
+            port.unplug()
+        return reader, tmp_path / "s.csv"
+
+    return record
+
+
+def test_a_recorded_session_has_them(recorded, played):
+    reader, path = recorded()
+    stored = read_session(path)
+    for number, gesture in enumerate(played):
+        assert same(stored.gestures[number][0].contacts, gesture.contacts)
+    parquet, count = convert_session(reader, path)
+    assert count == COUNT
+    touches = read_recording(parquet).touches
+    assert same(touches.contacts, np.stack([gesture.contacts for gesture in played]))
+    # They are in time with the readings: nothing is felt without a contact.
+    absent = touches.contacts[..., 0].isnan().all(2)
+    force = touches.readings.amax(2)
+    assert force[absent].max() < 0.5
+    assert force[~absent].max() > 1.0
+
+
+def test_a_session_without_them_is_read_as_before(recorded, played):
+    """As of a device without contacts, of a person, or of an earlier version."""
+    reader, path = recorded()
+    lines = path.read_text().splitlines(keepends=True)
+    from skin.record.session import decode_event, encode_event
+
+    for place, line in enumerate(lines):
+        if '"event": "begin"' in line:
+            content, _ = decode_event(line.rstrip("\n"))
+            del content["contacts"]
+            lines[place] = encode_event(content.pop("event"), **content)[0] + "\n"
+    path.write_text("".join(lines))
+    stored = read_session(path)
+    assert sorted(stored.gestures) == list(range(COUNT))
+    assert all(gesture.contacts is None for gesture, _ in stored.gestures.values())
+    assert read_recording(convert_session(reader, path)[0]).touches.contacts is None
+
+
+@pytest.mark.parametrize(
+    ("old", "new"), [('"most": 3', '"most": 0'), ('"rows": [[', '"rows": [[99, 0, 0, 0, 0, 0, 0], [')]
+)
+def test_contacts_that_cannot_be_are_a_damaged_line(recorded, old, new):
+    from skin.record.session import line_sum
+
+    _, path = recorded()
+    lines = path.read_text().splitlines()
+    place = next(number for number, line in enumerate(lines) if '"event": "begin"' in line)
+    text = lines[place].replace(old, new).rpartition(', "sum": "')[0]
+    lines[place] = f'{text}, "sum": "{line_sum(text + "}")}"}}'
+    path.write_text("\n".join(lines) + "\n")
+    stored = read_session(path)
+    assert stored.damaged == [place + 1]
+    assert 0 not in stored.gestures
+
+
+def test_a_gauge_tells_its_contacts():
+    columns = {"time": [1.0, 1.5, 2.0, 2.5], "force": [0.0, 10.0, 20.0, 0.0], "x_m": [0.05] * 4}
+    rows = bench.gauge_from_table(
+        pa.table(columns | {"y_m": [0.06] * 4}), "x", "disc", 0.01, 0.0, bench.Units()
+    )
+    peaks = bench.pressed_peaks(SHEET, rows)
+    assert peaks == pytest.approx(1 / (np.pi * 0.01**2), rel=0.02)
+    contacts = rows.contacts(np.array([0.5, 1.25, 2.0, 3.0]), peaks)
+    assert contacts.shape == (4, 1, 5)
+    assert np.isnan(contacts[[0, 3]]).all()
+    assert contacts[1, 0] == pytest.approx([0.05, 0.06, 0.01, 5.0, 5 * peaks[0]])
+    assert contacts[2, 0, 3] == 20.0
+
+
+def test_presses_of_a_bench_session_have_them(device, tmp_path):
+    protocol = bench_protocol.Protocol(idle=3.0, rate=50.0, indenter="disc")
+    gauge = protocol.gauge(np.array([[0.03, 0.03], [0.08, 0.08]]))
+    session = bench_protocol.emulate_session(device, gauge, protocol, np.random.default_rng(0))
+    path = bench.write_bench_session(session, tmp_path / "s.parquet")
+    settings = load_yaml(CONF / "compare.yaml")["compare"]
+    sides = compare_session(device, str(path), None, settings).touches
+    for touches in sides:
+        assert touches.contacts.shape == (2, 10, 1, 5)
+        x, y, radius, force, _ = touches.contacts[:, -1, 0].T
+        assert torch.stack([x, y, radius]).numpy() == pytest.approx(
+            np.array([[0.03, 0.08], [0.03, 0.08], [0.01, 0.01]]), abs=1e-6
+        )
+        assert (force > 0).all()

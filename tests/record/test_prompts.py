@@ -1,0 +1,130 @@
+"""What a prompted gesture needs to be recorded: that the skin has felt something."""
+
+import os
+from threading import Thread
+from time import sleep
+
+import numpy as np
+import pytest
+
+pytest.importorskip("termios", reason="pseudo-terminals need a POSIX system")
+
+from skin.body.base import Sheet
+from skin.body.layout import Grid
+from skin.device.files import read_recording
+from skin.device.resampling import Frame
+from skin.device.simulated import Simulated
+from skin.mechanics.simulator.naive import Naive
+from skin.record.recorder import convert_session, record_session
+from skin.record.serial import Serial
+from skin.record.session import read_session
+from skin.touch.labels import TOUCH, TOUCH_OR_NOT
+from skin.wire.channels import UnitConversion
+from skin.wire.emulator import Emulator, EmulatorSettings, Faults, open_port
+from skin.wire.segmentation import label_plan
+
+BODY, LAYOUT = Sheet((0.16, 0.16), (32, 32), [{"material": "EcoFlex 00-30", "thickness": 0.005}]), Grid(3, 3)
+IDLE = 12.0  # s, of which the first is the tare
+NOISE = 0.03  # N, with rounding a little more
+LEAST = 0.09  # N: five times that, less what the largest value of an interval has anyway
+
+
+@pytest.fixture
+def recorded(tmp_path, monkeypatch, capfd):
+    """Return a function that records an emulated skin and gives the session, and what was said.
+
+    Nothing touches the skin for some seconds, and then fingertips do. Enter is pressed at every prompt.
+    """
+
+    def record(count, stream=False, faults=Faults()):  # noqa: B008
+        port = open_port("pty", None)
+        device = Simulated(
+            body=BODY,
+            layout=LAYOUT,
+            simulator=Naive,
+            gestures=10,
+            touch={"window": 1.0, "press": [0.8, 0.95], "radius": [0.006, 0.012]},
+            noise=NOISE,
+        )
+        emulator = Emulator(device, port, EmulatorSettings(rate=100.0, speed=5.0, idle=IDLE, gap=0.1), faults)
+        reader = Serial(
+            body=BODY,
+            layout=LAYOUT,
+            port=port.address,
+            labels="prompted",
+            gestures=count,
+            timeout=20.0,
+            touch={"window": 1.0},
+            tare=1.0,
+            scale=emulator.converter.scale,
+            stream=stream,
+        )
+        typed, keyboard = os.pipe()
+        os.write(keyboard, b"\n" * 60)
+        thread = Thread(target=emulator.run, kwargs={"count": 40})
+        thread.start()
+        try:
+            with os.fdopen(typed) as lines:
+                monkeypatch.setattr("sys.stdin", lines)
+                record_session(reader, tmp_path / "s.csv", None, False, lambda text: None)
+                os.close(keyboard)
+        finally:
+            emulator.stop()
+            thread.join(20)
+            port.unplug()
+        recording = read_recording(convert_session(reader, tmp_path / "s.csv")[0])
+        return recording.touches, capfd.readouterr().err.splitlines()
+
+    return record
+
+
+def refused(said):
+    """Return the prompts for what was not felt; the same prompt follows each."""
+    prompts = [line for line in said if line.startswith(("next: ", "nothing was felt"))]
+    places = [place for place, line in enumerate(prompts) if line.startswith("nothing")]
+    assert all(prompts[place - 1] == prompts[place + 1] for place in places)
+    return [prompts[place - 1] for place in places]
+
+
+def test_a_gesture_that_nobody_made_is_asked_for_again(recorded, tmp_path):
+    touches, said = recorded(3)
+    assert touches.readings.amax(dim=(1, 2)).min() > LEAST
+    assert touches.labels.int().tolist() == [list(one.values()) for one in label_plan(TOUCH.names, 1, 0)][:3]
+    assert refused(said)
+    assert sorted(read_session(tmp_path / "s.csv").gestures) == [0, 1, 2]
+
+
+def test_a_prompt_for_no_touch_needs_none(recorded):
+    plan = [list(one.values()) for one in label_plan(TOUCH_OR_NOT.names, 1, 0)]
+    touches, said = recorded(16, stream=True)
+    assert touches.labels.int().tolist() == plan[:16]
+    felt = touches.readings.amax(dim=(1, 2)) > LEAST
+    wanted = touches.labels[:, TOUCH_OR_NOT.names.index("touch")] == 1
+    assert felt[wanted].all()
+    assert not felt[0]  # before the first touch
+    assert not any("not touch" in prompt for prompt in refused(said))
+
+
+def test_dead_sensors_feel_nothing_and_the_others_do(recorded):
+    touches, said = recorded(2, faults=Faults(dead=[0, 1, 2, 3]))
+    assert touches.readings[:, :, 4:].amax(dim=(1, 2)).min() > LEAST
+    assert refused(said)
+
+
+@pytest.mark.parametrize(("change", "felt"), [(0, False), (1, False), (2, True)])
+def test_a_count_more_is_no_touch_for_a_skin_without_noise(change, felt, monkeypatch, tmp_path):
+    """Its channels are still during the tare, and one changes by a count afterwards."""
+    (tmp_path / "typed").write_text("\n")
+    reader = Serial(body=BODY, layout=LAYOUT, port="/dev/null", labels="prompted", scale=0.04)
+    still = np.zeros(9)
+    conversion = UnitConversion(np.full(9, 0.04), np.full(9, 512.0), still > 0, noise=still, rest=still)
+    rows = [np.full(9, 512.0) for _ in range(450)]
+    rows[350][4] += change
+    frames = [Frame(number, number / 100, 0.0, row, row > 0) for number, row in enumerate(rows)]
+    with (tmp_path / "typed").open() as lines:
+        monkeypatch.setattr("sys.stdin", lines)
+        segmenter = reader.segmenter(None, conversion, frames[:100])
+        while segmenter._typed.qsize() < 2:  # Enter, and the end
+            sleep(0.01)
+    (done,) = [gesture for frame in frames[100:] if (gesture := segmenter.add(frame))]
+    assert done.broken is not felt

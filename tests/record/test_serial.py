@@ -1,0 +1,128 @@
+"""A skin at a port gives the touches that were played, or says why it cannot."""
+
+from threading import Thread
+
+import numpy as np
+import pytest
+import torch
+
+pytest.importorskip("termios", reason="pseudo-terminals need a POSIX system")
+
+from skin.body.base import Sheet
+from skin.body.layout import Grid
+from skin.device.calibration import Calibration
+from skin.device.simulated import Simulated
+from skin.errors import InputError
+from skin.mechanics.simulator.naive import Naive
+from skin.record.serial import Serial
+from skin.wire.channels import unit_conversion
+from skin.wire.emulator import Emulator, EmulatorSettings, Faults, emulated_gestures, open_port
+from skin.wire.protocol import Header
+
+SHEET = Sheet((0.16, 0.16), (32, 32), [{"material": "EcoFlex 00-30", "thickness": 0.005}])
+LAYOUT = Grid(2, 3)
+COUNT = 6
+# Nothing but the converter's own rounding is between what is drawn and what is read.
+PERFECT = {"gain_spread": 0.0, "offset": 0.0, "noise": 0.0, "clip": 100.0}
+
+
+def skin(**settings):
+    return Simulated(body=SHEET, layout=LAYOUT, simulator=Naive, gestures=10, **settings)
+
+
+@pytest.fixture
+def emulate():
+    """Return a function that plays a device and gives the port; nothing is left behind."""
+    playing = []
+
+    def begin(device, faults=None, binary=False, **settings):
+        port = open_port("tcp:0", None)
+        chosen = EmulatorSettings(**{"speed": 40.0, "idle": 4.0, "rate": 40.0} | settings)
+        emulator = Emulator(device, port, chosen, faults or Faults(), binary)
+        thread = Thread(target=emulator.run, kwargs={"count": COUNT + 1})
+        thread.start()
+        playing.append((emulator, thread))
+        return port.address
+
+    yield begin
+    for emulator, thread in playing:
+        emulator.stop()
+        thread.join(20)
+        assert not thread.is_alive()
+        emulator.port.unplug()
+
+
+def serial(port, layout=LAYOUT, **settings):
+    return Serial(body=SHEET, layout=layout, port=port, gestures=COUNT, timeout=30.0, **settings)
+
+
+def test_it_reads_what_was_played(emulate):
+    device = skin(**PERFECT)
+    touches = serial(emulate(device, bits=None)).touches("test")
+    played = [one for one, _ in zip(emulated_gestures(device), range(COUNT), strict=False)]
+    assert touches.labels.int().tolist() == [list(one.labels.values()) for one in played]
+    expected = torch.from_numpy(np.stack([one.force for one in played])).float()
+    assert torch.allclose(touches.readings, expected, atol=1e-4, rtol=1e-5)
+    assert touches.valid.all()
+    assert touches.rate == 10.0
+
+
+def test_counts_offsets_and_lost_frames_change_little(emulate):
+    device = skin(gain_spread=0.0, offset=0.5, noise=0.0, clip=10.0)
+    port = emulate(device, Faults(flipped_bits=2e-5, lost_bytes=1e-5, banner=True))
+    touches = serial(port, scale=20 / 512).touches("test")
+    played = {
+        str(list(one.labels.values())): one
+        for one, _ in zip(emulated_gestures(device), range(COUNT + 1), strict=False)
+    }
+    for labels, readings, valid in zip(
+        touches.labels.int().tolist(), *(touches.readings, touches.valid), strict=True
+    ):
+        expected = np.clip(played[str(labels)].force, -10, 10)
+        wrong = np.abs(readings.numpy() - expected)[valid.numpy()]
+        # Half a count each for baseline and value; most intervals lose no frame.
+        assert np.median(wrong) <= 20 / 512
+
+
+def test_another_number_of_sensors_is_refused_with_both(emulate):
+    with pytest.raises(InputError, match="sends 6 values per frame, the layout has 4"):
+        serial(emulate(skin()), layout=Grid(2, 2), scale=1.0).touches("test")
+
+
+def test_a_slower_device_is_refused_with_both_rates(emulate):
+    with pytest.raises(InputError, match=r"sends 5 frames a second, the model needs 10"):
+        serial(emulate(skin(), rate=5.0, idle=30.0), scale=1.0).touches("test")
+
+
+def test_counts_without_a_unit_are_refused(emulate):
+    with pytest.raises(InputError, match=r"sends adc.*device\.scale"):
+        serial(emulate(skin(noise=0.5))).touches("test")
+
+
+@pytest.mark.parametrize("split", ["train", "validation", "holdout"])
+def test_only_a_test_split(split):
+    with pytest.raises(InputError, match="skin record"):
+        serial("/dev/null").touches(split)
+
+
+def test_a_port_is_needed():
+    with pytest.raises(InputError, match=r"device\.port="):
+        serial(None).touches("test")
+
+
+def test_a_calibration_undoes_gain_and_offset():
+    known = Calibration(
+        {"gain": [2.0, 0.5], "offset": [0.1, -0.1]}, broken={"dead": [1]}, scale=0.01, zero=500.0
+    )
+    true = np.array([[3.0, 4.0]])
+    raw = (true * [2.0, 0.5] + [0.1, -0.1]) / 0.01 + 500.0
+    readings, valid = unit_conversion(2, None, None, known, None)(raw, np.ones((1, 2), dtype=bool))
+    assert readings[0, 0] == pytest.approx(3.0)
+    assert valid.tolist() == [[True, False]]
+    tared = unit_conversion(2, raw[0], None, known, None)(raw + 50.0, np.ones((1, 2), dtype=bool))[0]
+    assert tared[0, 0] == pytest.approx(0.25)
+
+
+def test_newtons_are_newtons():
+    found = unit_conversion(1, None, None, None, Header(unit="N"))
+    assert found(np.array([1.5]), np.array([True]))[0].tolist() == [1.5]

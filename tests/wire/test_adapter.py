@@ -1,0 +1,277 @@
+"""Adapters: their settings, what they refuse, what they say to a board, and any bytes at all."""
+
+from contextlib import suppress
+from itertools import pairwise
+from threading import Event, Thread
+from time import monotonic, sleep
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from skin.core.files import CONF
+from skin.errors import InputError
+from skin.wire.adapter import Adapter, read_adapter
+from skin.wire.clocks import ClockUnit, ClockWatch, SequenceTracker
+from skin.wire.decoder import Decoder
+from skin.wire.proposal import propose
+from skin.wire.reader import PortSettings, SkinTimeout
+from skin.wire.skin import open_skin
+
+PATIENT = 60.0  # s: machines are busy at times
+SHIPPED = sorted(path.stem for path in (CONF / "adapter").glob("*.yaml"))
+quickly = settings(
+    max_examples=60, deadline=None, derandomize=True, database=None, suppress_health_check=list(HealthCheck)
+)
+OTHERS = {
+    "pattern": Adapter(kind="text", pattern=r"<(?P<counter>\d+)\|(?P<values>[^>]*)>"),
+    "decimal": Adapter(kind="text", decimal=",", separator=";"),
+    "endless": Adapter(kind="text", end="", length=11, separator=" "),
+    "struct": Adapter(kind="binary", struct={"counter": "u1", "f": "(3,)<i2"}, head="aa 55"),
+    "index": Adapter(kind="text", rows=0, index=0),
+}
+ALL = {name: read_adapter(name) for name in SHIPPED} | OTHERS
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_every_shipped_adapter_is_read_and_written(name, tmp_path):
+    path = tmp_path / "board.yaml"
+    path.write_text(ALL[name].describe())
+    assert read_adapter(str(path)) == ALL[name]
+    assert PortSettings(adapter=name).frames == ALL[name]
+
+
+@pytest.mark.parametrize(
+    ("described", "said"),
+    [
+        ("cvs", "there is no device.adapter=cvs: there are .*csv"),
+        ("absent.yaml", "absent.yaml cannot be read"),
+        ({"kind": "xml"}, "device.adapter.kind=xml must be"),
+        ({"kind": "text", "seperator": ";"}, "no setting seperator: did you mean separator"),
+        ({"kind": "text", "pattern": "(?P<a"}, "no regular expression"),
+        ({"kind": "text", "pattern": r"\d+"}, "needs a named group"),
+        ({"kind": "text", "decimal": ",", "separator": ","}, "cannot separate fields"),
+        ({"kind": "text", "end": ""}, "needs its length"),
+        ({"kind": "binary"}, "need a struct"),
+        ({"kind": "binary", "struct": {"f": "<u2"}}, "need a head or a tail"),
+        ({"kind": "binary", "struct": {"f": "<q9"}, "head": "aa"}, "device.adapter.struct="),
+        ({"kind": "binary", "struct": {"f": "O"}, "head": "aa"}, "numbers alone"),
+        ({"kind": "binary", "struct": {"f": "<u2"}, "head": "xy"}, "no bytes in hexadecimal"),
+        ({"kind": "binary", "struct": {"f": "(99999,)<u2"}, "head": "aa"}, "at most 32768"),
+        ({"kind": "text", "time_unit": "min"}, "time_unit=min must be"),
+        ([1], "must be settings by name"),
+    ],
+)
+def test_a_wrong_description_is_one_sentence(described, said):
+    with pytest.raises(InputError, match=said) as error:
+        read_adapter(described)
+    assert "\n" not in str(error.value)
+
+
+def test_fields_that_the_board_does_not_send_are_named():
+    decoder = Decoder(adapter=Adapter(kind="text", label="=", drop=("temperature",)))
+    with pytest.raises(InputError, match=r"names a field temperature, the board sends 2 fields.*a, b"):
+        decoder.feed(b"a=1 b=2\n" * 40)
+
+
+def test_lines_that_do_not_match_are_shown_with_the_field_that_failed():
+    decoder = Decoder(4, adapter=read_adapter("csv"))
+    for n in range(60):
+        decoder.feed(b"12,13,%dmm,14\n" % n, 0.1 * n)
+    error = str(decoder.error())
+    assert all(f"'12,13,{n}mm,14' (field '{n}mm' is no number)" in error for n in (57, 58, 59))
+    assert "adapter=auto" in error
+
+
+@pytest.mark.parametrize(
+    ("frames", "rate", "said"),
+    [(200, None, "counts ms, by the host's clock"), (20, 100.0, "counts ms, by the header's rate=100")],
+)
+def test_the_unit_of_a_clock_follows_from_the_host_or_the_header(frames, rate, said):
+    unit = ClockUnit(1e-6, False)
+    changed = [unit.add(10 * n, n / 100, 1, rate) for n in range(frames)]
+    assert sum(changed) == 1
+    assert (unit.unit, said in unit.summary) == (1e-3, True)
+
+
+@pytest.mark.parametrize(("fixed", "arrival", "rate"), [(True, 0.01, None), (False, 10.0, 100.0)])
+def test_where_the_unit_contradicts_the_hosts_clock_that_rules(fixed, arrival, rate):
+    """The user set the unit; or the header says 100 Hz, but the host sees 0.1 Hz of the same clock."""
+    unit, watch = ClockUnit(1e-6, fixed), ClockWatch()
+    trusted = []
+    for n in range(400):
+        unit.add(10 * n, arrival * n, 1, rate)
+        trusted.append(watch.trust([10 * n * unit.unit], arrival * n, 1.0))
+    assert unit.unit == (1e-6 if fixed else 1e-3)
+    assert trusted[0]
+    assert not trusted[-1]
+
+
+@pytest.mark.parametrize("modulus", [37, 100, 256, 1000, 4096])
+@pytest.mark.parametrize("clocked", [True, False])
+def test_a_counter_wraps_at_any_modulus_and_losses_are_counted(modulus, clocked):
+    order, lost = SequenceTracker(), 0
+    sent = [n for n in range(5 * modulus) if n % 91 != 17]
+    placed = [order.place(n % modulus, 10_000.0 * n, 0, clocked) for n in sent]
+    resets = sum(place.after == "reset" for place in placed)
+    if clocked:
+        lost = sum(place.lost for place in placed)
+        assert (resets, lost) == (0, sent[-1] + 1 - sent[0] - len(sent))
+    else:
+        assert resets <= 1 + (modulus == 37)
+    assert order.modulus == modulus
+
+
+def test_a_restart_is_no_wrap():
+    order = SequenceTracker()
+    for n in range(300):
+        order.place(n, 10_000.0 * n, 0)
+    assert order.place(0, 10_000.0 * 400, 0).after == "reset"  # the counter after a pause
+    assert order.place(1, 0.0, 0).after == "reset"  # the clock
+
+
+def cut(data, cuts):
+    places = sorted({0, len(data), *(place % (len(data) + 1) for place in cuts)})
+    return [data[first:last] for first, last in pairwise(places)]
+
+
+TEXTS = st.one_of(
+    st.binary(max_size=200),
+    st.text(alphabet='0123456789,.;:-+eE \t\r\n"{}[]<>|nafov', max_size=300).map(str.encode),
+    st.lists(st.lists(st.integers(-9, 2000), min_size=1, max_size=5), max_size=30).map(
+        lambda rows: b"".join(b",".join(b"%d" % value for value in row) + b"\n" for row in rows)
+    ),
+)
+
+
+@pytest.mark.parametrize("name", ALL)
+@given(pieces=st.lists(TEXTS, max_size=10), sensors=st.sampled_from([None, 1, 3]))
+@quickly
+def test_nothing_but_a_sentence_is_raised(name, pieces, sensors):
+    decoder = Decoder(sensors, adapter=ALL[name])
+    for now, piece in enumerate(pieces):
+        with suppress(InputError):
+            for frame in decoder.feed(piece, float(now)):
+                assert np.isfinite(frame.values).all()
+                assert len(frame.values) == decoder.sensors
+    decoder.error()
+    decoder.explain()
+
+
+@given(pieces=st.lists(TEXTS, max_size=10))
+@settings(quickly, max_examples=15)
+def test_a_proposal_of_anything_is_one_or_a_sentence(pieces):
+    with suppress(InputError):
+        assert propose(list(enumerate(pieces))).sensors > 0
+
+
+def encoded(name, n, row):
+    """Return a frame of three values as an adapter describes it."""
+    values = [str(value) for value in row]
+    if name == "json_lines":
+        return f'{{"v": [{", ".join(values)}]}}\n'.encode()
+    if name == "arduino_plotter":
+        return (",".join(f"p{k}:{value}" for k, value in enumerate(values)) + "\n").encode()
+    if name == "pattern":
+        return f"<{n}|{','.join(values)}>\n".encode()
+    if name == "struct":
+        return b"\xaa\x55" + bytes([n % 256]) + np.array(row, "<i2").tobytes()
+    if name == "index":
+        return "".join(f"{k},{value}\n" for k, value in enumerate(values)).encode()
+    return (";" if name == "decimal" else ",").join(values).encode() + b"\n"
+
+
+@pytest.mark.parametrize(
+    "name", ["csv", "json_lines", "arduino_plotter", "pattern", "decimal", "struct", "index"]
+)
+@given(
+    noise=st.binary(max_size=60), cuts=st.lists(st.integers(0, 10**6), max_size=8), seed=st.integers(0, 999)
+)
+@quickly
+def test_noise_between_frames_changes_no_value_of_the_others(name, noise, cuts, seed):
+    rows = np.random.default_rng(seed).integers(300, 700, (60, 3)).tolist()
+    frames = [encoded(name, n, row) for n, row in enumerate(rows)]
+    data = b"".join(frames[:40]) + noise + (b"" if name == "struct" else b"\n") + b"".join(frames[40:])
+    decoder = Decoder(3, adapter=ALL[name])
+    decoded = [frame.values.tolist() for piece in cut(data, cuts) for frame in decoder.feed(piece)]
+    # Bytes that look like frames are frames; all others are as sent, and those after the noise come back.
+    waiting = int(name == "struct")  # the last frame counts once the next one follows it
+    assert [row for row in decoded if row in rows][-15:] == rows[-15 - waiting : len(rows) - waiting]
+    assert sum(row not in rows for row in decoded) <= 1 + noise.count(b"\n")
+
+
+@pytest.mark.parametrize("name", ["csv", "struct", "index"])
+def test_a_lost_byte_of_a_frame_without_a_checksum_is_not_two_wrong_frames(name):
+    rows = np.random.default_rng(5).integers(300, 700, (600, 3)).tolist()
+    rng, wrong = np.random.default_rng(6), 0
+    decoder = Decoder(3, adapter=ALL[name])
+    for n, row in enumerate(rows):
+        frame = encoded(name, n, row)
+        place = int(rng.integers(len(frame)))
+        spoilt = n > 100 and n % 10 == 0
+        for decoded in decoder.feed(frame[:place] + frame[place + spoilt :]):
+            wrong += decoded.values.tolist() not in rows
+    assert wrong <= 50  # at most the spoilt ones, of which a digit is lost
+    assert decoder.stats.frames > 480
+    if name == "struct":
+        assert wrong == 0
+
+
+class Board:
+    """A board at the other end of a cable that answers what it is told."""
+
+    def __init__(self, plug, behave):
+        self.received, self._plug, self._stop = b"", plug, Event()
+        self._thread = Thread(target=self._run, args=(behave,), daemon=True)
+
+    def _run(self, behave):
+        import os
+        import select
+
+        while not self._stop.is_set():
+            ready = select.select([self._plug.master], [], [], 0.01)[0]
+            fresh = os.read(self._plug.master, 100) if ready else b""
+            self.received += fresh
+            for line in behave(fresh, self.received):
+                self._plug.send(line)
+
+    def __enter__(self):
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_):
+        self._stop.set()
+        self._thread.join(5)
+
+
+def test_a_board_is_started_and_stopped(plug):
+    def behave(fresh, received):
+        return [b"7,8,%d\n" % (500 + monotonic() * 100 % 7)] if b"go\r" in received else []
+
+    adapter = {"kind": "text", "start": "go\r", "stop": "halt\r"}
+    with Board(plug, behave) as board:
+        with open_skin(plug.port, range(3), adapter=adapter, timeout=PATIENT) as skin:
+            assert len(skin.read(20)) == 20
+        deadline = monotonic() + PATIENT
+        while not board.received.endswith(b"halt\r"):
+            assert monotonic() < deadline
+            sleep(0.01)
+    assert board.received.count(b"go\r") >= 1
+
+
+def test_a_board_is_polled_for_each_frame(plug):
+    with (
+        Board(plug, lambda fresh, received: [b"1,2,3\n"] * fresh.count(b"?")) as board,
+        open_skin(plug.port, range(3), adapter={"kind": "text", "poll": "?"}, timeout=PATIENT) as skin,
+    ):
+        skin.read(40)
+    assert board.received.count(b"?") >= 40
+
+
+@pytest.mark.parametrize("name", ["start", "poll"])
+def test_a_string_that_is_never_answered_is_said(plug, name):
+    with open_skin(plug.port, range(3), adapter={"kind": "text", name: "go"}, timeout=1.5) as skin:
+        plug.send(b"type go\n")
+        with pytest.raises(SkinTimeout, match=rf"the {name} string 'go' of the adapter was sent \d+ times"):
+            skin.read(1)

@@ -1,0 +1,312 @@
+"""Streams of boards that nobody described: the proposed adapter reads every value that was sent."""
+
+import json
+import struct
+from collections.abc import Callable
+from time import process_time
+
+import numpy as np
+import pytest
+
+from skin.errors import InputError
+from skin.wire.adapter import Adapter, read_adapter
+from skin.wire.decoder import Decoder
+from skin.wire.formats import DetectedFormat
+from skin.wire.proposal import propose
+
+RATE = 50.0  # Hz
+COUNT = 250
+
+
+def table(sensors, digits=0, base=300.0, spread=4.0):
+    rng = np.random.default_rng(sensors)
+    return np.round(base + 30 * np.arange(sensors) + rng.normal(0, spread, (COUNT, sensors)), digits)
+
+
+def words(row, shape="%d"):
+    return [shape % value for value in row]
+
+
+def joined(separator, end="\n", shape="%d", before="", after=""):
+    return lambda n, row: (before + separator.join(words(row, shape)) + after + end).encode()
+
+
+def labelled(template, separator, end="\n", shape="%d"):
+    return lambda n, row: (
+        separator.join(template.format(k, shape % value) for k, value in enumerate(row)) + end
+    ).encode()
+
+
+def clocked(tick, separator=",", counter=None, first=0, shape="%d"):
+    """Return lines with a clock of ``tick`` units per frame, and a counter of a modulus."""
+
+    def line(n, row):
+        head = [] if counter is None else [str(n % counter)]
+        clock = [shape % (first + n * tick)] if tick else []
+        return (separator.join([*head, *clock, *words(row)]) + "\n").encode()
+
+    return line
+
+
+def packed(kinds, head=b"", tail=b"", check=None, values=lambda n, row: row):
+    def frame(n, row):
+        numbers = values(n, row)
+        cast = float if "f" in kinds.format(len(row)) else int
+        body = struct.pack(kinds.format(len(row)), *map(cast, numbers))
+        return head + body + (bytes([sum(body) % 256]) if check else b"") + tail
+
+    return frame
+
+
+def matrix(columns, between=b"\n", index=None, end="\n", shape="%d"):
+    def frame(n, row):
+        rows = np.reshape(row, (-1, columns))
+        lines = [
+            ([] if index is None else [str(index + k)]) + words(values, shape)
+            for k, values in enumerate(rows)
+        ]
+        text = "".join(",".join(line) + end for line in lines).encode()
+        return text + (between(n) if callable(between) else between)
+
+    return frame
+
+
+def pairs(template, first=0):
+    return lambda n, row: "".join(template.format(first + k, round(v)) for k, v in enumerate(row)).encode()
+
+
+F2, F3 = "%.2f", "%.3f"
+FLOATS = table(5, 2, 3.0, 0.2)
+STREAMS: dict[str, tuple[Callable, np.ndarray, float | None]] = {
+    # name: (bytes of frame n, values, s between two frames by the device's clock or None)
+    "pipes": (joined(" | ", shape="%d"), table(4), None),
+    "blanks padded": (joined(" ", shape="%6d", end="\r\n"), table(7), None),
+    "tabs lfcr": (joined("\t", end="\n\r"), table(6), None),
+    "comma blank cr": (joined(", ", end="\r"), table(3), None),
+    "semicolons trailing": (joined(";", after=";"), table(5), None),
+    "one channel": (joined(","), table(1), None),
+    "sixty-four channels": (joined(","), table(64), None),
+    "negative exponents": (joined(",", shape="%.3e"), table(4, 0, -300.0, 5.0), None),
+    "parentheses": (joined(",", before="(", after=")"), table(4), None),
+    "braces": (joined(" ", before="{", after="}"), table(4), None),
+    "word before": (joined(",", before="DATA,"), table(4), None),
+    "nmea-like": (joined(",", before="$FSR,", end="\r\n"), table(6), None),
+    "arrow before": (joined(" ", before="skin > "), table(5), None),
+    "units after": (joined(" N; ", shape=F2, after=" N"), FLOATS, None),
+    "millivolts": (labelled("ch{}={}mV", " "), table(4), None),
+    "labels equals": (labelled("P{}={}", " "), table(5), None),
+    "labels blank": (labelled("Sensor {}: {}", ", "), table(3), None),
+    "labels float tab": (labelled("pad{}:{}", "\t", shape=F2), FLOATS, None),
+    "labels semicolons": (labelled("c{} = {}", "; ", "\r\n"), table(9), None),
+    "decimal comma tabs": (lambda n, r: joined("\t", shape=F2)(n, r).replace(b".", b","), FLOATS, None),
+    "decimal comma blanks": (
+        lambda n, r: joined("  ", shape=F3)(n, r).replace(b".", b","), table(4, 3, 2, 0.3), None
+    ),
+    "milliseconds": (clocked(20, first=88_213), table(4), 0.02),
+    "microseconds": (clocked(20_000, ";", first=5_000_000), table(4), 0.02),
+    "seconds": (clocked(0.02, "\t", shape="%.3f"), table(4), 0.02),
+    "counter of 256, ms": (clocked(20, counter=256), table(4), 0.02),
+    "counter of 100, us": (clocked(20_000, counter=100), table(4), 0.02),
+    "counter of 37, s": (clocked(0.02, counter=37, shape="%.2f"), table(4), 0.02),
+    "counter alone": (clocked(0, counter=10_000), table(4), None),
+    "clock of 16 bits": (
+        lambda n, r: b"%d,%s" % ((64_000 + 20 * n) % 65_536, joined(",")(n, r)), table(4), 0.02
+    ),
+    "time of day": (
+        lambda n, r: b"10:59:%06.3f %s" % (20 + n / RATE, joined(" ")(n, r)), table(4), 0.02
+    ),
+    "json object": (
+        lambda n, r: json.dumps({f"s{k}": v for k, v in enumerate(r)}).encode() + b"\n", FLOATS, None
+    ),
+    "json nested": (
+        lambda n, r: json.dumps({"at": {"ms": 20 * n}, "pads": [list(r[:2]), list(r[2:])]}).encode() + b"\n",
+        table(4), 0.02,
+    ),
+    "json list with time": (lambda n, r: json.dumps([n * 20_000, *r]).encode() + b"\n", table(5), 0.02),
+    "json temperature": (
+        lambda n, r: json.dumps({"seq": n, "temp": 24.1, "f": list(r)}).encode() + b"\n", table(5), None
+    ),
+    "matrix, blank line": (matrix(4), table(12), None),
+    "matrix, word": (matrix(3, lambda n: b"frame %d\n" % n), table(9), None),
+    "matrix, dashes, crlf": (matrix(5, b"-----\r\n", end="\r\n"), table(10), None),
+    "matrix, index": (matrix(4, b"", index=0), table(16), None),
+    "matrix, index from 1": (matrix(2, b"", index=1), table(8), None),
+    "index and value": (pairs("{},{}\n"), table(6), None),
+    "index colon value": (pairs("{}: {}\r\n"), table(6), None),
+    "word index value": (pairs("ch{}={}\n"), table(8), None),
+    "u16 head": (packed("<{}H", b"\xaa\x55"), table(8), None),
+    "u16 big-endian head and tail": (packed(">{}H", b"\xff\xfe", b"\r\n"), table(6), None),
+    "f32 head": (packed("<{}f", b"\xa5\x5a"), FLOATS.astype("f4").astype(float), None),
+    "i16 head sum": (packed("<{}h", b"\x7e\x81", check=True), table(7, 0, -20, 30), None),
+    "u16 counter clock": (
+        packed("<HI{}H", b"\xab\xcd", values=lambda n, r: [n, 20 * n + 3_000, *r]), table(5), 0.02
+    ),
+    "no end": (lambda n, r: ",".join(f"{int(v):03d}" for v in r).encode(), table(5), None),
+}  # fmt: skip
+
+
+def sent(name):
+    encode, rows, _ = STREAMS[name]
+    pieces = [(n / RATE, encode(n, row)) for n, row in enumerate(rows)]
+    # In the middle of a frame, as a port is opened.
+    return [(pieces[0][0], pieces[0][1][len(pieces[0][1]) // 2 :]), *pieces[1:]]
+
+
+def check_frames(decoder, pieces, rows):
+    """Check that every frame has the values of a row, in order; return the frames."""
+    frames = [frame for now, data in pieces for frame in decoder.feed(data, now)]
+    assert len(frames) >= 0.85 * len(rows)
+    numbers, following = [], 0
+    for frame in frames:
+        assert frame.valid.all()
+        place = next((n for n in range(following, len(rows)) if np.array_equal(frame.values, rows[n])), None)
+        assert place is not None, f"{frame.values} was never sent"
+        numbers.append(place)
+        following = place + 1
+    return frames
+
+
+@pytest.mark.parametrize("name", STREAMS)
+def test_a_proposed_adapter_reads_what_was_sent(name):
+    _, rows, period = STREAMS[name]
+    pieces = sent(name)
+    proposal = propose(pieces)
+    assert proposal.sensors == rows.shape[1]
+    # What a person pastes is what is read.
+    import yaml
+
+    pasted = read_adapter(yaml.safe_load(proposal.adapter.describe()))
+    assert pasted == proposal.adapter
+    decoder = Decoder(adapter=pasted)
+    frames = check_frames(decoder, pieces, rows)
+    assert decoder.stats.resets == 0
+    if period is not None:
+        steps = np.diff([frame.t for frame in frames])
+        assert np.allclose(steps, period, atol=1e-6)
+        assert "counts" in decoder.stats.clock
+
+
+@pytest.mark.parametrize("name", ["pipes", "milliseconds", "json nested", "matrix, index", "u16 head"])
+@pytest.mark.parametrize("burst", [10, 25])
+def test_bursts_are_read_with_the_time_between_their_frames(name, burst):
+    _, rows, period = STREAMS[name]
+    pieces = sent(name)
+    bursts = [
+        (pieces[min(n + burst, len(pieces)) - 1][0], b"".join(data for _, data in pieces[n : n + burst]))
+        for n in range(0, len(pieces), burst)
+    ]
+    decoder = Decoder(adapter=propose(bursts).adapter)
+    frames = check_frames(decoder, bursts, rows)
+    steps = np.diff([frame.t for frame in frames])[len(frames) // 2 :]
+    assert np.median(steps) == pytest.approx(period or 1 / RATE, rel=0.1)
+
+
+def test_what_is_no_stream_is_shown():
+    with pytest.raises(InputError, match="nothing received"):
+        propose([])
+    lines = [(n * 0.1, b"Ready. Send g to go.\r\n") for n in range(20)]
+    with pytest.raises(InputError, match=r"the last lines are 'Ready. Send g to go.'.*start="):
+        propose(lines)
+    noise = np.random.default_rng(0).bytes(4000)
+    with pytest.raises(InputError, match=r"4000 bytes that are no text.*baud rate"):
+        propose([(0.0, noise[:2000]), (1.0, noise[2000:])])
+
+
+def test_no_adapter_holds_text_of_a_stream():
+    for name in ("csv", "arduino_plotter", "json_lines", "matrix_rows"):
+        described = read_adapter(name)
+        assert described.pattern is None
+        assert not described.names
+
+
+def test_the_shipped_adapters_read_what_they_are_named_after():
+    rng = np.random.default_rng(3)
+    rows = np.round(rng.normal(0, 50, (200, 3, 4)), 2)
+    text = [b"".join(b"%.2f\t%.2f\t%.2f\t%.2f" % tuple(chip) for chip in row) + b"\n" for row in rows]
+    frames = Decoder(9, adapter=read_adapter("anyskin")).feed(b"".join(text))
+    assert frames[-1].values.tolist() == rows[-1, :, 1:].ravel().tolist()
+    data = b"".join(rows[n].astype("<f4").tobytes() + b"\r\n" for n in range(200))
+    frames = Decoder(9, adapter=read_adapter("anyskin_binary")).feed(data)
+    assert len(frames) >= 199
+    assert frames[-1].values.tolist() == rows[-1, :, 1:].astype("f4").ravel().tolist()
+
+
+@pytest.mark.parametrize("axes", ["normal", "magnitude"])
+@pytest.mark.parametrize("kind", ["text", "binary", "rows"])
+def test_three_axes_at_one_place_become_one_sensor(axes, kind):
+    """A chip per row, or all chips in one frame; what one axis lacks, the length lacks, too."""
+    chips = np.random.default_rng(4).normal(0, 50, (60, 5, 3)).round(2)
+    chips[40, 2, 0] = -999
+    head, described = b"", {"kind": "text"}
+    encode = lambda chip: joined(",", shape="%.2f")(0, chip.ravel())  # noqa: E731
+    if kind == "binary":
+        described = {"kind": "binary", "struct": {"xyz": "(15,)<f8"}, "head": "aa 55"}
+        encode = lambda chip: chip.tobytes()  # noqa: E731
+        head = b"\xaa\x55"
+    elif kind == "rows":
+        described = {"kind": "text", "rows": 0}
+        encode = lambda chip: matrix(3, shape="%.2f")(0, chip.ravel())  # noqa: E731
+    adapter = read_adapter({**described, "axes": axes, "invalid": [-999]})
+    data = b"".join(head + encode(chip) for chip in chips) + head
+    for count in (5, None):
+        frames = Decoder(count, adapter=adapter).feed(data)
+        assert len(frames) > 40
+        expected = chips[..., 2] if axes == "normal" else np.sqrt((chips**2).sum(axis=2))
+        for frame, row in zip(frames[::-1], expected[::-1], strict=False):
+            lost = axes == "magnitude" and row[2] > 900
+            assert frame.valid.tolist() == [True, True, not lost, True, True]
+            assert np.allclose(frame.values[frame.valid], row[frame.valid])
+    with pytest.raises(InputError, match=r"axes.* takes x, y, z of each place, but 4 values are left"):
+        Decoder(adapter=Adapter(kind="text", axes=axes)).feed(b"1,2,3,4\n" * 60)
+
+
+def test_fields_are_kept_dropped_and_marked_invalid():
+    rows = [[n, 512 + n % 3, -999 if n % 5 == 0 else 7, 24.5, 300] for n in range(60)]
+    lines = "".join(" ".join(map(str, row)) + "\n" for row in rows).encode()
+    adapter = Adapter(kind="text", drop=(3,), invalid=(-999, "off"))
+    frames = Decoder(adapter=adapter).feed(lines)
+    assert frames[0].seq == 1
+    assert frames[-1].values.tolist() == [514, 7, 300]
+    assert {frame.valid[1] for frame in frames if frame.seq % 5 == 0} == {False}
+    frames = Decoder(adapter=Adapter(kind="text", values=(4, 1))).feed(lines)
+    assert frames[-1].values.tolist() == [300, 514]
+
+
+SHIPPED = {
+    "arduino_plotter": b"a:%d,b:2\n",
+    "anyskin": b"25.00%d.00-1.250.17\n",
+    "csv": b"%d,2,3\n",
+    "json_lines": b'{"a":%d,"b":2}\n',
+    "matrix_rows": b"%d,2,3\n",
+    "protocol": b"%d,2,3\n",
+    "anyskin_binary": b"%d",
+}
+
+
+@pytest.mark.parametrize("adapter", SHIPPED)
+def test_the_time_for_a_long_line_grows_with_its_length(adapter):
+    """Regular expressions that match blanks or digits in several ways took 4 s, or an hour."""
+
+    def seconds(line):
+        decoder = Decoder(adapter=read_adapter(adapter))
+        decoder.feed(b"".join(SHIPPED[adapter] % (place % 9) for place in range(40)))
+        start = process_time()
+        for place in range(0, len(line), 1024):
+            decoder.feed(line[place : place + 1024])
+        return process_time() - start
+
+    for begin in (b"a", b"a:", b"a:1", b"a:1,b:2", b"1.25", b"25.0"):
+        for middle in (b" ", b"1", b"a"):
+            short, long = (seconds(begin + middle * length + b"x\n") for length in (7_500, 30_000))
+            assert long < 8 * short + 0.1, (begin, middle)  # as the square: 16 times
+
+
+def test_what_is_read_to_find_a_format_grows_with_what_is_received(monkeypatch):
+    """Each of many small pieces made the decoder read all of those before it."""
+    read, decoder = [], Decoder(adapter=read_adapter("csv"))
+    monkeypatch.setattr(
+        Adapter, "detect", lambda self, data, sensors: read.append(len(data)) or DetectedFormat()
+    )
+    for _ in range(3000):
+        decoder.feed(b"xyz 1 of\r\n")
+    assert sum(read) < 20 * 30_000

@@ -1,0 +1,137 @@
+"""What a person meets at a real pseudo-terminal, beyond tests/port/test_open_skin.py."""
+
+import os
+import subprocess
+import sys
+from threading import Thread
+from time import monotonic, sleep
+
+import numpy as np
+import pytest
+
+from skin.body.base import Sheet
+from skin.body.layout import Grid
+from skin.live.engine import Detection, Engine
+from skin.live.loop import LiveLoop
+from skin.record.recorder import record_session
+from skin.record.serial import Serial
+from skin.record.session import read_session
+from skin.touch.labels import TOUCH
+from skin.wire.channels import Tare
+from skin.wire.protocol import Header, encode_header, encode_line
+from skin.wire.skin import open_skin
+
+PATIENT = 300.0  # s: machines are busy at times
+SHEET = Sheet((0.16, 0.16), (32, 32), [{"material": "EcoFlex 00-30", "thickness": 0.005}])
+
+
+@pytest.mark.parametrize("verb", ["listen", "record"])
+@pytest.mark.slow("a process for each command")
+def test_a_port_in_use_ends_a_command_with_code_2(plug, tmp_path, verb):
+    out = {"listen": [], "record": ["out=s.csv"]}[verb]
+    with open_skin(plug.port):
+        done = subprocess.run(
+            [sys.executable, "-m", "skin", verb, f"device.port={plug.port}", *out],
+            cwd=tmp_path,
+            capture_output=True,
+            text=True,
+            timeout=PATIENT,
+            check=False,
+        )
+    assert done.returncode == 2
+    assert (
+        done.stderr == f"{plug.port} is in use: close the serial monitor or any other program that reads it\n"
+    )
+    assert not list(tmp_path.glob("s.csv*"))
+
+
+def test_time_that_goes_backwards_is_a_new_start(plug):
+    with open_skin(plug.port, range(2)) as skin:
+        moments = [(number, 10_000 * number) for number in range(5)] + [(5, 100), (6, 10_100)]
+        plug.send(*(encode_line([1, number], number, t) for number, t in moments))
+        frames = skin.read(7, timeout=PATIENT)
+        assert skin.stats.resets == 1
+    assert [(frame.segment, frame.after) for frame in frames[4:]] == [(0, ""), (1, "reset"), (1, "")]
+
+
+@pytest.mark.parametrize(
+    ("rate", "said"),
+    [*((rate, " (short taps read low below 100 Hz)") for rate in (10, 20, 50)), (100, "")],
+)
+def test_a_rate_that_misses_the_peaks_of_taps_stands_in_the_status_line(plug, rate, said):
+    values = np.random.default_rng(0).integers(400, 600, (60, 6))
+    with open_skin(plug.port, range(6)) as skin:
+        plug.send(*(encode_line(row.tolist(), n, 1_000_000 // rate * n) for n, row in enumerate(values)))
+        skin.read(60, timeout=PATIENT)
+        assert LiveLoop(skin, Tare(None, 0.0, 10.0), engine(), None).line == f"{rate}.0 Hz{said}"
+
+
+def test_channels_that_mean_nothing_stand_in_the_status_line(plug):
+    rng = np.random.default_rng(0)
+    values = rng.integers(400, 600, (800, 6))
+    values[:, 1] = 0  # never a change
+    values[200:, 2] = 444  # none any more
+    values[-1, 3] = 1023  # the largest count
+    with open_skin(plug.port, range(6)) as skin:
+        plug.send(encode_header(Header(n=6, bits=10)))
+        plug.send(*(encode_line(row.tolist(), n, 10_000 * n) for n, row in enumerate(values)))
+        frames = skin.read(800, timeout=PATIENT)
+        line = LiveLoop(skin, Tare(None, 0.0, 10.0), engine(), None).line
+    assert frames[-1].valid.tolist() == [True, False, False, True, True, True]
+    assert "sensor 1 dead, sensor 2 stuck, sensor 3 saturated" in line
+
+
+def engine():
+    """Return an engine at 10 Hz that has nothing to say."""
+    return Engine(lambda readings, valid: [0.0] * len(TOUCH.names), TOUCH, 6, 30, 10.0, Detection(0.3))
+
+
+def sent(cable, stop, first=0):
+    """Send frames at a hundredth of a second each, ten times as fast, from number ``first`` on."""
+    rng, number = np.random.default_rng(first), 0
+    try:
+        while not stop():
+            if number % 100 == 0:
+                cable.send(encode_header(Header(n=4, rate=100.0, unit="N")))
+            cable.send(encode_line(rng.normal(scale=0.02, size=4).round(4), number, 10_000 * number))
+            number += 1
+            sleep(0.001)
+    except OSError:
+        return
+
+
+def test_an_unplugged_skin_is_recorded_on_with_a_gap_marker(new_plug, tmp_path):
+    link, path, said = tmp_path / "skin", tmp_path / "s.csv", []
+
+    def events(what):
+        return path.read_text().count(f'"event": "{what}"') if path.exists() else 0
+
+    def life():
+        """Be plugged in until a gesture is whole; be unplugged in the middle of the next, and come back."""
+        deadline = monotonic() + PATIENT
+        for end in (lambda: events("begin") >= 2, lambda: over):
+            cable = new_plug()
+            link.unlink(missing_ok=True)
+            os.symlink(cable.port, link)
+            ready.append(True)
+            sent(cable, lambda end=end: end() or monotonic() > deadline)
+            cable.unplug()
+
+    ready, over = [], []
+    thread = Thread(target=life, daemon=True)
+    thread.start()
+    while not ready:
+        sleep(0.001)
+    settings = {"touch": {"window": 1.0}, "tare": 1.0, "timeout": PATIENT, "backoff": (0.01, 0.05)}
+    device = Serial(body=SHEET, layout=Grid(2, 2), port=str(link), **settings)
+    record_session(device, path, 8.0, True, said.append)
+    over.append(True)
+    thread.join(PATIENT)
+    text = path.read_text()
+    assert text.count('"event": "gap", "after": "reconnect"') == 1
+    assert events("broken") == 1
+    assert events("end") >= 3
+    gestures = read_session(path).gestures
+    assert all(
+        np.diff([frame.t for frame in gesture.frames]).max() < 0.02 for gesture, _ in gestures.values()
+    )

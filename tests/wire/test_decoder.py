@@ -1,0 +1,259 @@
+"""Bytes to frames: formats found, counts kept, wires that are set wrongly."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from skin.wire.decoder import Decoder
+from skin.wire.protocol import Header, encode_comment, encode_frame, encode_header, encode_line
+
+
+def lines(count, sensors=4, first=0, check="crc16"):
+    return [
+        encode_line([100 * sensor + number for sensor in range(sensors)], number, 1000 * number, check)
+        for number in range(first, first + count)
+    ]
+
+
+def bare(rows, separator=","):
+    return "".join(separator.join(map(str, row)) + "\n" for row in rows).encode()
+
+
+def numbers(frames):
+    return [frame.seq for frame in frames]
+
+
+NOISE = np.random.default_rng(1).integers(0, 1024, (12, 4)).tolist()
+
+
+@pytest.mark.parametrize("check", ["crc16", "xor", "none"])
+@pytest.mark.parametrize("end", [b"\n", b"\r\n"])
+@pytest.mark.parametrize("sensors", [4, None])
+def test_lines_are_recognised(check, end, sensors):
+    decoder = Decoder(sensors)
+    frames = decoder.feed(b"".join(lines(12, check=check)).replace(b"\n", end))
+    # Without a CRC the first line may be half a line.
+    assert numbers(frames) == list(range(check != "crc16", 12))
+    assert frames[-1].values.tolist() == [11, 111, 211, 311]
+    assert (frames[-1].t, frames[-1].valid.all()) == (0.011, True)
+    assert (decoder.frame_format.check, decoder.stats.weak) == (check, 0 if check == "crc16" else 11)
+
+
+@pytest.mark.parametrize("separator", [",", ";", "\t", " ", ", "])
+@pytest.mark.parametrize("sensors", [4, None])
+def test_bare_values_are_recognised(separator, sensors):
+    frames = Decoder(sensors).feed(bare(NOISE, separator), now=5.0)
+    assert [frame.values.tolist() for frame in frames] == NOISE[1:]
+    assert (frames[0].seq, frames[0].t, frames[0].t_host) == (None, 5.0, 5.0)
+
+
+@pytest.mark.parametrize("kind", ["u16", "i16", "f32"])
+@pytest.mark.parametrize("sensors", [4, None])
+def test_binary_is_recognised_at_the_second_frame(kind, sensors):
+    decoder = Decoder(sensors)
+    assert decoder.feed(b"\x07\x00" + encode_frame([1, 0, 3, 4], 0, 0, kind)) == []
+    assert numbers(decoder.feed(encode_frame([1, 0, 3, 4], 1, 500, kind))) == [0, 1]
+    assert (decoder.frame_format.name, decoder.frame_format.check, decoder.stats.skipped) == (
+        "binary",
+        "crc16",
+        1,
+    )
+
+
+def test_a_header_tells_the_number_of_sensors_at_the_third_line():
+    header = Header(n=4, bits=10)
+    decoder = Decoder()
+    assert numbers(decoder.feed(encode_header(header) + b"".join(lines(3)))) == [0, 1, 2]
+    assert (decoder.sensors, decoder.header) == (4, header)
+
+
+def test_a_layout_of_n_plus_two_sensors_takes_lines_that_count_for_values():
+    frames = Decoder(6).feed(b"".join(lines(4)))
+    assert [len(frame.values) for frame in frames] == [6] * 4
+    assert frames[0].seq is None
+
+
+def test_one_byte_at_a_time_gives_the_same():
+    data = b"boot\n" + b"".join(lines(20)) + b"1,2\n" + b"".join(lines(5, first=22))
+    together, single = Decoder(4), Decoder(4)
+    whole = together.feed(data)
+    pieces = [frame for byte in data for frame in single.feed(bytes([byte]))]
+    assert [frame[:3] + frame[5:] for frame in pieces] == [frame[:3] + frame[5:] for frame in whole]
+    assert (single.stats, len(whole)) == (together.stats, 25)
+
+
+@pytest.mark.parametrize("format", ["text", "binary"])
+def test_a_format_that_was_demanded_is_the_only_one(format):
+    binary = b"".join(encode_frame([1, 2, 3, 4], number, number) for number in range(4))
+    streams = {"text": b"".join(lines(4)), "binary": binary}
+    for spoken, data in streams.items():
+        assert len(Decoder(4, format).feed(data)) == (4 if spoken == format else 0)
+
+
+@pytest.mark.parametrize("spoken", ["text", "binary"])
+def test_another_number_of_sensors_is_refused_with_both_counts(spoken):
+    decoder = Decoder(25)
+    encode = {"text": encode_line, "binary": encode_frame}[spoken]
+    number = 0
+    while decoder.stats.bytes < 5000:
+        assert decoder.feed(encode([number % 7] * 16, number, number * 10)) == []
+        number += 1
+    assert "16 values per frame, the layout has 25 sensors" in str(decoder.error())
+    assert "layout.path" in str(decoder.error())
+
+
+def test_a_wrong_baud_rate_is_refused_with_64_bytes_in_hex():
+    decoder, noise = Decoder(25), np.random.default_rng(0).bytes(5000)
+    for start in range(0, 4000, 100):
+        decoder.feed(noise[start : start + 100])
+        assert decoder.error() is None
+    decoder.feed(noise[4000:])
+    assert noise[:64].hex(" ") in str(decoder.error())
+    assert "device.baudrate" in str(decoder.error())
+
+
+def test_two_seconds_of_receiving_are_enough_but_a_slow_start_is_none():
+    decoder = Decoder(4)
+    decoder.feed(b"ets Jun  8 2016 00:22:57\nrst:0x1\n", now=0.0)
+    decoder.feed(b"wifi\n", now=6.0)  # seconds of silence while the board starts
+    assert decoder.error() is None
+    for step in range(12):
+        decoder.feed(b"hello\n", now=6.2 + 0.2 * step)
+    assert "no frame in" in str(decoder.error())
+    assert numbers(decoder.feed(b"".join(lines(3)), now=9)) == [0, 1, 2]
+    assert decoder.error() is None
+
+
+@pytest.mark.parametrize(
+    ("spoilt", "reason"),
+    [
+        (b"3,3000,1,2,3\n", "fields"),
+        (b"3,3000,1,2,3,4,5\n", "fields"),
+        (b"3,3000,x,y,z,4\n", "number"),
+        (b"3,x,1,2,3,4\n", "number"),
+        (b"nan,3000,1,2,3,4\n", "number"),
+        (b"-3,3000,1,2,3,4\n", "number"),
+        (b"3.5,3000,1,2,3,4\n", "number"),
+        (b"3,3000,1,2,3,4*0000\n", "checksum"),
+        (b"3" * 70000 + b"\n", "long"),
+    ],
+)
+def test_a_bad_line_is_dropped_and_the_next_one_taken(spoilt, reason):
+    decoder = Decoder(4)
+    data = [*lines(3, check="none"), spoilt, *lines(3, first=4, check="none")]
+    frames = [frame for piece in data for frame in decoder.feed(piece)]
+    assert numbers(frames) == [1, 2, 4, 5, 6]
+    assert (frames[2].after, frames[2].lost) == ("gap", 1)
+    counters = decoder.stats
+    assert (counters.bad, counters.resyncs, counters.gaps, counters.lost) == ({reason: 1}, 1, 1, 1)
+
+
+def test_a_word_in_place_of_a_value_costs_that_value():
+    decoder = Decoder(4)
+    frames = decoder.feed(b"".join(lines(3, check="none")) + b"3,3000,1,OL,3,4\n")
+    assert (frames[-1].seq, frames[-1].valid.tolist()) == (3, [True, False, True, True])
+    assert frames[-1].values.tolist() == [1, 102, 3, 4]  # its latest value, which does not count
+    assert (decoder.stats.bad_frames, decoder.stats.invalid) == (0, 1)
+
+
+def test_a_weaker_checksum_than_the_first_lines_had_is_refused():
+    decoder = Decoder(4)
+    weaker = lines(1, first=3, check="none") + lines(1, first=4, check="xor")
+    frames = decoder.feed(b"".join(lines(3) + weaker))
+    assert (numbers(frames), decoder.stats.bad) == ([0, 1, 2], {"checksum": 2})
+
+
+def test_memory_stays_small_without_any_delimiter():
+    decoder = Decoder(4)
+    decoder.feed(b"".join(lines(3)))
+    for _ in range(100):
+        decoder.feed(b"5" * 10_000)
+        assert len(decoder._buffer) <= 65536 + 10_000
+    assert numbers(decoder.feed(b"\n" + lines(1, first=3)[0])) == [3]
+    assert decoder.stats.bad == {"long": 1}
+
+
+def test_more_than_half_bad_over_two_seconds_is_trouble_until_it_is_not():
+    decoder, good = Decoder(4), lines(400)
+    decoder.feed(b"".join(good[:3]), now=0.0)
+    for step in range(21):
+        decoder.feed(b"\xf3\x81\n\x99\n" + good[3 + step], now=0.1 * (1 + step))
+    assert "wrong baud rate or format?" in decoder.stats.trouble
+    for step in range(21):
+        decoder.feed(good[24 + step], now=2.2 + 0.1 * step)
+    assert decoder.stats.trouble == ""
+
+
+def test_a_device_that_sends_another_number_of_values_later_is_told_with_it():
+    decoder = Decoder(4)
+    decoder.feed(b"".join(lines(3)), now=0.0)
+    for step in range(25):
+        assert decoder.feed(lines(1, sensors=3, first=3 + step)[0], now=0.1 * step) == []
+    assert "sends 3 values per frame now" in decoder.stats.trouble
+
+
+def test_after_a_restart_the_number_of_sensors_is_demanded_again():
+    decoder = Decoder()
+    decoder.feed(b"".join(lines(8)))
+    decoder.restart()
+    frames = decoder.feed(b"23,4\n" + b"".join(lines(4)))
+    assert [(frame.after, frame.segment) for frame in frames] == [("reconnect", 1)] + [("", 1)] * 3
+    decoder.restart()
+    for number in range(0, 400, 40):
+        decoder.feed(b"".join(lines(40, sensors=3, first=number)))
+    assert "3 values per frame, the layout has 4" in str(decoder.error())
+
+
+HEADER = Header(n=4, rate=100.0, unit="adc", bits=10, id="arm-L")
+
+
+def comment(header, binary):
+    return encode_comment(encode_header(header, "none").rstrip()) if binary else encode_header(header)
+
+
+@pytest.mark.parametrize("binary", [False, True])
+def test_frames_after_a_reconnection_count_only_once_the_same_header_came(binary):
+    def send(first):
+        values = [1, 0, 3, 4]
+        encode = encode_frame if binary else encode_line
+        return decoder.feed(b"".join(encode(values, n, 1000 * n) for n in range(first, first + 20)))
+
+    decoder = Decoder(4)
+    decoder.feed(comment(HEADER, binary))
+    assert len(send(0)) == 20
+    decoder.restart()
+    assert send(0) == send(20) == []
+    assert decoder.stats.trouble == "the device has not sent its header since it was connected again"
+    decoder.feed(comment(replace(HEADER, id="arm-R"), binary))
+    assert send(40) == []
+    assert decoder.stats.trouble == (
+        "another device is connected: proto=1 n=4 rate=100 unit=adc bits=10 id=arm-R"
+    )
+    assert decoder.header == HEADER
+    decoder.feed(comment(replace(HEADER, rate=99.7), binary))
+    frames = send(60)
+    assert [(frame.seq, frame.segment, frame.after, frame.lost) for frame in frames[:2]] == [
+        (60, 1, "reconnect", 0),
+        (61, 1, "", 0),
+    ]
+    assert (decoder.stats.trouble, decoder.stats.frames, decoder.stats.bad_frames) == ("", 40, 0)
+
+
+def test_a_damaged_header_without_a_checksum_does_not_lock_the_device_out():
+    decoder = Decoder(4)
+    for header in (HEADER, replace(HEADER, id="arm-M")):
+        decoder.feed(encode_header(header, "none") + b"".join(lines(10)))
+    decoder.restart()
+    assert len(decoder.feed(encode_header(HEADER, "none") + b"".join(lines(10)))) == 10
+
+
+def test_a_device_that_never_sent_a_header_needs_none():
+    decoder = Decoder(4)
+    decoder.feed(b"".join(lines(10)))
+    decoder.restart()
+    assert len(decoder.feed(b"".join(lines(10)))) == 10
+
+
+def test_a_long_first_piece_is_read_from_its_first_frame():
+    assert numbers(Decoder(4).feed(b"".join(lines(3000)))) == list(range(3000))

@@ -1,0 +1,357 @@
+"""A skin on a real pseudo-terminal or socket, and everything that goes wrong with one."""
+
+import logging
+import os
+import signal
+import socket
+import subprocess
+import sys
+from itertools import islice
+from time import monotonic, sleep
+
+import numpy as np
+import pytest
+
+from skin.errors import InputError
+from skin.wire.protocol import Header, encode_frame, encode_header, encode_line
+from skin.wire.reader import SkinDisconnected, SkinTimeout, open_stream
+from skin.wire.skin import open_skin
+
+LAYOUT = range(4)
+PATIENT = 60.0  # s: machines are busy at times
+
+
+def line(number, values=(500, 501, 502, 503), check="crc16", period=10_000):
+    return encode_line(values, number, number * period, check)
+
+
+def lines(*numbers, **how):
+    return b"".join(line(number, **how) for number in numbers)
+
+
+def numbers(frames):
+    return [frame.seq for frame in frames]
+
+
+def wait_for(condition):
+    deadline = monotonic() + PATIENT
+    while not condition():
+        assert monotonic() < deadline
+        sleep(0.005)
+
+
+@pytest.mark.parametrize("kind", ["text", "binary"])
+def test_frames_of_a_serial_port(plug, kind):
+    encode = {"text": encode_line, "binary": encode_frame}[kind]
+    with open_skin(plug.port, LAYOUT) as skin:
+        before = monotonic()
+        plug.send(*(encode([1, 0, 3, number], number, 10_000 * number) for number in range(300)))
+        frames = skin.read(300, timeout=PATIENT)
+        stats = skin.stats
+    assert numbers(frames) == list(range(300))
+    assert frames[9].values.tolist() == [1, 0, 3, 9]
+    assert frames[9].t == pytest.approx(0.09)
+    assert before < frames[0].t_host <= frames[-1].t_host <= monotonic()
+    assert (stats.frames, stats.bad_frames, stats.dropped, stats.format) == (300, 0, 0, kind)
+    assert stats.rate_hz == pytest.approx(100)
+
+
+def test_frames_of_a_socket_and_its_end():
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        skin = open_skin(f"socket://127.0.0.1:{server.getsockname()[1]}", LAYOUT)
+        device, _ = server.accept()
+    with skin:
+        device.sendall(lines(*range(50)))
+        assert numbers(skin.read(50, timeout=PATIENT)) == list(range(50))
+        device.sendall(lines(50, 51))
+        device.close()
+        with pytest.raises(SkinDisconnected, match="closed the connection") as caught:
+            skin.read(3, timeout=PATIENT)
+        assert numbers(caught.value.frames) == [50, 51]
+
+
+def test_iterating(plug):
+    with open_skin(plug.port, timeout=PATIENT) as skin:
+        plug.send(encode_header(Header(n=4, id="arm-L")), lines(*range(5)))
+        assert (numbers(islice(skin, 5)), skin.header.id) == ([0, 1, 2, 3, 4], "arm-L")
+
+
+def test_what_comes_when_a_port_is_opened_is_skipped_and_counted(plug):
+    with open_skin(plug.port, LAYOUT) as skin:
+        plug.send(b"\x00\xff503,50", b"4*1F\nets Jun  8 2016\r\nrst:0x1 (POWERON)\r\n\xff\xfe\x00\n")
+        plug.send(lines(*range(5)))
+        assert numbers(skin.read(5, timeout=PATIENT)) == [0, 1, 2, 3, 4]
+        assert (skin.stats.skipped, skin.stats.bad_frames) == (4, 0)
+
+
+@pytest.mark.parametrize(
+    ("spoilt", "reason"),
+    [
+        (b"5,50000,1,2,3\n", "fields"),
+        (b"5,50000,one,two,three,4\n", "number"),
+        (b"5,nan,1,2,3,4\n", "number"),
+        (line(5).replace(b"501", b"511"), "checksum"),
+        (b"9" * 70_000 + b"\n", "long"),
+    ],
+)
+def test_a_bad_line_costs_itself_only(plug, spoilt, reason):
+    # Where every line has a checksum, one without is bad for that.
+    check = "crc16" if reason == "checksum" else "none"
+    with open_skin(plug.port, LAYOUT) as skin:
+        plug.send(lines(*range(5), check=check), spoilt, lines(6, 7, check=check))
+        frames = skin.read(7 if check == "crc16" else 6, timeout=PATIENT)
+        assert (numbers(frames[-3:]), frames[-2].lost) == ([4, 6, 7], 1)
+        assert (skin.stats.bad, skin.stats.resyncs) == ({reason: 1}, 1)
+
+
+def test_bad_lines_are_told_once_a_second_with_their_reason(plug, caplog):
+    caplog.set_level(logging.WARNING, "skin.wire")
+    with open_skin(plug.port, LAYOUT) as skin:
+        start = monotonic()
+        plug.send(lines(*range(5)))
+        number = 5
+        while not any("bad frames" in entry.message for entry in caplog.records):
+            plug.send(line(number).replace(b"501", b"502") + line(number + 1))
+            number += 2
+            sleep(0.02)
+        skin.read(5)
+        passed = monotonic() - start
+    told = [entry.message for entry in caplog.records if "bad frames" in entry.message]
+    assert 1 <= len(told) <= 1 + passed
+    assert "checksum" in told[0]
+
+
+@pytest.mark.parametrize(("check", "said"), [("none", "29 %"), ("xor", "weak checksum"), ("crc16", "")])
+def test_what_protects_the_frames_is_said_once(plug, caplog, check, said):
+    with open_skin(plug.port, LAYOUT) as skin:
+        plug.send(lines(*range(9), check=check))
+        skin.read(8, timeout=PATIENT)
+        assert skin.stats.check == check
+    assert [said in entry.message for entry in caplog.records] == [True] * bool(said)
+
+
+def test_more_than_half_bad_asks_for_baud_rate_and_format(plug):
+    with open_skin(plug.port, LAYOUT) as skin:
+        plug.send(lines(*range(5)))
+        skin.read(5, timeout=PATIENT)
+        deadline = monotonic() + PATIENT
+        while not skin.stats.trouble and monotonic() < deadline:
+            plug.send(b"\xfa\x92\x00\n\x81\x82\n")
+            sleep(0.05)
+        with pytest.raises(SkinTimeout, match="wrong baud rate or format"):
+            skin.read(1, timeout=0.1)
+
+
+@pytest.mark.parametrize(
+    ("sent", "reason"),
+    [
+        (b"".join(line(number, [1] * 16) for number in range(200)), "16 values per frame, the layout has 4"),
+        (np.random.default_rng(0).bytes(6000), r"begin with ([0-9a-f]{2} ){63}[0-9a-f]{2}: is the baud rate"),
+    ],
+)
+def test_what_cannot_be_read_is_refused(plug, sent, reason):
+    with open_skin(plug.port, LAYOUT) as skin:
+        plug.send(sent)
+        with pytest.raises(InputError, match=reason):
+            skin.read(1, timeout=PATIENT)
+
+
+def test_a_gap_is_flagged_and_not_filled(plug):
+    with open_skin(plug.port, LAYOUT) as skin:
+        plug.send(lines(0, 1, 2, 3, 7, 8))
+        frames = skin.read(6, timeout=PATIENT)
+    told = [(frame.seq, frame.lost, frame.after) for frame in frames[3:]]
+    assert told == [(3, 0, ""), (7, 3, "gap"), (8, 0, "")]
+    assert {frame.segment for frame in frames} == {0}
+
+
+def test_a_device_that_starts_anew_is_a_new_segment(plug):
+    with open_skin(plug.port, LAYOUT) as skin:
+        plug.send(lines(700, 701, 702), b"booted\n", lines(0, 1))
+        frames = skin.read(5, timeout=PATIENT)
+        assert skin.stats.resets == 1
+    assert [(frame.segment, frame.after) for frame in frames] == [(0, "")] * 3 + [(1, "reset"), (1, "")]
+
+
+def test_silence_is_told_apart_from_nonsense_and_carries_what_came(plug):
+    with open_skin(plug.port, LAYOUT, timeout=0.1) as skin:
+        with pytest.raises(SkinTimeout, match="port open, nothing received"):
+            skin.read(1)
+        with pytest.raises(SkinTimeout, match="port open, nothing received"):
+            next(iter(skin))
+        plug.send(b"hello\n")
+        wait_for(lambda: skin.stats.bytes)
+        with pytest.raises(SkinTimeout, match="6 bytes but no frame"):
+            skin.read(1)
+        plug.send(lines(0, 1, 2))
+        wait_for(lambda: skin.stats.frames == 3)
+        with pytest.raises(
+            SkinTimeout, match=r"3 of 100 frames arrived within 0.2 s: .* stopped sending"
+        ) as caught:
+            skin.read(100, timeout=0.2)
+        assert numbers(caught.value.frames) == [0, 1, 2]
+
+
+def test_unplugging_is_an_error_after_what_came_before(plug):
+    with open_skin(plug.port, LAYOUT) as skin:
+        plug.send(lines(0, 1, 2))
+        assert numbers(skin.read(3, timeout=PATIENT)) == [0, 1, 2]
+        plug.unplug()
+        with pytest.raises(SkinDisconnected, match="unplugged"):
+            skin.read(1, timeout=PATIENT)
+        with pytest.raises(SkinDisconnected, match="unplugged"):
+            next(iter(skin))
+
+
+def test_two_hundred_times_unplugged_and_plugged_in_again(new_plug):
+    def opener():
+        cable = new_plug()
+        stream = open_stream(cable.port, 115200)
+        cable.send(b"77,5", b"\n", lines(*range(4)))
+        cables.append(cable)
+        return stream
+
+    cables = []
+    with open_skin("cable", LAYOUT, opener=opener, reconnect=True, backoff=(0.001, 0.01)) as skin:
+        frames = skin.read(4, timeout=PATIENT)
+        for _ in range(200):
+            cables[-1].unplug()
+            frames += skin.read(4, timeout=PATIENT)
+        assert (skin.stats.reconnects, skin.stats.frames, skin.stats.dropped) == (200, 804, 0)
+    assert [frame.after for frame in frames] == ["", "", "", ""] + ["reconnect", "", "", ""] * 200
+    assert [frame.segment for frame in frames[::4]] == list(range(201))
+
+
+def test_while_it_is_away_it_is_tried_again_and_said(plug, new_plug):
+    ports = [plug.port]
+    with open_skin(
+        "x", LAYOUT, opener=lambda: open_stream(ports[-1], 115200), reconnect=True, backoff=(0.01, 0.02)
+    ) as skin:
+        plug.send(lines(0, 1, 2))
+        skin.read(3, timeout=PATIENT)
+        ports.append("/dev/nothing")
+        plug.unplug()
+        wait_for(lambda: skin.away)
+        with pytest.raises(SkinTimeout, match="unplugged; trying again"):
+            skin.read(1, timeout=0.1)
+        other = new_plug()
+        ports.append(other.port)
+        wait_for(lambda: skin.stats.reconnects)
+        other.send(b"".join(line(number, [5, 6, 7]) for number in range(300)))
+        with pytest.raises(InputError, match="sends 3 values per frame, the layout has 4"):
+            skin.read(1, timeout=PATIENT)
+
+
+def test_who_is_late_loses_the_oldest_frames_and_is_told(plug):
+    with open_skin(plug.port, LAYOUT, queue=10) as skin:
+        plug.send(lines(*range(100)))
+        # A frame counts when it is decoded, before it waits to be read.
+        wait_for(lambda: skin.stats.dropped == 90)
+        frames = skin.read(10)
+        assert (numbers(frames), skin.stats.dropped) == (list(range(90, 100)), 90)
+    assert [(frame.lost, frame.after) for frame in frames[:2]] == [(90, "gap"), (0, "")]
+
+
+@pytest.mark.parametrize(
+    ("port", "reason"),
+    [
+        ("/dev/ttyACM77", r"no port /dev/ttyACM77: there (are /dev/|is no serial port)"),
+        (os.devnull, "is no serial port"),
+        (__file__, "is no serial port"),
+        ("socket://127.0.0.1:1", "does anything listen there"),
+        ("socket://nowhere", "is no address"),
+        ("socket://127.0.0.1:many", "is no address"),
+        ("simulated", "simulated needs a device"),
+        ("/nowhere/x.parquet", "no recording"),
+    ],
+)
+def test_a_port_that_is_none_is_refused(port, reason):
+    with pytest.raises(InputError, match=reason):
+        open_skin(port, LAYOUT)
+
+
+def test_a_port_in_use_is_refused(plug):
+    with open_skin(plug.port), pytest.raises(InputError, match="in use: close the serial monitor"):
+        open_skin(plug.port)
+
+
+def test_a_forbidden_port_is_refused(plug):
+    os.chmod(plug.port, 0)
+    # As root nothing is forbidden, so another user tries; by then everything is imported.
+    code = (
+        "import os, sys, serial; from skin.wire.skin import open_skin\n"
+        "os.geteuid() or os.seteuid(65534)\n"
+        "try: open_skin(sys.argv[1])\n"
+        "except ValueError as error: print(error)\n"
+    )
+    command = [sys.executable, "-c", code, plug.port]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENT, check=False)
+    assert "may not be opened: add your user to dialout" in done.stdout, done.stderr
+
+
+@pytest.mark.parametrize(
+    ("setting", "named"),
+    [
+        ({"format": "xml"}, "format"),
+        ({"baudrate": 0}, "baudrate"),
+        ({"backoff": (2, 1)}, "backoff"),
+    ],
+)
+def test_a_setting_that_cannot_be_used_is_refused(plug, setting, named):
+    with pytest.raises(InputError, match=f"device.{named}"):
+        open_skin(plug.port, **setting)
+
+
+def test_channels_that_mean_nothing_are_masked_and_named(plug):
+    rng = np.random.default_rng(0)
+    values = rng.integers(400, 600, (800, 6))
+    values[:, 1] = 0  # never a change
+    values[200:, 2] = 444  # none any more
+    values[-1, 3] = 1023
+    with open_skin(plug.port, range(6)) as skin:
+        plug.send(encode_header(Header(n=6, bits=10)))
+        plug.send(*(line(number, row.tolist()) for number, row in enumerate(values)))
+        frames = skin.read(800, timeout=PATIENT)
+        assert skin.channels == ("ok", "dead", "stuck", "saturated", "ok", "ok")
+    assert frames[100].valid.all()
+    assert frames[-1].valid.tolist() == [True, False, False, True, True, True]
+    assert frames[-1].saturated.tolist() == [False, False, False, True, False, False]
+
+
+def test_tare_and_a_touch(plug):
+    rng, pressed = np.random.default_rng(0), []
+
+    def values(number):
+        return rng.integers(499, 502, 4) + np.array([0, 0, 300 * bool(pressed), 0])
+
+    with open_skin(plug.port, LAYOUT, timeout=PATIENT) as skin, plug.sending(values):
+        baseline = skin.tare(0.5)
+        assert baseline == pytest.approx([500] * 4, abs=1.01)
+        pressed.append(True)
+        sleep(0.3)
+        with pytest.raises(InputError, match="channel 2 differs from its old baseline by 300"):
+            skin.tare(0.5)
+        assert skin.baseline is baseline
+        assert skin.tare(0.5, force=True)[2] == pytest.approx(800, abs=1.01)
+
+
+def test_tare_while_the_device_starts_anew_is_refused(plug):
+    with open_skin(plug.port, LAYOUT, timeout=PATIENT) as skin:
+        with plug.sending(lambda number: [500] * 4, restart=20), pytest.raises(InputError, match="restarted"):
+            skin.tare(0.5)
+        assert skin.baseline is None
+
+
+def test_ctrl_c_ends_a_read_that_waits(plug):
+    code = (
+        "import sys; from skin.wire.skin import open_skin\n"
+        "with open_skin(sys.argv[1]) as skin:\n"
+        "    print('open', flush=True)\n"
+        "    skin.read(1, timeout=600)\n"
+    )
+    command = [sys.executable, "-c", code, plug.port]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        assert process.stdout.readline() == b"open\n"
+        sleep(0.2)
+        process.send_signal(signal.SIGINT)
+        assert b"KeyboardInterrupt" in process.communicate(timeout=PATIENT)[1]

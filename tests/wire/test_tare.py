@@ -1,0 +1,298 @@
+"""What numbers mean, and when the skin was untouched."""
+
+import numpy as np
+import pytest
+
+from skin.device.calibration import Calibration
+from skin.device.resampling import Frame
+from skin.errors import InputError
+from skin.wire.channels import SkinTouched, Tare, unit_conversion
+from skin.wire.protocol import Header
+from skin.wire.skin import warm_up
+
+REST = np.array([512.0, 300.0, 40.0])
+RATE = 10.0  # Hz, of the model
+
+
+def frames(values, start=0.0, rate=100.0):
+    """Return frames of counts."""
+    times = start + np.arange(len(values)) / rate
+    return [Frame(None, t, t, row, np.ones(3, bool)) for t, row in zip(times, values, strict=True)]
+
+
+def noisy(count, seed=0):
+    """Return counts of an untouched skin."""
+    return REST + np.random.default_rng(seed).integers(-1, 2, (count, 3))
+
+
+class Watch:
+    """Shows frames to a tare and returns them in N, as the live view does; None before the tare."""
+
+    def __init__(self, tare):
+        self.tare = tare
+
+    @property
+    def status(self):
+        return self.tare.status
+
+    def __call__(self, frame):
+        self.tare.add(frame)
+        known = self.tare.conversion
+        if known is None:
+            return None
+        values, valid = known(frame.values, frame.valid)
+        return frame._replace(values=values, valid=valid)
+
+
+def watched(scale=None, tare=1.0, known=None, header=None):
+    """Return what turns the frames of three sensors into N."""
+    conversion = lambda baseline, told: unit_conversion(3, baseline, scale, known, told)  # noqa: E731
+    return Watch(Tare(conversion, tare, RATE, lambda: header))
+
+
+def test_force_is_counted_from_the_first_quiet_second():
+    watch = watched(scale=0.01)
+    touched = noisy(150)
+    touched[:, 1] += np.linspace(0, 400, 150)
+    assert all(watch(one) is None for one in frames(touched))
+    assert "touched: channel 1" in watch.status
+    quiet = [watch(one) for one in frames(noisy(300), start=1.5)]
+    first = next(number for number, one in enumerate(quiet) if one is not None)
+    assert 90 <= first <= 180
+    assert watch.status == ""
+    pressed = watch(frames([REST + 200])[0])
+    np.testing.assert_allclose(pressed.values, 2.0, atol=0.021)
+
+
+def test_the_baseline_is_that_of_maxima_over_the_intervals_of_the_model():
+    """The window shows maxima, of which an untouched skin's must be 0."""
+    watch, rows = watched(scale=1.0), noisy(400)
+    shown = [one.values for row in frames(rows) if (one := watch(row)) is not None]
+    highest = np.stack(shown)[: len(shown) // 10 * 10].reshape(-1, 10, 3).max(axis=1)
+    assert np.median(highest, axis=0).tolist() == [0, 0, 0]
+
+
+def test_a_device_that_sends_newtons_says_so():
+    watch = watched(tare=0, header=Header(unit="N"))
+    np.testing.assert_allclose(watch(frames(np.array([[1.0, 2.0, 3.0]]))[0]).values, [1, 2, 3])
+
+
+def test_a_device_may_tell_its_unit_a_little_late():
+    told = []
+    tare = Tare(
+        lambda baseline, header: unit_conversion(3, baseline, None, None, header),
+        0.0,
+        RATE,
+        lambda: told[0] if told else None,
+    )
+    watch = Watch(tare)
+    assert watch(frames(noisy(1))[0]) is None
+    assert watch.status == "waiting for the header of the device"
+    told.append(Header(unit="N"))
+    assert watch(frames(noisy(1), start=0.5)[0]) is not None
+
+
+def test_counts_without_a_scale_are_refused():
+    with pytest.raises(InputError, match=r"sends adc, .* device\.scale="):
+        watched(header=Header(unit="adc", bits=10))(frames(noisy(1))[0])
+    watch = watched()
+    with pytest.raises(InputError, match=r"values of no unit, .* device\.scale="):
+        list(map(watch, frames(noisy(700))))
+
+
+def test_a_device_that_sends_its_header_every_five_seconds_has_a_unit():
+    told = []
+    tare = Tare(
+        lambda baseline, header: unit_conversion(3, baseline, None, None, header),
+        0.0,
+        RATE,
+        lambda: told[0] if told else None,
+    )
+    watch = Watch(tare)
+    assert all(watch(frame) is None for frame in frames(noisy(500)))
+    told.append(Header(unit="N"))
+    assert watch(frames(noisy(1), start=5.0)[0]) is not None
+
+
+def test_a_tare_too_short_for_a_baseline_is_refused():
+    watch = watched(scale=1.0, tare=0.5)
+    with pytest.raises(InputError, match="10 frames, got 5: give more seconds"):
+        list(map(watch, frames(noisy(200))))
+
+
+def test_a_calibration_gives_scale_gains_and_broken_sensors():
+    known = Calibration(
+        {"gain": [0.5, 1.0, 1.0], "offset": [0.1, 0.2, 0.0]}, {"dead": [2]}, scale=0.02, zero=512
+    )
+    raw = np.array([612.0, 612.0, 0.0])
+    one = watched(tare=0, known=known)(frames([raw])[0])
+    np.testing.assert_allclose(one.values[:2], known.corrected(raw)[:2])
+    assert one.valid.tolist() == [True, True, False]
+
+
+FAST = 100.0  # Hz, of the device
+
+
+class Played:
+    """Hands out frames made before, as a skin does: ``force`` (F,) on the first of two channels."""
+
+    def __init__(self, force, rate=FAST, segments=None):
+        noise = np.random.default_rng(0).normal(scale=0.1, size=(len(force), 2))
+        values = 500 + noise + np.column_stack([force, np.zeros(len(force))])
+        segments = np.zeros(len(force), dtype=int) if segments is None else segments
+        self.frames = [
+            Frame(n, n / rate, n / rate, row, np.ones(2, dtype=bool), segment=int(segment))
+            for n, (row, segment) in enumerate(zip(values, segments, strict=True))
+        ]
+        self.taken = 0
+
+    def read(self, count):
+        self.taken += count
+        return self.frames[self.taken - count : self.taken]
+
+
+def settled(played, seconds, said=None):
+    """Return the frames that settling took, and the baseline."""
+    tare = Tare(lambda baseline, header: unit_conversion(2, baseline, 1.0, None, header), seconds, RATE)
+    tell = (lambda _: None) if said is None else said.append
+    frames, conversion = warm_up(played, tare, RATE, seconds, tell)
+    return frames, conversion.zero
+
+
+def test_an_untouched_skin_gives_its_baseline_at_once():
+    said = []
+    frames, baseline = settled(Played(np.zeros(1000)), 2.0, said)
+    assert baseline == pytest.approx([500.0, 500.0], abs=0.3)
+    assert 2.0 <= frames[-1].t <= 2.1
+    assert len(said) == 1
+
+
+def test_it_waits_until_the_skin_is_let_go():
+    force = np.zeros(3000)
+    force[50:420] = 80 * np.sin(np.linspace(0, 3 * np.pi, 370)) ** 2
+    said = []
+    frames, baseline = settled(Played(force), 2.0, said)
+    assert baseline == pytest.approx([500.0, 500.0], abs=0.3)
+    # All frames are there, for a recording keeps them; the last two seconds of them are after the touch.
+    assert [frame.seq for frame in frames] == list(range(len(frames)))
+    assert 6.1 <= frames[-1].t <= 6.4
+    assert said[1:] == ["the skin is touched: let go"]
+
+
+def test_it_does_not_wait_for_ever():
+    force = 80 * np.sin(np.arange(9000) / 40)
+    with pytest.raises(SkinTouched, match="touched"):
+        settled(Played(force), 2.0)
+
+
+def test_a_short_tare_is_refused_at_once():
+    played = Played(np.zeros(1000))
+    with pytest.raises(InputError, match="10 frames, got 5"):
+        settled(played, 0.5)
+    assert played.taken < 150
+
+
+def test_a_device_that_starts_anew_is_listened_to_anew():
+    frames, _ = settled(Played(np.zeros(1000), segments=np.arange(1000) // 120), 1.0)
+    assert frames[0].segment == 0
+    frames, _ = settled(Played(np.zeros(1000), segments=np.arange(1000) > 70), 1.0)
+    assert {frame.segment for frame in frames} == {1}
+
+
+def test_without_tare_only_the_rate_is_read():
+    frames, baseline = settled(Played(np.full(1000, 50.0)), 0.0)
+    assert not baseline.any()
+    assert frames[-1].t <= 1.1
+
+
+def test_a_slow_device_is_refused():
+    with pytest.raises(InputError, match="rate"):
+        settled(Played(np.zeros(100), rate=4.0), 2.0)
+
+
+def limited(values, channels, limit=1023.0):
+    """Return frames of which some channels are at their limit."""
+    rows = []
+    for frame in frames(values):
+        full = np.isin(np.arange(3), channels)
+        rows.append(frame._replace(values=np.where(full, limit, frame.values), saturated=full))
+    return rows
+
+
+def test_a_channel_at_its_limit_has_no_baseline():
+    watch = watched(scale=0.01)
+    for one in limited(noisy(150), [1]):
+        watch(one)
+    assert watch.tare.conversion.broken.tolist() == [False, True, False]
+    assert watch.tare.warning == "channel 1 at the limit or without a value: no baseline"
+
+
+def test_a_channel_at_its_limit_keeps_its_last_baseline():
+    watch = watched(scale=0.01)
+    for one in frames(noisy(150)):
+        watch(one)
+    assert watch.tare.warning == ""
+    before = watch.tare.conversion.zero
+    watch.tare.restart()
+    for one in limited(noisy(150, 1), [1]):
+        watch(one._replace(t=one.t + 2, t_host=one.t_host + 2))
+    after = watch.tare.conversion
+    assert watch.tare.count == 2
+    assert not after.broken.any()
+    assert after.zero[1] == before[1]
+
+
+def test_all_channels_at_their_limit_give_no_baseline():
+    watch = watched(scale=0.01)
+    for one in limited(noisy(400), [0, 1, 2]):
+        watch(one)
+    assert watch.tare.conversion is None
+    assert watch.status == "no baseline: all channels at the limit or without a value"
+
+
+def test_a_device_without_noise_is_told():
+    watch = watched(scale=0.01)
+    for one in frames(np.tile(REST, (150, 1))):
+        watch(one)
+    assert "this device shows no noise" in watch.tare.warning
+
+
+def test_the_noise_of_the_untouched_skin_is_known():
+    watch = watched(scale=0.01)
+    for one in frames(REST + np.random.default_rng(0).normal(scale=5.0, size=(400, 3))):
+        watch(one)
+    np.testing.assert_allclose(watch.tare.conversion.noise, 0.05, rtol=0.3)
+    assert (watch.tare.conversion.changing > 0.9).all()
+
+
+def test_a_device_that_restarts_often_gets_a_baseline():
+    """Its clock begins again every 0.6 s; the baseline needs a second."""
+    watch = watched(scale=0.01)
+    for number, one in enumerate(frames(noisy(300))):
+        watch(one._replace(t=number % 60 / 100, segment=number // 60))
+    assert watch.tare.conversion is not None
+
+
+def test_a_new_baseline_waits_for_the_end_of_a_touch_unless_it_is_forced():
+    tare = watched(scale=0.01).tare
+    for one in frames(noisy(150)):
+        tare.add(one)
+    later = [one._replace(t=one.t + 2, t_host=one.t_host + 2) for one in frames(noisy(150) + 100)]
+    tare.restart()
+    for one in later:
+        tare.add(one, touched=True)
+    assert (tare.count, tare.status) == (1, "the new baseline waits: something touches the skin")
+    tare.restart(force=True)
+    for one in later:
+        tare.add(one._replace(t=one.t + 2, t_host=one.t_host + 2), touched=True)
+    assert tare.count == 2
+    np.testing.assert_allclose(tare.conversion.zero, REST + 100, atol=1.5)
+
+
+def test_few_frames_are_waited_for():
+    """Frames of a bridge without a clock come in bursts: only some intervals have any."""
+    watch = watched(scale=1.0, tare=2.0)
+    for burst in range(6):
+        for one in frames(noisy(25)):
+            watch(one._replace(t=0.5 * burst + 0.5, t_host=0.5 * burst + 0.5))
+    assert watch.status == "taking the baseline: waiting for more frames"

@@ -47,7 +47,7 @@ def read_gains(given, count):
         return np.full(count, float(given)), order, broken
     stored = read_yaml(given)
     if (stored.get("format"), stored.get("count")) != (1, count):
-        end(f"{given} is no calibration (format: 1) of the {count} sensors of the model")
+        end(f"{given} is not a calibration (format: 1) of the {count} sensors of the model")
     sensors = {name: np.array(value, dtype=float) for name, value in stored["sensors"].items()}
     if stored.get("tables") or (np.nan_to_num(sensors.get("exponent", 1.0), nan=1.0) != 1).any():
         end(f"{given} has curves (tables or exponent), which this example does not apply: use skin live")

@@ -1,6 +1,6 @@
 """
-Expected error of the place
-===========================
+Expected error of the position
+==============================
 
 How well the posterior locates fingertips of about 5 N, against the thickness of the skin, for regular grids
 of sensors (:doc:`/design`).

@@ -2,7 +2,7 @@
 Which skin should I build?
 ==========================
 
-``skin design`` computes how well the posterior tells where and how hard a skin is touched, before anything is
+``skin design`` computes how well the posterior locates a touch and estimates its force, before anything is
 built or trained. This tutorial calls it from Python for four skins (:doc:`/design`).
 """
 
@@ -17,7 +17,7 @@ from skin.design.expected import ExpectedPosterior
 # Thickness and number of sensors
 # -------------------------------
 # The touches have a force of about 5 N. A touch is blind if it raises no sensor above three standard
-# deviations of the noise. The error of a place is that of the posterior mean along one axis.
+# deviations of the noise. The error of a position is that of the posterior mean along one axis.
 
 
 def build(thickness: float, count: int) -> tuple[skin.Sheet, skin.Solid]:

@@ -194,7 +194,7 @@ class Units:
             unit = fits[near[0]]
             hint = f"{near[0]} would be {1 / (step * unit):.4g} Hz: add {self.command}.time_scale={unit:g}"
         raise InputError(
-            f"{where}: a row every {step:.4g} s is no rate of a bench "
+            f"{where}: a row every {step:.4g} s is not the rate of a bench "
             f"({_SLOWEST:g} to {_FASTEST:g} Hz); {hint}"
         )
 

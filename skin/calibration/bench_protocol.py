@@ -23,7 +23,7 @@ class Protocol:
 
     Attributes:
         peak: largest force of every press, N.
-        steps: shares of the peak on the way up, and reversed on the way down.
+        steps: fractions of the peak on the way up, and reversed on the way down.
         hold: at every step, s.
         ramp: from one step to the next, s; the release takes none.
         idle: before the first press, s.

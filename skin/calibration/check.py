@@ -49,7 +49,7 @@ class Verification:
     Attributes:
         state: ``exempt`` (no device that anybody touches), ``checked`` (by a second load), ``declared`` (by
             ``device.sensitivity``) or ``unverified``.
-        text: what to tell the user; empty if nothing.
+        text: message for the user, or empty.
         check: that confirms it; None: none does.
     """
 

@@ -40,7 +40,7 @@ def check_gauge(bench: BenchData) -> None:
 
 
 def _fit_lines(bench: BenchData) -> np.ndarray:
-    """Return rows of time (share of the presses before), sensor, log slope, and intercept over the peak."""
+    """Return rows of time (fraction of presses before), sensor, log slope, and intercept over the peak."""
     responses, rows = collect_responses(bench), []
     strength, largest = bench.each.max(axis=0), np.abs(responses.measured).max(axis=0)
     for press, each in enumerate(bench.each):

@@ -30,7 +30,7 @@ _HEAVIEST = 50.0  # kg: nobody puts more on a skin by hand
 _SPREAD = 0.35  # of gains and model together, in assigning placements to sensors
 _FLOOR = 0.03  # of the largest reading: what a model leaves beside a base
 _QUIETER = 200.0  # times that the noise of sensors may be below that of the simulated device
-_MISSED = 0.25  # share of the sensors that may have no gain
+_MISSED = 0.25  # fraction of the sensors that may have no gain
 _PATIENCE = 60.0  # s in which a further load must be put down
 
 
@@ -306,7 +306,7 @@ def measure_ratios(
             )
         counted = found.end - found.begin >= seconds
         for change in found.change[counted]:
-            # The pattern tells the sensor, whatever the scale and its sign.
+            # The pattern identifies the sensor for any scale and sign.
             sensor = int(np.abs(shapes @ change).argmax())
             if str(sensor) not in ratios:
                 say(

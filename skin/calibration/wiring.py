@@ -29,7 +29,7 @@ _SURE, _VISIBLE, _STEP = 5.0, 1.0, 1.5  # standard errors, noise and steps above
 _LIMITS = np.geomspace(0.9, 30.0, 40)  # largest prediction over the limit; at 300 any shape fits a step
 _TINY = 1e-6  # of the largest prediction: less is 0
 _INVERSE = 4.5  # factor on the residual of a channel whose polarity is not that of most
-_STRONGER = 20.0  # times the predicted share of the strongest response: more has another cause
+_STRONGER = 20.0  # response over its prediction, relative to the strongest: above, the channel is a wrong one
 
 
 @dataclass(frozen=True)
@@ -122,10 +122,10 @@ class Match:
     """How well every channel is explained by the prediction for every sensor.
 
     Attributes:
-        residual: (channels, sensors), share of a channel's energy that the prediction does not explain with
-            any gain and limit, without that of the noise: 0 to 1.
+        residual: (channels, sensors), fraction of a channel's energy that the prediction does not explain
+            with any gain and limit, without that of the noise: 0 to 1.
         sign: (channels, sensors), 1 or -1: whether the channel rises or falls with force.
-        expected: (sensors,), largest prediction, share of the largest of all.
+        expected: (sensors,), largest prediction, as a fraction of the largest of all.
     """
 
     residual: np.ndarray
@@ -267,7 +267,7 @@ _PLAIN = 0.05  # residual: channels that are explained at least as well need no 
 _FITS = 0.45  # residual: sensors misplaced by 5 mm leave 0.25, another sensor 0.6 and more
 _WELL = 0.15  # residual: a channel that is called exchanged has to fit its new place at least as well
 _CLEARER = 2.0, 0.1  # another explanation leaves less than half of the residual, less 0.1 of a channel's
-_MOST = 0.25  # share of the responding channels that an explanation may leave, and of unusable sensors
+_MOST = 0.25  # fraction of the responding channels that an explanation may leave, and of unusable sensors
 _PRESSED = 0.2  # of the largest prediction: a sensor with less was not pressed, so it identifies no channel
 _LISTED = 12  # channels in a message
 _FEWEST = 3  # channels that a turn must explain, because two exchanged channels look like a mirrored axis

@@ -1,4 +1,4 @@
-"""Readings of fingertips on a skin, for every place and radius: sampled once, then interpolated."""
+"""Readings of fingertips on a skin, for every position and radius: sampled once, then interpolated."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -71,7 +71,7 @@ def disc_readings(
 ) -> np.ndarray:
     """Return the readings (N, S), N/N, of discs (N, 3) of 1 N: x, y and radius, m.
 
-    The only place where candidates meet the mechanics.
+    The only part of inference that calls the mechanics.
     """
     touches = torch.from_numpy(np.column_stack([discs, np.ones(len(discs))])).float()
     home = next(simulator.buffers()).device
@@ -81,7 +81,7 @@ def disc_readings(
 
 
 class Boxes(NamedTuple):
-    """Boxes of places and radii.
+    """Boxes of positions and radii.
 
     Attributes:
         centre: (N, 3), x, y and radius, m.
@@ -121,7 +121,7 @@ class CandidateReadings:
     """Readings per newton of fingertips anywhere, and their derivatives.
 
     The surface is divided into patches of at most 2 mm. On each, readings are polynomials of third order in
-    place and radius, fitted to samples on the corners of the patch and of its neighbours.
+    position and radius, fitted to samples on the corners of the patch and of its neighbours.
 
     Args:
         simulator: of the skin; its readings must add up.

@@ -1,4 +1,4 @@
-"""One contact: boxes of places and radii, refined where the probability is."""
+"""One contact: boxes of positions and radii, refined where the probability is."""
 
 import math
 from collections.abc import Sequence
@@ -24,7 +24,7 @@ _DROPPED = 1e-7  # estimated probability that a refinement may lose; 1e-6 makes 
 _MOST = 500  # boxes
 _ROUNDS = 12
 _FORCE_STEP = 0.5  # largest change of the logarithm of the force over a box
-_RADIUS_STEP = 0.3  # largest share of the radii in a box
+_RADIUS_STEP = 0.3  # largest fraction of the radii in a box
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class _Leaves(NamedTuple):
     Attributes:
         boxes: N of them.
         readings: (N, S), N/N.
-        slopes: (N, 3, S), their derivatives by place and radius, N/N/m.
+        slopes: (N, 3, S), their derivatives by position and radius, N/N/m.
         spread: (N, S), variance from gains and positions per square newton, or None.
         forces: of the boxes.
         evidence: (N,), log of the probability in a box.
@@ -94,7 +94,7 @@ class _Leaves(NamedTuple):
 
 
 def blur_first(candidates: CandidateReadings, noise: Noise) -> tuple[np.ndarray | None, np.ndarray]:
-    """Return what all frames share: the relative variance of the first boxes, and that with their width."""
+    """Return the relative variance of the first boxes, without and with their width; common to all frames."""
     spread = relative_variance(noise, candidates.readings, candidates.slopes)
     return spread, _blurred(candidates.boxes, candidates.slopes, spread)
 
@@ -152,7 +152,7 @@ def _judge(
 
 
 def _blurred(boxes: Boxes, slopes: np.ndarray, spread: np.ndarray | None) -> np.ndarray:
-    """Return the variance (N, S) per square newton with that over a box, which then speaks for all in it."""
+    """Return the variance (N, S) per square newton averaged over a box, which the box then represents."""
     scaled = slopes * (boxes.width * math.sqrt(1 / 12)).astype(np.float32)[..., None]
     scaled *= scaled
     blurred = scaled[:, 0]
@@ -176,7 +176,7 @@ def _expand(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return slope (N, 3), 1/m, and information (N, 3, 3), 1/m^2, of the log likelihood in boxes.
 
-    Derivatives are those by place and radius at the most probable force, which follows them: the last result
+    Derivatives are by position and radius, at the most probable force, which depends on both: the last result
     is the derivative of its logarithm, (N, 3), 1/m.
     """
     readings, spread = leaves.readings, leaves.spread
@@ -185,7 +185,7 @@ def _expand(
     weight = np.broadcast_to(frame.counts / variance, readings.shape)
     pull = weight * (frame.readings - force * readings)
     if len(frame.clipped):
-        # A sensor that clips tells most where it is predicted to read about its limit.
+        # A sensor that clips is most informative where its predicted reading is near its limit.
         clipped = frame.clipped
         deviation = np.broadcast_to(np.sqrt(variance), readings.shape)[:, clipped]
         above = (force * readings[:, clipped] - np.float32(frame.noise.clip)) / deviation

@@ -15,8 +15,8 @@ from skin.inference.likelihood import Observation, fit_residual
 
 _STEPS = 12  # of Gauss-Newton
 _LONGEST = [-0.01, -0.01, -1, -2], [0.01, 0.01, 1, 2]  # step
-_LATTICE = 0.0064  # m, largest distance of places that are searched in pairs
-_TOLERANCE = 0.2  # relative misfit of a pair of such places
+_LATTICE = 0.0064  # m, largest distance of positions that are searched in pairs
+_TOLERANCE = 0.2  # relative misfit of a pair of such positions
 _PAIRS = 8  # pairs that are refined
 _SAMPLES = 10  # binary logarithm of the number of samples
 _WIDER = 1.1  # spread of the samples' proposal, relative to the posterior's
@@ -50,13 +50,13 @@ class Mixture:
 
 
 class Addition(NamedTuple):
-    """What a further contact would explain, at each of N places.
+    """What a further contact would explain, at each of N positions.
 
     Attributes:
         mode: (N,), the most probable log force.
         ratio: (N,), log of the likelihood ratio to no further contact, integrated over the force.
-        factor: log factor of the evidence: the mean of the ratio over all places, also those that no sensor
-            feels, times the orders that the contact can have among the others.
+        factor: log factor of the evidence: the mean of the ratio over all positions, also where no sensor
+            responds, times the orders that the contact can have among the others.
     """
 
     mode: np.ndarray
@@ -94,7 +94,7 @@ class Search:
         return np.sqrt(_FREEDOM / np.random.default_rng(1).chisquare(_FREEDOM, 2**_SAMPLES))
 
     def felt(self, guess: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return readings (M, S), N, and their derivatives (M, 4 n, S) by place, radius and log force."""
+        """Return readings (M, S), N, and their derivatives (M, 4 n, S) by position, radius and log force."""
         count, number, _ = guess.shape
         places, force, stretch = self._places_of(guess.reshape(-1, 4))
         readings, slopes = self.candidates.at(places)
@@ -106,7 +106,7 @@ class Search:
         return felt.reshape(count, number, -1).sum(1), columns.reshape(count, 4 * number, -1)
 
     def _places_of(self, guess: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return places and radii (N, 3), m, forces (N,), N, and m of radius per score (N,)."""
+        """Return positions and radii (N, 3), m, forces (N,), N, and m of radius per score (N,)."""
         radius = self._least + self._range * ndtr(guess[:, 2])
         stretch = self._range * np.exp(-0.5 * guess[:, 2] ** 2) / math.sqrt(2 * math.pi)
         force = self.prior.force * np.exp(self.prior.spread * guess[:, 3])
@@ -203,7 +203,7 @@ class Search:
         return chosen
 
     def pairs(self, frame: Observation, felt: np.ndarray) -> np.ndarray:
-        """Return the pairs (M, 2, 4) that explain best what contacts that feel (S,), N, leave over."""
+        """Return the pairs (M, 2, 4) that explain best what contacts with readings (S,), N, leave over."""
         left = (frame.readings - felt).astype(np.float32)
         weight = frame.counts / (frame.noise.floor + (_TOLERANCE * left) ** 2).astype(np.float32)
         scaled = self._lattice * weight
@@ -279,7 +279,7 @@ class Search:
 
     @staticmethod
     def _distinct(modes: np.ndarray, score: np.ndarray) -> list[int]:
-        """Return the modes that count, the best first: likely ones, each set of places once."""
+        """Return the modes that count, the best first: likely ones, each set of positions once."""
         chosen = list[int]()
         for index in np.argsort(-score, kind="stable"):
             likely = score[index] > score.max() - _UNLIKELY and len(chosen) < _MODES
@@ -344,7 +344,7 @@ class Search:
 def _order(guess: np.ndarray, mode: np.ndarray) -> np.ndarray:
     """Return guesses (N, n, 4) with each contact in the row of the contact of a mode (n, 4) that it is near.
 
-    Contacts have no order of their own: without one, two places would be averaged.
+    Contacts have no order of their own: without one, two positions would be averaged.
     """
     orders = np.array(list(permutations(range(len(mode)))))
     away = ((guess[:, orders, :2] - mode[:, :2]) ** 2).sum((2, 3))

@@ -1,4 +1,4 @@
-"""Large contacts, such as hands and bars: what a frame may be if it is no fingertips."""
+"""Large contacts, such as hands and bars: the alternative to fingertips."""
 
 import math
 from dataclasses import replace
@@ -24,9 +24,8 @@ _TOLERANCES = [(own, common) for own in (0.05, 0.1, 0.2, 0.4) for common in (0.0
 class LargeContacts:
     """Evidence of a contact larger than a fingertip: the mean likelihood of many such contacts.
 
-    A drawn contact stands for those that are similar, with readings within a tolerance: a share of each
-    reading, and a share of the root mean square of all. The tolerances are those that give held-out contacts
-    the greatest evidence.
+    A drawn contact represents similar ones, with readings within a tolerance: a fraction of each reading, and
+    a fraction of the root mean square of all. The tolerances maximise the evidence of held-out contacts.
 
     Args:
         candidates: whose fingertips add up to larger contacts.
@@ -66,8 +65,8 @@ class LargeContacts:
 def draw_large(candidates: CandidateReadings, count: int, rng: np.random.Generator) -> np.ndarray:
     """Return the readings (N, S), N, of large contacts under their median force, float32.
 
-    Shape, place and angle are uniform; the logarithm of the area is, from that of the largest fingertip up. A
-    contact is made of small fingertips with the pressures of its picture.
+    Shape, position, angle and the logarithm of the area, from the largest fingertip up, are uniform. A
+    contact consists of small fingertips with the pressures of its picture.
     """
     size, radii = candidates.size, candidates.radii
     steps = np.ceil(size / _SPACING).astype(int)

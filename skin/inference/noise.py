@@ -48,7 +48,7 @@ class Noise:
 
     @property
     def floor(self) -> float:
-        """Variance of the reading of a sensor that feels nothing, N^2."""
+        """Variance of the reading of an unloaded sensor, N^2."""
         return self.frame**2 / self.frames + self.offset**2
 
     def variance(self, readings: Tensor) -> Tensor:

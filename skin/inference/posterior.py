@@ -1,4 +1,10 @@
-"""Where and how hard a skin is touched, and how sure that is, from readings of any layout."""
+"""Where and how hard a skin is touched, and how certain that is, from readings of any layout.
+
+Boxes of positions and radii are refined until they are 1.8 standard deviations long. The likelihood is
+averaged over each to second order, with the force integrated. A further contact is tried where the frame fits
+badly or the residual supports it: it starts from the residual and from all pairs of positions, is refined by
+Gauss-Newton, and importance samples give its evidence, Markov chains the regions.
+"""
 
 import math
 from dataclasses import dataclass, field, replace
@@ -17,10 +23,10 @@ from skin.inference.noise import Noise
 from skin.mechanics.simulator.base import AbstractSimulator
 
 MOST_CONTACTS = 3
-"""Contacts that are told apart."""
+"""Largest number of contacts in an estimate."""
 
 _WIDTH = 1.0  # of the boxes around samples of several contacts, in standard deviations
-_PER_CONTACT = 3  # sensors that a contact takes at least: it has a place and a force
+_PER_CONTACT = 3  # sensors that a contact takes at least: it has a position and a force
 _FITS = 0.01  # a smaller predictive probability says that no contacts give such readings
 _POOR, _LIKELY = 1e-3, 0.5  # a further contact is tried below this probability, or above these odds
 _CELLS = 160  # of a region, along an axis at most
@@ -28,7 +34,7 @@ _CELLS = 160  # of a region, along an axis at most
 
 @dataclass(frozen=True)
 class Region:
-    """The most probable places of a contact, as cells of a raster.
+    """The most probable positions of a contact, as cells of a raster.
 
     Attributes:
         cells: (C, 2), x and y of their centres, m.
@@ -46,7 +52,7 @@ class Region:
         return float(len(self.cells) * self.width.prod())
 
     def contains(self, place: np.ndarray) -> bool:
-        """Return whether a place (2,), m, lies in a cell."""
+        """Return whether a position (2,), m, lies in a cell."""
         return bool((np.abs(self.cells - place) <= self.width / 2).all(axis=1).any())
 
 
@@ -59,8 +65,8 @@ class ContactEstimate:
         force, force_deviation: N.
         radius, radius_deviation: m.
         peak: highest pressure of the most probable contact, Pa.
-        peak_interval: that holds the highest pressure with 90 %, Pa; readings hardly tell the radius.
-        places, widths: (N, 2), boxes that hold the place, m.
+        peak_interval: contains the highest pressure with 90 %, Pa; readings hardly determine the radius.
+        places, widths: (N, 2), boxes that hold the position, m.
         peaks: (N, J), Pa, of the boxes' forces.
         weights: (N, J), probabilities that sum to 1.
     """
@@ -83,7 +89,7 @@ class ContactEstimate:
         return float(self.weights[self.peaks > pressure].sum())
 
     def region(self, share: float = 0.9, least: float = 0.0) -> Region:
-        """Return the smallest set of cells that holds the place with a probability; it may have parts.
+        """Return the smallest set of cells that holds the position with a probability; it may have parts.
 
         Each sample counts as a normal distribution of the variance of its box: boxes are up to 1.8 standard
         deviations long, and what is uniform over each holds 2 points less than it says.
@@ -102,7 +108,7 @@ class ContactEstimate:
         mass /= mass.sum()
         order = np.argsort(-mass, axis=None, kind="stable")
         total = np.cumsum(mass.ravel()[order])
-        # The last cell counts if the share is nearer with it than without.
+        # The last cell is included if the probability is nearer to ``share`` with it than without.
         count = max(1, int(np.argmin(np.abs(total - share))) + 1)
         chosen = np.unravel_index(order[:count], mass.shape)
         middles = [(line[1:] + line[:-1]) / 2 for line in edges]
@@ -117,7 +123,7 @@ def _overlap(edges: np.ndarray, centre: np.ndarray, width: np.ndarray) -> np.nda
 
 @dataclass(frozen=True)
 class FrameEstimate:
-    """What the readings of a frame tell.
+    """Estimate from the readings of a frame.
 
     Attributes:
         number: the most probable number of contacts.
@@ -169,9 +175,7 @@ class Posterior:
         contacts: int = MOST_CONTACTS,
     ) -> None:
         if not 1 <= contacts <= MOST_CONTACTS:
-            raise InputError(
-                f"a posterior tells 1 to {MOST_CONTACTS} contacts apart, got contacts={contacts}"
-            )
+            raise InputError(f"a posterior estimates 1 to {MOST_CONTACTS} contacts, got contacts={contacts}")
         if not isinstance(simulator, AbstractSimulator):
             raise InputError(
                 f"a posterior needs the mechanics of a skin, such as skin.Solid, got {simulator!r}"
@@ -195,7 +199,7 @@ class Posterior:
     def estimate(
         self, readings: np.ndarray, valid: np.ndarray | None = None, saturated: np.ndarray | None = None
     ) -> "FrameEstimate | list[FrameEstimate]":
-        """Return what readings tell, frame by frame.
+        """Return the estimate of each frame.
 
         Args:
             readings: (S,), N, or (T, S) of several frames.
@@ -226,7 +230,7 @@ class Posterior:
     def estimate_touch(
         self, readings: np.ndarray, valid: np.ndarray | None = None, saturated: np.ndarray | None = None
     ) -> FrameEstimate:
-        """Return what the frames of a touch that does not move tell together.
+        """Return one estimate from the frames of a touch that does not move.
 
         Readings are proportional to the force, so that the mean of the frames is the reading of the mean
         force. A sensor that is invalid or clips in a frame is so in all.
@@ -281,7 +285,7 @@ class Posterior:
         felt = self._search.felt(mode[None])[0][0]
         for number in range(2, most + 1):
             addition = self._search.add(frame, mode)
-            # It explains no more than the first: where nothing is felt, it is hidden as well as that.
+            # It explains no more than the first contact: where no sensor responds, both are hidden.
             factor = min(addition.factor, single.evidence - evidence[0])
             odds = factor + self._numbers[number] - self._numbers[number - 1]
             if gammaincc(sensors, misfit / 2) > _POOR and odds < math.log(_LIKELY):
@@ -337,7 +341,7 @@ class Posterior:
         weight: np.ndarray,
         mode: np.ndarray,
     ) -> ContactEstimate:
-        """Return the moments of weighted boxes of places and radii (N, 3), m, and forces (N, J), N.
+        """Return the moments of weighted boxes of positions and radii (N, 3), m, and forces (N, J), N.
 
         ``mode`` (2,) holds the most probable radius, m, and force, N.
         """
@@ -371,12 +375,12 @@ def _variance(places: np.ndarray, weight: np.ndarray) -> np.ndarray:
 
 
 def _unknown(sensors: int, frame: Observation) -> str | None:
-    """Return what a frame cannot tell, in a sentence."""
+    """Return what a frame cannot determine, in a sentence."""
     if sensors == 0:
         return "no sensor is valid: nothing is known beyond the prior"
     if sensors < 3:
         return (
-            f"{sensors} valid sensor{'s' if sensors > 1 else ''}: place and force cannot be told apart; "
-            "a region is where the prior allows, and several contacts look like one"
+            f"{sensors} valid sensor{'s' if sensors > 1 else ''}: position and force cannot be separated; "
+            "regions follow the prior, and several contacts look like one"
         )
     return None

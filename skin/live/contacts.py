@@ -1,6 +1,6 @@
 """Contacts in the live view: where, how hard and how sure, estimated in a process of their own.
 
-No verdict waits for them: the loop leaves the newest readings behind and goes on. The process ends with its
+No verdict waits for them: the loop hands over the newest readings and continues. The process ends with its
 present estimate when the pipe to it is closed, however the command ends. torch is not imported here, but in
 that process.
 """
@@ -260,7 +260,7 @@ def average_frames(
 
 
 def estimate_contacts(posterior: "Posterior", nominal: "Noise", readings: MeanReadings) -> dict[str, Any]:
-    """Return what readings tell of contacts, as JSON data.
+    """Return the contacts estimated from readings, as JSON data.
 
     Args:
         posterior: of the skin.
@@ -295,7 +295,7 @@ def serve() -> None:
     if hasattr(os, "nice"):
         os.nice(_NICE)
     answers = os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)  # what a library prints is no answer
+    os.dup2(2, 1)  # what a library prints is not an answer
     with suppress(EOFError, OSError, pickle.UnpicklingError):  # the command has ended
         for answer in _answers(partial(pickle.load, sys.stdin.buffer)):
             pickle.dump(answer, answers)

@@ -38,7 +38,7 @@ class DebounceSettings:
         above: probability above which a touch is dangerous; None: that of the run.
 
     Raises:
-        InputError: a negative time, an alarm that would be too late, or a value that is no probability.
+        InputError: a negative time, an alarm that would be too late, or a value that is not a probability.
     """
 
     label: NonNegativeFloat = 0.15
@@ -81,7 +81,7 @@ Classify = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 _DISTINCT = 10  # different frames of a block that is repeated
 _GAP = 0.5  # s without a frame after which the history of the window is lost
-_CHANGING = 0.3  # share of changes at the tare from which a channel must change within FROZEN
+_CHANGING = 0.3  # fraction of changes at the tare from which a channel must change within FROZEN
 _ROUNDING = 1e-6  # s
 
 
@@ -332,7 +332,7 @@ class Engine:
         """Return the notes on a decision.
 
         Args:
-            unknown, below: (S,), bool, sensors at which a touch could not be felt, and that are below rest.
+            unknown, below: (S,), bool, sensors where a touch would stay undetected; sensors below rest.
             pause: s without a frame before the latest; 0 if it was short.
         """
         void, beyond, lost = self._contact.void, self._contact.beyond, self._contact.lost

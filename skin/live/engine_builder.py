@@ -34,7 +34,7 @@ STRENGTH = 1.5
 _WEAK = 1.2  # the same of weaker ones: a network is surer of strong touches than of those that a limit hides
 _LEAST = 0.5  # of the presses that must raise the alarm with nominal settings
 _SHARE = 0.9  # of what the model finds with nominal settings that the settings in use must find
-_MASKED = 0.25  # share of the sensors that may be without a valid reading
+_MASKED = 0.25  # fraction of the sensors that may be without a valid reading
 _RATE = 20.0  # Hz of the simulated frames: a decision at each
 _REST, _HOLD, _FALL = 0.4, 0.4, 0.2  # s
 _FAST, _SLOW = 0.2, 4.0  # s in which the force rises; the slow one shows a baseline that follows touches
@@ -364,7 +364,7 @@ def watch_exported(
         opened: closes the port in the end.
 
     Raises:
-        InputError: the file cannot be used, or the device is no skin at a port, or cannot be opened.
+        InputError: the file cannot be used, or the device is not a skin at a port, or cannot be opened.
     """
     if "port" not in device:
         raise InputError(

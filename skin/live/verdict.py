@@ -17,7 +17,7 @@ NOTES = {
     "over_range": "no value of {sensors} since the force rose: beyond the range, or a broken wire",
     "unreadable": "more frames are unreadable in this contact than at rest: values beyond the range?",
     "lost_wire": "{sensors} fell to rest while neighbours stay pressed: a broken wire",
-    "masked": "a touch near {sensors} could not be felt: no valid reading",
+    "masked": "a touch near {sensors} would stay undetected: no valid reading",
     "pause": "no frame for {seconds:.2f} s, in which a touch may have come and gone",
     "near_threshold": "probably dangerous, but below the threshold of the alarm",
     "unverified": "{text}",
@@ -90,7 +90,7 @@ class Verdict:
         gap: whether frames are missing in the window.
         masked: sensors without a valid reading.
         contact: duration of the contact, s; None without contact.
-        unknown: sensors at which a dangerous touch could not be felt, because no valid sensor would respond.
+        unknown: sensors where a dangerous touch would stay undetected, because no valid sensor would respond.
         notes: on what may be wrong, the gravest first.
         agreeing: label -> its probability in the latest window that agreed with the debounced label; where it
             is missing, that of this window.
@@ -111,7 +111,7 @@ class Verdict:
 
     @property
     def state(self) -> State:
-        """``touch``; ``unknown``, where a dangerous touch on a sensor could not be felt; or ``no touch``."""
+        """``touch``; ``unknown``, if a dangerous touch on a sensor would stay undetected; or ``no touch``."""
         touching = self.touched or self.contact is not None
         return "touch" if touching else "unknown" if self.unknown else "no touch"
 

@@ -237,5 +237,5 @@ def log_alarms(display: Display, path: Path) -> Iterator[None]:
         with write_changes(display, file, warn):
             yield
     finally:
-        with suppress(OSError):  # of a full disk: the message has told of it
+        with suppress(OSError):  # of a full disk, which the message has reported
             file.close()

@@ -10,7 +10,7 @@ from skin.body.base import GEOMETRY, REACHES, AbstractBody, Sensors
 from skin.mechanics.simulator.base import AbstractSimulator
 from skin.touch import splines
 
-# The pressure of a fingertip, differentiable in its place, radius and force.
+# The pressure of a fingertip, differentiable in its position, radius and force.
 
 
 PARAMETERS = ("x", "y", "radius", "force")
@@ -79,7 +79,7 @@ def fingertip_readings(
 
 _RADIUS, _RIM = 0.008, 0.0015  # m, of the fingertip that probes a skin
 _AT_ONCE = 64  # touches
-_AROUND = 8  # places at each distance from a sensor
+_AROUND = 8  # positions at each distance from a sensor
 _UNIFORM = 1000.0  # Pa
 
 
@@ -88,7 +88,7 @@ def sensor_geometry(body: AbstractBody, sensors: Sensors, model: AbstractSimulat
     """Return the columns :data:`skin.device.touches.GEOMETRY` of each sensor, (S, G), float32.
 
     Responses are readings of ``model`` under a fingertip of 1 N at some distances from the sensor, the mean
-    over places around it that are on the surface, and under a uniform pressure, relative to the force on the
+    over positions around it on the surface, and under a uniform pressure, relative to the force on the
     footprint.
 
     Args:

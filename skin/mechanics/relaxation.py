@@ -48,7 +48,7 @@ def running_peak(readings: Tensor) -> Tensor:
 
 
 def apply_hysteresis(readings: Tensor, hysteresis: Tensor) -> Tensor:
-    """Return readings (B, T, S), N, with hysteresis: larger on unloading, by a mean share of the peak.
+    """Return readings (B, T, S), N, with hysteresis: larger on unloading, by a mean fraction of the peak.
 
     At a force x after a peak P that is x + 6 hysteresis x (P - x) / P: no gap at rest and none at the peak.
     """

@@ -41,7 +41,7 @@ _PIXELS = 48
 _COLOURS = 96
 _NAMED = 40  # sensors whose readings can be read as numbers beside them
 _SHOWN_LABELS = ("big", "dynamic", "press")
-_SHOWN = 0.15  # share of the strongest reading
+_SHOWN = 0.15  # fraction of the strongest reading
 _HALO = (withStroke(linewidth=2, foreground="white"),)
 
 
@@ -88,7 +88,7 @@ def still(scene: Scene, view: str, path: Path) -> Path:
 
 
 def thinning(frames: int, rate: float) -> int:
-    """Return which share of the frames is shown: every first, second, ... one."""
+    """Return the step between two frames that are shown: every first, second, ... one."""
     return max(math.ceil(frames / _LONGEST), math.ceil(rate / _FASTEST))
 
 
@@ -158,7 +158,7 @@ def _flat(figure: Figure, scene: Scene) -> Draw:
 
 
 def _bars(axis: Axes3D, scene: Scene) -> Draw:
-    """Show each sensor's reading as a bar over its place."""
+    """Show each sensor's reading as a bar over its position."""
     colour = Normalize(0, scene.strongest)
     width = 450 * math.sqrt(scene.size[0] * scene.size[1] / scene.readings.shape[1])
     axis.set(
@@ -210,7 +210,7 @@ def _between(scene: Scene) -> np.ndarray:
 def simulate_scene(
     device: AbstractSimulated, labels: Sequence[str] | None, shape: str | None, seed: int, field: bool
 ) -> Scene:
-    """Draw a touch as a simulated device feels it.
+    """Draw a touch as a simulated device measures it.
 
     Args:
         device: whose skin, sensors and imperfections are shown.

@@ -11,7 +11,7 @@ from torch import Tensor
 from skin.core.files import whole
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
-"""Okabe and Ito's palette: told apart by colour-blind readers too."""
+"""Okabe and Ito's palette, which colour-blind readers can distinguish."""
 
 MARKS = ("o", "s", "^", "D", "v", "P", "X")
 """Markers of lines, so that they differ without colour."""
@@ -29,7 +29,7 @@ def images(pictures: Mapping[str, Tensor], points: np.ndarray, size: tuple[float
 
     Args:
         pictures: name -> (H, W).
-        points: (S, 2), m, where the sensors are; drawn on every picture but ``fourier``, which has no places.
+        points: (S, 2), m, of the sensors; drawn on every picture but ``fourier``, which has no positions.
         size: extent (x, y) of the sheet, m.
     """
     figure = Figure(figsize=(2.4 * len(pictures), 2.8), layout="constrained")
@@ -46,7 +46,7 @@ def images(pictures: Mapping[str, Tensor], points: np.ndarray, size: tuple[float
 
 
 def confusions(matrices: Mapping[str, np.ndarray], names: tuple[str, str]) -> Figure:
-    """Draw 2 x 2 confusion matrices side by side, as shares of each true class (report, figure 8).
+    """Draw 2 x 2 confusion matrices side by side, as fractions of each true class (report, figure 8).
 
     Args:
         matrices: row -> (2, 2) counts, true class down, predicted class across.
@@ -80,11 +80,11 @@ def confusions(matrices: Mapping[str, np.ndarray], names: tuple[str, str]) -> Fi
 def misclassified_shares(
     speeds: np.ndarray, wrong: np.ndarray, bins: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the share of gestures with a wrong label, and its standard error, by the speed of the slide.
+    """Return the fraction of gestures with a wrong label, and its standard error, by the speed of the slide.
 
     Args:
         speeds: (B,), m/s; 0 for a static touch.
-        wrong: (B,), share of runs in which the label is wrong.
+        wrong: (B,), fraction of runs in which the label is wrong.
         bins: (K + 1,), ascending edges, m/s.
 
     Returns:
@@ -101,7 +101,7 @@ def misclassified_shares(
 def misclassified(
     courses: Mapping[str, tuple[np.ndarray, np.ndarray]], label: str, bins: np.ndarray
 ) -> Figure:
-    """Draw the share of gestures whose label is wrong against the speed of the slide (report, figure 7).
+    """Draw the fraction of gestures whose label is wrong against the speed of the slide (report, figure 7).
 
     Bars are two standard errors.
 
@@ -113,13 +113,13 @@ def misclassified(
     figure = Figure(figsize=(7, 4), layout="constrained")
     axis = figure.subplots()
     middles = np.concatenate([[0.0], (bins[1:] + bins[:-1]) / 2])
-    # Every colour comes with one mark after the other, so that any number of rows can be told apart.
+    # Every colour comes with one mark after the other, so that any number of rows can be distinguished.
     styles = product(MARKS, COLOURS)
     for (row, (shares, errors)), (mark, colour) in zip(courses.items(), styles, strict=False):
         axis.errorbar(
             middles * 1e3, shares, 2 * errors, marker=mark, markersize=4, capsize=2, color=colour, label=row
         )
-    axis.set(xlabel="speed, mm/s (0: static)", ylabel=f"share with “{label}” wrong")
+    axis.set(xlabel="speed, mm/s (0: static)", ylabel=f"fraction with “{label}” wrong")
     axis.set_ylim(bottom=0)
     figure.legend(loc="outside right upper", fontsize=8)
     return figure

@@ -279,7 +279,7 @@ def skin_in_space(axis: Axes3D, scene: Scene, body: AbstractBody) -> Draw:
 
 
 def sensors_in_space(axis: Axes3D, scene: Scene, body: AbstractBody) -> Draw:
-    """Show each sensor's reading as a bar that stands out of the surface over its place."""
+    """Show each sensor's reading as a bar that stands out of the surface over its position."""
     colour, shell, longest = Normalize(0, scene.strongest), _Shell(body), _LONGEST * min(body.size)
     bare = np.broadcast_to(_SKIN, (*body.shape, 4))
     surface = shell.surface(np.zeros_like(shell.lines[0]))

@@ -231,7 +231,7 @@ def compare_gestures(device: AbstractSimulated, path: str, seed: int) -> Session
             prompt = dict(take.labels or {})
             pairs.append(Pair(take.number, prompt, time, gesture.applied, simulated, measured, valid))
     if not pairs:
-        raise InputError(f"{path} has no gesture that any sensor feels: record more, or check the wiring")
+        raise InputError(f"{path} has no gesture with a sensor response: record more, or check the wiring")
     simulated, measured, valid = (
         np.stack([getattr(pair, name) for pair in pairs]) for name in ("simulated", "measured", "valid")
     )

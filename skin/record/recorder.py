@@ -192,7 +192,7 @@ class SessionLog:
 
     def conversion(self, conversion: UnitConversion) -> None:
         """Write the conversion of the following values to N; its ``zero`` is the baseline."""
-        # What a tare tells of the noise is for those who watch.
+        # The noise of a tare is only shown.
         arrays = {name: getattr(conversion, name).tolist() for name in ("scale", "zero", "broken")}
         if conversion.curves is not None:
             arrays["curves"] = conversion.curves.to_json()
@@ -251,7 +251,7 @@ def _is_begun(path: Path, header: str) -> bool:
     if not path.exists():
         return False
     if not path.is_file():
-        raise InputError(f"{path} is no regular file: give another out=")
+        raise InputError(f"{path} is not a regular file: give another out=")
     with path.open("rb") as file:
         return not header.encode().startswith(file.read(len(header) + 1))
 

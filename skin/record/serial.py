@@ -75,8 +75,8 @@ class Serial(PortSettings, AbstractDevice):
         labels: ``announced``, ``prompted`` or ``none``.
         gestures: number of gestures.
         seed: of the order of prompts.
-        trigger: force above which a window begins with ``labels=none``, N; without a tare, which tells the
-            noise, also that above which a prompted gesture is felt.
+        trigger: force above which a window begins with ``labels=none``, N; without a tare, which measures the
+            noise, also the force above which a prompted gesture is detected.
         touch: rate and window of the model (``conf/touch``).
         stream: add the label ``touch``.
 

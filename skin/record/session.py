@@ -102,7 +102,7 @@ def read_session(path: Path) -> StoredSession:
     """
     beside = path.with_name(path.name + ".json")
     if path.exists() and not beside.exists():
-        raise InputError(f"{path} is no session of skin record: no {beside.name} is beside it")
+        raise InputError(f"{path} is not a session of skin record: no {beside.name} is beside it")
     try:
         reading = _Reading(_about(beside))
         regular(path)

@@ -39,14 +39,14 @@ from skin.wire.lines import (
 )
 from skin.wire.protocol import INVALID, Format, Header, Line, parse_header
 
-_RUN = 12  # frames alike that show a format: that noise rises as often by chance is improbable
+_RUN = 12  # frames alike that show a format: noise hardly rises as often by accident
 _MOST_REPEATS = 256
 _NUMBER = rb"[-+.\d ]"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Adapter:
-    """What a board sends, and what it must be told.
+    """Format of what a board sends, and texts to send to it.
 
     Attributes:
         kind: ``protocol`` (ours, docs/hardware.md), ``text``, ``json`` (one value per line), ``binary``, or
@@ -116,7 +116,7 @@ class Adapter:
                 re.compile(settings[name] or "")
             except re.error as error:
                 raise InputError(
-                    f"device.adapter.{name}={settings[name]} is no regular expression: {error}"
+                    f"device.adapter.{name}={settings[name]} is not a regular expression: {error}"
                 ) from error
         if self.pattern and not re.compile(self.pattern).groupindex:
             raise InputError("device.adapter.pattern needs a named group per field, as in (?P<values>.*)")
@@ -153,7 +153,7 @@ class Adapter:
         try:
             return bytes.fromhex(text)
         except ValueError as error:
-            raise InputError(f"device.adapter: {text} are no bytes in hexadecimal, as in aa 55") from error
+            raise InputError(f"device.adapter: {text} are not bytes in hexadecimal, as in aa 55") from error
 
     @cached_property
     def _words(self) -> frozenset[bytes]:
@@ -361,7 +361,9 @@ class Adapter:
                 count = len(reader(line).fields)
                 reasons.append(f"{count} fields")
             except FrameError as error:
-                reasons.append(f"field {error.word!r} is no number" if error.word else "its shape is another")
+                reasons.append(
+                    f"field {error.word!r} is not a number" if error.word else "its shape is another"
+                )
         shown = "; ".join(
             f"{line[:80].decode('ascii', 'replace')!r} ({reason})"
             for line, reason in zip(texts, reasons, strict=True)

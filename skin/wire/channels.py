@@ -20,7 +20,7 @@ Limits = tuple[float | None, float | None]
 
 _SILENT = 5.0  # s without any change
 _LIVELY = 1.0  # s within which most channels change, if their noise can be seen at all
-_BELOW = 0.01  # share of the range below 0 that an offset explains
+_BELOW = 0.01  # fraction of the range below 0 that an offset explains
 _FAR = 20  # smallest steps of a channel: more than its noise ranges over
 
 
@@ -135,7 +135,7 @@ class UnitConversion:
         zero: (S,), values of the untouched skin, in the device's unit.
         broken: (S,), bool: sensors without valid readings according to the calibration, or without a zero.
         noise: (S,), N, standard deviation of a frame of the untouched skin; None: unknown.
-        changing: (S,), share of the frames of the untouched skin that differed from the one before; None:
+        changing: (S,), fraction of the frames of the untouched skin that differed from the one before; None:
             unknown.
         equal: (L,), probability that a frame of the untouched skin equals that 1, 2, ... frames before.
         curves: of the sensors, for gain 1; None: all are linear.
@@ -239,7 +239,7 @@ def check_scale(scale: float | None, calibration: Calibration | None) -> None:
 
 
 AGREES = 0.25
-"""Relative difference up to which two references agree: a finger on a kitchen scale is no better."""
+"""Relative difference up to which two references agree: a finger on a kitchen scale is not more exact."""
 
 
 def check_sensitivity(conversion: UnitConversion, declared: float | None) -> None:
@@ -326,7 +326,7 @@ HEADER = 6.0
 _OFTEN = 0.2  # s between two attempts to take a baseline
 PATIENCE = 60.0  # s for which a touch may delay the baseline
 _UNTOUCHED = "taking the baseline: do not touch the skin"
-_AT_LIMIT = 0.5  # share of the time at its limit from which a channel cannot be tared
+_AT_LIMIT = 0.5  # fraction of the time at its limit from which a channel cannot be tared
 FROZEN = 5.0
 """s without a change after which readings are frozen."""
 _LAGS = 1000  # frames of the longest block that is recognised when it is sent again and again
@@ -486,12 +486,12 @@ class Tare:
         self._quiet.clear()
 
 
-_FRAMES, _FEW = 100, 3  # frames at rest and failures, of which less tell nothing
+_FRAMES, _FEW = 100, 3  # minimum number of frames at rest and of failures
 _TIMES, _ACCIDENT = 2.0, 1e-4  # times the failures at rest; least probability of an accident
 
 
 def fails_in_contact(failed: int, frames: int, failed_at_rest: int, frames_at_rest: int) -> bool:
-    """Return whether so many frames fail in a contact that it is no accident, given those at rest.
+    """Return whether more frames fail in a contact than by accident, given those at rest.
 
     Values beyond the range may make frames, or values in them, unreadable.
     """

@@ -94,7 +94,7 @@ class SequenceTracker:
     def _ahead(self, before: int, seq: int, elapsed: float, clocked: bool) -> int:
         """Return by how many frames ``seq`` is ahead; 0 if the counter began again."""
         if seq == before and elapsed > 0:
-            return 1  # a counter that stands still tells nothing
+            return 1  # a constant counter gives no information
         ahead = frames_ahead(before, seq, self.modulus)
         if ahead or self._fixed or elapsed < 0 or not self._period:
             return ahead
@@ -240,7 +240,7 @@ class ClockWatch:
 class FrameClock:
     """Time of frames that carry none, from their number and their arrival.
 
-    Frames may arrive in bursts of up to a second. Their number tells how far apart they were measured, once
+    Frames may arrive in bursts of up to a second. Their number gives the time between them, once
     the rate is known: measured over the last seconds, or that of the header until then.
     """
 

@@ -16,9 +16,9 @@ if TYPE_CHECKING:
 UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6}
 _LEADING = 2  # fields before the values that may be a counter and a clock without a name
 _AXES = 3  # values of a sensor that measures along x, y, z
-_MOSTLY = 0.75  # share of the steps, of which one may be a wrap and a few may miss frames
+_MOSTLY = 0.75  # fraction of the steps, of which one may be a wrap and a few may miss frames
 _REGULAR = 0.1, 10.0  # times the median step of a clock
-_USUAL = 0.01  # s between two frames: the unit whose steps are nearest is taken until the host's clock tells
+_USUAL = 0.01  # s between two frames: the unit with the nearest steps is taken until the host's clock decides
 _CLOCKS = re.compile(r"(?i)t|t.?(s|ms|us|sec|micros|millis)|ms|us|micros|millis|clock|.*time.*|.*stamp.*")
 _COUNTERS = re.compile(r"(?i)n|i|seq|count|counter|frame|sample|packet|num|nr|.*(seq|count|frame|sample).*")
 _NAMED_UNITS = {

@@ -1,4 +1,4 @@
-"""Lines in which an emulated skin tells the contacts of its next gesture, one for each frame with contact.
+"""Lines in which an emulated skin announces the contacts of its next gesture, one per frame with contact.
 
 They are comments of the text protocol, after the announcement of the gesture, in m, N and Pa, with CRC-16:
 ``# contacts v=1 rate=10 number=0 lines=12 frames=30 most=3 frame=4 c0=x,y,radius,force,peak c1=...*HHHH``.

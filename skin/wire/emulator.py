@@ -332,8 +332,8 @@ class Faults:
     of the device.
 
     Attributes:
-        flipped_bits: share of bits that arrive flipped.
-        lost_bytes: share of bytes that are lost.
+        flipped_bits: fraction of bits that arrive flipped.
+        lost_bytes: fraction of bytes that are lost.
         banner: send the boot message of a board at the start and after each reset and unplugging.
         silence: nothing is sent for ``silent`` s; frame numbers continue.
         reset: frame numbers start from 0 again.

@@ -318,7 +318,7 @@ class DetectedFormat(NamedTuple):
         frame_format: None if it is not known yet.
         count_seen: number of values in readable frames that do not match the layout; or None.
         header: the last one received.
-        unit: s per tick of the device's clock, as far as the bytes tell; None: they do not.
+        unit: s per tick of the device's clock, if the bytes determine it; None: they do not.
         settled: whether ``unit`` was set by the user.
         summary: what was inferred, in words.
     """
@@ -332,7 +332,7 @@ class DetectedFormat(NamedTuple):
 
 
 _LINES, _FRAMES = 3, 2
-_LINES_UNKNOWN = 8  # three lines of noise may count upwards by chance, eight hardly
+_LINES_UNKNOWN = 8  # three lines of noise may count upwards by accident, eight hardly
 _STEP = 1000  # frames that may be missing between two consecutive lines
 
 

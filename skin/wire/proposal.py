@@ -22,7 +22,7 @@ _SHARE = 0.9  # of the pieces after the first frame that an adapter must read
 _FRAMES = 10  # that it must read
 _MOST_ROWS = 64
 _LONGEST = 512  # bytes of a frame without an end
-_SAME = 0.98  # share of the characters that repeat from frame to frame
+_SAME = 0.98  # fraction of the characters that repeat from frame to frame
 _SIZE = 1e-4, 1e7  # of floats that are readings
 _LONGEST_MARK = 8  # bytes
 _MARKED = 0.01  # that a byte of a mark counts against the spread of readings
@@ -32,7 +32,7 @@ _SINGLE = (0xA5, 0xAA, 0x55, 0xFF, 0xFE, 0x7E, 0x02)
 _NUMBER = re.compile(rb"(?<![\w.])(?:\d{1,2}:\d\d:\d\d(?:\.\d+)?|[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)")
 _INDEXED = re.compile(rb"([A-Za-z_ \[(]*?)(\d+)([^\w.+-]+)([-+.\d].*)")
 _ASIDE = re.compile(r"(?i)temp.*|.*_t|.*_temp.*|.*humid.*|rssi|.*batt.*")
-"""Names of fields that are no force."""
+"""Names of fields that are not forces."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ def _sample(data: bytes) -> str:
         hint = "if it waits for a text, give start=; a pattern (docs/hardware.md) reads any lines"
         return f"the last lines are {texts}: {hint}"
     return (
-        f"{len(data)} bytes that are no text, which begin with {data[:48].hex(' ')}: is the baud rate right?"
+        f"{len(data)} bytes that are not text, which begin with {data[:48].hex(' ')}: is the baud rate right?"
     )
 
 
@@ -150,7 +150,7 @@ def _has_rows(adapter: Adapter, data: bytes) -> bool:
 
 
 def _named(adapter: Adapter, data: bytes, lines: Sequence[bytes]) -> Iterator[Adapter]:
-    """Yield an adapter with names of its fields and without those that are no force, and the adapter."""
+    """Yield an adapter with names of its fields and without those that are not forces, and the adapter."""
     try:
         detected = adapter.detect(data, None).frame_format
     except InputError:

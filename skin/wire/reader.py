@@ -236,7 +236,7 @@ def _address(port: str) -> tuple[str, int]:
     except ValueError:
         host = number = None
     if not host or not number:
-        raise InputError(f"{port} is no address: give device.port=socket://HOST:NUMBER")
+        raise InputError(f"{port} is not an address: give device.port=socket://HOST:NUMBER")
     return host, number
 
 
@@ -253,7 +253,7 @@ def _refused(port: str, baudrate: int, error: Exception) -> InputError:
             "sudo usermod -a -G dialout $USER, and log in again"
         )
     if number in (errno.ENOTTY, errno.EINVAL, errno.EISDIR) or "configure port" in text:
-        return InputError(f"{port} is no serial port: {_existing()}")
+        return InputError(f"{port} is not a serial port: {_existing()}")
     return InputError(f"cannot open {port} with device.baudrate={baudrate}: {text}")
 
 
@@ -409,7 +409,7 @@ class WireFeed:
 
     @property
     def unanswered(self) -> str:
-        """What the board was told without an answer, in words; empty if it answered or was told nothing."""
+        """Text sent to the board without an answer; empty if it answered or nothing was sent."""
         return self._prompter.unanswered
 
     def close(self) -> None:

@@ -25,9 +25,9 @@ _KEPT = 64  # announcements that are kept unread
 
 Labels = Mapping[str, int]
 
-_LATE = 0.25  # share of an announced window that may be missed at its beginning
+_LATE = 0.25  # fraction of an announced window that may be missed at its beginning
 _INTERRUPTED = "the gesture was interrupted: the skin was unplugged or restarted"
-_UNFELT = "nothing was felt, so the gesture does not count: no working sensor read more than its noise"
+_UNFELT = "no touch was detected, so the gesture is asked for again: all working sensors read noise"
 
 
 @dataclass
@@ -41,7 +41,7 @@ class RecordedGesture:
         segment: of the device's clock.
         frames: of the window.
         lost: number of frames known to be missing.
-        broken: it cannot be used: the device restarted within the window, or felt nothing.
+        broken: it cannot be used: the device restarted within the window, or detected nothing.
         resampled: the window at the model's rate, in the device's unit; None until it is complete.
         contacts: (T, K, 5) at the model's rate, as of :class:`skin.device.touches.Touches`; None if unknown.
     """
@@ -218,13 +218,13 @@ class AnnouncedSegmenter(AbstractSegmenter):
 class PromptedSegmenter(AbstractSegmenter):
     """Prompts for each gesture, which begins when Enter is pressed: s skips one, q ends.
 
-    It prompts again where the skin was interrupted, or felt nothing although the labels say a touch.
+    It prompts again where the skin was interrupted, or detected nothing although the labels say a touch.
 
     Args:
         window: as in :class:`AbstractSegmenter`.
         plan: (number, labels) of the gestures.
         notify: called with each message for the user.
-        felt: tells whether the skin has felt something in a window.
+        felt: returns whether the skin has detected a touch in a window.
         lines: typed lines; None: standard input. Lines typed before a prompt count, unless they come from a
             keyboard.
     """
@@ -252,7 +252,7 @@ class PromptedSegmenter(AbstractSegmenter):
         self._typed.put("q")
 
     def add(self, frame: Frame) -> RecordedGesture | None:
-        """As in the base class; a gesture that was not felt is broken, too."""
+        """As in the base class; a gesture that was not detected is broken, too."""
         done = super().add(frame)
         if done is not None and done.labels is not None:
             done.broken = done.resampled is None or (

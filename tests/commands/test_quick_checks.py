@@ -22,7 +22,7 @@ def check(*overrides, name="evaluate"):
     [
         (["device=serial", "device.port=/dev/none"], "no port /dev/none"),
         (["device=serial", "device.port=./skin-port"], "no port ./skin-port"),
-        (["device=serial", "device.port=socket://x"], "is no address"),
+        (["device=serial", "device.port=socket://x"], "is not an address"),
         (["touch.rate=-1"], r"touch\.rate=-1 must be greater than 0"),
         (["device.noise=-1"], r"device\.noise=-1"),
         (["body.size=[160,160]"], r"body\.size=160 m is not plausible"),

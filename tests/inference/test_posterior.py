@@ -344,7 +344,7 @@ def test_two_sensors_say_what_cannot_be_known():
     two = type(sensors)(sensors.positions[[3, 5]], sensors.footprint)
     subject = Posterior(Solid(SMALL, two, divisions=1), NOISE, SMALL)
     estimate = subject.estimate(np.array([0.3, 0.0]))
-    assert "cannot be told apart" in estimate.unknown
+    assert "cannot be separated" in estimate.unknown
     assert estimate.number >= 1
     assert estimate.contacts[0].region().area > 5e-4
     nothing = subject.estimate(np.array([np.nan, np.nan]))

@@ -329,7 +329,7 @@ def test_an_unknown_place_is_not_shown_as_no_touch():
     assert (sent["state"], sent["unknown"]) == ("unknown", [2])
     text = shown(subject)
     assert "no touch" not in text
-    assert "near sensor 2 could not be felt" in text
+    assert "near sensor 2 would stay undetected" in text
     assert "(and 1 more note)" in text
     subject.set_verdict(None, "readings are frozen")
     assert web.message(subject.state(), SkinPicture(PLACES, SIZE, 8, 4.0))["unknown"] == [0, 1, 2, 3, 4]

@@ -148,7 +148,7 @@ def test_a_folder_that_may_not_be_written_is_said(tmp_path):
 def test_a_file_that_is_no_session_is_left_alone(tmp_path, text):
     path = tmp_path / "x.csv"
     path.write_text(text)
-    with pytest.raises(InputError, match="no session"):
+    with pytest.raises(InputError, match="not a session"):
         SessionLog(path, ABOUT, 2)
     assert path.read_text() == text
 
@@ -258,5 +258,5 @@ def test_a_hard_link_is_the_same_file(tmp_path):
 
 def test_a_device_is_no_session(tmp_path):
     os.mkfifo(tmp_path / "pipe.csv")
-    with pytest.raises(InputError, match="is no regular file"):
+    with pytest.raises(InputError, match="is not a regular file"):
         SessionLog(tmp_path / "pipe.csv", ABOUT, 2)

@@ -80,8 +80,8 @@ def recorded(tmp_path, monkeypatch, capfd):
 
 def refused(said):
     """Return the prompts for what was not felt; the same prompt follows each."""
-    prompts = [line for line in said if line.startswith(("next: ", "nothing was felt"))]
-    places = [place for place, line in enumerate(prompts) if line.startswith("nothing")]
+    prompts = [line for line in said if line.startswith(("next: ", "no touch was detected"))]
+    places = [place for place, line in enumerate(prompts) if line.startswith("no touch was")]
     assert all(prompts[place - 1] == prompts[place + 1] for place in places)
     return [prompts[place - 1] for place in places]
 

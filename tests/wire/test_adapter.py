@@ -49,7 +49,7 @@ def test_every_shipped_adapter_is_read_and_written(name, tmp_path):
         ("absent.yaml", "absent.yaml cannot be read"),
         ({"kind": "xml"}, "device.adapter.kind=xml must be"),
         ({"kind": "text", "seperator": ";"}, "no setting seperator: did you mean separator"),
-        ({"kind": "text", "pattern": "(?P<a"}, "no regular expression"),
+        ({"kind": "text", "pattern": "(?P<a"}, "not a regular expression"),
         ({"kind": "text", "pattern": r"\d+"}, "needs a named group"),
         ({"kind": "text", "decimal": ",", "separator": ","}, "cannot separate fields"),
         ({"kind": "text", "end": ""}, "needs its length"),
@@ -57,7 +57,7 @@ def test_every_shipped_adapter_is_read_and_written(name, tmp_path):
         ({"kind": "binary", "struct": {"f": "<u2"}}, "need a head or a tail"),
         ({"kind": "binary", "struct": {"f": "<q9"}, "head": "aa"}, "device.adapter.struct="),
         ({"kind": "binary", "struct": {"f": "O"}, "head": "aa"}, "numbers alone"),
-        ({"kind": "binary", "struct": {"f": "<u2"}, "head": "xy"}, "no bytes in hexadecimal"),
+        ({"kind": "binary", "struct": {"f": "<u2"}, "head": "xy"}, "not bytes in hexadecimal"),
         ({"kind": "binary", "struct": {"f": "(99999,)<u2"}, "head": "aa"}, "at most 32768"),
         ({"kind": "text", "time_unit": "min"}, "time_unit=min must be"),
         ([1], "must be settings by name"),
@@ -80,7 +80,7 @@ def test_lines_that_do_not_match_are_shown_with_the_field_that_failed():
     for n in range(60):
         decoder.feed(b"12,13,%dmm,14\n" % n, 0.1 * n)
     error = str(decoder.error())
-    assert all(f"'12,13,{n}mm,14' (field '{n}mm' is no number)" in error for n in (57, 58, 59))
+    assert all(f"'12,13,{n}mm,14' (field '{n}mm' is not a number)" in error for n in (57, 58, 59))
     assert "adapter=auto" in error
 
 

@@ -208,7 +208,7 @@ def test_what_is_no_stream_is_shown():
     with pytest.raises(InputError, match=r"the last lines are 'Ready. Send g to go.'.*start="):
         propose(lines)
     noise = np.random.default_rng(0).bytes(4000)
-    with pytest.raises(InputError, match=r"4000 bytes that are no text.*baud rate"):
+    with pytest.raises(InputError, match=r"4000 bytes that are not text.*baud rate"):
         propose([(0.0, noise[:2000]), (1.0, noise[2000:])])
 
 

@@ -22,7 +22,7 @@ from skin.touch.sampler import AbstractContact, ContactProblem, ContactResult
 
 # Problems per batch, so that their vectors stay in the processor's cache.
 _PART = 256
-# Errors below this share of the tolerance are rounding, and give no search direction.
+# Errors below this fraction of the tolerance are rounding, and give no search direction.
 _REST = 0.1
 
 
@@ -51,8 +51,8 @@ def solve_contact(
     """Minimise p' C p / 2 + g' p over p >= 0 with sum(p) given.
 
     The conditions are C p + g = d where p > 0 and C p + g >= d elsewhere, for one approach d. The residual is
-    the largest gap under pressure or overlap anywhere, as a share of the largest deflection max(C p). Sum and
-    sign of the pressure hold exactly at any residual.
+    the largest gap under pressure or overlap anywhere, as a fraction of the largest deflection max(C p). Sum
+    and sign of the pressure hold exactly at any residual.
 
     The method is that of Polonsky and Keer (Wear 231, 1999): conjugate gradients over the cells in contact.
     Cells whose pressure becomes negative leave the contact; cells that overlap enter it and restart the
@@ -120,7 +120,7 @@ class _State:
     def __init__(
         self, compliance: Tensor, gap: Tensor, total: Tensor, start: Tensor | None, rest: float
     ) -> None:
-        # The rest is a share of the largest deflection.
+        # The rest is a fraction of the largest deflection.
         self.compliance, self.rest, self.total = compliance, rest, total
         self.allowed = gap.isfinite()
         self.gap = gap.where(self.allowed, 0)
@@ -131,7 +131,7 @@ class _State:
         self.pressure = self._loaded(begin, total)
         self.deflection = self.pressure @ compliance
         self.direction = torch.zeros_like(gap)
-        self.carried = torch.zeros_like(total)  # share of the last direction in the next, times its square
+        self.carried = torch.zeros_like(total)  # fraction of the last direction in the next, times its square
         self._update_contact()
 
     def _loaded(self, pressure: Tensor, total: Tensor) -> Tensor:
@@ -169,7 +169,7 @@ class _State:
         along = (along - (along.sum(1) / self.count)[:, None]).where(self.touches & moves[:, None], 0)
         answer = along @ self.compliance
         curvature = (along * answer).sum(1)
-        # Without a direction the dent of a cell alone tells what a joining one needs.
+        # Without a direction, the compliance of a cell alone gives the step of a joining cell.
         length = torch.where(
             moves, (inside * along).sum(1) / curvature, 1 / self.compliance.diagonal().mean()
         )
@@ -464,7 +464,7 @@ class Rigid(AbstractContact):
         peak = np.zeros(len(force))
         np.maximum.at(peak, trajectories.owner[solved], states.pressure.amax(1).double().numpy())
         frames = (frames / shares).view(-1, *body.shape)
-        # At other places of a path, or under a small object, the peak may exceed its range.
+        # At other positions of a path, or under a small object, the peak may exceed its range.
         settings = problem.settings
         dangerous = trajectories.wanted[:, 3]
         refused |= peak > np.where(dangerous, settings.dangerous_peak[1], settings.safe_peak[1])

@@ -33,7 +33,7 @@ def build_meshes(
     """Return meshes, their weights in a solution, and the elements along a side of a cell in each.
 
     Errors fall with the square of the elements' size. A mesh with half the rows and half the elements a side
-    therefore tells most of the error of the fine one: (4 fine - coarse) / 3. An odd ``refinement`` cannot be
+    therefore gives most of the error of the fine one: (4 fine - coarse) / 3. An odd ``refinement`` cannot be
     halved, and leaves the fine mesh alone.
 
     Against endless layers (``make physics``), with cells of 5 mm and two elements a cell: at most 1.5 % of

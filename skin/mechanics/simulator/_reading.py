@@ -1,4 +1,4 @@
-"""What a sensor feels of the motion of elements: the force across its footprint, wherever it faces."""
+"""Readings from the motion of elements: the force across the footprint of a sensor in any direction."""
 
 import warnings
 
@@ -11,15 +11,15 @@ from skin.mechanics.simulator._hexahedra import Hexahedra, lagrange
 
 _POINTS = 24  # along each side of a tilted footprint: what it loses is known to 4 %, its reading to 0.1 %
 _NOTHING = 1e-13  # of the largest weight of a node; weights fade by 0.27 from node to node
-_LEAST_CUT = 0.03  # of a footprint, of which a warning tells: less than a line of points
+_LEAST_CUT = 0.03  # fraction of a footprint that causes a warning: less than a line of points
 
 
 def reading_rows(mesh: Hexahedra, sensors: Sensors) -> sp.csr_array:
     """Return rows (S, 3 N) that give the normal force on each sensor, N, from nodal displacements.
 
-    A sensor that faces the surface feels the pressure that belongs to the forces between the rows of elements
-    above and below its plane of nodes; where it lies between planes, the cubic through the nearest four. A
-    tilted sensor feels the stress in the middles of elements.
+    A sensor that faces the surface reads the pressure that belongs to the forces between the rows of elements
+    above and below its plane of nodes; between planes, the cubic through the nearest four. A tilted sensor
+    reads the stress in the middles of elements.
     """
     tilted = sensors.tilted
     near, weights = lagrange(mesh.lines[2], sensors.positions[:, 2], min(4, len(mesh.lines[2])))
@@ -85,7 +85,7 @@ def warn_of_cut(sensors: Sensors, extent: tuple[float, float, float]) -> None:
     if lost.max(initial=0) > _LEAST_CUT:
         warnings.warn(
             f"the footprints of {(lost > _LEAST_CUT).sum()} tilted sensors pass the surface, the base or an "
-            f"edge of the body, where nothing is felt: sensor {lost.argmax() + 1} loses "
+            f"edge of the body, where there is no stress: sensor {lost.argmax() + 1} loses "
             f"{100 * lost.max():.0f} % of its footprint; move or turn the sensors, or make layout.footprint "
             "smaller",
             UserWarning,

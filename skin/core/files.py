@@ -2,13 +2,14 @@
 
 import errno
 import json
-import math
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import NamedTemporaryFile
 from typing import Any
+
+from pydantic_core import to_jsonable_python
 
 from skin.errors import InputError
 
@@ -79,7 +80,8 @@ def write(text: str, path: Path) -> Path:
 
 def json_text(content: Any) -> str:
     """Return JSON with numbers to six digits; further ones depend on the processor."""
-    return json_line(_map_floats(content, lambda number: float(f"{number:.6g}")), indent=2) + "\n"
+    rounded = json.loads(json_line(content), parse_float=lambda text: float(f"{float(text):.6g}"))
+    return json_line(rounded, indent=2) + "\n"
 
 
 def json_line(content: Any, **settings: Any) -> str:
@@ -89,20 +91,7 @@ def json_line(content: Any, **settings: Any) -> str:
         content: plain containers.
         settings: of :func:`json.dumps`.
     """
-    try:
-        return json.dumps(content, allow_nan=False, **settings)
-    except ValueError:  # seldom: the copy is made only where it is needed
-        finite = _map_floats(content, lambda number: number if math.isfinite(number) else None)
-        return json.dumps(finite, allow_nan=False, **settings)
-
-
-def _map_floats(value: Any, change: Callable[[float], float | None]) -> Any:
-    """Return a copy of plain containers with every float changed."""
-    if isinstance(value, Mapping):
-        return {key: _map_floats(entry, change) for key, entry in value.items()}
-    if isinstance(value, list | tuple):
-        return [_map_floats(entry, change) for entry in value]
-    return change(value) if isinstance(value, float) else value
+    return json.dumps(to_jsonable_python(content, inf_nan_mode="null"), **settings)
 
 
 def unwritable(path: Path | str, error: OSError, place: str) -> InputError:

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from typing import Annotated, Any, Literal
 
+import numpy as np
 import pytest
 from annotated_types import Ge, Gt, Le
 
@@ -36,6 +37,7 @@ FIT = {"count": 2, "share": 1, "width": None, "kind": "b", "widths": [1, 2], "na
 
 def test_what_fits_is_taken():
     check_settings(Thing, {**FIT, "_partial_": True, "made": {"_target_": "anything"}}, "thing")
+    check_settings(Thing, {"count": np.int64(2), "share": np.float32(0.5), "span": (1, 2.5)}, "thing")
     check_settings(lambda **settings: None, {"anything": 1}, "thing")
 
 
@@ -43,8 +45,8 @@ def test_what_fits_is_taken():
     ("wrong", "said"),
     [
         ({"count": 0}, "thing.count=0 must be greater than or equal to 1"),
-        ({"count": 0.5}, "thing.count=0.5 must be a valid integer"),
-        ({"count": "2"}, "thing.count=2 is text, and must be a number"),
+        ({"count": 0.5}, "thing.count=0.5 must be a whole number"),
+        ({"count": "2"}, "thing.count=2 must be a whole number, not text"),
         ({"share": "abc"}, "thing.share=abc must be a valid number"),
         ({"share": float("nan")}, "thing.share=nan must be a finite number"),
         ({"share": float("inf")}, "thing.share=inf must be a finite number"),
@@ -53,11 +55,11 @@ def test_what_fits_is_taken():
         ({"where": "in"}, "thing.where=in must be 'out'"),
         ({"kind": "c"}, "thing.kind=c must be 'a' or 'b'"),
         ({"widths": 8}, "thing.widths=8 must be a list"),
-        ({"widths": ["x"]}, r"thing.widths=\['x'\] must be a valid integer"),
+        ({"widths": ["x"]}, r"thing.widths=\['x'\] must be a whole number"),
         ({"name": 1}, "thing.name=1 must be a valid string"),
         ({"count": 2.0}, "thing.count=2.0 must be a whole number"),
         ({"count": True}, "thing.count=True must be a whole number"),
-        ({"widths": [1, "2"]}, r"thing.widths=\[1, '2'\] is text, and must be a number"),
+        ({"widths": [1, "2"]}, r"thing.widths=\[1, '2'\] must be a whole number, not text"),
         ({"share": -1j}, "thing.share=.*: as in thing.share=0.5$"),
         (
             {"span": [2, 1]},
@@ -66,7 +68,7 @@ def test_what_fits_is_taken():
         ({"span": [2]}, r"thing.span=\[2\] has too few entries"),
         ({"span": [1, 2, 3]}, r"thing.span=\[1, 2, 3\] has too many entries"),
         ({"labels": ["a", "b", "a"]}, r"thing.labels=\['a', 'b', 'a'\] must hold each name once"),
-        ({"widths": [0.5] * 50}, r"thing.widths=.{80}\.\.\. must be a valid integer"),
+        ({"widths": [0.5] * 50}, r"thing.widths=.{80}\.\.\. must be a whole number"),
         ({"shar": 1}, "thing has no setting shar: did you mean share[?] it has count, share, width"),
         ({"zzz": 1}, "thing has no setting zzz: it has count"),
         ({1: 2}, "thing has no setting 1: it has count"),
@@ -133,7 +135,7 @@ SERIAL = ["device=serial", "device.port=/dev/null"]
         (["+optimizer.lrr=1"], "the optimizer refuses its settings: .*lrr"),
         (["model.channels=8"], "model.channels=8 must be a list"),
         (["+model.channelz=3"], "model has no setting channelz: did you mean channels"),
-        (["fusion.hidden=x"], "fusion.hidden=x must be a valid integer"),
+        (["fusion.hidden=x"], "fusion.hidden=x must be a whole number"),
         (["trainer.max_epochs=0"], "trainer.max_epochs=0 must be a whole number from 1 up"),
         (["trainer.max_epochs=0.5"], "trainer.max_epochs=0.5 must be a whole number from 1 up"),
         (["trainer.accelerator=gpus"], "Trainer refuses trainer: .*gpus"),
@@ -141,20 +143,20 @@ SERIAL = ["device=serial", "device.port=/dev/null"]
         (["learner=boosted_trees", "learner.rounds=0"], "learner.rounds=0 must be greater than or equal"),
         (
             ["representation=interp", "representation.pixels=x"],
-            "representation.pixels=x must be a valid integer",
+            "representation.pixels=x must be a whole number",
         ),
         (["device.noise=abc"], "device.noise=abc must be a valid number"),
         (["device.noise=-1"], "device.noise=-1 must be greater than or equal to 0"),
         (["device.clip=0"], "device.clip=0 must be greater than 0"),
-        (["device.stuck=0.5"], "device.stuck=0.5 must be a valid integer"),
-        (["device.dead=[4,2]"], r"device.dead=\[4, 2\] must be a range \[least, most\]"),
+        (["device.stuck=0.5"], "device.stuck=0.5 must be a whole number"),
+        (["device.dead=[4,2]"], r"device.dead=\[4, 2\] must be a range \[minimum, maximum\]"),
         (
             ["+device.noize=1"],
             "device has no setting noize: did you mean noise[?] it has .*gain_spread, scale_spread, offset",
         ),
-        (["layout=grid", "layout.rows=1.5"], "layout.rows=1.5 must be a valid integer"),
+        (["layout=grid", "layout.rows=1.5"], "layout.rows=1.5 must be a whole number"),
         (["body.cells=9"], "body.cells=9 must be a list"),
-        (["simulator=solid", "simulator.divisions=x"], "simulator.divisions=x must be a valid integer"),
+        (["simulator=solid", "simulator.divisions=x"], "simulator.divisions=x must be a whole number"),
         ([*SERIAL, "device.scale=abc"], "device.scale=abc must be a valid number"),
         ([*SERIAL, "device.tare=inf"], "device.tare=inf must be a finite number"),
         ([*SERIAL, "device.limits=[a,b]"], "device.limits=.* must be a valid number"),
@@ -175,7 +177,7 @@ LIVE = {"web_port": 8765, "top": 4.0, "touch": None, "drift": 0.2, "verdicts": N
 @pytest.mark.parametrize(
     ("wrong", "said"),
     [
-        ({"web_port": "abc"}, "live.web_port=abc must be a valid integer"),
+        ({"web_port": "abc"}, "live.web_port=abc must be a whole number"),
         ({"web_port": 70000}, "live.web_port=70000 must be less than or equal to 65535"),
         ({"top": 0}, "live.top=0 must be greater than 0"),
         ({"top": float("nan")}, "live.top=nan must be a finite number"),

@@ -8,16 +8,13 @@ out=; run= compares the predictions of a run, too.
 """
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from skin.commands._command import command
 from skin.core.files import results
+from skin.core.messages import quiet
 from skin.errors import InputError
 from skin.runs.configuration import Config
-
-if TYPE_CHECKING:
-    from skin.device.base import AbstractSimulated
-    from skin.record.comparison import Agreement, SessionComparison
 
 
 @command("compare")
@@ -33,8 +30,7 @@ def main(
     if session is None:
         raise InputError("which session? add session=session.csv, of skin record or a bench")
 
-    from skin.core.messages import quiet
-    from skin.record.comparison import compare_session, publish_comparison
+    from skin.record.comparison import Agreement, compare_session, publish_comparison
     from skin.runs.build import build_device
 
     quiet()
@@ -44,29 +40,24 @@ def main(
         f" with {device.calibration}." if device.calibration else ", not calibrated."
     )
     comparison = compare_session(device, session, presses, compare)
-    agreement = None if run is None else _compare_predictions(run, config, device, comparison)
+    agreement = None
+    if run is not None:
+        import numpy as np
+
+        from skin.device.base import Blank
+        from skin.runs.run import FinishedRun
+        from skin.runs.torch_model import load_model
+
+        trained = FinishedRun.named(run, config)
+        if (learned := trained.stored.simulator["_target_"]) != config.simulator["_target_"]:
+            name = f"run {trained.identity}"
+            print(f"{name} was trained with {learned}: add simulator= to simulate the session with it\n")
+        blank = Blank.of(device.task, device.size, comparison.touches[0])
+        stored = replace(trained.stored, layout=config.layout)
+        model = load_model(trained, stored, device=blank, alarm=False)
+        simulated, measured = ((model.predict(side) > 0.5).numpy() for side in comparison.touches)
+        labels = [pair.labels for pair in comparison.pairs if pair.labels is not None]
+        truth = np.array([[bool(row[name]) for name in device.task.names] for row in labels])
+        agreement = Agreement(device.task.names, simulated, measured, truth if labels else None)
     page, picture = publish_comparison(comparison, agreement, about, compare["shown"], folder)
     print(page.read_text(encoding="utf-8"), page, picture, sep="\n")
-
-
-def _compare_predictions(
-    name: str, config: Config, device: "AbstractSimulated", comparison: "SessionComparison"
-) -> "Agreement":
-    """Return the predictions of a run for both sides; warn if it learned another mechanics."""
-    import numpy as np
-
-    from skin.device.base import Blank
-    from skin.record.comparison import Agreement
-    from skin.runs.run import FinishedRun
-    from skin.runs.torch_model import load_model
-
-    run, blank = FinishedRun.named(name, config), Blank.of(device.task, device.size, comparison.touches[0])
-    if (learned := run.stored.simulator["_target_"]) != config.simulator["_target_"]:
-        print(
-            f"run {run.identity} was trained with {learned}: add simulator= to simulate the session with it\n"
-        )
-    model = load_model(run, replace(run.stored, layout=config.layout), device=blank, alarm=False)
-    simulated, measured = ((model.predict(side) > 0.5).numpy() for side in comparison.touches)
-    labels = [pair.labels for pair in comparison.pairs if pair.labels is not None]
-    truth = np.array([[bool(row[name]) for name in device.task.names] for row in labels])
-    return Agreement(device.task.names, simulated, measured, truth if labels else None)

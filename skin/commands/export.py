@@ -12,19 +12,16 @@ recorded touches first. The folder holds any run: run=my_skin then selects it wh
 import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 from annotated_types import Ge, Gt, MinLen
 
 from skin.commands._command import command
 from skin.core.files import results
+from skin.core.messages import Steps, quiet
+from skin.core.settings import configured
 from skin.errors import InputError
 from skin.runs.configuration import Config, overrides
-
-if TYPE_CHECKING:
-    from skin.core.messages import Steps
-    from skin.device.touches import Touches
-    from skin.runs.torch_model import TorchModel
 
 _FORMATS = ("onnx", "folder")
 
@@ -71,37 +68,26 @@ def main(
     if format == "folder":
         if out is not None:
             raise InputError(f"a folder is written to models/NAME, not to out={out}: add name=my_skin")
-        _export_folder(run, config, name, licence)
+
+        from skin.runs.card import check_folder, write_folder
+        from skin.runs.run import FinishedRun
+
+        folder = check_folder(name, licence)
+        write_folder(FinishedRun.named(run, config), folder, str(licence))
+        print(folder)
         return
-
-    from skin.core.messages import Steps
-    from skin.core.settings import configured
-
     if name is not None or licence is not None:
         raise InputError("name and licence are those of a folder: add format=folder, or leave them out")
     with Steps(_STEPS) as steps:
         _export_file(run, config, configured(ExportSettings, export, "export"), out, steps)
 
 
-def _export_folder(run: str, config: Config, name: str | None, licence: str | None) -> None:
-    """Write the files of a pretrained model, all or none."""
-    from skin.runs.card import check_folder, write_folder
-    from skin.runs.run import FinishedRun
-
-    folder = check_folder(name, licence)
-    write_folder(FinishedRun.named(run, config), folder, str(licence))
-    print(folder)
-
-
-def _export_file(
-    name: str, config: Config, settings: ExportSettings, out: str | None, steps: "Steps"
-) -> None:
+def _export_file(name: str, config: Config, settings: ExportSettings, out: str | None, steps: Steps) -> None:
     """Write the network of a run for one skin, with the thresholds of its alarm."""
     path = None if out is None else Path(out).expanduser()
     if path is not None and path.suffix != ".onnx":
         raise InputError(f"out={out} must end in .onnx: as in out=skin.onnx")
 
-    from skin.core.messages import quiet
     from skin.evaluation.alarm import choose_alarm_threshold
     from skin.live.engine import DebounceSettings
     from skin.runs.model import describe_skin
@@ -140,15 +126,11 @@ def _export_file(
         )
     path = path or results(None) / f"{run.title.split()[0]}_{run.identity[:8]}.onnx"
     steps.begin("simulating touches to compare")
-    touches = _touches(model, settings.touches)
+    if (simulation := model.device.reference) is None:
+        touches = model.device.touches("test")[: settings.touches]
+    else:  # a tenth of the gestures is the validation split
+        drawn = simulation.replace(gestures=10 * max(10, settings.touches))
+        touches = drawn.touches("validation")[: settings.touches]
     steps.begin("writing the file and comparing it")
     difference = write_model(module, described, touches, path)
     print(f"{path}: differs from the run by {difference:.1g} at most on {len(touches)} touches")
-
-
-def _touches(model: "TorchModel", count: int) -> "Touches":
-    """Return at most ``count`` touches; a run on a recording has those of its own only."""
-    if (simulation := model.device.reference) is None:
-        return model.device.touches("test")[:count]
-    # A tenth of the gestures is the validation split.
-    return simulation.replace(gestures=10 * max(10, count)).touches("validation")[:count]

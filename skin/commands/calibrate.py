@@ -12,21 +12,11 @@ calibrate.demo=true first writes the session of an emulated device: no hardware 
 import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from skin.commands._command import command
-from skin.core.settings import configured
 from skin.errors import InputError
 from skin.runs.configuration import Config
-
-if TYPE_CHECKING:
-    from skin.calibration.bench import BenchSession, Gauge
-    from skin.calibration.wiring import Confirmed
-    from skin.device.base import AbstractSimulated
-    from skin.device.calibration import Calibration
-
-_UNITS = ("force_scale", "time_scale")
-_CONFIRMED = ("places", "channels", "broken")
 
 
 @command("calibrate")
@@ -49,22 +39,24 @@ def main(
     if by_load and presses is not None:
         raise InputError("a known load replaces the gauge: leave out presses=, or weight= and base=")
 
+    from rich.console import Console
+
     from skin.calibration import bench, known_loads
     from skin.calibration.bench_protocol import write_demo_session
-    from skin.calibration.wiring import Confirmed, device_channels
+    from skin.calibration.fit import fit_presses, print_calibration
+    from skin.calibration.wiring import Confirmed, device_channels, wired_bench
     from skin.device.calibration import write_calibration
     from skin.runs.build import build_device
 
-    confirmed = configured(Confirmed, {name: calibrate[name] for name in _CONFIRMED}, "calibrate")
-    units = configured(bench.Units, {name: calibrate[name] for name in _UNITS}, "calibrate")
+    confirmed = Confirmed(calibrate["places"], calibrate["channels"], calibrate["broken"])
+    units = bench.Units(calibrate["force_scale"], calibrate["time_scale"])
     device = build_device(config).simulated("a calibration fits the simulation to a skin")
-    shape = calibrate["indenter"], calibrate["radius"]
-    about: dict[str, Any] = {"session": session}
     load = known_loads.KnownLoad.of(weight, base, device.size) if by_load else None
     if calibrate["demo"] and load is not None:
         print(known_loads.write_demo_placements(device, load, calibrate, session))
     elif calibrate["demo"]:
         print(write_demo_session(device, calibrate, session))
+    shape, metadata = (calibrate["indenter"], calibrate["radius"]), dict[str, Any](session=session)
     recorded = bench.read_bench_session(session, *shape, calibrate["unit"], units)
     if load is not None:
         result = known_loads.fit_known_load(device, confirmed.ordered(recorded), load)
@@ -72,41 +64,17 @@ def main(
         calibration = result.calibration
     else:
         rows = None if presses is None else bench.read_gauge(presses, *shape, calibrate["delay"], units)
-        calibration, errors = _fit_presses(device, recorded, rows, confirmed, calibrate, out)
-        about = {**errors, **about, "presses_file": presses}
-    about, channels = {**calibration.about, **about}, device_channels(recorded, confirmed)
-    print(write_calibration(replace(calibration, about=about, channels=channels), out))
-
-
-def _fit_presses(
-    device: "AbstractSimulated",
-    session: "BenchSession",
-    rows: "Gauge | None",
-    confirmed: "Confirmed",
-    settings: dict[str, Any],
-    out: str,
-) -> tuple["Calibration", dict[str, Any]]:
-    """Return a calibration and its errors on held-out presses; end the command where it does not help."""
-    from rich.console import Console
-
-    from skin.calibration import fit as fitting
-    from skin.calibration.gauge_drift import check_gauge
-    from skin.calibration.wiring import check_usable, wired_bench
-
-    with Console(stderr=True).status("fitting"):
-        bench = wired_bench(device, session, rows, confirmed)
-        check_gauge(bench)
-        calibration = fitting.fit_calibration(bench)
-        check_usable(calibration)
-        if settings["force_scale"] is None:
-            fitting.check_force(calibration, device.imperfection.clip)
-        outcome = fitting.evaluate_held_out(bench, settings["held_out"])
-    fitting.print_calibration(calibration, outcome)
-    if not outcome.helps:
-        print(
-            f"The calibration does not reduce the error, so {out} was not written: is the layout, the "
-            "body or the clock wrong?"
-        )
-        sys.exit(1)
-    rmse = {name: round(getattr(outcome, name), 6) for name in ("simulated", "tared", "calibrated")}
-    return calibration, {"held_out": list(outcome.held_out), "rmse": rmse}
+        clip = device.imperfection.clip if units.force_scale is None else None
+        with Console(stderr=True).status("fitting"):
+            wired = wired_bench(device, recorded, rows, confirmed)
+            calibration, errors = fit_presses(wired, calibrate["held_out"], clip)
+        print_calibration(calibration, errors)
+        if not errors.helps:
+            print(
+                f"The calibration does not reduce the error, so {out} was not written: is the layout, the "
+                "body or the clock wrong?"
+            )
+            sys.exit(1)
+        metadata |= {"presses_file": presses}
+    metadata, channels = {**calibration.about, **metadata}, device_channels(recorded, confirmed)
+    print(write_calibration(replace(calibration, about=metadata, channels=channels), out))

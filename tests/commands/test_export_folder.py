@@ -74,7 +74,7 @@ def test_an_altered_file_ends_a_command_with_a_sentence(model, run):
         (["name=new", "licence=MIT", "run=small"], "has no predictions.parquet"),
         (["name=new", "licence=MIT", "out=x"], "not to out=x: add name=my_skin"),
         (["name=new", "licence=MIT", "format=onnx"], "add format=folder"),
-        (["name=new", "licence=MIT", "format=zip"], "format must be one of onnx, folder"),
+        (["name=new", "licence=MIT", "format=zip"], "format=zip must be 'onnx' or 'folder'"),
     ],
 )
 def test_bad_input_ends_with_a_sentence(folder, run, overrides, message):

@@ -20,7 +20,8 @@ from pydantic import PositiveFloat
 
 from skin.commands._command import command
 from skin.core.files import results
-from skin.core.messages import Steps, quiet
+from skin.core.messages import quiet
+from skin.core.progress import Steps
 from skin.core.settings import check_settings
 from skin.errors import InputError
 from skin.runs.configuration import Config, overrides

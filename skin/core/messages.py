@@ -1,4 +1,4 @@
-"""Messages of a command: errors in one sentence, and its progress."""
+"""Messages of a command: errors in one sentence, durations, and the silence of libraries."""
 
 import errno
 import logging
@@ -6,11 +6,8 @@ import math
 import os
 import re
 import sqlite3
-import sys
-import threading
-import time
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 
 from hydra.errors import CompactHydraException, HydraException, InstantiationException, OverrideParseException
 from omegaconf.errors import OmegaConfBaseException
@@ -97,14 +94,21 @@ def one_line(error: BaseException) -> str:
 # Silence library messages that a user of the command line cannot act on.
 
 
+_LEVELS = {
+    "lightning_fabric": logging.ERROR,
+    "pytorch_lightning": logging.ERROR,
+    "pytorch_lightning.utilities.rank_zero": logging.ERROR,
+    "alembic": logging.WARNING,
+    "mlflow": logging.WARNING,
+}
+
+
 def quiet() -> None:
-    """Quieten Lightning's remarks on hardware and logging, and torch's on a change in its own insides."""
-    for name in ("lightning_fabric", "pytorch_lightning", "pytorch_lightning.utilities.rank_zero"):
+    """Silence remarks of libraries on hardware, logging and their own internals."""
+    for name, level in _LEVELS.items():
         logger = logging.getLogger(name)
         logger.handlers.clear()
-        logger.setLevel(logging.ERROR)
-    for name in ("alembic", "mlflow"):
-        logging.getLogger(name).setLevel(logging.WARNING)
+        logger.setLevel(level)
     logging.getLogger("urllib3.connectionpool").addFilter(_rephrase)
     # One task needs no srun.
     for text in ("treespec", "does not have many workers", "`srun` command is available"):
@@ -118,59 +122,8 @@ def _rephrase(record: logging.LogRecord) -> bool:
     return True
 
 
-# The progress of a command.
-
-
 def format_duration(duration: float) -> str:
     """Return a duration in s as text."""
     if duration > 2 * 3600:
         return f"{duration / 3600:.1f} h"
     return f"{duration:.0f} s" if duration < 90 else f"{math.ceil(duration / 60)} min"
-
-
-class Steps:
-    """Prints how far a command is, on standard error, every ten seconds; use it in a ``with`` statement.
-
-    Args:
-        seconds: duration of each step on some machine, in order, by what the command does in it.
-        pause: s between two lines.
-
-    Attributes:
-        silent: whether to print nothing for now, such as while a person is prompted.
-    """
-
-    def __init__(self, seconds: Mapping[str, float], pause: float = 10.0) -> None:
-        self._seconds, self._pause, self.silent = dict(seconds), pause, False
-        self._began, self._ended = time.monotonic(), threading.Event()
-        self._thread = threading.Thread(target=self._report, daemon=True)
-        self.begin(next(iter(self._seconds)))
-
-    def __enter__(self) -> "Steps":
-        self._thread.start()
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self._ended.set()
-        self._thread.join()
-
-    def begin(self, name: str) -> None:
-        """Say which step begins; those before it have ended."""
-        names = list(self._seconds)
-        # s of the steps that have ended, as expected
-        self._done = sum(self._seconds[before] for before in names[: names.index(name)])
-        self._name, self._step_began = name, time.monotonic()
-
-    def line(self) -> str:
-        """Return the step, the fraction that is done in percent, and the estimated remaining time."""
-        now, total = time.monotonic(), sum(self._seconds.values())
-        spent = self._step_began - self._began
-        pace = spent / self._done if self._done and spent else 1.0  # s for each expected one
-        # A step that takes longer than expected is almost done, never done.
-        done = self._done + min((now - self._step_began) / pace, 0.95 * self._seconds[self._name])
-        left = (now - self._began) * (total / done - 1) if done else pace * total
-        return f"{self._name}: {100 * done / total:.0f} % done, about {format_duration(left)} left"
-
-    def _report(self) -> None:
-        while not self._ended.wait(self._pause):
-            if not self.silent:
-                print(self.line(), file=sys.stderr, flush=True)

@@ -192,11 +192,11 @@ _LINE = "sha256:"
 
 
 class ChecksumError(ValueError):
-    """A file is not as it was written."""
+    """A file is not as it was written; its argument, if any, is what fixes that."""
 
-    def __init__(self, fix: str = "") -> None:
+    def __str__(self) -> str:
         reason = "it is damaged or was changed: its checksum differs from its content"
-        super().__init__(f"{reason}: {fix}" if fix else reason)
+        return ": ".join([reason, *self.args])
 
 
 def sha256(content: bytes) -> str:

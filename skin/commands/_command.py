@@ -240,7 +240,7 @@ def _run(job: Callable[[DictConfig], Any], name: str, words: Sequence[str]) -> N
     version.setbase(_VERSION)
     parser = get_args_parser()
     parser.usage = "skin VERB [--OPTION ...] [NAME=VALUE ...]"
-    # Neither the shell nor Hydra expands ~ in device.path=~/x.csv. An id such as 3e066519 is no number.
+    # Neither the shell nor Hydra expands ~ in device.path=~/x.csv, and Hydra reads 3e066519 as a number.
     options = parser.parse_intermixed_args(
         [
             re.sub(r"^run=(\d[\da-f]*)$", r"run='\1'", word.replace("=~/", f"={Path.home()}/", 1))

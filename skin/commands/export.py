@@ -82,7 +82,7 @@ def _export_file(
         config: of the command.
         out: path of the file; None: in ``results``.
         steps: to be shown.
-        touch: contact threshold, N above the baseline; None: that of the run.
+        touch: contact threshold, N above the baseline; None: as in the run.
         touches: number of touches on which the file is compared with the run.
         rates: of devices, Hz, for each of which the threshold of the alarm is chosen.
     """

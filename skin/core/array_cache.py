@@ -17,7 +17,7 @@ from skin.core.files import whole
 from skin.core.safe_loading import load_npz
 from skin.errors import InputError
 
-_HEADER = 512  # bytes: that of an array in a file of numpy takes 128
+_HEADER = 512  # bytes of the header of an array in a file of numpy, at most; it usually takes 128
 
 
 def folder(path: str | Path | None) -> Path:
@@ -60,7 +60,7 @@ def kept(
 
 
 def _load(path: Path, key: str, shapes: Mapping[str, Sequence[int]]) -> dict[str, np.ndarray] | None:
-    """Return the arrays of a file, or None if there is no file or anything about it is wrong."""
+    """Return the arrays of a file, or None if there is no file or anything in it is wrong."""
     expected = sum(8 * math.prod(shape) + _HEADER for shape in shapes.values())
     with suppress(Exception):  # any error of a broken archive: build the arrays again
         arrays = load_npz(path, maximum=expected + 4 * len(key) + _HEADER)

@@ -36,7 +36,7 @@ def tabular(path: str | Path, what: str) -> Path:
 
 
 @contextmanager
-def whole(path: Path, place: str = "out=FOLDER") -> Iterator[Path]:
+def whole(path: Path, override: str = "out=FOLDER") -> Iterator[Path]:
     """Yield a temporary path that replaces ``path`` if the block succeeds.
 
     The file is flushed to the disk first, so that a power cut leaves either the old file or the new one.
@@ -44,7 +44,7 @@ def whole(path: Path, place: str = "out=FOLDER") -> Iterator[Path]:
 
     Args:
         path: of the file.
-        place: override that selects another folder, for the message.
+        override: setting that selects another folder, for the message.
 
     Raises:
         InputError: the disk is full or read-only, or the folder cannot be written.
@@ -64,7 +64,7 @@ def whole(path: Path, place: str = "out=FOLDER") -> Iterator[Path]:
         finally:
             partial.unlink(missing_ok=True)
     except OSError as error:
-        raise unwritable(path, error, place) from error
+        raise unwritable(path, error, override) from error
 
 
 def write(text: str, path: Path) -> Path:
@@ -94,12 +94,12 @@ def json_line(content: Any, **settings: Any) -> str:
     return json.dumps(to_jsonable_python(content, inf_nan_mode="null"), **settings)
 
 
-def unwritable(path: Path | str, error: OSError, place: str) -> InputError:
+def unwritable(path: Path | str, error: OSError, override: str) -> InputError:
     """Return the error for a file that cannot be written."""
     # The message of Arrow repeats the number and hides the reason.
     reason = os.strerror(error.errno) if error.errno else str(error)
     fix = "make room there" if error.errno in (errno.ENOSPC, errno.EDQUOT) else "make it writable"
-    return InputError(f"cannot write {path}: {reason}: {fix}, or choose another place, as in {place}")
+    return InputError(f"cannot write {path}: {reason}: {fix}, or choose another place, as in {override}")
 
 
 # Where the files that come with the package are: in the repository, or in an installed wheel.

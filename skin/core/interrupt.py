@@ -6,7 +6,7 @@ import socket
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from threading import Event, Thread, current_thread, main_thread
+from threading import Event, Thread, Timer, current_thread, main_thread
 from types import FrameType, TracebackType
 
 _PATIENCE = _LAST = 1.0  # s
@@ -75,12 +75,7 @@ def _watch(receiver: socket.socket, answered: list[int], ended: Event, last: Cal
             if not numbers:
                 return
     if not ended.wait(_PATIENCE) and not (answered and ended.wait(_CLOSING)):
-        ending = Thread(target=_try, args=(last,), daemon=True)
-        ending.start()
-        ending.join(_LAST)
+        Timer(_LAST, os._exit, [128 + signal.SIGTERM]).start()
+        with suppress(Exception):  # nobody can be informed any more
+            last()
         os._exit(128 + signal.SIGTERM)
-
-
-def _try(last: Callable[[], object]) -> None:
-    with suppress(Exception):  # nobody can be informed any more
-        last()

@@ -149,7 +149,7 @@ _HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.r
 
 
 def _check_size(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> None:
-    """Raise ValueError where an array claims another size than that of its entry."""
+    """Raise ValueError where an array claims another size than its entry has."""
     with archive.open(entry) as file:
         if (version := np.lib.format.read_magic(file)) not in _HEADERS:
             raise ValueError(f"{entry.filename} has the unknown version {version}")
@@ -186,7 +186,7 @@ KEY = "skin_file_sha256"
 """Name of the entry with the checksum in the metadata of a binary file (Parquet, ONNX)."""
 BLANK = 64 * "0"
 """Its value before :func:`seal`."""
-# The formats write at most three bytes between a key and its value.
+# The formats write up to three bytes between a key and its value.
 _ENTRY = re.compile(KEY.encode() + b".{1,4}?([0-9a-f]{64})", re.DOTALL)
 _LINE = "sha256:"
 
@@ -235,7 +235,7 @@ def write_parquet(table: "pa.Table", path: Path, **settings: Any) -> None:
 def seal(path: Path) -> None:
     """Replace the value :data:`BLANK` of the entry :data:`KEY` of a file by the checksum of the file.
 
-    The checksum is of all bytes, with :data:`BLANK` in its own place.
+    The checksum is of all bytes, with :data:`BLANK` at its own position.
 
     Raises:
         ValueError: the file has no such entry.

@@ -57,7 +57,7 @@ def check_settings(
     Args:
         target: the class or function.
         settings: in plain containers; keys that begin with ``_`` are Hydra's.
-        name: their place in the configuration, for the message.
+        name: their group in the configuration, for the message.
         whole: whether they are all arguments; if not, the program passes those without a default.
 
     Raises:
@@ -271,7 +271,7 @@ def check_targets(config: Any, where: str) -> None:
             _refuse(where, path, f"names {value!r}, which could run any code")
     row = config.get("row") if isinstance(config, dict) else None
     if row is not None and (not isinstance(row, str) or {"/", "\\", "\0"} & set(row)):
-        _refuse(where, ("row",), f"is {row!r}, which is no name of a file")
+        _refuse(where, ("row",), f"is {row!r}, which cannot name a file")
 
 
 def _refuse(where: str, path: tuple[str, ...], reason: str) -> None:
@@ -291,7 +291,7 @@ def walk_settings(value: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tupl
 
 
 def _is_allowed(name: Any) -> bool:
-    """Return whether a name is that of an allowed class.
+    """Return whether a name belongs to an allowed class.
 
     The name's package is checked first, because to resolve a name imports modules, and then the class.
     """
@@ -313,7 +313,7 @@ def _is_allowed(name: Any) -> bool:
 def option_name(made: object) -> str:
     """Return the name of the option that an object or its class is.
 
-    It is that of the YAML file in ``conf/`` that names the class: ``PlatesAndBeams`` is the option ``fem``,
+    The YAML file in ``conf/`` that names the class has this name: ``PlatesAndBeams`` is the option ``fem``,
     as in ``simulator=fem``. A class from outside ``skin`` is named after its module.
     """
     kind = made if hasattr(made, "__qualname__") else type(made)

@@ -13,7 +13,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from annotated_types import Ge, MinLen
 from pydantic import PositiveFloat
@@ -25,6 +25,9 @@ from skin.core.progress import Steps
 from skin.core.settings import check_settings
 from skin.errors import InputError
 from skin.runs.configuration import Config, overrides
+
+if TYPE_CHECKING:
+    from skin.runs.torch_model import TorchModel
 
 _THRESHOLDS = "choosing the thresholds of the alarm for touches"
 # Expected seconds of each step, for the fraction that is done.
@@ -90,8 +93,6 @@ def _export_file(
     if path is not None and path.suffix != ".onnx":
         raise InputError(f"out={out} must end in .onnx: as in out=skin.onnx")
 
-    from skin.evaluation.alarm import choose_alarm_threshold
-    from skin.live.engine import DebounceSettings
     from skin.runs.model import describe_skin
     from skin.runs.run import FinishedRun
     from skin.runs.torch_model import equation10_warning, load_model
@@ -113,19 +114,7 @@ def _export_file(
     described = replace(model.describe(), skin=describe_skin(whole, model.positions))
     if "simulator" in run.stored.device and model.threshold is not None:
         steps.begin(_THRESHOLDS)
-        patience = DebounceSettings().alarm
-        conditions = (model.live_conditions(rate, patience, False) for rate in rates)
-        points = {
-            f"{live.rate:g}": choose_alarm_threshold(model.alarm, live, say=print) for live in conditions
-        }
-        hiding = [at.warning() for at in points.values() if at and at.useless]
-        refused = "".join(f"{text}: skin live refuses the file at this rate\n" for text in hiding)
-        print(refused, end="", file=sys.stderr)
-        described = replace(
-            described,
-            # One of 1 raises no alarm, and is refused.
-            thresholds={rate: 1.0 if at.useless else at.threshold for rate, at in points.items() if at},
-        )
+        described = replace(described, thresholds=_choose_thresholds(model, rates))
     path = path or results(None) / f"{run.title.split()[0]}_{run.identity[:8]}.onnx"
     steps.begin("simulating touches to compare")
     device = model.device
@@ -135,3 +124,17 @@ def _export_file(
     steps.begin("writing the file and comparing it")
     difference = write_model(module, described, compared, path)
     print(f"{path}: differs from the run by {difference:.1g} at most on {len(compared)} touches")
+
+
+def _choose_thresholds(model: "TorchModel", rates: Sequence[float]) -> dict[str, float]:
+    """Return the threshold of the alarm for devices of each rate, Hz; 1 raises no alarm, and is refused."""
+    from skin.evaluation.alarm import choose_alarm_threshold
+    from skin.live.engine import DebounceSettings
+
+    patience = DebounceSettings().alarm
+    conditions = (model.live_conditions(rate, patience, False) for rate in rates)
+    points = {f"{live.rate:g}": choose_alarm_threshold(model.alarm, live, say=print) for live in conditions}
+    hiding = [at.warning() for at in points.values() if at and at.useless]
+    refused = "".join(f"{text}: skin live refuses the file at this rate\n" for text in hiding)
+    print(refused, end="", file=sys.stderr)
+    return {rate: 1.0 if at.useless else at.threshold for rate, at in points.items() if at}

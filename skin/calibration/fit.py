@@ -12,11 +12,13 @@ from rich.console import Console
 from rich.table import Table
 
 from skin.calibration.bench import BenchData
+from skin.calibration.gauge_drift import check_gauge
 from skin.calibration.response_fit import Shape, curves_of, describe_shapes, fit_shape
 from skin.calibration.wiring import (
     _MAD,
     _MEDIAN,
     Idle,
+    check_usable,
     collect_responses,
     find_polarity,
     find_quantum,
@@ -516,6 +518,28 @@ def check_force(calibration: Calibration, clip: float) -> None:
             f"{words}: the force of the gauge seems to be in {fits[0]}; add "
             f"calibrate.force_scale={_GAUGES[fits[0]]:g}, or calibrate.force_scale=1 if it is in N"
         )
+
+
+def fit_presses(bench: BenchData, fraction: float, clip: float | None) -> tuple[Calibration, HeldOutErrors]:
+    """Return a calibration by presses of a gauge, and its errors on held-out ones.
+
+    Args:
+        bench: data of the session.
+        fraction: of the presses that are held out.
+        clip: of the designed device, N, with which the unit of the gauge is compared; None: it is known.
+
+    Raises:
+        InputError: the gauge drifts, its unit is wrong, or too few sensors can be used.
+    """
+    check_gauge(bench)
+    calibration = fit_calibration(bench)
+    check_usable(calibration)
+    if clip is not None:
+        check_force(calibration, clip)
+    outcome = evaluate_held_out(bench, fraction)
+    rmse = {name: round(getattr(outcome, name), 6) for name in ("simulated", "tared", "calibrated")}
+    metadata = {**calibration.about, "held_out": list(outcome.held_out), "rmse": rmse}
+    return replace(calibration, about=metadata), outcome
 
 
 def print_calibration(calibration: Calibration, outcome: HeldOutErrors) -> None:

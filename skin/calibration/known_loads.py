@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from skin.body.base import AbstractBody, Sensors
-from skin.calibration.bench import BenchSession, Gauge, per_newton
+from skin.calibration.bench import BenchSession, Gauge, per_newton, write_bench_session
 from skin.calibration.bench_protocol import Protocol, sent_session
 from skin.calibration.placements import Placements, find_placements
 from skin.calibration.wiring import find_quantum, list_numbers, measure_idle
@@ -353,18 +353,20 @@ def emulate_placements(
     return sent_session(device, true, time, generator, bits)
 
 
-def emulate_known_load(
-    device: AbstractSimulated, load: KnownLoad, settings: Mapping[str, Any]
-) -> BenchSession:
-    """Simulate a session of a load on an emulated skin: on every sensor twice, in any order.
+def write_demo_placements(
+    device: AbstractSimulated, load: KnownLoad, settings: Mapping[str, Any], path: str
+) -> str:
+    """Write the simulated session of a load on every sensor twice, in any order; return a summary.
 
     Args:
         device: the skin.
         load: what is put on it.
         settings: ``conf/calibrate.yaml`` under ``calibrate``.
+        path: .csv or .parquet.
     """
     protocol = configured(Protocol, settings["protocol"], "calibrate.protocol")
     randomness = np.random.default_rng(device.seed)
     order = np.concatenate([randomness.permutation(len(device.sensors)) for _ in range(2)])
     readings = load.force * base_readings(device.model, device.body, device.sensors, load.base)[order]
-    return emulate_placements(device, readings, protocol, randomness, settings["bits"])
+    session = emulate_placements(device, readings, protocol, randomness, settings["bits"])
+    return f"{write_bench_session(session, path)}: {session.time[-1]:.0f} s"

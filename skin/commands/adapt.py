@@ -3,8 +3,8 @@
     skin adapt run=latest device=recording device.path=session.parquet
     skin adapt run=latest device.seed=7 profile=rough adapt.gestures=48
 
-The gestures are recorded (skin record) or simulated. body= and layout= describe the skin if it is not that of
-the run. Logs a new run, which keeps the weights if fine-tuning is not better on held-out gestures.
+The gestures are recorded (skin record) or simulated. body= and layout= describe the skin if the run has
+another one. Logs a new run, which keeps the weights if fine-tuning is not better on held-out gestures.
 """
 
 from skin.commands._command import command

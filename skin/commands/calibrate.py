@@ -18,9 +18,6 @@ from skin.commands._command import command
 from skin.errors import InputError
 from skin.runs.configuration import Config
 
-_UNITS = ("force_scale", "time_scale")
-_CONFIRMED = ("places", "channels", "broken")
-
 
 @command("calibrate")
 def main(
@@ -38,87 +35,46 @@ def main(
     files = [presses, None if calibrate["demo"] else session]
     if missing := [name for name in files if name and not Path(name).expanduser().is_file()]:
         raise InputError(f"no file {missing[0]}: calibrate.demo=true makes a session without hardware")
+    by_load = weight is not None or base is not None
+    if by_load and presses is not None:
+        raise InputError("a known load replaces the gauge: leave out presses=, or weight= and base=")
 
-    if weight is not None or base is not None:
-        if presses is not None:
-            raise InputError("a known load replaces the gauge: leave out presses=, or weight= and base=")
-        _calibrate_by_load(config, calibrate, weight, base, session, out)
-    else:
-        _calibrate_by_gauge(config, calibrate, presses, session, out)
-
-
-def _calibrate_by_load(
-    config: Config, settings: dict[str, Any], weight: float | None, base: float | None, path: str, out: str
-) -> None:
-    """Calibrate from placements of a weight."""
-    from skin.calibration.bench import Units, read_bench_session, write_bench_session
-    from skin.calibration.known_loads import KnownLoad, emulate_known_load, fit_known_load, print_known_load
-    from skin.calibration.wiring import Confirmed, device_channels
-    from skin.core.settings import configured
-    from skin.device.calibration import write_calibration
-    from skin.runs.build import build_device
-
-    confirmed = configured(Confirmed, {name: settings[name] for name in _CONFIRMED}, "calibrate")
-    device = build_device(config).simulated("a calibration fits the simulation to a skin")
-    load = KnownLoad.of(weight, base, device.size)
-    if settings["demo"]:
-        session = emulate_known_load(device, load, settings)
-        print(f"{write_bench_session(session, path)}: {session.time[-1]:.0f} s")
-    units = configured(Units, {name: settings[name] for name in _UNITS}, "calibrate")
-    shape = settings["indenter"], settings["radius"]
-    session = read_bench_session(path, *shape, settings["unit"], units)
-    result = fit_known_load(device, confirmed.ordered(session), load)
-    print_known_load(result)
-    about = dict(result.calibration.about) | {"session": path}
-    calibration = replace(result.calibration, about=about, channels=device_channels(session, confirmed))
-    print(write_calibration(calibration, out))
-
-
-def _calibrate_by_gauge(
-    config: Config, settings: dict[str, Any], presses: str | None, path: str, out: str
-) -> None:
-    """Calibrate from presses of a force gauge."""
     from rich.console import Console
 
-    from skin.calibration.bench import Units, read_bench_session, read_gauge
+    from skin.calibration import bench, known_loads
     from skin.calibration.bench_protocol import write_demo_session
-    from skin.calibration.fit import (
-        check_force,
-        evaluate_held_out,
-        fit_calibration,
-        print_calibration,
-    )
-    from skin.calibration.gauge_drift import check_gauge
-    from skin.calibration.wiring import Confirmed, check_usable, device_channels, wired_bench
-    from skin.core.settings import configured
+    from skin.calibration.fit import fit_presses, print_calibration
+    from skin.calibration.wiring import Confirmed, device_channels, wired_bench
     from skin.device.calibration import write_calibration
     from skin.runs.build import build_device
 
-    confirmed = configured(Confirmed, {name: settings[name] for name in _CONFIRMED}, "calibrate")
+    confirmed = Confirmed(calibrate["places"], calibrate["channels"], calibrate["broken"])
+    units = bench.Units(calibrate["force_scale"], calibrate["time_scale"])
     device = build_device(config).simulated("a calibration fits the simulation to a skin")
-    if settings["demo"]:
-        print(write_demo_session(device, settings, path))
-    shape = settings["indenter"], settings["radius"]
-    units = configured(Units, {name: settings[name] for name in _UNITS}, "calibrate")
-    session = read_bench_session(path, *shape, settings["unit"], units)
-    rows = None if presses is None else read_gauge(presses, *shape, settings["delay"], units)
-    with Console(stderr=True).status("fitting"):
-        bench = wired_bench(device, session, rows, confirmed)
-        check_gauge(bench)
-        calibration = fit_calibration(bench)
-        check_usable(calibration)
-        if units.force_scale is None:
-            check_force(calibration, device.imperfection.clip)
-        outcome = evaluate_held_out(bench, settings["held_out"])
-    print_calibration(calibration, outcome)
-    if not outcome.helps:
-        print(
-            f"The calibration does not reduce the error, so {out} was not written: is the layout, the "
-            "body or the clock wrong?"
-        )
-        sys.exit(1)
-    rmse = {name: round(getattr(outcome, name), 6) for name in ("simulated", "tared", "calibrated")}
-    about = dict(calibration.about) | {"held_out": list(outcome.held_out), "rmse": rmse}
-    about |= {"session": path, "presses_file": presses}
-    channels = device_channels(session, confirmed)
-    print(write_calibration(replace(calibration, about=about, channels=channels), out))
+    load = known_loads.KnownLoad.of(weight, base, device.size) if by_load else None
+    if calibrate["demo"] and load is not None:
+        print(known_loads.write_demo_placements(device, load, calibrate, session))
+    elif calibrate["demo"]:
+        print(write_demo_session(device, calibrate, session))
+    shape, metadata = (calibrate["indenter"], calibrate["radius"]), dict[str, Any](session=session)
+    recorded = bench.read_bench_session(session, *shape, calibrate["unit"], units)
+    if load is not None:
+        result = known_loads.fit_known_load(device, confirmed.ordered(recorded), load)
+        known_loads.print_known_load(result)
+        calibration = result.calibration
+    else:
+        rows = None if presses is None else bench.read_gauge(presses, *shape, calibrate["delay"], units)
+        clip = device.imperfection.clip if units.force_scale is None else None
+        with Console(stderr=True).status("fitting"):
+            wired = wired_bench(device, recorded, rows, confirmed)
+            calibration, errors = fit_presses(wired, calibrate["held_out"], clip)
+        print_calibration(calibration, errors)
+        if not errors.helps:
+            print(
+                f"The calibration does not reduce the error, so {out} was not written: is the layout, the "
+                "body or the clock wrong?"
+            )
+            sys.exit(1)
+        metadata |= {"presses_file": presses}
+    metadata, channels = {**calibration.about, **metadata}, device_channels(recorded, confirmed)
+    print(write_calibration(replace(calibration, about=metadata, channels=channels), out))

@@ -9,6 +9,9 @@ readings agree with simulator= within 25 %, the check is stored, and skin live n
 """
 
 from datetime import UTC, datetime
+from typing import Annotated
+
+from annotated_types import Ge
 
 from skin.commands._command import command, notify
 from skin.errors import InputError
@@ -16,7 +19,7 @@ from skin.runs.configuration import Config
 
 
 @command("check")
-def main(config: Config, weight: float | None, base: float | None, seconds: float | None) -> None:
+def main(config: Config, weight: float | None, base: float | None, seconds: Annotated[float, Ge(2)]) -> None:
     """Compare readings under the load with predicted ones, and store the result."""
     from skin.calibration.check import Check, describe_setup, store_check
     from skin.calibration.known_loads import KnownLoad, base_readings, measure_ratios
@@ -26,8 +29,6 @@ def main(config: Config, weight: float | None, base: float | None, seconds: floa
 
     device = require_port(build_device(config))
     load = KnownLoad.of(weight, base, device.size)
-    if not seconds or seconds < 2:
-        raise InputError(f"seconds={seconds}: each load must lie for at least 2 s, as in seconds=10")
     model = build_skin(config).simulator(device.body, device.sensors)
     expected = load.force * base_readings(model, device.body, device.sensors, load.base)
     try:

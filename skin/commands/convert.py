@@ -28,14 +28,10 @@ def main(config: Config, from_: str | None, path: str | None, out: str | None) -
     from skin.runs.build import build_skin
 
     mapping = read_format(from_)
-    written = from_.endswith((".yaml", ".yml"))
-    if path is None and not written:
+    if path is None and not from_.endswith((".yaml", ".yml")):
         raise InputError(f"from={from_} needs path=FOLDER, where the recordings are")
     folder = Path(path if path is not None else Path(from_).parent).expanduser()
-    if mapping.positions == "layout":
-        skin = build_skin(config)
-        recording = convert_files(mapping, folder, skin.sensors, skin.body.size)
-    else:
-        recording = convert_files(mapping, folder)
+    skin = build_skin(config) if mapping.positions == "layout" else None
+    recording = convert_files(mapping, folder, *((skin.sensors, skin.body.size) if skin else ()))
     write_recording(recording, file)
     print(f"{file}: {summarise_conversion(recording)}")

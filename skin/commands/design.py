@@ -1,6 +1,6 @@
-"""Compute how well a skin tells a touch, and where to put its sensors.
+"""Compute how precisely a skin measures a touch, and where to put its sensors.
 
-    skin design simulator=solid                        # expected errors of place, radius and force of a touch
+    skin design simulator=solid  # expected errors of position, radius and force of a touch
     skin design design=place simulator=solid design.count=16
 
 Writes tables, pictures and JSON into out=.

@@ -7,13 +7,11 @@ Prints the settings that connect to it, then sends gestures until Ctrl-C.
 
 import signal
 from contextlib import suppress
-from typing import Any
+from typing import Any, Literal
 
 from skin.commands._command import command
-from skin.errors import InputError
+from skin.core.settings import configured
 from skin.runs.configuration import Config
-
-_FORMATS = ("text", "binary")
 
 
 @command("emulate")
@@ -23,15 +21,11 @@ def main(
     link: str | None,
     seconds: float | None,
     gestures: int | None,
-    format: str,
+    format: Literal["text", "binary"],
     emulate: dict[str, Any],
     faults: dict[str, Any],
 ) -> None:
     """Send gestures of the configured simulator, device and layout in real time."""
-    if format not in _FORMATS:
-        raise InputError(f"format must be one of {', '.join(_FORMATS)}, got {format}")
-
-    from skin.core.settings import configured
     from skin.runs.build import build_device
     from skin.wire.emulator import Emulator, EmulatorSettings, Faults, open_port
 

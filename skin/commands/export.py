@@ -10,42 +10,27 @@ recorded touches first. The folder holds any run: run=my_skin then selects it wh
 """
 
 import sys
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from annotated_types import Ge, Gt, MinLen
+from annotated_types import Ge, MinLen
+from pydantic import PositiveFloat
 
 from skin.commands._command import command
 from skin.core.files import results
+from skin.core.messages import quiet
+from skin.core.progress import Steps
+from skin.core.settings import check_settings
 from skin.errors import InputError
 from skin.runs.configuration import Config, overrides
 
 if TYPE_CHECKING:
-    from skin.core.messages import Steps
-    from skin.device.touches import Touches
     from skin.runs.torch_model import TorchModel
 
-_FORMATS = ("onnx", "folder")
-
-
-@dataclass(frozen=True)
-class ExportSettings:
-    """Settings under ``export:`` (``conf/export.yaml``).
-
-    Attributes:
-        touch: contact threshold, N above the baseline; None: that of the run.
-        touches: number of touches on which the file is compared with the run.
-        rates: of devices, Hz, for each of which the threshold of the alarm is chosen.
-    """
-
-    touch: Annotated[float, Gt(0)] | None
-    touches: Annotated[int, Ge(1)]
-    rates: Annotated[list[Annotated[float, Gt(0)]], MinLen(1)]
-
-
 _THRESHOLDS = "choosing the thresholds of the alarm for touches"
-# Expected seconds of each step, for the share in the progress.
+# Expected seconds of each step, for the fraction that is done.
 _STEPS = {
     "loading the run and the threshold of its alarm": 25.0,
     "tuning the contact threshold": 10.0,
@@ -59,51 +44,55 @@ _STEPS = {
 def main(
     config: Config,
     run: str,
-    format: str,
+    format: Literal["onnx", "folder"],
     out: str | None,
     name: str | None,
     licence: str | None,
     export: dict[str, Any],
 ) -> None:
     """Restore a finished run, write it, and print the path."""
-    if format not in _FORMATS:
-        raise InputError(f"format must be one of {', '.join(_FORMATS)}, got {format}")
     if format == "folder":
         if out is not None:
             raise InputError(f"a folder is written to models/NAME, not to out={out}: add name=my_skin")
-        _export_folder(run, config, name, licence)
-        return
 
-    from skin.core.messages import Steps
-    from skin.core.settings import configured
+        from skin.runs.card import check_folder, write_folder
+        from skin.runs.run import FinishedRun
 
-    if name is not None or licence is not None:
-        raise InputError("name and licence are those of a folder: add format=folder, or leave them out")
-    with Steps(_STEPS) as steps:
-        _export_file(run, config, configured(ExportSettings, export, "export"), out, steps)
-
-
-def _export_folder(run: str, config: Config, name: str | None, licence: str | None) -> None:
-    """Write the files of a pretrained model, all or none."""
-    from skin.runs.card import check_folder, write_folder
-    from skin.runs.run import FinishedRun
-
-    folder = check_folder(name, licence)
-    write_folder(FinishedRun.named(run, config), folder, str(licence))
-    print(folder)
+        folder = check_folder(name, licence)
+        write_folder(FinishedRun.named(run, config), folder, str(licence))
+        print(folder)
+    elif name is not None or licence is not None:
+        raise InputError("only a folder takes name and licence: add format=folder, or leave them out")
+    else:
+        check_settings(_export_file, export, "export")
+        with Steps(_STEPS) as steps:
+            _export_file(run, config, out, steps, **export)
 
 
 def _export_file(
-    name: str, config: Config, settings: ExportSettings, out: str | None, steps: "Steps"
+    name: str,
+    config: Config,
+    out: str | None,
+    steps: Steps,
+    touch: PositiveFloat | None,
+    touches: Annotated[int, Ge(1)],
+    rates: Annotated[Sequence[PositiveFloat], MinLen(1)],
 ) -> None:
-    """Write the network of a run for one skin, with the thresholds of its alarm."""
+    """Write the network of a run for one skin, with the thresholds of its alarm.
+
+    Args:
+        name: of the run.
+        config: of the command.
+        out: path of the file; None: in ``results``.
+        steps: to be shown.
+        touch: contact threshold, N above the baseline; None: as in the run.
+        touches: number of touches on which the file is compared with the run.
+        rates: of devices, Hz, for each of which the threshold of the alarm is chosen.
+    """
     path = None if out is None else Path(out).expanduser()
     if path is not None and path.suffix != ".onnx":
         raise InputError(f"out={out} must end in .onnx: as in out=skin.onnx")
 
-    from skin.core.messages import quiet
-    from skin.evaluation.alarm import choose_alarm_threshold
-    from skin.live.engine import DebounceSettings
     from skin.runs.model import describe_skin
     from skin.runs.run import FinishedRun
     from skin.runs.torch_model import equation10_warning, load_model
@@ -117,7 +106,7 @@ def _export_file(
     quiet()
     run = FinishedRun.named(name, config)
     whole = run.configured(overrides())
-    model = load_model(run, whole, touch=settings.touch, one_skin=True)
+    model = load_model(run, whole, touch=touch, one_skin=True)
     module = model.learner.pipeline(model.places)  # refused before anything else is simulated
     if advice := equation10_warning(run.stored):
         print(advice, file=sys.stderr)
@@ -125,30 +114,27 @@ def _export_file(
     described = replace(model.describe(), skin=describe_skin(whole, model.positions))
     if "simulator" in run.stored.device and model.threshold is not None:
         steps.begin(_THRESHOLDS)
-        patience = DebounceSettings().alarm
-        conditions = (model.live_conditions(rate, patience, False) for rate in settings.rates)
-        points = {
-            f"{live.rate:g}": choose_alarm_threshold(model.alarm, live, say=print) for live in conditions
-        }
-        hiding = [at.warning() for at in points.values() if at and at.useless]
-        refused = "".join(f"{text}: skin live refuses the file at this rate\n" for text in hiding)
-        print(refused, end="", file=sys.stderr)
-        described = replace(
-            described,
-            # One of 1 raises no alarm, and is refused.
-            thresholds={rate: 1.0 if at.useless else at.threshold for rate, at in points.items() if at},
-        )
+        described = replace(described, thresholds=_choose_thresholds(model, rates))
     path = path or results(None) / f"{run.title.split()[0]}_{run.identity[:8]}.onnx"
     steps.begin("simulating touches to compare")
-    touches = _touches(model, settings.touches)
+    device = model.device
+    if device.reference is not None:  # a tenth of the gestures is the validation split
+        device = device.reference.replace(gestures=10 * max(10, touches))
+    compared = device.touches("test" if model.device.reference is None else "validation")[:touches]
     steps.begin("writing the file and comparing it")
-    difference = write_model(module, described, touches, path)
-    print(f"{path}: differs from the run by {difference:.1g} at most on {len(touches)} touches")
+    difference = write_model(module, described, compared, path)
+    print(f"{path}: differs from the run by {difference:.1g} at most on {len(compared)} touches")
 
 
-def _touches(model: "TorchModel", count: int) -> "Touches":
-    """Return at most ``count`` touches; a run on a recording has those of its own only."""
-    if (simulation := model.device.reference) is None:
-        return model.device.touches("test")[:count]
-    # A tenth of the gestures is the validation split.
-    return simulation.replace(gestures=10 * max(10, count)).touches("validation")[:count]
+def _choose_thresholds(model: "TorchModel", rates: Sequence[float]) -> dict[str, float]:
+    """Return the threshold of the alarm for devices of each rate, Hz; 1 raises no alarm, and is refused."""
+    from skin.evaluation.alarm import choose_alarm_threshold
+    from skin.live.engine import DebounceSettings
+
+    patience = DebounceSettings().alarm
+    conditions = (model.live_conditions(rate, patience, False) for rate in rates)
+    points = {f"{live.rate:g}": choose_alarm_threshold(model.alarm, live, say=print) for live in conditions}
+    hiding = [at.warning() for at in points.values() if at and at.useless]
+    refused = "".join(f"{text}: skin live refuses the file at this rate\n" for text in hiding)
+    print(refused, end="", file=sys.stderr)
+    return {rate: 1.0 if at.useless else at.threshold for rate, at in points.items() if at}

@@ -10,14 +10,11 @@ Listens for seconds=, or until Ctrl-C.
 import signal
 import sys
 from contextlib import closing, suppress
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from skin.commands._command import command
 from skin.errors import InputError
 from skin.runs.configuration import Config
-
-if TYPE_CHECKING:
-    from skin.wire.reader import PortSettings
 
 _ENOUGH = 5.0  # s of a stream that show what a board sends
 
@@ -33,13 +30,19 @@ def main(config: Config, n: int | None, seconds: float | None, adapter: Any) -> 
 
     from skin.wire.formats import SensorCountError
     from skin.wire.monitor import PortMonitor
-    from skin.wire.reader import PortSettings, SkinDisconnected, SkinTimeout
+    from skin.wire.proposal import listen_raw, propose
+    from skin.wire.reader import PortSettings, SkinDisconnected, SkinTimeout, open_stream
     from skin.wire.skin import open_skin
 
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     settings = PortSettings.select(device)
     if settings.frames.kind == "auto":
-        _propose(settings, seconds)
+        with closing(open_stream(str(settings.port), settings.baudrate)) as stream:
+            pieces = listen_raw(stream, _ENOUGH if seconds is None else min(seconds, _ENOUGH))
+        proposal = propose(pieces)
+        # As YAML to paste; what it makes of the board goes to standard error.
+        print(f"# {proposal.summary}", proposal.adapter.describe(), sep="\n")
+        print("save it, as board.yaml, and give device.adapter=board.yaml", file=sys.stderr)
         return
     sensors = None if n is None else range(n)
     with open_skin(settings, sensors) as skin:
@@ -56,15 +59,3 @@ def main(config: Config, n: int | None, seconds: float | None, adapter: Any) -> 
                 "leave it out"
             ) from error
         print(listener.summary())
-
-
-def _propose(settings: "PortSettings", seconds: float | None) -> None:
-    """Print an adapter that reads the board, as YAML to paste; what it makes of it goes to standard error."""
-    from skin.wire.proposal import listen_raw, propose
-    from skin.wire.reader import open_stream
-
-    with closing(open_stream(str(settings.port), settings.baudrate)) as stream:
-        pieces = listen_raw(stream, _ENOUGH if seconds is None else min(seconds, _ENOUGH))
-    proposal = propose(pieces)
-    print(f"# {proposal.summary}", proposal.adapter.describe(), sep="\n")
-    print("save it, as board.yaml, and give device.adapter=board.yaml", file=sys.stderr)

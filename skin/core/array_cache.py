@@ -6,6 +6,7 @@ import math
 import os
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,8 @@ import platformdirs
 from skin.core.files import whole
 from skin.core.safe_loading import load_npz
 from skin.errors import InputError
+
+_HEADER = 512  # bytes of the header of an array in a file of numpy, at most; it usually takes 128
 
 
 def folder(path: str | Path | None) -> Path:
@@ -45,29 +48,25 @@ def kept(
         build: computes them.
     """
     stored = _load(path, key, shapes)
-    if stored is not None:
-        return stored
-    built = dict(build())
-    try:
-        with whole(path) as partial:
-            np.savez(partial, allow_pickle=False, **({"key": np.array(key)} | built))
-    except InputError as error:
-        warnings.warn(f"the operator cannot be kept in {path.parent}: {error}", RuntimeWarning, stacklevel=3)
-    return built
+    if stored is None:
+        stored = dict(build())
+        try:
+            with whole(path) as partial:
+                np.savez(partial, allow_pickle=False, **({"key": np.array(key)} | stored))
+        except InputError as error:
+            text = f"the operator cannot be kept in {path.parent}: {error}"
+            warnings.warn(text, RuntimeWarning, stacklevel=3)
+    return stored
 
 
 def _load(path: Path, key: str, shapes: Mapping[str, Sequence[int]]) -> dict[str, np.ndarray] | None:
-    """Return the arrays of a file, or None if there is no file or anything about it is wrong."""
-    try:
-        expected = sum(8 * math.prod(shape) for shape in shapes.values())
-        stored = load_npz(path, most=expected + 4 * len(key))
-        if str(stored["key"]) != key:
-            return None
-        arrays = {name: stored[name] for name in shapes}
-    except Exception:  # any error of a broken archive: build the arrays again
-        return None
-    sound = all(
-        array.shape == tuple(shapes[name]) and array.dtype == np.float64 and np.isfinite(array).all()
-        for name, array in arrays.items()
-    )
-    return arrays if sound else None
+    """Return the arrays of a file, or None if there is no file or anything in it is wrong."""
+    expected = sum(8 * math.prod(shape) + _HEADER for shape in shapes.values())
+    with suppress(Exception):  # any error of a broken archive: build the arrays again
+        arrays = load_npz(path, maximum=expected + 4 * len(key) + _HEADER)
+        if str(arrays.pop("key")) == key and all(
+            array.shape == tuple(shapes[name]) and array.dtype == np.float64 and np.isfinite(array).all()
+            for name, array in arrays.items()
+        ):
+            return {name: arrays[name] for name in shapes}
+    return None

@@ -2,13 +2,14 @@
 
 import errno
 import json
-import math
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import NamedTemporaryFile
 from typing import Any
+
+from pydantic_core import to_jsonable_python
 
 from skin.errors import InputError
 
@@ -35,7 +36,7 @@ def tabular(path: str | Path, what: str) -> Path:
 
 
 @contextmanager
-def whole(path: Path, place: str = "out=FOLDER") -> Iterator[Path]:
+def whole(path: Path, override: str = "out=FOLDER") -> Iterator[Path]:
     """Yield a temporary path that replaces ``path`` if the block succeeds.
 
     The file is flushed to the disk first, so that a power cut leaves either the old file or the new one.
@@ -43,7 +44,7 @@ def whole(path: Path, place: str = "out=FOLDER") -> Iterator[Path]:
 
     Args:
         path: of the file.
-        place: override that selects another folder, for the message.
+        override: setting that selects another folder, for the message.
 
     Raises:
         InputError: the disk is full or read-only, or the folder cannot be written.
@@ -63,7 +64,7 @@ def whole(path: Path, place: str = "out=FOLDER") -> Iterator[Path]:
         finally:
             partial.unlink(missing_ok=True)
     except OSError as error:
-        raise unwritable(path, error, place) from error
+        raise unwritable(path, error, override) from error
 
 
 def write(text: str, path: Path) -> Path:
@@ -79,7 +80,8 @@ def write(text: str, path: Path) -> Path:
 
 def json_text(content: Any) -> str:
     """Return JSON with numbers to six digits; further ones depend on the processor."""
-    return json_line(_map_floats(content, lambda number: float(f"{number:.6g}")), indent=2) + "\n"
+    rounded = json.loads(json_line(content), parse_float=lambda text: float(f"{float(text):.6g}"))
+    return json_line(rounded, indent=2) + "\n"
 
 
 def json_line(content: Any, **settings: Any) -> str:
@@ -89,28 +91,15 @@ def json_line(content: Any, **settings: Any) -> str:
         content: plain containers.
         settings: of :func:`json.dumps`.
     """
-    try:
-        return json.dumps(content, allow_nan=False, **settings)
-    except ValueError:  # seldom: the copy is made only where it is needed
-        finite = _map_floats(content, lambda number: number if math.isfinite(number) else None)
-        return json.dumps(finite, allow_nan=False, **settings)
+    return json.dumps(to_jsonable_python(content, inf_nan_mode="null"), **settings)
 
 
-def _map_floats(value: Any, change: Callable[[float], float | None]) -> Any:
-    """Return a copy of plain containers with every float changed."""
-    if isinstance(value, Mapping):
-        return {key: _map_floats(entry, change) for key, entry in value.items()}
-    if isinstance(value, list | tuple):
-        return [_map_floats(entry, change) for entry in value]
-    return change(value) if isinstance(value, float) else value
-
-
-def unwritable(path: Path | str, error: OSError, place: str) -> InputError:
+def unwritable(path: Path | str, error: OSError, override: str) -> InputError:
     """Return the error for a file that cannot be written."""
     # The message of Arrow repeats the number and hides the reason.
     reason = os.strerror(error.errno) if error.errno else str(error)
     fix = "make room there" if error.errno in (errno.ENOSPC, errno.EDQUOT) else "make it writable"
-    return InputError(f"cannot write {path}: {reason}: {fix}, or choose another place, as in {place}")
+    return InputError(f"cannot write {path}: {reason}: {fix}, or choose another place, as in {override}")
 
 
 # Where the files that come with the package are: in the repository, or in an installed wheel.

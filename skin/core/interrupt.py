@@ -6,7 +6,7 @@ import socket
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from threading import Event, Thread
+from threading import Event, Thread, Timer, current_thread, main_thread
 from types import FrameType, TracebackType
 
 _PATIENCE = _LAST = 1.0  # s
@@ -41,6 +41,9 @@ def ends_on_signal(last: Callable[[], object] = bool) -> Iterator[None]:
     Args:
         last: called in another thread before such an end; it has a second. By default nothing is.
     """
+    if current_thread() is not main_thread():
+        yield
+        return
     # No Event: a signal that interrupts its handler would wait for the lock that this handler holds.
     answered = list[int]()
 
@@ -49,50 +52,30 @@ def ends_on_signal(last: Callable[[], object] = bool) -> Iterator[None]:
             answered.append(number)
             raise SystemExit(128 + number)
 
-    try:
-        before = signal.signal(signal.SIGTERM, end)
-    except ValueError:
-        yield
-        return
-    try:
-        with _watched(answered, last):
-            yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
-
-
-@contextmanager
-def _watched(answered: list[int], last: Callable[[], object]) -> Iterator[None]:
-    """End the process where a signal does not end the block."""
+    ended, handler = Event(), signal.signal(signal.SIGTERM, end)
     # A pair of sockets, because Windows has no pipes that do not block before Python 3.12.
     receiver, sender = socket.socketpair()
     sender.setblocking(False)
-    ended = Event()
     # The interpreter writes the numbers of signals at once, whatever the main thread does.
-    before = signal.set_wakeup_fd(sender.fileno(), warn_on_full_buffer=False)
-    watch = Thread(target=_watch, args=(receiver, answered, ended, last), name="skin-signals", daemon=True)
-    watch.start()
+    wakeup = signal.set_wakeup_fd(sender.fileno(), warn_on_full_buffer=False)
+    Thread(target=_watch, args=(receiver, answered, ended, last), name="skin-signals", daemon=True).start()
     try:
         yield
     finally:
-        signal.set_wakeup_fd(before)
+        signal.set_wakeup_fd(wakeup)
         sender.close()
         ended.set()
+        signal.signal(signal.SIGTERM, handler)
 
 
 def _watch(receiver: socket.socket, answered: list[int], ended: Event, last: Callable[[], object]) -> None:
+    """End the process where a signal does not end the block."""
     with receiver:
         while signal.SIGTERM not in (numbers := receiver.recv(64)):
             if not numbers:
                 return
-        if ended.wait(_PATIENCE) or (answered and ended.wait(_CLOSING)):
-            return
-    ending = Thread(target=_try, args=(last,), daemon=True)
-    ending.start()
-    ending.join(_LAST)
-    os._exit(128 + signal.SIGTERM)
-
-
-def _try(last: Callable[[], object]) -> None:
-    with suppress(Exception):  # there is nobody to tell
-        last()
+    if not ended.wait(_PATIENCE) and not (answered and ended.wait(_CLOSING)):
+        Timer(_LAST, os._exit, [128 + signal.SIGTERM]).start()
+        with suppress(Exception):  # nobody can be informed any more
+            last()
+        os._exit(128 + signal.SIGTERM)

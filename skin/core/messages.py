@@ -1,15 +1,13 @@
-"""What a command tells a person: errors in one sentence, and how far it is."""
+"""Messages of a command: errors in one sentence, durations, and the silence of libraries."""
 
 import errno
 import logging
 import math
 import os
+import re
 import sqlite3
-import sys
-import threading
-import time
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 
 from hydra.errors import CompactHydraException, HydraException, InstantiationException, OverrideParseException
 from omegaconf.errors import OmegaConfBaseException
@@ -17,7 +15,7 @@ from omegaconf.errors import OmegaConfBaseException
 from skin.errors import InputError
 
 PARENT = "SKIN_PARENT_RUN"
-"""Environment variable by which a sweep tells its jobs the id of their parent run, so that they are quiet."""
+"""Environment variable with the id of the parent run, by which a sweep makes its jobs quiet."""
 
 # Errors of the disk or its permissions; all other system errors are bugs.
 _DISK = frozenset(
@@ -56,21 +54,24 @@ def to_input_error(error: Exception) -> InputError | None:
                 f"cannot use {where}: {os.strerror(link.errno)}: make room or give another folder, and run "
                 "the same command again; what has finished is kept"
             )
-    if not isinstance(error, HydraException | OmegaConfBaseException | TypeError):
-        return None
     if isinstance(error, OverrideParseException):
-        return InputError(f"{error.override} is no override: {one_line(error)}")
-    cause = error.__cause__ if isinstance(error, InstantiationException) else None
-    if isinstance(cause, InputError):
-        return cause
-    reason = cause or error
-    # Hydra's own TypeErrors are about words such as _partial_ of a configuration.
-    hydras = str(reason).startswith("Instantiation:")
-    if isinstance(reason, TypeError) and "argument" not in str(reason) and not hydras:
-        return InputError(one_line(error)) if isinstance(error, InstantiationException) else None
-    if isinstance(error, InstantiationException) and cause is not None and not isinstance(cause, TypeError):
-        return InputError(one_line(error)) if isinstance(cause, _UNFIT) else None
-    return InputError(one_line(reason))
+        return InputError(f"{error.override} cannot be read as an override: {one_line(error)}")
+    if isinstance(error, InstantiationException):
+        cause = error.__cause__
+        if isinstance(cause, InputError):
+            return cause
+        if isinstance(cause, TypeError) and _is_argument(cause):
+            return InputError(one_line(cause))
+        refused = cause is None or isinstance(cause, (*_UNFIT, TypeError))
+    else:
+        refused = isinstance(error, HydraException | OmegaConfBaseException) or _is_argument(error)
+    return InputError(one_line(error)) if refused else None
+
+
+def _is_argument(error: Exception) -> bool:
+    """Return whether an error is about an argument, or about words of Hydra such as ``_partial_``."""
+    text = str(error)
+    return isinstance(error, TypeError) and ("argument" in text or text.startswith("Instantiation:"))
 
 
 def _iterate_causes(error: BaseException) -> Iterator[BaseException]:
@@ -84,95 +85,45 @@ def _iterate_causes(error: BaseException) -> Iterator[BaseException]:
 def one_line(error: BaseException) -> str:
     """Return the message of an error on one line, without the details that OmegaConf adds."""
     text = str(error).split("Config search path:")[0]
-    lines = [line.strip() for line in text.splitlines() if line.strip()]
-    lines_left = [line for line in lines if not line.startswith(("object_type", "reference_type"))]
-    ends = [" " if line.endswith((".", ":", ",")) else "; " for line in lines_left[:-1]] + [""]
-    return "".join(line + end for line, end in zip(lines_left, ends, strict=True))
+    lines = [line.strip() for line in text.splitlines()]
+    kept = [line for line in lines if line and not line.startswith(("object_type", "reference_type"))]
+    # A line that ends a sentence, or announces the next line, needs no semicolon.
+    return re.sub(r"(?<=[.:,]);", "", "; ".join(kept))
 
 
 # Silence library messages that a user of the command line cannot act on.
 
 
+_LEVELS = {
+    "lightning_fabric": logging.ERROR,
+    "pytorch_lightning": logging.ERROR,
+    "pytorch_lightning.utilities.rank_zero": logging.ERROR,
+    "alembic": logging.WARNING,
+    "mlflow": logging.WARNING,
+}
+
+
 def quiet() -> None:
-    """Quieten Lightning's remarks on hardware and logging, and torch's on a change in its own insides."""
-    for name in ("lightning_fabric", "pytorch_lightning", "pytorch_lightning.utilities.rank_zero"):
+    """Silence remarks of libraries on hardware, logging and their own internals."""
+    for name, level in _LEVELS.items():
         logger = logging.getLogger(name)
         logger.handlers.clear()
-        logger.setLevel(logging.ERROR)
-    logging.getLogger("alembic").setLevel(logging.WARNING)
-    logging.getLogger("mlflow").setLevel(logging.WARNING)
-    logging.getLogger("urllib3.connectionpool").addFilter(_tell_of_server)
-    warnings.filterwarnings("ignore", message=".*treespec.*", category=FutureWarning)
-    warnings.filterwarnings("ignore", message=".*does not have many workers.*")
-    warnings.filterwarnings("ignore", message=".*`srun` command is available.*")  # one task needs none
+        logger.setLevel(level)
+    logging.getLogger("urllib3.connectionpool").addFilter(_rephrase)
+    # One task needs no srun.
+    for text in ("treespec", "does not have many workers", "`srun` command is available"):
+        warnings.filterwarnings("ignore", message=f".*{text}")
 
 
-def _tell_of_server(record: logging.LogRecord) -> bool:
+def _rephrase(record: logging.LogRecord) -> bool:
     """Say in plain words that a request to the tracking server is repeated."""
     if "/mlflow" in str(record.args):
         record.msg, record.args = "the tracking server does not answer: trying again", ()
     return True
 
 
-# How far a command is.
-
-
 def format_duration(duration: float) -> str:
     """Return a duration in s as text."""
-    minutes = math.ceil(duration / 60)
     if duration > 2 * 3600:
         return f"{duration / 3600:.1f} h"
-    return f"{duration:.0f} s" if duration < 90 else f"{minutes} min"
-
-
-class Steps:
-    """Prints how far a command is, on standard error, every ten seconds; use it in a ``with`` statement.
-
-    Args:
-        seconds: duration of each step on some machine, in order, by what the command does in it.
-        pause: s between two lines.
-
-    Attributes:
-        silent: whether to print nothing for now, such as while a person is prompted.
-        share: of the step that is done, where it is counted; None: it is estimated from the time.
-    """
-
-    def __init__(self, seconds: Mapping[str, float], pause: float = 10.0) -> None:
-        self._seconds, self._pause = dict(seconds), pause
-        self._name, self.silent = next(iter(self._seconds)), False
-        self.share: float | None = None
-        self._done = 0.0  # s of the steps that have ended, as expected
-        self._began = self._step_began = time.monotonic()
-        self._ended = threading.Event()
-        self._thread = threading.Thread(target=self._report, daemon=True)
-
-    def __enter__(self) -> "Steps":
-        self._thread.start()
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self._ended.set()
-        self._thread.join()
-
-    def begin(self, name: str) -> None:
-        """Say which step begins; those before it have ended."""
-        names = list(self._seconds)
-        self._done = sum(self._seconds[before] for before in names[: names.index(name)])
-        self._name, self._step_began, self.share = name, time.monotonic(), None
-
-    def line(self) -> str:
-        """Return the step, the share that is done, and the estimated remaining time."""
-        now, whole = time.monotonic(), sum(self._seconds.values())
-        spent = self._step_began - self._began
-        pace = spent / self._done if self._done and spent else 1.0  # s for each expected one
-        # A step that takes longer than expected is almost done, never done.
-        share = (now - self._step_began) / (pace * self._seconds[self._name])
-        share = min(share, 0.95) if self.share is None else self.share
-        done = self._done + self._seconds[self._name] * share
-        left = (now - self._began) * (whole / done - 1) if done else pace * whole
-        return f"{self._name}: {100 * done / whole:.0f} % done, about {format_duration(left)} left"
-
-    def _report(self) -> None:
-        while not self._ended.wait(self._pause):
-            if not self.silent:
-                print(self.line(), file=sys.stderr, flush=True)
+    return f"{duration:.0f} s" if duration < 90 else f"{math.ceil(duration / 60)} min"

@@ -3,8 +3,6 @@
 import hashlib
 import json
 import math
-import mmap
-import os
 import re
 import stat
 import zipfile
@@ -14,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import psutil
 import yaml
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -24,40 +23,36 @@ if TYPE_CHECKING:
 
 TEXT = 1 << 20
 """Bytes of a configuration or a calibration: the largest ones are some kB."""
-_DEEP = 50  # levels: the deepest configuration has 6
+_DEEPEST = 50  # levels: the deepest configuration has 6
 _BYTES = 1 << 30
 
 
 def regular(path: Path) -> None:
-    """Check that a file is a regular one: a device has no end, and a named pipe may never answer.
+    """Check that a file is a regular one: a device never ends, and a named pipe may never answer.
 
     Raises:
         ValueError: it is something else.
         OSError: there is none.
     """
     if not stat.S_ISREG(path.stat().st_mode):
-        raise ValueError("it is no regular file")
+        raise ValueError("it is not a regular file")
 
 
-def read_file(path: Path, most: int = _BYTES) -> bytes:
+def read_file(path: Path, maximum: int = _BYTES) -> bytes:
     """Return the content of a regular file.
 
     Args:
         path: of the file.
-        most: largest size, bytes.
+        maximum: largest size, bytes.
 
     Raises:
-        ValueError: larger, or no regular file.
+        ValueError: larger, or not a regular file.
         OSError: unreadable.
     """
     regular(path)
-    with path.open("rb") as file:
-        # Reading with a limit would allocate as much as the limit.
-        size = os.fstat(file.fileno()).st_size
-        content = file.read(min(size, most) + 1)
-    if len(content) > most:
-        raise ValueError(f"it has more than {most} bytes")
-    return content
+    if path.stat().st_size > maximum:
+        raise ValueError(f"it has more than {maximum} bytes")
+    return path.read_bytes()
 
 
 def parse_json(text: str | bytes) -> Any:
@@ -67,18 +62,14 @@ def parse_json(text: str | bytes) -> Any:
         ValueError: no JSON, nested too deep, or with ``NaN`` or ``Infinity``.
     """
     try:
-        return json.loads(text, parse_constant=_refuse_constant, parse_float=_finite)
+        return json.loads(text, parse_constant=_finite, parse_float=_finite)
     except RecursionError as error:
         raise ValueError("it is nested too deep") from error
 
 
-def _refuse_constant(name: str) -> Any:
-    raise ValueError(f"{name} is no number of JSON")
-
-
 def _finite(text: str) -> float:
-    if math.isinf(number := float(text)):
-        raise ValueError(f"{text} is too large")
+    if not math.isfinite(number := float(text)):
+        raise ValueError(f"{text} must be a finite number")
     return number
 
 
@@ -86,7 +77,7 @@ def load_yaml(path: Path) -> Any:
     """Return the content of a YAML file as plain containers, without resolving interpolations.
 
     Raises:
-        ValueError: no regular file, no YAML, too large, or with aliases, which can expand to gigabytes.
+        ValueError: not a regular file, no YAML, too large, or with aliases, which can expand to gigabytes.
         OSError: unreadable.
     """
     return parse_yaml(read_file(path, TEXT).decode("utf-8"))
@@ -102,30 +93,26 @@ def parse_yaml(text: str) -> Any:
         depth = 0
         for event in yaml.parse(text, Loader=yaml.SafeLoader):
             depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
-            if isinstance(event, yaml.AliasEvent) or depth > _DEEP:
-                raise ValueError(f"aliases and more than {_DEEP} levels are not read")
+            if isinstance(event, yaml.AliasEvent) or depth > _DEEPEST:
+                raise ValueError(f"aliases and more than {_DEEPEST} levels are not read")
         return OmegaConf.to_container(OmegaConf.create(text), resolve=False)
     except (yaml.YAMLError, OmegaConfBaseException, AssertionError, TypeError, LookupError) as error:
-        raise ValueError(" ".join(str(error).split()) or "it is no configuration") from error
+        raise ValueError(" ".join(str(error).split()) or "it contains no configuration") from error
 
 
-def load_npz(path: Path, most: int = _BYTES) -> dict[str, np.ndarray]:
+def load_npz(path: Path, maximum: int = _BYTES) -> dict[str, np.ndarray]:
     """Return the arrays of an .npz file without objects.
 
     Args:
         path: of the file.
-        most: largest total size of the arrays, bytes.
+        maximum: largest total size of the arrays and their headers, bytes.
 
     Raises:
         ValueError: no such file, objects, larger arrays, or shapes that do not match the data.
         OSError: unreadable.
     """
-    regular(path)
     try:
-        with zipfile.ZipFile(path) as archive:
-            total = sum(_check_size(archive, entry) for entry in archive.infolist())
-        if total > most:
-            raise ValueError(f"its arrays take {total} bytes, more than {most}")
+        check_archive(path, maximum)
         with np.load(path, allow_pickle=False) as file:
             return dict(file)
     except OSError:
@@ -134,43 +121,41 @@ def load_npz(path: Path, most: int = _BYTES) -> dict[str, np.ndarray]:
         raise ValueError(" ".join(str(error).split()) or "it is cut off") from error
 
 
-def check_archive(path: Path, most: int = _BYTES) -> None:
+def check_archive(path: Path, maximum: int = _BYTES) -> None:
     """Check that what a zip archive, such as weights of torch, expands to fits into memory, as its arrays do.
 
     Args:
         path: of the file.
-        most: largest total size of its entries, bytes.
+        maximum: largest total size of its entries, bytes.
 
     Raises:
-        ValueError: no regular file, no zip archive, larger entries, or arrays that claim another size.
+        ValueError: not a regular file, no zip archive, larger entries, or arrays that claim another size.
         OSError: unreadable.
     """
     regular(path)
     try:
         with zipfile.ZipFile(path) as archive:
             entries = archive.infolist()
-            total = sum(entry.file_size for entry in entries)
+            if (total := sum(entry.file_size for entry in entries)) > maximum:
+                raise ValueError(f"it expands to {total} bytes, more than {maximum}")
             for entry in entries:
                 if entry.filename.endswith(".npy"):
                     _check_size(archive, entry)
     except zipfile.BadZipFile as error:
-        raise ValueError(f"it is no archive of weights: {error}") from error
-    if total > most:
-        raise ValueError(f"it expands to {total} bytes, more than {most}")
+        raise ValueError(f"it cannot be read as an archive of arrays: {error}") from error
 
 
-def _check_size(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> int:
-    """Return the size of an array, bytes, which must match that of its entry."""
+_HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+
+
+def _check_size(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> None:
+    """Raise ValueError where an array claims another size than its entry has."""
     with archive.open(entry) as file:
-        version = np.lib.format.read_magic(file)
-        readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
-        if version not in readers:
+        if (version := np.lib.format.read_magic(file)) not in _HEADERS:
             raise ValueError(f"{entry.filename} has the unknown version {version}")
-        shape, _, kind = readers[version](file)
-        size = math.prod(shape) * kind.itemsize
-        if kind.hasobject or size != entry.file_size - file.tell():
+        shape, _, kind = _HEADERS[version](file)
+        if kind.hasobject or math.prod(shape) * kind.itemsize != entry.file_size - file.tell():
             raise ValueError(f"{entry.filename} holds objects, or claims another size than it has")
-    return size
 
 
 @contextmanager
@@ -180,16 +165,14 @@ def limited_memory(extra: int) -> Iterator[None]:
     Who asks for more gets a MemoryError or the error of its library. There is no limit where the system does
     not know one for address space, as on macOS and Windows.
     """
-    statm = Path("/proc/self/statm")
-    if not statm.exists():
+    try:
+        import resource
+    except ImportError:  # Windows
         yield
         return
-    import resource  # not on Windows
-
     before = resource.getrlimit(resource.RLIMIT_AS)
-    limit = int(statm.read_text().split()[0]) * resource.getpagesize() + extra
-    if before[0] != resource.RLIM_INFINITY:
-        limit = min(limit, before[0])
+    limit = psutil.Process().memory_info().vms + extra
+    limit = limit if before[0] == resource.RLIM_INFINITY else min(limit, before[0])
     resource.setrlimit(resource.RLIMIT_AS, (limit, before[1]))
     try:
         yield
@@ -203,17 +186,17 @@ KEY = "skin_file_sha256"
 """Name of the entry with the checksum in the metadata of a binary file (Parquet, ONNX)."""
 BLANK = 64 * "0"
 """Its value before :func:`seal`."""
-# The formats write at most three bytes between a key and its value.
+# The formats write up to three bytes between a key and its value.
 _ENTRY = re.compile(KEY.encode() + b".{1,4}?([0-9a-f]{64})", re.DOTALL)
 _LINE = "sha256:"
 
 
 class ChecksumError(ValueError):
-    """A file is not as it was written."""
+    """A file is not as it was written; its argument, if any, is what fixes that."""
 
-    def __init__(self, fix: str = "") -> None:
-        reason = "it is damaged or was changed: its checksum is not that of its content"
-        super().__init__(f"{reason}: {fix}" if fix else reason)
+    def __str__(self) -> str:
+        reason = "it is damaged or was changed: its checksum differs from its content"
+        return ": ".join([reason, *self.args])
 
 
 def sha256(content: bytes) -> str:
@@ -225,7 +208,7 @@ def file_sha256(path: Path) -> str:
     """Return the checksum of a regular file, which need not fit into memory.
 
     Raises:
-        ValueError: no regular file.
+        ValueError: not a regular file.
         OSError: unreadable.
     """
     regular(path)
@@ -252,16 +235,14 @@ def write_parquet(table: "pa.Table", path: Path, **settings: Any) -> None:
 def seal(path: Path) -> None:
     """Replace the value :data:`BLANK` of the entry :data:`KEY` of a file by the checksum of the file.
 
-    The checksum is of all bytes, with :data:`BLANK` in its own place.
+    The checksum is of all bytes, with :data:`BLANK` at its own position.
 
     Raises:
         ValueError: the file has no such entry.
     """
-    with path.open("r+b") as file, mmap.mmap(file.fileno(), 0) as content:
-        place = _find(content)
-        if place is None:
-            raise ValueError(f"{path} has no entry {KEY}")
-        content[place] = _digest(content, place).encode()
+    content = path.read_bytes()
+    position, digest = _checksum(content)
+    path.write_bytes(content[: position.start] + digest + content[position.stop :])
 
 
 def check_seal(path: Path) -> None:
@@ -271,41 +252,35 @@ def check_seal(path: Path) -> None:
 
     Raises:
         ChecksumError: the file is not as it was written.
-        ValueError: no regular file.
+        ValueError: not a regular file.
         OSError: unreadable.
     """
     regular(path)
-    if path.stat().st_size:  # nothing cannot be mapped
-        with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
-            check_content(content)
+    check_content(path.read_bytes())
 
 
-def check_content(content: bytes | mmap.mmap) -> None:
+def check_content(content: bytes) -> None:
     """Do the same with the content of a file.
 
     Raises:
         ChecksumError: it is not as it was written.
     """
-    place = _find(content)
-    if place is not None and content[place].decode() != _digest(content, place):
+    if KEY.encode() in content:
+        position, digest = _checksum(content)
+        if content[position] != digest:
+            raise ChecksumError
+
+
+def _checksum(content: bytes) -> tuple[slice, bytes]:
+    """Return where the checksum is, in the last entry (metadata are at the end), and what it must be."""
+    match = _ENTRY.match(content, max(content.rfind(KEY.encode()), 0))
+    if match is None:
         raise ChecksumError
-
-
-def _find(content: bytes | mmap.mmap) -> slice | None:
-    """Return where the checksum is: in the last entry, because metadata are at the end."""
-    start = content.rfind(KEY.encode())
-    match = None if start < 0 else _ENTRY.match(content, start)
-    if start >= 0 and match is None:
-        raise ChecksumError
-    return match and slice(*match.span(1))
-
-
-def _digest(content: bytes | mmap.mmap, place: slice) -> str:
-    with memoryview(content) as whole:
-        result = hashlib.sha256(whole[: place.start])
-        result.update(BLANK.encode())
-        result.update(whole[place.stop :])
-    return result.hexdigest()
+    view = memoryview(content)
+    result = hashlib.sha256(view[: match.start(1)])
+    result.update(BLANK.encode())
+    result.update(view[match.end(1) :])
+    return slice(*match.span(1)), result.hexdigest().encode()
 
 
 def text_sum(text: str) -> str:

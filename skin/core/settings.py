@@ -12,9 +12,12 @@ from importlib import import_module
 from inspect import Parameter, signature
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
+from hydra._internal.utils import _locate  # hydra.utils.get_object, without its message in the log
+from omegaconf import OmegaConf
 from pydantic import AfterValidator, ConfigDict, TypeAdapter, ValidationError
+from pydantic_core import to_json
 
 from skin.core.files import CONF
 from skin.errors import InputError
@@ -22,30 +25,27 @@ from skin.errors import InputError
 _Made = TypeVar("_Made")
 
 _LIBRARIES = ("torch.", "torch_geometric.")  # which check their own settings
-_FINITE = ConfigDict(allow_inf_nan=False)
+_STRICT = ConfigDict(strict=True, allow_inf_nan=False)
 _INNER = {"contact", "fusion", "model", "simulator"}
 _SCALARS = {int, float, bool, str, dict, Path, NoneType, Ellipsis}
-_COLLECTIONS = {Union, UnionType, Sequence, Mapping, list, tuple, dict}
-_LONG = 80  # characters of a value, in a message
-_FEW = "has too few entries"
-_LENGTHS = {"missing": _FEW, "too_short": _FEW, "too_long": "has too many entries"}
+_COLLECTIONS = {Annotated, Union, UnionType, Sequence, Mapping, list, tuple, dict}
+_LONGEST = 80  # characters of a value, in a message
 
 
-def _check_rising(limits: tuple[Any, Any]) -> tuple[Any, Any]:
-    if limits[0] > limits[1]:
-        raise ValueError("must be a range [least, most]")
-    return limits
+def _rule(holds: Callable[[Any], bool], text: str) -> AfterValidator:
+    """Return a validator that refuses values with a text."""
+
+    def check(value: Any) -> Any:
+        if not holds(value):
+            raise ValueError(text)
+        return value
+
+    return AfterValidator(check)
 
 
-def _check_unique(names: Sequence[str]) -> Sequence[str]:
-    if len(set(names)) < len(names):
-        raise ValueError("must hold each name once")
-    return names
-
-
-RISING = AfterValidator(_check_rising)
+RISING = _rule(lambda limits: limits[0] <= limits[1], "must be a range [minimum, maximum]")
 """Makes a pair a range: ``Annotated[tuple[float, float], RISING]``."""
-ONCE = AfterValidator(_check_unique)
+ONCE = _rule(lambda names: len(set(names)) == len(names), "must hold each name once")
 """Makes a list one of different names."""
 
 
@@ -57,7 +57,7 @@ def check_settings(
     Args:
         target: the class or function.
         settings: in plain containers; keys that begin with ``_`` are Hydra's.
-        name: their place in the configuration, for the message.
+        name: their group in the configuration, for the message.
         whole: whether they are all arguments; if not, the program passes those without a default.
 
     Raises:
@@ -65,28 +65,21 @@ def check_settings(
     """
     if not isinstance(settings, Mapping):
         raise InputError(f"{name} must be settings by name, got {settings!r}")
-    parameters = signature(target).parameters
-    hints = _hints(target)
+    parameters = _parameters(target)
     required = [key for key, its in parameters.items() if its.default is its.empty]
-    for key, value in zip(map(str, settings), settings.values(), strict=True):
-        if key.startswith("_"):
-            continue
-        label = f"{name}.{key}".removeprefix(".")
-        if key not in parameters:
-            if any(parameter.kind == Parameter.VAR_KEYWORD for parameter in parameters.values()):
-                continue
+    takes_others = any(parameter.kind == Parameter.VAR_KEYWORD for parameter in parameters.values())
+    for key, value in ((str(key), value) for key, value in settings.items()):
+        if key in parameters and (wrong := _explain_refusal(parameters[key].annotation, value)):
+            label, default = f"{name}.{key}".removeprefix("."), _written(parameters[key].default)
+            text = str(list(value) if isinstance(value, tuple) else value)
+            text = text if len(text) <= _LONGEST else f"{text[:_LONGEST]}..."
+            example = f": as in {label}={default}" if default else ""
+            raise InputError(f"{label}={text} {wrong}{example}")
+        if not (key in parameters or key.startswith("_") or takes_others):
             choices = [name for name in parameters if whole or name not in required or name in settings]
             near = get_close_matches(key, choices, 1)
-            meant = f": did you mean {near[0]}?" if near else ":"
-            raise InputError(f"{name} has no setting {key}{meant} it has {', '.join(choices)}")
-        if key in hints and _takes_made(hints[key]) and _is_nothing_made(hints[key], value):
-            raise InputError(f"{label}={str(value)[:_LONG]} must be an option with its settings")
-        if key in hints and _is_plain(hints[key]) and (wrong := _explain_refusal(hints[key], value)):
-            default = _written(parameters[key].default)
-            example = f": as in {label}={default}" if default else ""
-            text = str(list(value) if isinstance(value, tuple) else value)
-            text = text if len(text) <= _LONG else f"{text[:_LONG]}..."
-            raise InputError(f"{label}={text} {wrong}{example}")
+            hint = f": did you mean {near[0]}?" if near else ":"
+            raise InputError(f"{name} has no setting {key}{hint} it has {', '.join(choices)}")
     if whole and (missing := [key for key in required if key not in settings]):
         raise InputError(f"{name} needs {' and '.join(missing)}, got {', '.join(settings) or 'nothing'}")
 
@@ -136,11 +129,17 @@ def check_groups(config: Mapping[str, Any]) -> None:
     Raises:
         InputError: as :func:`check_settings`, or a class that cannot be imported.
     """
-    for name, part in _parts(config, ""):
+    for path, part in reversed([*walk_settings(dict(config))]):
+        if not path or not isinstance(part, dict):
+            continue
         # The model is inside the learner, but is set by the name of its group.
-        inner = name.split(".")[-1]
-        label = inner if inner in _INNER else name
-        check_settings(import_target(part["_target_"], label), part, label)
+        name = path[-1] if path[-1] in _INNER else ".".join(path)
+        if not isinstance(part.get("_partial_", False), bool):
+            raise InputError(f"{name}._partial_={part['_partial_']} must be true or false")
+        if (target := part.get("_target_")) is None and name in _INNER:
+            raise InputError(f"{name} chooses no option: leave it out, or give one that --help lists")
+        if target is not None and not str(target).startswith(_LIBRARIES):
+            check_settings(import_target(target, name), part, name)
 
 
 def import_target(target: str, name: str) -> Callable[..., Any]:
@@ -154,90 +153,61 @@ def import_target(target: str, name: str) -> Callable[..., Any]:
         InputError: it cannot be imported.
     """
     try:
-        return import_name(target)
-    except ImportError as error:
+        return _locate(str(target))
+    except (ImportError, ValueError) as error:
         raise InputError(
-            f"{name}._target_={target} cannot be imported: {error}: correct the name, or add the folder of "
-            "its module to PYTHONPATH"
+            f"{name}._target_={target} cannot be imported: {error.__cause__ or error}: correct "
+            "the name, or add the folder of its module to PYTHONPATH"
         ) from error
 
 
-def _parts(value: Any, name: str) -> Iterator[tuple[str, Mapping[str, Any]]]:
-    """Yield every mapping with a ``_target_`` outside of libraries, the innermost first, with its name."""
-    if isinstance(value, Mapping):
-        for key, entry in value.items():
-            yield from _parts(entry, f"{name}.{key}" if name else str(key))
-        if not isinstance(value.get("_partial_", False), bool):
-            raise InputError(f"{name}._partial_={value['_partial_']} must be true or false")
-        target = value.get("_target_")
-        if target is None and (option := name.rpartition(".")[2]) in _INNER:
-            raise InputError(f"{option} chooses no option: leave it out, or give one that --help lists")
-        if target is not None and not str(target).startswith(_LIBRARIES):
-            yield name, value
-
-
-def _hints(target: Callable[..., Any]) -> dict[str, Any]:
-    made = target.__init__ if isinstance(target, type) else target  # type: ignore[misc]
+def _parameters(target: Callable[..., Any]) -> Mapping[str, Parameter]:
+    """Return the parameters; their types stay text where only type checkers know the names in them."""
     try:
-        return get_type_hints(made, include_extras=True)
+        return signature(target, eval_str=True).parameters
     except NameError:
-        if target.__module__.startswith("skin."):
-            raise
-        return {}  # annotations of others may need names that exist for type checkers only
-
-
-def _takes_made(hint: Any) -> bool:
-    """Return whether an annotation is that of a factory, which Hydra makes of the settings of an option."""
-    return any(get_origin(part) is Callable for part in (hint, *get_args(hint)))
-
-
-def _is_nothing_made(hint: Any, value: Any) -> bool:
-    """Return whether a value cannot be what Hydra makes; None can where it is allowed."""
-    return isinstance(value, str | int | float | list) or (value is None and NoneType not in get_args(hint))
+        return signature(target).parameters
 
 
 def _is_plain(hint: Any) -> bool:
     """Return whether an annotation is made of numbers, text and collections of these alone."""
-    if hint in _SCALARS:
-        return True
     origin, arguments = get_origin(hint), get_args(hint)
-    if origin is Annotated:
-        return _is_plain(arguments[0])
-    return origin is Literal or (origin in _COLLECTIONS and all(map(_is_plain, arguments)))
+    parts = arguments[:1] if origin is Annotated else arguments
+    return origin is Literal or hint in _SCALARS or (origin in _COLLECTIONS and all(map(_is_plain, parts)))
 
 
 @cache
 def _adapter(hint: Any) -> TypeAdapter:
-    return TypeAdapter(hint, config=_FINITE)
+    return TypeAdapter(hint, config=_STRICT)
 
 
 def _explain_refusal(hint: Any, value: Any) -> str:
     """Return why a value is invalid, and what is valid; empty if it is valid."""
+    if any(get_origin(part) is Callable for part in (hint, *get_args(hint))):
+        # Hydra makes a factory of the settings of an option.
+        kinds = (str, int, float, list) if NoneType in get_args(hint) else (str, int, float, list, NoneType)
+        return "must be an option with its settings" * isinstance(value, kinds)
     try:
-        taken = _adapter(hint).validate_python(value)
+        # As JSON, a list may be a tuple and text a path, but nothing else is converted.
+        if _is_plain(hint):
+            _adapter(hint).validate_json(to_json(value, fallback=_to_plain, inf_nan_mode="constants"))
+        return ""
     except ValidationError as error:
         # Of a union, the message for the closest member: the deepest, or one whose type fits.
         fits = ("value_error", "greater_than", "greater_than_equal", "less_than", "less_than_equal")
         nearest = max(error.errors(), key=lambda detail: (len(detail["loc"]), detail["type"] in fits))
-        sentence = nearest["msg"].removeprefix("Value error, ").replace("Input should be", "must be")
-        sentence = sentence.split(", unable to parse")[0].replace("an instance of Sequence", "a list")
-        sentence = _LENGTHS.get(nearest["type"], sentence.replace("a valid tuple", "a list"))
-        return sentence[0].lower() + sentence[1:]
-    for original, number in _find_changed(value, taken):
-        if isinstance(original, str):
-            return "is text, and must be a number"
-        return f"must be a {'whole ' * isinstance(number, int)}number"
-    return ""
+    if nearest["type"] in ("missing", "too_short", "too_long"):
+        return f"has too {'many' if nearest['type'] == 'too_long' else 'few'} entries"
+    sentence = nearest["msg"].removeprefix("Value error, ").replace("Input should be", "must be")
+    sentence = sentence.replace("a valid array", "a list").replace("a valid integer", "a whole number")
+    return sentence + ", not text" * (isinstance(nearest["input"], str) and sentence.endswith("number"))
 
 
-def _find_changed(value: Any, taken: Any) -> Iterator[tuple[Any, Any]]:
-    """Yield values that pydantic converted to another type, because the class gets the original."""
-    if isinstance(value, list | tuple):
-        for pair in zip(value, taken, strict=True):
-            yield from _find_changed(*pair)
-    for kind in (bool, str, float):
-        if isinstance(value, kind) and not isinstance(taken, kind | Path):
-            yield value, taken
+def _to_plain(value: Any) -> Any:
+    """Return the content of a configuration or of an array as plain containers, anything else as text."""
+    if OmegaConf.is_config(value):
+        return OmegaConf.to_container(value, resolve=True)
+    return value.tolist() if hasattr(value, "tolist") else str(value)
 
 
 def _written(default: Any) -> str:
@@ -264,19 +234,18 @@ GROUPS = {
 """Configuration groups whose options are classes -> module of the abstract class that they derive from."""
 
 # Package -> base classes, as (module, name). Not every module of PyTorch Geometric: some of them fetch models
-# from the network and run what these contain.
-_TRUSTED_LIBRARIES = {
+# from the network and run what these contain. Of other libraries' models, the learners run one program, which
+# no setting can change.
+_BASES = {
+    "skin": tuple((module, f"Abstract{group.capitalize()}") for group, module in GROUPS.items()),
     "torch.optim": (("torch.optim", "Optimizer"),),
     "torch_geometric.nn": (
         ("torch_geometric.nn.aggr", "Aggregation"),
         ("torch_geometric.nn.conv", "MessagePassing"),
         ("torch_geometric.nn.models.basic_gnn", "BasicGNN"),
     ),
+    "experiments.peers": (("skin.learning.learner", "AbstractLearner"),),
 }
-_BASES = {"skin": tuple((module, f"Abstract{group.capitalize()}") for group, module in GROUPS.items())}
-_BASES |= _TRUSTED_LIBRARIES
-# Models of other libraries: their learners run one program, which no setting can change.
-_BASES["experiments.peers"] = (("skin.learning.learner", "AbstractLearner"),)
 
 
 def check_targets(config: Any, where: str) -> None:
@@ -302,7 +271,7 @@ def check_targets(config: Any, where: str) -> None:
             _refuse(where, path, f"names {value!r}, which could run any code")
     row = config.get("row") if isinstance(config, dict) else None
     if row is not None and (not isinstance(row, str) or {"/", "\\", "\0"} & set(row)):
-        _refuse(where, ("row",), f"is {row!r}, which is no name of a file")
+        _refuse(where, ("row",), f"is {row!r}, which cannot name a file")
 
 
 def _refuse(where: str, path: tuple[str, ...], reason: str) -> None:
@@ -322,37 +291,20 @@ def walk_settings(value: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tupl
 
 
 def _is_allowed(name: Any) -> bool:
-    """Return whether a name is that of an allowed class.
+    """Return whether a name belongs to an allowed class.
 
     The name's package is checked first, because to resolve a name imports modules, and then the class.
     """
-    if not isinstance(name, str):
-        return False
-    package = next((prefix for prefix in _BASES if name.startswith(f"{prefix}.")), None)
-    if package is None:
+    package = next((prefix for prefix in _BASES if str(name).startswith(f"{prefix}.")), None)
+    if package is None or not isinstance(name, str):
         return False
     try:
-        kind = import_name(name)
+        kind = _locate(name)
     except Exception:  # any error means that there is no such class
         return False
-    if not inspect.isclass(kind) or inspect.isabstract(kind):
-        return False
     bases = tuple(getattr(import_module(module), base) for module, base in _BASES[package])
-    return issubclass(kind, bases) and f"{kind.__module__}.".startswith(f"{package}.")
-
-
-def import_name(name: str) -> Any:
-    """Import an object by its dotted name, like Hydra, but without logging errors.
-
-    Raises:
-        ImportError: there is no such module, class or function.
-    """
-    first, *others = name.split(".")
-    member, path = import_module(first), first
-    for part in others:
-        path = f"{path}.{part}"
-        member = getattr(member, part) if hasattr(member, part) else import_module(path)
-    return member
+    concrete = inspect.isclass(kind) and not inspect.isabstract(kind) and issubclass(kind, bases)
+    return concrete and f"{kind.__module__}.".startswith(f"{package}.")
 
 
 # The name of an option: of a simulator, device, model, ...
@@ -361,7 +313,7 @@ def import_name(name: str) -> Any:
 def option_name(made: object) -> str:
     """Return the name of the option that an object or its class is.
 
-    It is that of the YAML file in ``conf/`` that names the class: ``PlatesAndBeams`` is the option ``fem``,
+    The YAML file in ``conf/`` that names the class has this name: ``PlatesAndBeams`` is the option ``fem``,
     as in ``simulator=fem``. A class from outside ``skin`` is named after its module.
     """
     kind = made if hasattr(made, "__qualname__") else type(made)

@@ -22,7 +22,7 @@ from omegaconf import OmegaConf
 
 from skin.core import array_cache
 from skin.core.files import CONF
-from skin.core.messages import Steps
+from skin.core.progress import Steps
 from skin.core.rng import Stream, generator
 from skin.device.calibration import read_calibration
 from skin.errors import InputError

@@ -27,13 +27,14 @@ from skin.calibration.wiring import turn_gauge
 from skin.core.files import write
 from skin.core.rng import Stream, generator
 from skin.core.settings import configured
-from skin.device.base import AbstractSimulated
+from skin.device.base import AbstractSimulated, Blank
 from skin.device.resampling import resample
 from skin.device.touches import Touches
 from skin.errors import InputError
 from skin.plot.figures import COLOURS, save_figure
 from skin.record.recorder import check_session
 from skin.record.session import read_session
+from skin.runs.configuration import Config
 from skin.touch.labels import TOUCH
 from skin.wire.emulator import Gesture, emulated_gestures, gestures_with_labels
 from skin.wire.segmentation import label_text
@@ -169,6 +170,35 @@ def compare_session(
     if rows is not None:
         rows = turn_gauge(rows, settings["places"], device.size)
     return compare_presses(device, build_bench_data(device, session, rows), settings["scale"])
+
+
+def compare_predictions(
+    name: str, config: Config, comparison: SessionComparison, device: AbstractSimulated
+) -> Agreement:
+    """Return the predictions of a run for both sides; print a warning if it learned another mechanics.
+
+    Args:
+        name: of the run.
+        config: of the command.
+        comparison: of the session.
+        device: with which the session was simulated.
+
+    Raises:
+        InputError: there is no such run, or it cannot predict these touches.
+    """
+    from skin.runs.run import FinishedRun
+    from skin.runs.torch_model import load_model
+
+    run = FinishedRun.named(name, config)
+    if (learned := run.stored.simulator["_target_"]) != config.simulator["_target_"]:
+        text = f"run {run.identity} was trained with {learned}"
+        print(f"{text}: add simulator= to simulate the session with it\n")
+    blank = Blank.of(device.task, device.size, comparison.touches[0])
+    model = load_model(run, replace(run.stored, layout=config.layout), device=blank, alarm=False)
+    simulated, measured = ((model.predict(side) > 0.5).numpy() for side in comparison.touches)
+    labels = [pair.labels for pair in comparison.pairs if pair.labels is not None]
+    truth = np.array([[bool(row[name]) for name in device.task.names] for row in labels])
+    return Agreement(device.task.names, simulated, measured, truth if labels else None)
 
 
 def holds_gestures(path: str) -> bool:

@@ -29,7 +29,7 @@ from pydantic import NonNegativeInt, PositiveFloat, PositiveInt
 from rich.console import Console
 from torch import Tensor, nn
 
-from skin.core.messages import Steps
+from skin.core.progress import Steps
 from skin.core.rng import Stream, generator
 from skin.core.settings import checked, configured, import_target
 from skin.device.base import AbstractDevice, Blank
@@ -480,9 +480,10 @@ def _adapt(config: Config, name: str, overrides: Sequence[str], steps: Steps) ->
     parent.load_weights(learner, data)
     network = learner.network  # refuses another learner before gestures are read from a port
     steps.begin("reading or simulating the gestures")
-    steps.silent = target.device.real
+    if target.device.real:
+        steps.stop()  # a person may be prompted
     touches, others = choose_gestures(target.device, settings)
-    steps.silent = False
+    steps.start()
     steps.begin("choosing the threshold of the alarm")
     source = replace(alarm_source(parent, learner, target.config), device=target.twin)
     point = choose_alarm_threshold(source, one_skin=True)

@@ -28,7 +28,8 @@ from rich.console import Console
 from torch import Tensor
 
 from skin.core.files import results, unwritable
-from skin.core.messages import PARENT, Steps, quiet
+from skin.core.messages import PARENT, quiet
+from skin.core.progress import Steps
 from skin.core.settings import import_target, option_name
 from skin.device.balance import report_balance
 from skin.errors import InputError
@@ -414,9 +415,10 @@ def _evaluate(run: FinishedRun, folder: Path, changes: Sequence[str], steps: Ste
     model = load_model(run, config)
     device, learner, point = model.device, model.learner, model.point
     steps.begin("reading or simulating the touches")
-    steps.silent = device.real
+    if device.real:
+        steps.stop()  # a person may be prompted
     touches = device.touches("test")  # read before anything is logged, because a port may fail
-    steps.silent = False
+    steps.start()
     steps.begin("evaluating them")
     title = f"{run.title} ({run.identity})"
     tags = {"evaluated": run.identity, "overrides": " ".join(changes)}

@@ -27,16 +27,14 @@ def folder(run, tmp_path_factory):
     """A folder with a finished run of a network."""
     folder = tmp_path_factory.mktemp("runs")
     quick = ["data.gestures=480", "trainer.max_epochs=15", "optimizer.lr=0.003", "fusion.hidden=16"]
-    done = run(folder, "train", *NETWORK, *SKIN, *SMALL, TEST, *quick)
-    assert done.returncode == 0, done.stderr
+    run(folder, "train", *NETWORK, *SKIN, *SMALL, TEST, *quick)
     return folder
 
 
 @pytest.fixture(scope="module")
 def session(run, folder):
     """Gestures of a skin with other gains and a lag."""
-    done = run(folder, "generate", *SKIN, *OTHER, "n=60", "seed=5", "out=session.parquet", store=False)
-    assert done.returncode == 0, done.stderr
+    run(folder, "generate", *SKIN, *OTHER, "n=60", "seed=5", "out=session.parquet", store=False)
     return folder / "session.parquet"
 
 
@@ -64,7 +62,6 @@ def adapted(run, folder):
     """The run to adapt, the run that was made of it with simulated gestures, and what the command printed."""
     parent = runs(folder)[-1]
     done = run(folder, "adapt", f"run={parent}", *OTHER, "adapt.gestures=48", TEST, *QUICK)
-    assert done.returncode == 0, done.stderr
     return parent, runs(folder)[-1], done.stdout
 
 
@@ -84,8 +81,7 @@ def test_a_simulated_skin_is_adapted_to(folder, adapted):
 @pytest.mark.slow("trains and adapts a run")
 def test_the_new_run_is_evaluated_on_its_skin_with_its_weights(run, folder, adapted):
     _, made, _ = adapted
-    done = run(folder, "evaluate", f"run={made}")
-    assert done.returncode == 0, done.stderr
+    run(folder, "evaluate", f"run={made}")
     name = "same/overall/accuracy"
     assert metrics(folder, runs(folder)[-1])[name] == pytest.approx(metrics(folder, made)[name], abs=1e-6)
 
@@ -93,7 +89,6 @@ def test_the_new_run_is_evaluated_on_its_skin_with_its_weights(run, folder, adap
 @pytest.mark.slow("trains and adapts a run")
 def test_the_new_run_is_shown_live(run, folder, adapted):
     done = run(folder, "live", f"run={adapted[1]}", "live.touch=0.3", "live.patience.above=0.5", "seconds=2")
-    assert done.returncode == 0, done.stderr
     assert "verdicts" in done.stderr
 
 
@@ -109,17 +104,14 @@ def test_the_same_adaptation_is_not_repeated(run, folder, adapted):
 @pytest.mark.slow("trains and adapts a run")
 def test_a_recording_is_adapted_to_and_the_rest_of_it_is_reported(run, folder, session, adapted):
     recorded = ["device=recording", f"device.path={session}"]
-    done = run(folder, "adapt", f"run={adapted[0]}", *recorded, "adapt.gestures=48", *QUICK)
-    assert done.returncode == 0, done.stderr
+    run(folder, "adapt", f"run={adapted[0]}", *recorded, "adapt.gestures=48", *QUICK)
     made = runs(folder)[-1]
     assert "same/overall/accuracy" in metrics(folder, made)
-    whole = run(folder, "adapt", f"run={adapted[0]}", *recorded, *QUICK)
-    assert whole.returncode == 0, whole.stderr
+    run(folder, "adapt", f"run={adapted[0]}", *recorded, *QUICK)
     assert "same/overall/accuracy" not in metrics(folder, runs(folder)[-1])
     assert "validation/overall/accuracy" in metrics(folder, runs(folder)[-1])
     # The skin of the new run is simulated, so that it does not need the file.
-    again = run(folder, "evaluate", f"run={made}", TEST)
-    assert again.returncode == 0, again.stderr
+    run(folder, "evaluate", f"run={made}", TEST)
 
 
 @pytest.mark.slow("trains and adapts a run")
@@ -128,7 +120,6 @@ def test_what_is_not_better_keeps_the_weights(run, folder, adapted):
     line = ["adapt.gestures=16", "adapt.lr=[1000]", "adapt.layers=[all]", "adapt.epochs=2", TEST, *SMALL]
     line.append("adapt.scratch=[]")
     done = run(folder, "adapt", f"run={parent}", *OTHER, *line)
-    assert done.returncode == 0, done.stderr
     assert f"the new run keeps the weights of run {parent}" in " ".join(done.stdout.split())
     found = metrics(folder, runs(folder)[-1])
     assert found["same/overall/accuracy"] == found["before/overall/accuracy"]
@@ -149,24 +140,21 @@ def test_a_learner_from_scratch_is_kept_where_it_is_better(run, folder, adapted,
         "adapt.scratch=[extra_trees]",
     ]
     done = run(folder, "adapt", f"run={adapted[0]}", *words)
-    assert done.returncode == 0, done.stderr
     made = runs(folder)[-1]
     assert tags(folder, made)["chosen"] == "extra_trees, from scratch"
     assert "chosen: extra_trees, from scratch" in done.stdout
     found = metrics(folder, made)
     assert found["validation/overall/accuracy"] > found["validation_before/overall/accuracy"]
-    again = run(
+    run(
         folder, "evaluate", f"run={made}", "device=recording", "device.path=turned.parquet", "device.test=all"
     )
-    assert again.returncode == 0, again.stderr
     assert metrics(folder, runs(folder)[-1])["same/overall/accuracy"] > 0.95
 
 
 @pytest.fixture(scope="module")
 def bad(run, folder, session):
     """A run of rules, and recordings without labels and with few gestures."""
-    done = run(folder, "train", "experiment=rules", *SKIN, *SMALL, TEST, "data.gestures=80")
-    assert done.returncode == 0, done.stderr
+    run(folder, "train", "experiment=rules", *SKIN, *SMALL, TEST, "data.gestures=80")
     known = read_recording(session)
     unknown = replace(known, touches=replace(known.touches, labels=None))
     return {
@@ -194,9 +182,8 @@ def bad(run, folder, session):
 def test_bad_input_ends_with_2_and_one_sentence(run, folder, adapted, bad, row, given, reason):
     before = query(folder, "select count(*) from runs")
     words = [one.format(**bad) for one in given]
-    done = run(folder, "adapt", f"run={bad['rules'] if row else adapted[0]}", *words, *SMALL)
-    assert (done.returncode, reason in done.stderr) == (2, True), done.stderr
-    assert "Traceback" not in done.stderr
+    done = run(folder, "adapt", f"run={bad['rules'] if row else adapted[0]}", *words, *SMALL, code=2)
+    assert reason in done.stderr
     assert query(folder, "select count(*) from runs") == before
 
 
@@ -216,15 +203,12 @@ def test_gestures_recorded_at_a_port_make_the_run_better_on_others(run, begin, f
             done = run(
                 folder, "record", *SKIN, *port, f"out={name}.csv", f"device.gestures={count}", store=False
             )
-        assert done.returncode == 0, done.stderr
         assert f"{count} gestures" in done.stdout
     recorded = ["device=recording", "device.path=few.parquet", "adapt.gestures=48"]
     done = run(folder, "adapt", f"run={adapted[0]}", *recorded, *QUICK)
-    assert done.returncode == 0, done.stderr
     made, accuracies = runs(folder)[-1], []
     for one in (adapted[0], made):
         others = ["device=recording", "device.path=others.parquet", "device.test=all"]
         done = run(folder, "evaluate", f"run={one}", *others)
-        assert done.returncode == 0, done.stderr
         accuracies.append(metrics(folder, runs(folder)[-1])["same/overall/accuracy"])
     assert accuracies[1] > accuracies[0] + 0.02

@@ -20,13 +20,12 @@ def test_from_a_bench_to_touches_of_the_calibrated_device(run, tmp_path):
         "device.gain_spread=0.2",
         store=False,
     )
-    assert done.returncode == 0, done.stderr
     assert "Warning" not in done.stderr
     assert "8 presses" in done.stdout
     assert "RMSE on 2 held-out presses" in done.stdout
     assert len(read_calibration(out)) == 4
     touches = tmp_path / "touches.csv"
-    made = run(
+    run(
         tmp_path,
         "generate.py",
         *SMALL[:3],
@@ -36,7 +35,6 @@ def test_from_a_bench_to_touches_of_the_calibrated_device(run, tmp_path):
         "device.randomise=true",
         store=False,
     )
-    assert made.returncode == 0, made.stderr
     assert touches.is_file()
 
 
@@ -46,32 +44,16 @@ def test_a_calibration_that_does_not_help_ends_with_1_and_writes_nothing(run, tm
     perfect = ["device.gain_spread=0", "device.offset=0", "device.clip=1000"]
     session, out = tmp_path / "bench.csv", tmp_path / "mine.yaml"
     files = f"session={session}", f"out={out}"
-    done = run(tmp_path, "calibrate", *SMALL, *perfect, *files, "calibrate.demo=true", store=False)
-    assert done.returncode == 1, done.stdout + done.stderr
+    done = run(tmp_path, "calibrate", *SMALL, *perfect, *files, "calibrate.demo=true", store=False, code=1)
     assert "does not reduce the error" in done.stdout
     assert not out.exists()
-
-
-@pytest.mark.parametrize(
-    ("arguments", "reason"),
-    [
-        ((), "which session?"),
-        (("session=none.csv",), "no file none.csv"),
-    ],
-)
-def test_bad_input_ends_with_2_and_one_sentence(run, tmp_path, arguments, reason):
-    done = run(tmp_path, "calibrate", *arguments, store=False)
-    assert done.returncode == 2
-    assert reason in done.stderr
-    assert "Traceback" not in done.stderr
 
 
 @pytest.mark.slow("fits a bench")
 def test_a_session_with_other_axes_is_refused_until_that_is_confirmed(run, tmp_path):
     session, out = tmp_path / "bench.csv", tmp_path / "mine.yaml"
     files, demo = (f"session={session}", f"out={out}"), "calibrate.demo=true"
-    done = run(tmp_path, "calibrate", *SMALL, *files, demo, "calibrate.places=mirror_y", store=False)
-    assert done.returncode == 2
+    done = run(tmp_path, "calibrate", *SMALL, *files, demo, "calibrate.places=mirror_y", store=False, code=2)
     assert len(done.stderr.strip().splitlines()) == 1
     assert "respond, but not to the presses near their sensors" in done.stderr
     assert "add calibrate.places=as_given" in done.stderr
@@ -83,9 +65,7 @@ def test_a_session_with_other_axes_is_refused_until_that_is_confirmed(run, tmp_p
         line[1], line[2] = line[2], line[1]
     session.write_text("\n".join(map(",".join, lines)) + "\n")
     wrong = ["calibrate.places=mirror_y", "calibrate.channels=[1,0,2,3]"]
-    done = run(tmp_path, "calibrate", *SMALL, *files, store=False)
-    assert done.returncode == 2
+    done = run(tmp_path, "calibrate", *SMALL, *files, store=False, code=2)
     assert all(f"{setting}" in done.stderr for setting in wrong)
     done = run(tmp_path, "calibrate", *SMALL, *files, *wrong, store=False)
-    assert done.returncode == 0, done.stderr
     assert list(read_calibration(out).channels) == [1, 0, 2, 3]

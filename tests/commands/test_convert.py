@@ -59,7 +59,6 @@ def converted(run, tmp_path_factory):
                 write(folder)
                 (folder / "map.yaml").write_text(yaml.safe_dump(MAPPING | more, sort_keys=False))
                 done = run(folder, "convert", "from=map.yaml", "out=x.parquet", store=False)
-                assert done.returncode == 0, done.stderr
                 known[key] = folder / "x.parquet", done.stdout
         return known[key]
 
@@ -80,7 +79,6 @@ def test_a_folder_is_converted_and_trained_on_by_person(run, converted, tmp_path
     assert recording.touches.labels[:, 1].isnan().sum() == 36
     train = ["device=recording", f"device.path={path}", "device.test_groups=[p1]", *settings]
     done = run(tmp_path, "train", *train)
-    assert done.returncode == 0, done.stderr
     assert "split: by person: 4 to train (1 for validation), 1 to test (p1)\n" in done.stdout
     database = sqlite3.connect(tmp_path / "m.db")
     ((split,),) = database.execute("select value from tags where key = 'split'").fetchall()
@@ -90,23 +88,10 @@ def test_a_folder_is_converted_and_trained_on_by_person(run, converted, tmp_path
     assert losses == [(0,)] * (settings is NETWORK)
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        ([], "skin convert needs from= and out=, as in from=map.yaml out=x.parquet"),
-        (["from=map.yaml", "out=x.txt"], "a recording is a .parquet or .csv file, got x.txt"),
-        (["from=map.yaml", "out=x.csv", "path=nowhere"], "nowhere has no file */*.csv"),
-        (["from=none.yaml", "out=x.csv"], "cannot read the mapping none.yaml"),
-        (["from=efles", "out=x.csv"], "from=efles is no format: give map.yaml, or one of cost, eflesh_force"),
-        (["from=epi", "out=x.csv"], "from=epi needs path=FOLDER"),
-    ],
-)
-def test_bad_input_ends_with_a_sentence(run, tmp_path, words, message):
+def test_a_folder_without_files_is_refused(run, tmp_path):
     write(tmp_path, persons=1, touches=3)
-    done = run(tmp_path, "convert", *words, store=False)
-    assert done.returncode == 2, done.stderr
-    assert message in done.stderr
-    assert done.stderr.count("\n") == 1
+    done = run(tmp_path, "convert", "from=map.yaml", "out=x.csv", "path=nowhere", store=False, code=2)
+    assert "nowhere has no file */*.csv" in done.stderr
     assert not list(tmp_path.glob("x.*"))
 
 
@@ -117,12 +102,10 @@ def test_classes_and_targets_are_learned_instead_of_labels(run, converted, tmp_p
     assert "classes pat, press, tap" in said
     words = ["device=recording", f"device.path={path}", f"task={task}", *settings]
     done = run(tmp_path, "train", *words)
-    assert done.returncode == 0, done.stderr
     assert figure in done.stdout
     assert "press/accuracy" not in done.stdout
     if (task, settings) == ("regression", TREES):
         done = run(tmp_path, "evaluate", "run=latest")
-        assert done.returncode == 0, done.stderr
         assert figure in done.stdout
 
 
@@ -133,8 +116,7 @@ def two(run, tmp_path_factory):
     write(folder, persons=2, touches=12)
     for path in (folder / "p0").glob("press*"):
         path.unlink()
-    done = run(folder, "convert", "from=map.yaml", "out=x.csv", store=False)
-    assert done.returncode == 0, done.stderr
+    run(folder, "convert", "from=map.yaml", "out=x.csv", store=False)
     groups = json.loads((folder / "x.csv.json").read_text())["metadata"]["groups"]
     assert groups == {"person": ["p0", "p1"]}
     return f"device.path={folder}/x.csv"
@@ -149,27 +131,14 @@ def two(run, tmp_path_factory):
         (["task=gestures"], "device.task=gestures must be"),
         (["task=regression", "learner=rules"], "learner=rules knows the labels"),
         (["task=regression", "device=simulated"], "task=regression needs device=recording"),
-    ],
-)
-def test_what_is_not_in_a_recording_is_not_learned(run, two, tmp_path, words, message):
-    recording = [] if "device=simulated" in words else ["device=recording", two]
-    done = run(tmp_path, "train", *recording, "experiment=features", *words)
-    assert done.returncode == 2, done.stderr
-    assert message in done.stderr
-    assert done.stderr.count("\n") == 1
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
         (["device.group=session"], "has no group session: give device.group=person, gesture"),
         (["device.test_groups=[p9]"], "has no person p9, it has p0, p1"),
         (["device.test_groups=[p0,p1]"], "has every person: leave out some to train on"),
         (["device.test_groups=[p1]"], "press lacks a class in the touches to train on"),
     ],
 )
-def test_a_split_that_leaves_nothing_to_learn_is_refused(run, two, tmp_path, words, message):
-    done = run(tmp_path, "train", "device=recording", two, "experiment=features", *words)
-    assert done.returncode == 2, done.stderr
+def test_a_task_or_a_split_that_a_recording_does_not_have_is_refused(run, two, tmp_path, words, message):
+    recording = [] if "device=simulated" in words else ["device=recording", two]
+    done = run(tmp_path, "train", *recording, "experiment=features", *words, code=2)
     assert message in done.stderr
     assert done.stderr.count("\n") == 1

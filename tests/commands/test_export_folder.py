@@ -15,10 +15,8 @@ def folder(run, tmp_path_factory):
     """A folder with a finished run of rules, published as ``small``, and what its training said."""
     folder = tmp_path_factory.mktemp("runs")
     done = run(folder, "train", "experiment=rules", *SKIN, *SMALL)
-    assert done.returncode == 0, done.stderr
     (folder / "said").write_text(done.stdout)
     done = run(folder, "export", "format=folder", *GOOD)
-    assert done.returncode == 0, done.stderr
     assert done.stdout == "models/small\n"
     return folder
 
@@ -42,7 +40,6 @@ def test_the_folder_has_weights_configuration_hashes_and_card(folder):
 
 def test_its_name_is_a_run_where_the_run_itself_is_not(folder, model, run):
     done = run(model.parents[1], "evaluate", "run=small")
-    assert done.returncode == 0, done.stderr
     table = lambda text: [line for line in text.splitlines() if "accuracy" in line]  # noqa: E731
     assert len(table(done.stdout)) > 3
     assert table(done.stdout) == table((folder / "said").read_text())
@@ -52,8 +49,7 @@ def test_an_altered_file_ends_a_command_with_a_sentence(model, run):
     with (model / "rules.json").open("a") as file:
         file.write(" ")
     for verb in ("evaluate", "live"):
-        done = run(model.parents[1], verb, "run=small")
-        assert done.returncode == 2
+        done = run(model.parents[1], verb, "run=small", code=2)
         assert "rules.json in " in done.stderr
         assert "differs from SHA256SUMS: restore the folder" in done.stderr
         assert done.stderr.count("\n") == 1
@@ -73,13 +69,10 @@ def test_an_altered_file_ends_a_command_with_a_sentence(model, run):
         (["name=new", "licence=MIT", "run=0123"], "no finished training run 0123"),
         (["name=new", "licence=MIT", "run=small"], "has no predictions.parquet"),
         (["name=new", "licence=MIT", "out=x"], "not to out=x: add name=my_skin"),
-        (["name=new", "licence=MIT", "format=onnx"], "add format=folder"),
-        (["name=new", "licence=MIT", "format=zip"], "format must be one of onnx, folder"),
     ],
 )
 def test_bad_input_ends_with_a_sentence(folder, run, overrides, message):
-    done = run(folder, "export", "format=folder", *overrides)
-    assert done.returncode == 2
+    done = run(folder, "export", "format=folder", *overrides, code=2)
     assert message in done.stderr
     assert done.stderr.count("\n") == 1
     assert [path.name for path in (folder / "models").iterdir()] == ["small"]
@@ -90,7 +83,6 @@ def test_weights_that_are_too_large_are_refused(folder, run):
     code += "main(['format=folder', 'name=new', 'licence=MIT'{own}])"
     own = f", 'tracking.uri=sqlite:///{folder}/m.db'"
     (folder / "limited.py").write_text(code.format(own=own))
-    done = run(folder, folder / "limited.py", store=False)
-    assert done.returncode == 2
+    done = run(folder, folder / "limited.py", store=False, code=2)
     assert "0.0 MB of weights, and a model is one file of at most 0.0001 MB" in done.stderr
     assert [path.name for path in (folder / "models").iterdir()] == ["small"]

@@ -1,7 +1,5 @@
 """`skin generate` as a person runs it."""
 
-import pytest
-
 from skin.device.files import read_recording
 
 NAIVE = ("generate", "simulator=naive")
@@ -9,7 +7,6 @@ NAIVE = ("generate", "simulator=naive")
 
 def test_writes_a_recording(run, tmp_path):
     done = run(tmp_path, *NAIVE, "n=32", "out=x.csv", store=False, apart=True)
-    assert done.returncode == 0, done.stderr
     assert "x.csv: 32 gestures" in done.stdout
     recording = read_recording(tmp_path / "x.csv")
     assert len(recording) == 32
@@ -19,22 +16,18 @@ def test_writes_a_recording(run, tmp_path):
 
 def test_a_folder_becomes_a_data_set_to_train_on(run, tmp_path):
     done = run(tmp_path, *NAIVE, "n=48", "out=touches", store=False)
-    assert done.returncode == 0, done.stderr
     assert "touches: 48 gestures in 1 shards, " in done.stdout
     train = ["device=recording", "device.path=touches", "representation=readings", "model=mlp"]
     done = run(tmp_path, "train", *train, "trainer.max_epochs=1")
-    assert done.returncode == 0, done.stderr
     assert "holdout" in done.stdout
     shard = tmp_path / "touches" / "shards" / "00000.parquet"
     shard.write_bytes(shard.read_bytes()[:-100])
     for done in (
-        run(tmp_path, "train", *train, "trainer.max_epochs=3"),
-        run(tmp_path, *NAIVE, "n=48", "out=touches", store=False),
+        run(tmp_path, "train", *train, "trainer.max_epochs=3", code=2),
+        run(tmp_path, *NAIVE, "n=48", "out=touches", store=False, code=2),
     ):
-        assert done.returncode == 2
         assert "00000.parquet is damaged" in done.stderr
         assert "delete it, and repeat the skin generate" in done.stderr
-        assert "Traceback" not in done.stderr
 
 
 ONE_SIZE = ("touch.shapes=[disc,bar]", "touch.stretch=1", "touch.big_area=[0.45,0.7]")
@@ -43,7 +36,6 @@ ONE_SIZE = ("touch.shapes=[disc,bar]", "touch.stretch=1", "touch.big_area=[0.45,
 def test_tells_the_balance_and_warns_where_a_shape_is_the_label(run, tmp_path):
     """Bars have no room as big touches unless they are stretched."""
     done = run(tmp_path, *NAIVE, "n=160", "out=x.csv", *ONE_SIZE, store=False)
-    assert done.returncode == 0, done.stderr
     title, header, big, small = done.stderr.splitlines()[:4]
     assert title.startswith("balance: ")
     assert header.split()[:3] == ["accuracy", "disc", "bar"]
@@ -52,28 +44,8 @@ def test_tells_the_balance_and_warns_where_a_shape_is_the_label(run, tmp_path):
     assert "warning: the shape alone predicts big (" in done.stderr
 
 
-@pytest.mark.parametrize(
-    ("overrides", "message"),
-    [
-        (["n=32"], "add out=touches.parquet"),
-        (["n=32", "out=x.txt"], "got x.txt"),
-        (["n=32", "out=x.csv", "touch.shapes=[potato]"], "no shape potato"),
-    ],
-)
-def test_bad_input_ends_with_a_sentence(run, tmp_path, overrides, message):
-    done = run(tmp_path, *NAIVE, *overrides, store=False)
-    assert done.returncode == 2
-    assert message in done.stderr
-    assert "Traceback" not in done.stderr
-    assert not list(tmp_path.glob("x.*"))
-
-
 def test_fingertips_are_written_with_their_contacts(run, tmp_path):
     words = ["simulator=naive", "touch=fingertips", "n=16", "out=tips.parquet"]
-    done = run(tmp_path, "generate", *words, store=False)
-    assert done.returncode == 0, done.stderr
+    run(tmp_path, "generate", *words, store=False)
     contacts = read_recording(tmp_path / "tips.parquet").touches.contacts
     assert contacts.shape == (16, 30, 3, 5)
-    refused = run(tmp_path, "generate", *words, "touch.force=50", store=False)
-    assert refused.returncode == 2
-    assert "touch.force=50 N is more than" in refused.stderr

@@ -77,24 +77,6 @@ def test_it_names_channels_and_frames_that_fail_under_a_press(played):
     assert done.stdout.count("in contact than at rest") == 2
 
 
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        ([], "device.port is missing: add device.port="),
-        (["device.port=/dev/ttyACM77"], "no port /dev/ttyACM77"),
-        (
-            ["device.port=/dev/ttyACM77", "device.format=xml"],
-            "device.format=xml must be 'auto', 'text' or 'binary'",
-        ),
-    ],
-)
-def test_what_cannot_be_listened_to_ends_with_code_2_and_a_sentence(arguments, said):
-    done = listen(*arguments)
-    assert (done.returncode, done.stdout) == (2, "")
-    assert said in done.stderr
-    assert len(done.stderr.strip().splitlines()) == 1
-
-
 def test_another_number_of_sensors_and_silence_end_with_code_2(address):
     done = listen(f"device.port={address}", "n=25", "seconds=20", "device.timeout=20")
     assert done.returncode == 2

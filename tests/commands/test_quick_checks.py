@@ -34,20 +34,6 @@ def test_a_wrong_setting_is_refused(overrides, message):
         check(*overrides)
 
 
-@pytest.mark.parametrize(
-    ("name", "override"),
-    [
-        *((name, "seconds=-1") for name in ("live", "record", "listen", "emulate")),
-        ("emulate", "gestures=-1"),
-        ("generate", "n=-1"),
-    ],
-)
-def test_a_negative_number_of_what_is_counted_is_refused(name, override, run, tmp_path):
-    done = run(tmp_path, name, override, store=False)
-    assert done.returncode == 2
-    assert done.stderr.startswith(f"{override} is below 0: give a number above 0")
-
-
 @pytest.mark.parametrize("name", ["train", "live", "export", "adapt", "record", "listen", "emulate", "study"])
 def test_the_defaults_of_every_command_are_accepted(name):
     check(name=name)

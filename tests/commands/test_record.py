@@ -68,7 +68,7 @@ def skin(*lives):
 @pytest.fixture
 def record(run, tmp_path):
     """Run record.py in a folder of its own."""
-    return lambda *arguments: run(tmp_path, "record.py", "out=s.csv", *arguments, store=False)
+    return lambda *words, **code: run(tmp_path, "record.py", "out=s.csv", *words, store=False, **code)
 
 
 @pytest.fixture(scope="module")
@@ -76,8 +76,7 @@ def once(run, tmp_path_factory):
     """Record a few gestures; give the folder."""
     folder = tmp_path_factory.mktemp("once")
     with skin({}) as port:
-        done = run(folder, "record.py", "out=s.csv", *FREE, port, "seconds=6", store=False)
-    assert done.returncode == 0, done.stderr
+        run(folder, "record.py", "out=s.csv", *FREE, port, "seconds=6", store=False)
     return folder
 
 
@@ -110,7 +109,6 @@ def test_a_full_disk_is_one_sentence_and_there_is_room_again(record, begin, tmp_
         assert done >= 2
         assert not (tmp_path / "s.parquet").exists()
         again = record(*FREE, port, "seconds=3")
-    assert again.returncode == 0, again.stderr
     assert f"s.csv has {done} gestures: going on" in again.stderr
     assert path.read_bytes().startswith(before)
     assert len(read_recording(tmp_path / "s.parquet")) > done
@@ -119,7 +117,8 @@ def test_a_full_disk_is_one_sentence_and_there_is_room_again(record, begin, tmp_
 def test_a_session_that_is_being_recorded_is_left_alone(record, tmp_path):
     with locked(tmp_path / "s.csv"), skin({}) as port:
         refused(
-            record(*FREE, port), r"^s\.csv is being recorded by another process: end that, or give another"
+            record(*FREE, port, code=2),
+            r"^s\.csv is being recorded by another process: end that, or give another",
         )
     assert not (tmp_path / "s.csv").exists()
 
@@ -128,10 +127,9 @@ def test_a_session_that_is_being_recorded_is_left_alone(record, tmp_path):
 def test_two_recordings_at_once_do_not_mix_and_kill_9_unlocks(record, begin, tmp_path):
     with skin({}) as port, begin(tmp_path, "record.py", "out=s.csv", *FREE, port) as first:
         next(line for line in first.lines(errors=True) if line.startswith("2 of"))
-        refused(record(*FREE, port), "being recorded by another process")
+        refused(record(*FREE, port, code=2), "being recorded by another process")
     with skin({}) as port:
         done = record(*FREE, port, "seconds=3")
-    assert done.returncode == 0, done.stderr
     assert "going on" in done.stderr
 
 
@@ -147,9 +145,9 @@ def test_two_recordings_at_once_do_not_mix_and_kill_9_unlocks(record, begin, tmp
 )
 def test_another_window_or_rate_is_refused_in_finishing_and_going_on(record, recorded, change, reason):
     before = recorded.read_bytes()
-    refused(record(*SKIN, change, "record.finish=true"), reason)
+    refused(record(*SKIN, change, "record.finish=true", code=2), reason)
     with skin({}) as port:
-        refused(record(*FREE, change, port, "device.tare=2", "seconds=6"), reason)
+        refused(record(*FREE, change, port, "device.tare=2", "seconds=6", code=2), reason)
     assert recorded.read_bytes() == before
     assert not recorded.with_suffix(".parquet").exists()
 
@@ -157,21 +155,22 @@ def test_another_window_or_rate_is_refused_in_finishing_and_going_on(record, rec
 def test_another_device_is_refused_however_late_its_header_comes(record, recorded):
     before = recorded.read_bytes()
     with skin({"id": "arm-R", "header": 500}) as port:
-        refused(record(*FREE, port, "device.scale=1", "seconds=30"), "from the device arm-L, this is arm-R")
+        refused(
+            record(*FREE, port, "device.scale=1", "seconds=30", code=2),
+            "from the device arm-L, this is arm-R",
+        )
     assert recorded.read_bytes() == before
 
 
 def test_the_device_itself_goes_on_however_late_its_header_comes(record, recorded):
     with skin({"header": 500}) as port:
         done = record(*FREE, port, "device.scale=1", "seconds=9")
-    assert done.returncode == 0, done.stderr
     assert "going on" in done.stderr
 
 
 def test_another_device_at_the_port_is_not_recorded(record, tmp_path):
     with skin({"frames": 400}, {"id": "arm-R", "header": 100}) as port:
         done = record(*FREE, port, "seconds=30", "device.timeout=1", "device.silence=0.3")
-    assert done.returncode == 0, done.stderr
     assert re.search(r"another device is connected: proto=1 n=4 rate=100 unit=N id=arm-R\n", done.stderr)
     assert "reconnect" not in (tmp_path / "s.csv").read_text()
 
@@ -192,7 +191,6 @@ def test_damaged_lines_are_skipped_and_named(record, recorded):
 def test_a_half_open_socket_is_opened_anew(record, tmp_path):
     with skin({"frames": 400}, {}) as port:
         done = record(*FREE, port, "seconds=8", "device.silence=0.5")
-    assert done.returncode == 0, done.stderr
     assert "the skin was unplugged (nothing received for 0.5 s); trying again" in done.stderr
     text = (tmp_path / "s.csv").read_text()
     assert text.count('"event": "gap", "after": "reconnect"') == 1
@@ -209,14 +207,7 @@ def test_a_half_open_socket_is_opened_anew(record, tmp_path):
 )
 def test_what_cannot_be_recorded_is_one_sentence(record, tmp_path, lives, reason):
     with skin(*lives) as port:
-        refused(record(*FREE, port, "seconds=30", "device.timeout=1", "device.silence=0.3"), reason)
+        refused(record(*FREE, port, "seconds=30", "device.timeout=1", "device.silence=0.3", code=2), reason)
     assert not (tmp_path / "s.parquet").exists()
     if (tmp_path / "s.csv").exists():
         assert not read_session(tmp_path / "s.csv").warnings
-
-
-def test_a_silence_that_is_none_is_refused(record):
-    refused(
-        record(*FREE, "device.port=socket://127.0.0.1:1", "device.silence=-1"),
-        r"device\.silence=-1 must be greater than or equal to 0",
-    )

@@ -3,8 +3,10 @@
 from collections.abc import Callable, Mapping, Sequence
 from typing import Annotated, Any, Literal
 
+import numpy as np
 import pytest
 from annotated_types import Ge, Gt, Le
+from omegaconf import OmegaConf
 
 from skin.core.settings import ONCE, RISING, check_groups, check_settings, checked, configured
 from skin.errors import InputError
@@ -36,6 +38,9 @@ FIT = {"count": 2, "share": 1, "width": None, "kind": "b", "widths": [1, 2], "na
 
 def test_what_fits_is_taken():
     check_settings(Thing, {**FIT, "_partial_": True, "made": {"_target_": "anything"}}, "thing")
+    check_settings(Thing, {"count": np.int64(2), "share": np.float32(0.5), "span": (1, 2.5)}, "thing")
+    composed = OmegaConf.create({"span": [1, 2.5], "copies": {"a": 1}})
+    check_settings(Thing, {name: composed[name] for name in composed}, "thing")
     check_settings(lambda **settings: None, {"anything": 1}, "thing")
 
 
@@ -43,32 +48,26 @@ def test_what_fits_is_taken():
     ("wrong", "said"),
     [
         ({"count": 0}, "thing.count=0 must be greater than or equal to 1"),
-        ({"count": 0.5}, "thing.count=0.5 must be a valid integer"),
-        ({"count": "2"}, "thing.count=2 is text, and must be a number"),
+        ({"count": 0.5}, "thing.count=0.5 must be a whole number"),
+        ({"count": "2"}, "thing.count=2 must be a whole number, not text"),
         ({"share": "abc"}, "thing.share=abc must be a valid number"),
         ({"share": float("nan")}, "thing.share=nan must be a finite number"),
-        ({"share": float("inf")}, "thing.share=inf must be a finite number"),
-        ({"width": 0}, "thing.width=0 must be greater than 0"),
         ({"where": 10}, "thing.where=10 must be less than or equal to 9"),
         ({"where": "in"}, "thing.where=in must be 'out'"),
         ({"kind": "c"}, "thing.kind=c must be 'a' or 'b'"),
         ({"widths": 8}, "thing.widths=8 must be a list"),
-        ({"widths": ["x"]}, r"thing.widths=\['x'\] must be a valid integer"),
+        ({"widths": ["x"]}, r"thing.widths=\['x'\] must be a whole number"),
         ({"name": 1}, "thing.name=1 must be a valid string"),
         ({"count": 2.0}, "thing.count=2.0 must be a whole number"),
         ({"count": True}, "thing.count=True must be a whole number"),
-        ({"widths": [1, "2"]}, r"thing.widths=\[1, '2'\] is text, and must be a number"),
+        ({"widths": [1, "2"]}, r"thing.widths=\[1, '2'\] must be a whole number, not text"),
         ({"share": -1j}, "thing.share=.*: as in thing.share=0.5$"),
-        (
-            {"span": [2, 1]},
-            r"thing.span=\[2, 1\] must be a range .*: as in thing.span=\[1,10\]$",
-        ),
+        ({"span": [2, 1]}, r"thing.span=\[2, 1\] must be a range .*: as in thing.span=\[1,10\]$"),
         ({"span": [2]}, r"thing.span=\[2\] has too few entries"),
         ({"span": [1, 2, 3]}, r"thing.span=\[1, 2, 3\] has too many entries"),
         ({"labels": ["a", "b", "a"]}, r"thing.labels=\['a', 'b', 'a'\] must hold each name once"),
-        ({"widths": [0.5] * 50}, r"thing.widths=.{80}\.\.\. must be a valid integer"),
+        ({"widths": [0.5] * 50}, r"thing.widths=.{80}\.\.\. must be a whole number"),
         ({"shar": 1}, "thing has no setting shar: did you mean share[?] it has count, share, width"),
-        ({"zzz": 1}, "thing has no setting zzz: it has count"),
         ({1: 2}, "thing has no setting 1: it has count"),
     ],
 )
@@ -81,13 +80,10 @@ def test_what_does_not_fit_is_refused_by_name(wrong, said):
     ("part", "said"),
     [
         ({"_target_": f"{__name__}.Thing", "count": 0}, "model.count=0 must be greater"),
-        (
-            {"_target_": "absent.Thing"},
-            "model._target_=absent.Thing cannot be imported: No module named 'absent'",
-        ),
+        ({"_target_": "absent.Thing"}, "model._target_=absent.Thing cannot be imported: .*'absent'"),
         (
             {"_target_": "skin.learning.model.Mpl"},
-            "model._target_=skin.learning.model.Mpl cannot be imported",
+            "model._target_=skin.learning.model.Mpl cannot be",
         ),
     ],
 )
@@ -129,37 +125,23 @@ SERIAL = ["device=serial", "device.port=/dev/null"]
     ("overrides", "said"),
     [
         (["optimizer.lr=oops"], "optimizer.lr=oops is text"),
-        (["optimizer.lr=-1"], "the optimizer refuses its settings: Invalid learning rate: -1"),
         (["+optimizer.lrr=1"], "the optimizer refuses its settings: .*lrr"),
         (["model.channels=8"], "model.channels=8 must be a list"),
         (["+model.channelz=3"], "model has no setting channelz: did you mean channels"),
-        (["fusion.hidden=x"], "fusion.hidden=x must be a valid integer"),
-        (["trainer.max_epochs=0"], "trainer.max_epochs=0 must be a whole number from 1 up"),
-        (["trainer.max_epochs=0.5"], "trainer.max_epochs=0.5 must be a whole number from 1 up"),
+        (["fusion.hidden=x"], "fusion.hidden=x must be a whole number"),
         (["trainer.accelerator=gpus"], "Trainer refuses trainer: .*gpus"),
         (["+trainer.typo=1"], "Trainer refuses trainer: .*typo"),
         (["learner=boosted_trees", "learner.rounds=0"], "learner.rounds=0 must be greater than or equal"),
-        (
-            ["representation=interp", "representation.pixels=x"],
-            "representation.pixels=x must be a valid integer",
-        ),
-        (["device.noise=abc"], "device.noise=abc must be a valid number"),
+        (["representation=interp", "representation.pixels=x"], "representation.pixels=x must be a whole"),
         (["device.noise=-1"], "device.noise=-1 must be greater than or equal to 0"),
-        (["device.clip=0"], "device.clip=0 must be greater than 0"),
-        (["device.stuck=0.5"], "device.stuck=0.5 must be a valid integer"),
-        (["device.dead=[4,2]"], r"device.dead=\[4, 2\] must be a range \[least, most\]"),
+        (["device.dead=[4,2]"], r"device.dead=\[4, 2\] must be a range \[minimum, maximum\]"),
         (
             ["+device.noize=1"],
             "device has no setting noize: did you mean noise[?] it has .*gain_spread, scale_spread, offset",
         ),
-        (["layout=grid", "layout.rows=1.5"], "layout.rows=1.5 must be a valid integer"),
-        (["body.cells=9"], "body.cells=9 must be a list"),
-        (["simulator=solid", "simulator.divisions=x"], "simulator.divisions=x must be a valid integer"),
+        (["simulator=solid", "simulator.divisions=x"], "simulator.divisions=x must be a whole number"),
         ([*SERIAL, "device.scale=abc"], "device.scale=abc must be a valid number"),
-        ([*SERIAL, "device.tare=inf"], "device.tare=inf must be a finite number"),
-        ([*SERIAL, "device.limits=[a,b]"], "device.limits=.* must be a valid number"),
         ([*SERIAL, "device.limits=[1023,0]"], r"device.limits=\[1023, 0\] must be \[smallest, largest\]"),
-        ([*SERIAL, "device.limits=[1]"], r"device.limits=\[1\] has too few entries"),
     ],
 )
 def test_a_group_refuses_a_setting_before_anything_is_made(configured, overrides, said):
@@ -175,13 +157,8 @@ LIVE = {"web_port": 8765, "top": 4.0, "touch": None, "drift": 0.2, "verdicts": N
 @pytest.mark.parametrize(
     ("wrong", "said"),
     [
-        ({"web_port": "abc"}, "live.web_port=abc must be a valid integer"),
         ({"web_port": 70000}, "live.web_port=70000 must be less than or equal to 65535"),
-        ({"top": 0}, "live.top=0 must be greater than 0"),
-        ({"top": float("nan")}, "live.top=nan must be a finite number"),
         ({"touch": -1}, "live.touch=-1 must be greater than 0"),
-        ({"drift": -1}, "live.drift=-1 must be greater than or equal to 0"),
-        ({"patience": {"alarm": "abc"}}, "live.patience.alarm=abc must be a valid number"),
         ({"patience": {"alarms": 0.1}}, "live.patience has no setting alarms: did you mean alarm"),
         ({"tuoch": 1}, "live has no setting tuoch: did you mean touch"),
     ],
@@ -190,9 +167,3 @@ def test_the_live_view_refuses_a_setting_by_name(wrong, said):
     assert LiveSettings.of(LIVE).patience.label == 0.15
     with pytest.raises(InputError, match=said):
         LiveSettings.of(LIVE | wrong)
-
-
-def test_a_command_ends_with_code_2_and_logs_nothing(run, tmp_path):
-    done = run(tmp_path, "train", *SMALL, "trainer.max_epochs=0.5")
-    assert done.returncode == 2
-    assert done.stderr == "trainer.max_epochs=0.5 must be a whole number from 1 up\n"

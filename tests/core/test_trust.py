@@ -1,10 +1,17 @@
-"""A stored run builds every shipped option, and nothing that only looks like one."""
+"""A stored run builds every shipped option, and nothing that only looks like one; an option has a name."""
+
+from functools import partial
+from inspect import signature
 
 import pytest
 
+from skin.body.layout import Grid
 from skin.core.files import CONF
-from skin.core.settings import GROUPS, check_targets
+from skin.core.settings import GROUPS, check_targets, import_target, option_name
+from skin.device.base import Blank
 from skin.errors import InputError
+from skin.learning.representation import Interpolation
+from skin.mechanics.simulator.fem import PlatesAndBeams
 from skin.runs.configuration import settings_of
 
 OPTIONS = [(group, path.stem) for group in GROUPS for path in sorted((CONF / group).glob("*.yaml"))]
@@ -16,8 +23,10 @@ def refuse(name):
 
 
 @pytest.mark.parametrize(("group", "option"), OPTIONS)
-def test_every_option_may_be_built(configured, group, option):
-    check_targets(settings_of(configured(f"{group}={option}")), "a run")
+def test_every_option_may_be_built_and_has_types(configured, group, option):
+    settings = settings_of(configured(f"{group}={option}"))
+    check_targets(settings, "a run")
+    signature(import_target(settings[group]["_target_"], group), eval_str=True)
 
 
 @pytest.mark.parametrize(
@@ -83,3 +92,18 @@ def test_names_are_resolved_only_inside_the_package(tmp_path, monkeypatch):
 def test_values_are_final(place, value):
     with pytest.raises(InputError, match="interpolation"):
         check_targets(place(value), "a run")
+
+
+@pytest.mark.parametrize(
+    ("made", "name"),
+    [
+        (PlatesAndBeams, "fem"),
+        (Interpolation, "interp"),
+        (Grid(), "grid"),
+        (Blank(None, (1.0, 1.0), None), "base"),
+        (partial, "functools"),
+        (option_name, "settings"),
+    ],
+)
+def test_an_option_is_named_after_its_file_of_settings_or_its_module(made, name):
+    assert option_name(made) == name

@@ -74,7 +74,7 @@ def test_a_sweep_has_a_line_for_each_thickness_and_grid(run, tmp_path):
         ),
         (["design.touches=3"], "design.touches=3 must be"),
         (["design.noise=0"], "design.noise=0 must be greater than 0"),
-        (["design.radii=[0.01,0.002]"], "must be a range [least, most]"),
+        (["design.radii=[0.01,0.002]"], "must be a range [minimum, maximum]"),
         (["device.noise=[0.05,0.2]"], "design.noise="),
         (["design=sweep", "simulator=naive"], "needs a simulator with mechanics: set simulator=solid"),
         (["design=sweep", "design.height=0.02", "simulator=solid"], "design.height=0.02 m is not inside"),

@@ -240,7 +240,7 @@ def test_a_clock_that_stood_still_is_said(lines, stored):
         ("{", "Expecting property name"),
         ("[" * 100_000, "nested too deep"),
         ('{"positions": [[0, 0, 0]], "started_unix": "now"}', "started_unix"),
-        ('{"positions": [[0, 0, 0]], "started_unix": NaN}', "NaN is no number"),
+        ('{"positions": [[0, 0, 0]], "started_unix": NaN}', "NaN must be a finite number"),
         ('{"positions": [[0, 0, 0]], "started_unix": 1, "rate": 0}', "rate"),
         ('{"positions": {}, "started_unix": 1}', "damaged or no session's"),
         ('{"positions": [[0, 0, 0]], "started_unix": 1}', "line 2: 2 values, 1 sensors"),

@@ -217,9 +217,9 @@ def test_a_model_of_somebody_else_works_or_is_refused(model, name):
 def test_weights_without_an_end_are_refused(model):
     (model / "weights.pt").unlink()
     os.mkfifo(model / "weights.pt")
-    with pytest.raises(InputError, match="no complete pretrained model: it is no regular file"):
+    with pytest.raises(InputError, match="no complete pretrained model: it is not a regular file"):
         find_pretrained("mine")
     (model / "weights.pt").unlink()
     (model / "weights.pt").symlink_to("/dev/zero")
-    with pytest.raises(InputError, match="it is no regular file"):
+    with pytest.raises(InputError, match="it is not a regular file"):
         find_pretrained("mine")

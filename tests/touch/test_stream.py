@@ -196,7 +196,7 @@ def test_regular_strides():
     ("wrong", "message"),
     [
         ({"gap": [0, 0.5]}, r"touch.gap=.* must be greater than 0: as in touch.gap=\[1.0,6.0\]"),
-        ({"gap": [0.9, 0.5]}, r"touch.gap=.* must be a range \[least, most\]: as in touch.gap="),
+        ({"gap": [0.9, 0.5]}, r"touch.gap=.* must be a range \[minimum, maximum\]: as in touch.gap="),
         ({"gap": [0.04, 0.5]}, r"touch.gap=\[0.04, 0.5\] s gives 0 to 5 frames .* at least 1 \(0.1 s\)"),
         ({"stride": [0.01, 0.02]}, r"touch.stride=.* s gives 0 frames at touch.rate=10 Hz"),
     ],

@@ -41,7 +41,7 @@ def test_without_a_tilt_sensors_face_the_surface_to_the_last_bit():
         ({"tilt": float("nan")}, "layout.tilt=nan must be a finite number"),
         ({"tilt": "much"}, "layout.tilt=much must be a valid number"),
         ({"rows": 0}, "layout.rows=0 must be greater than 0: as in layout.rows=5"),
-        ({"columns": 2.5}, "layout.columns=2.5 must be a valid integer"),
+        ({"columns": 2.5}, "layout.columns=2.5 must be a whole number"),
         ({"footprint": [0.01, 0]}, "layout.footprint=.* must be greater than 0"),
         ({"footprint": [0.01]}, "layout.footprint=.* has too few entries"),
     ],

@@ -1,0 +1,16 @@
+"""Commands as a person runs them."""
+
+import pytest
+
+
+@pytest.fixture(scope="session")
+def run(run):
+    """Return ``run`` of all tests, which expects an exit code here; 2 comes without a traceback."""
+
+    def checked(folder, script, *words, code=0, **settings):
+        done = run(folder, script, *words, **settings)
+        assert code in (done.returncode, None), done.stdout + done.stderr
+        assert code != 2 or "Traceback" not in done.stderr, done.stderr
+        return done
+
+    return checked

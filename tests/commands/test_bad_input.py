@@ -1,0 +1,62 @@
+"""Bad input of any verb ends with code 2 and one sentence, and nothing is written."""
+
+import pytest
+
+PORT = "device.port=/dev/ttyACM77"
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("animate", "add out=touch.gif"),
+        ("animate out=x.gif touch=fingertips labels=[big]", "fingertips cannot be drawn to be big"),
+        ("animate out=x.mp4", "a still a .png file, got out=x.mp4"),
+        ("animate vieww=flat", "vieww"),
+        ("calibrate", "which session?"),
+        ("calibrate session=none.csv", "no file none.csv"),
+        ("check weight=0 layout=grid simulator=naive", "weight=0 is a mass in kg above 0"),
+        ("check seconds=1 layout=grid", "seconds=1 must be greater than or equal to 2"),
+        ("compare", "which session?"),
+        ("convert", "skin convert needs from= and out=, as in from=map.yaml out=x.parquet"),
+        ("convert from=map.yaml out=x.txt", "a recording is a .parquet or .csv file, got x.txt"),
+        ("convert from=none.yaml out=x.csv", "cannot read the mapping none.yaml"),
+        (
+            "convert from=efles out=x.csv",
+            "from=efles is no format: give map.yaml, or one of cost, eflesh_force",
+        ),
+        ("convert from=epi out=x.csv", "from=epi needs path=FOLDER"),
+        ("design out=x design.radii=[0.01,0.002]", "must be a range [minimum, maximum]"),
+        ("emulate format=xml", "format=xml must be 'text' or 'binary'"),
+        ("emulate gestures=-1", "gestures=-1 is below 0: give a number above 0"),
+        ("emulate emulate.rate=0", "emulate.rate=0 must be greater than 0"),
+        ("export format=zip", "format=zip must be 'onnx' or 'folder'"),
+        ("export name=small", "only a folder takes name and licence: add format=folder, or leave them out"),
+        ("export export.rates=[]", "export.rates=[] has too few entries"),
+        ("export out=x.txt", "out=x.txt must end in .onnx"),
+        ("generate n=-1", "n=-1 is below 0: give a number above 0"),
+        ("generate n=32", "add out=touches.parquet"),
+        ("generate n=32 out=x.txt", "got x.txt"),
+        ("generate n=32 out=x.csv touch.shapes=[potato]", "no shape potato"),
+        ("generate n=16 out=x.parquet touch=fingertips touch.force=50", "touch.force=50 N is more than"),
+        ("listen", "device.port is missing: add device.port="),
+        (f"listen {PORT}", "no port /dev/ttyACM77"),
+        (f"listen {PORT} device.format=xml", "device.format=xml must be 'auto', 'text' or 'binary'"),
+        ("live demo=true run=none", "no finished training run none"),
+        ("live demo=true device=serial", "leave out device=serial, or demo=true"),
+        ("live live.top=0", "live.top=0 must be greater than 0"),
+        *(
+            (f"{verb} seconds=-1", "seconds=-1 is below 0")
+            for verb in ("live", "record", "listen", "emulate")
+        ),
+        ("record", "a session is a .csv file, got None: add out=session.csv"),
+        ("record out=x.csv device.silence=-1", "device.silence=-1 must be greater than or equal to 0"),
+        ("record out=x.csv +record.x=1", "record has no x: it takes free, finish"),
+        ("train trainer.max_epochs=0.5", "trainer.max_epochs=0.5 must be a whole number from 1 up"),
+    ],
+)
+def test_bad_input_ends_with_a_sentence(run, tmp_path, words, message):
+    verb, *settings = words.split()
+    done = run(tmp_path, verb, *settings, store=verb in ("live", "export", "train"), code=2)
+    assert message in done.stderr
+    assert (done.stdout, done.stderr.count("\n")) == ("", 1)
+    assert not {path.suffix for path in tmp_path.iterdir()} - {".db"}

@@ -2,7 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from typing import Literal, Protocol
+from typing import Literal
 
 import torch
 from pydantic import PositiveInt
@@ -13,11 +13,8 @@ from skin.errors import InputError
 from skin.learning.model import AbstractModel, Kind, Reduced, encoder
 from skin.learning.representation import Frames
 
-
-class MakeModel(Protocol):
-    """A model without the arguments that the data decide."""
-
-    def __call__(self, kind: Kind, shape: Sequence[int]) -> AbstractModel: ...
+MakeModel = Callable[[Kind, Sequence[int]], AbstractModel]
+"""A model without the arguments that the data decide: kind and shape."""
 
 
 class AbstractFusion(nn.Module, ABC):

@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -40,6 +40,18 @@ class AbstractLearner(ABC):
     parameters: int
     seconds_per_epoch: float
     unfinished: Path | None = None
+    _learned: Any = None
+
+    @property
+    def learned(self) -> Any:
+        """What was fitted or loaded.
+
+        Raises:
+            RuntimeError: before ``fit`` or ``load``.
+        """
+        if self._learned is None:
+            raise RuntimeError("fit or load the learner first")
+        return self._learned
 
     def check(self, data: "TouchData") -> None:  # noqa: B027 - most have nothing that could be missing
         """Raise InputError if the learner cannot be fitted, before anything is logged."""
@@ -138,7 +150,7 @@ class Rules(AbstractLearner):
     """
 
     def __init__(self, seed: int = 0) -> None:
-        self._rules: dict[str, Rule] = {}
+        """Accept a seed as every learner does: nothing is drawn."""
 
     def fit(self, data: "TouchData", logger: "Logger | None" = None) -> None:
         """Tune the thresholds.
@@ -152,58 +164,48 @@ class Rules(AbstractLearner):
                 "use learner=boosted_trees"
             )
         began = time.perf_counter()
-        train, validation = data.touches("train"), data.touches("validation")
-        train_features, validation_features = (
-            engineered_features(train.to("cpu")),
-            engineered_features(validation.to("cpu")),
-        )
-        self._set(
-            {
-                name: _tune(
-                    name,
-                    _select_defined(train_features, train.known_labels, data.task, i),
-                    _select_defined(validation_features, validation.known_labels, data.task, i),
-                )
-                for i, name in enumerate(data.task.names)
-            }
-        )
+        splits = [data.touches(split).to("cpu") for split in ("train", "validation")]
+        features = [engineered_features(touches) for touches in splits]
+        rules = {}
+        for label, name in enumerate(data.task.names):
+            known = [
+                _select_defined(values, touches.known_labels, data.task, label)
+                for values, touches in zip(features, splits, strict=True)
+            ]
+            rules[name] = _tune(name, *known)
+        self._set(rules)
         self.seconds_per_epoch = time.perf_counter() - began
 
     def probabilities(self, touches: Touches) -> Tensor:
         """Return the probability of each label, (B, L), for touches of any layout."""
-        if not self._rules:
-            raise RuntimeError("fit or load the learner first")
-        values = engineered_features(touches.to("cpu"))
-        return torch.stack([rule.probability(values) for rule in self._rules.values()], dim=1)
+        rules, values = self.learned.values(), engineered_features(touches.to("cpu"))
+        return torch.stack([rule.probability(values) for rule in rules], dim=1)
 
     def save(self, folder: Path) -> Path:
         """Write the rules to ``rules.json`` in ``folder`` and return its path."""
-        if not self._rules:
-            raise RuntimeError("fit or load the learner first")
         path = Path(folder) / "rules.json"
-        path.write_text(json.dumps({name: asdict(rule) for name, rule in self._rules.items()}, indent=2))
+        path.write_text(json.dumps({name: asdict(rule) for name, rule in self.learned.items()}, indent=2))
         return path
 
     def load(self, data: "FrameMaker", path: Path) -> None:
-        """Load the rules that :meth:`save` wrote."""
+        """Load the rules that :meth:`save` wrote.
+
+        Raises:
+            ValueError, LookupError, TypeError: they are damaged, or of other labels or features.
+        """
         stored = parse_json(read_file(Path(path), TEXT))
-        rules = {name: Rule(**stored[name]) for name in data.task.names}
-        features = engineered_features(data.example.to("cpu"))
-        for name, rule in rules.items():
-            numbers = all(isinstance(value, int | float) for value in (rule.threshold, rule.slope))
-            if rule.measurement not in features or not numbers:
-                raise ValueError(f"the rule of {name} is {asdict(rule)}")
-        self._set(rules)
+        self._set({name: Rule(**stored[name]) for name in data.task.names})
+        self.probabilities(data.example)  # refuses unknown measurements and what is no number
 
     def _set(self, rules: dict[str, Rule]) -> None:
-        self._rules = rules
+        self._learned = rules
         self.parameters = 2 * len(rules)
 
 
 def _select_defined(values: dict[str, Tensor], labels: Tensor, task: Task, label: int) -> _Split:
     """Return the features and one label of the touches for which that label is defined."""
-    rows = task.counts(labels)[:, label].cpu()
-    return {name: column[rows] for name, column in values.items()}, labels[:, label].cpu()[rows].numpy()
+    rows = task.counts(labels)[:, label]
+    return {name: column[rows] for name, column in values.items()}, labels[rows, label].numpy()
 
 
 def _tune(label: str, train: _Split, validation: _Split) -> Rule:

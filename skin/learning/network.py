@@ -1,7 +1,6 @@
 """Networks: the module with its loss, and the learner that trains it (:mod:`skin.learning.training`)."""
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -19,7 +18,7 @@ from skin.device.touches import Touches
 from skin.errors import InputError
 from skin.learning.fusion import AbstractFusion
 from skin.learning.learner import AbstractLearner
-from skin.learning.model import AbstractModel, make_activation
+from skin.learning.model import make_activation
 from skin.learning.representation import AbstractRepresentation, FrameMaker, Frames
 from skin.touch.labels import Task
 
@@ -90,20 +89,14 @@ class TouchClassifier(nn.Module):
     @property
     def targets(self) -> "_Targets":
         """The last layer of a regression."""
-        layer = self.head[-1]
-        assert isinstance(layer, _Targets)
-        return layer
+        return self.head[-1]  # type: ignore[return-value]
 
     def forward(self, frames: Frames) -> Tensor:
         """Return the logits (B, L) of frames; the targets of a regression."""
-        return self.head(self.embed(frames))
-
-    def embed(self, frames: Frames) -> Tensor:
-        """Return the input of the dense layers: the embedding (B, E), with that of the summary if any."""
         embedding = self.fusion(frames)
-        if self.summary is None:
-            return embedding
-        return torch.cat([embedding, self.summary(frames.summary)], dim=1)
+        if self.summary is not None:
+            embedding = torch.cat([embedding, self.summary(frames.summary)], dim=1)
+        return self.head(embedding)
 
     def loss(self, logits: Tensor, labels: Tensor) -> Tensor:
         """Return the mean loss of logits (B, L) given labels (B, L), 0 or 1, or the cosines of a direction.
@@ -283,21 +276,27 @@ class Network(AbstractLearner):
         self._optimizer, self._trainer = optimizer, dict(trainer)
         self._hidden, self._activation, self._seed = hidden, activation, seed
         self._warmup, self._dropout = None if warmup is None else float(warmup), dropout
-        self._data: FrameMaker | None = None
-        self._classifier: TouchClassifier | None = None
 
     def check(self, data: "TouchData") -> None:
-        """Build network, optimizer and trainer once, so that errors in the settings are reported early."""
+        """Build and use network, optimizer and trainer once, so that errors are reported early.
+
+        Raises:
+            InputError: the settings do not fit each other or the data, or a part gives wrong shapes.
+        """
         from skin.learning.training import make_trainer
 
         with torch.random.fork_rng():
             network = self.build(data)
         self._begin(network)
-        _check_widths(network, data.frames(data.example)[0])
+        try:
+            with torch.no_grad():
+                network.eval()(data.show(data.example))
+        except RuntimeError as error:
+            raise InputError(
+                "model and fusion must return embeddings (N, E), as wide as their attribute width says: "
+                f"{one_line(error)}"
+            ) from error
         make_trainer(self._trainer)
-        settings = self._optimizer.keywords if isinstance(self._optimizer, partial) else {}
-        if text := [name for name, value in settings.items() if isinstance(value, str)]:
-            raise InputError(f"optimizer.{text[0]}={settings[text[0]]} is text, and must be a number")
         try:
             self._optimizer(network.parameters())
         except (TypeError, ValueError) as error:
@@ -314,13 +313,14 @@ class Network(AbstractLearner):
         # Imported here because Lightning takes seconds and a prediction does not need it.
         from skin.learning.training import Training, train_network
 
-        with torch.random.fork_rng(), self._folder() as folder:
+        with torch.random.fork_rng(), TemporaryDirectory() as temporary:
             torch.manual_seed(self._seed)
             classifier = self.build(data)
             if data.task.kind == "regression":
                 classifier.targets.scale(torch.cat([part.known_labels for part in data.parts("train")]))
             self._begin(classifier)
             training = Training(classifier, self._optimizer, self._warmup)
+            folder = self.unfinished or Path(temporary)
             self.seconds_per_epoch = train_network(
                 training, data, self._trainer, logger, folder, self.unfinished is not None
             )
@@ -347,15 +347,6 @@ class Network(AbstractLearner):
             if isinstance(module, nn.BatchNorm1d):
                 module.reset_running_stats()
 
-    @contextmanager
-    def _folder(self) -> Iterator[Path]:
-        """Yield the folder for checkpoints: the one that outlives this process, or a temporary one."""
-        if self.unfinished:
-            yield self.unfinished
-            return
-        with TemporaryDirectory() as folder:
-            yield Path(folder)
-
     def probabilities(self, touches: Touches) -> Tensor:
         """Return the probability of each label, (B, L), for touches of any layout that the model accepts."""
         return self._map(
@@ -373,27 +364,23 @@ class Network(AbstractLearner):
         Raises:
             RuntimeError: before ``fit`` or ``load``.
         """
-        if self._classifier is None:
-            raise RuntimeError("fit or load the learner first")
-        return self._classifier
+        return self.learned[0]
 
     def pipeline(self, positions: Tensor) -> nn.Module:
         """Return representation and network as one module, in evaluation mode."""
-        if self._classifier is None or self._data is None:
-            raise RuntimeError("fit or load the learner first")
-        data = self._data
-        pipeline = Pipeline(data.representation_for(positions), self._classifier, positions, data.geometry)
+        classifier, data = self.learned
+        pipeline = Pipeline(data.representation_for(positions), classifier, positions, data.geometry)
         return pipeline.cpu().eval()
 
     def _map(self, touches: Touches, function: Callable[[TouchClassifier, Frames], Tensor]) -> Tensor:
         """Return a function of the classifier and frames, (B, ...), computed in chunks."""
-        classifier = self.network.eval()
-        assert self._data is not None
+        classifier, data = self.learned
+        classifier.eval()
         parts = []
         with torch.inference_mode():
             for start in range(0, len(touches), CHUNK):
                 part = touches[start : start + CHUNK].to(next(classifier.parameters()).device)
-                parts.append(function(classifier, self._data.show(part)).cpu())
+                parts.append(function(classifier, data.show(part)).cpu())
         return torch.cat(parts)
 
     def save(self, folder: Path) -> Path:
@@ -424,31 +411,6 @@ class Network(AbstractLearner):
             self._dropout,
             0 if frames.summary is None else frames.summary.shape[1],
         )
-        self._data, self._classifier = data, classifier
+        self._learned = classifier, data
         self.parameters = sum(p.numel() for p in classifier.parameters() if p.requires_grad)
         return classifier
-
-
-def _check_widths(network: TouchClassifier, frames: Frames) -> None:
-    """Check that the model and the fusion of a network give embeddings as wide as they say.
-
-    Raises:
-        InputError: one does not.
-    """
-
-    def compare(part: AbstractModel | AbstractFusion, inputs: tuple[Tensor | Frames], output: Tensor) -> None:
-        if output.shape != (expected := (len(getattr(inputs[0], "x", inputs[0])), part.width)):
-            raise InputError(
-                f"{type(part).__name__}.forward returned {tuple(output.shape)}, and must return embeddings "
-                f"{expected}, as wide as its attribute width says"
-            )
-
-    hooks = [
-        part.register_forward_hook(compare)
-        for part in network.modules()
-        if isinstance(part, AbstractModel | AbstractFusion)
-    ]
-    with torch.no_grad():
-        network.eval()(frames)
-    for hook in hooks:
-        hook.remove()

@@ -416,7 +416,7 @@ class Sites(AbstractRepresentation):
         Raises:
             InputError: always.
         """
-        raise _no_geometry()
+        return self.show(Touches(readings, valid, torch.zeros(readings.shape[2], 3), None, 1.0))
 
     def show(self, touches: Touches) -> Frames:
         """Return frames (B, T, F) and a summary of the skin (B, D).
@@ -425,7 +425,11 @@ class Sites(AbstractRepresentation):
             InputError: the geometry of the sensors is not known.
         """
         if touches.geometry is None:
-            raise _no_geometry()
+            raise InputError(
+                "representation=sites needs to know what each sensor responds to, and this device has no "
+                "mechanics: use device=simulated, device=serial, a recording with positions: layout, or "
+                "another representation"
+            )
         batch, _, sensors = touches.readings.shape
         geometry = touches.geometry.expand(batch, sensors, len(GEOMETRY))
         values = self._scaled(touches, geometry)
@@ -487,13 +491,6 @@ def _engineered(touches: Touches) -> Tensor:
     features = engineered_features(touches)
     selected = [value for name, value in features.items() if not name.startswith(_COUNTING)]
     return torch.stack([value.to(touches.readings) for value in selected], dim=1).asinh()
-
-
-def _no_geometry() -> InputError:
-    return InputError(
-        "representation=sites needs to know what each sensor responds to, and this device has no mechanics: "
-        "use device=simulated, device=serial, a recording with positions: layout, or another representation"
-    )
 
 
 # The frames of any touches of a device.

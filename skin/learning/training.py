@@ -125,13 +125,13 @@ def train_network(
         InputError: the trainer refuses its settings, or the loss is not a number.
     """
     best = ModelCheckpoint(folder, monitor="val_loss", save_weights_only=True)
-    clock, last = Clock(folder / "seconds.json"), folder / LAST
-    trainer = make_trainer(settings, logger, [best, clock], folder)
+    progress, last = Progress(folder / "seconds.json"), folder / LAST
+    trainer = make_trainer(settings, logger, [best, progress], folder)
     alone = trainer.world_size == 1
     if resumable and alone:
         # Behind `best`, whose state it saves; several processes would have to save together.
         every = ModelCheckpoint(folder, last.stem, enable_version_counter=False)
-        trainer.callbacks += [RandomState(), every]  # type: ignore[attr-defined]
+        trainer.callbacks.append(every)  # type: ignore[attr-defined]
     again = last if alone and last.is_file() else None
     with warnings.catch_warnings():
         # Lightning 2.6 asks torch 2.13 for a deprecated class
@@ -141,7 +141,7 @@ def train_network(
         return math.nan
     weights = torch.load(best.best_model_path, weights_only=True, map_location="cpu")
     training.load_state_dict(weights["state_dict"])
-    return clock.median()
+    return progress.median()
 
 
 def make_trainer(
@@ -199,8 +199,10 @@ def _check(trainer: Trainer) -> None:
         )
 
 
-class Clock(Callback):
+class Progress(Callback):
     """Measures the training part of every epoch, from its start to the end of its last batch.
+
+    Checkpoints also keep torch's random state: a continued training drops out the same units.
 
     Args:
         path: of a file that keeps the durations; the process that trains may be another one.
@@ -210,6 +212,7 @@ class Clock(Callback):
         self._path = path
         self._seconds: list[float] = []
         self._began = 0.0
+        self._state: Tensor | None = None
 
     def median(self) -> float:
         """Return the median duration of an epoch after the training, s; validation is left out."""
@@ -230,30 +233,15 @@ class Clock(Callback):
         if trainer.is_global_zero:
             self._path.write_text(json.dumps(self._seconds))
 
-    def state_dict(self) -> dict[str, list[float]]:
-        """Return the durations, for a checkpoint."""
-        return {"seconds": self._seconds}
+    def state_dict(self) -> dict[str, Any]:
+        """Return the durations and the random state, for a checkpoint."""
+        return {"seconds": self._seconds, "state": torch.get_rng_state()}
 
-    def load_state_dict(self, state_dict: dict[str, list[float]]) -> None:
-        """Take the durations of a checkpoint."""
-        self._seconds = state_dict["seconds"]
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Take the durations and the random state of a checkpoint."""
+        self._seconds, self._state = state_dict["seconds"], state_dict["state"]
 
-
-class RandomState(Callback):
-    """Keeps torch's random state in checkpoints: a continued training drops out the same units."""
-
-    def __init__(self) -> None:
-        self._state: Tensor | None = None
-
-    def state_dict(self) -> dict[str, Tensor]:
-        """Return the state, for a checkpoint."""
-        return {"state": torch.get_rng_state()}
-
-    def load_state_dict(self, state_dict: dict[str, Tensor]) -> None:
-        """Take the state of a checkpoint."""
-        self._state = state_dict["state"]
-
-    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+    def on_train_start(self, *_: Any) -> None:
         """Set the state, after the last use of random numbers by the start itself."""
         if self._state is not None:
             torch.set_rng_state(self._state)

@@ -150,7 +150,7 @@ def test_validation_in_parts_keeps_its_order(make):
     data = make(kind=InParts)
     assert flat(data.val_dataloader()) == list(range(23))
     assert len(data.val_dataloader()) == 6
-    assert data.window == 6
+    assert data.example.readings.shape[1] == 6
 
 
 def test_the_hash_is_of_all_parts(make, monkeypatch):
@@ -193,7 +193,7 @@ def test_a_batch_arrives_as_frames_and_labels(make):
     frames, labels = data.on_after_batch_transfer(touches, 0)
     assert torch.equal(frames.x, touches.readings)
     assert labels.shape == (5, 4)
-    assert data.window == 6
+    assert data.example.readings.shape[1] == 6
 
 
 def test_a_layout_is_represented_once(make):

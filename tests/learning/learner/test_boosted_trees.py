@@ -3,7 +3,6 @@
 import zipfile
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 
@@ -28,7 +27,7 @@ def test_validation_chooses_the_number_of_trees(made_up_device):
     for features in (few, many):
         features.fit(TouchData(made_up_device, Readings))
     assert few.parameters < many.parameters
-    assert all(model.n_iter_ < 400 for model in many._models)
+    assert all(model.n_iter_ < 400 for model in many.learned[0])
 
 
 def test_a_label_that_never_changes_is_refused(made_up_device):
@@ -71,12 +70,6 @@ def test_what_is_stored_predicts_the_same_bits_without_a_pickle(made_up_device, 
     assert again.parameters == features.parameters
     touches = made_up_device.touches("test")
     assert torch.equal(again.probabilities(touches), features.probabilities(touches))
-
-
-def test_trees_of_an_earlier_version_are_refused(made_up_device, tmp_path):
-    np.savez(tmp_path / "features.npz", train=np.zeros(3))
-    with pytest.raises(InputError, match=r"features.npz holds the training data .*: train the run again"):
-        BoostedTrees().load(TouchData(made_up_device, Readings), tmp_path / "features.npz")
 
 
 def test_trees_do_not_learn_from_unknown_labels(made_up_device):

@@ -21,9 +21,6 @@ from skin.learning.representation import Batch, FrameMaker, MakeRepresentation, 
 # Data augmentation: changes of a touch that keep its labels.
 
 
-_MARGIN = 2  # frames that a touch may last beyond what stands out
-
-
 @checked("data.augment")
 @dataclass(frozen=True)
 class Augmentation:
@@ -62,28 +59,25 @@ class Augmentation:
         if self.reverse:
             turned = torch.rand(count, generator=generator) < 0.5
             order = torch.where(turned[:, None], order.flip(1), order)
-        order = order[..., None].expand(-1, -1, sensors)
-        readings, valid = touches.readings.gather(1, order), touches.valid.gather(1, order)
+        rows = torch.arange(count)[:, None]
+        frames = {name: getattr(touches, name) for name in ("readings", "valid", "saturated", "contacts")}
+        moved = {name: values[rows, order] for name, values in frames.items() if values is not None}
         if self.gain:
-            readings = readings * (self.gain * torch.randn(count, 1, sensors, generator=generator)).exp()
+            moved["readings"] *= (self.gain * torch.randn(count, 1, sensors, generator=generator)).exp()
         if self.noise:
-            readings = readings + self.noise * torch.randn(readings.shape, generator=generator)
-        saturated = None if touches.saturated is None else touches.saturated.gather(1, order)
-        contacts = touches.contacts
-        if contacts is not None:
-            contacts = contacts.gather(1, order[..., :1, None].expand(-1, -1, *contacts.shape[2:]))
-        return replace(touches, readings=readings, valid=valid, saturated=saturated, contacts=contacts)
+            moved["readings"] += self.noise * torch.randn(touches.readings.shape, generator=generator)
+        return replace(touches, **moved)
 
     def _shifts(self, touches: Touches, generator: torch.Generator) -> Tensor:
         """Draw the shift of each touch, (B,), frames, such that none is cut."""
         raw = touches.readings * touches.valid
         force = (raw - idle_level(raw)).clamp(min=0).sum(dim=2)
         touched = (force > 0.12 * force.amax(dim=1, keepdim=True)).int()
-        first = touched.argmax(dim=1) - _MARGIN
-        last = raw.shape[1] - touched.flip(1).argmax(dim=1) - 1 + _MARGIN
-        early, late = first.clamp(min=0), (raw.shape[1] - 1 - last).clamp(min=0)
-        chance = torch.rand(len(raw), generator=generator)
-        return (chance * (early + late + 1)).floor().long() - early
+        margin = 2  # frames that a touch may last beyond what stands out
+        early = (touched.argmax(dim=1) - margin).clamp(min=0)
+        late = (touched.flip(1).argmax(dim=1) - margin).clamp(min=0)
+        fraction = torch.rand(len(raw), generator=generator)
+        return (fraction * (early + late + 1)).floor().long() - early
 
 
 @checked("data")

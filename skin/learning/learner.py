@@ -3,7 +3,7 @@
 import json
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -118,8 +118,6 @@ LOOK_AT = {
 }
 """Label -> beginnings of the names of the features that its rule may use."""
 
-_LARGEST_LOGIT = 12.0
-
 _Split = tuple[dict[str, Tensor], np.ndarray]
 
 
@@ -223,7 +221,7 @@ def _tune(label: str, train: _Split, validation: _Split) -> Rule:
         return float(np.logaddexp(0, np.exp(log_slope) * distance / unit * (1 - 2 * truth)).mean())
 
     # The slope is limited so that float32 probabilities have no ties, which would change the ranking.
-    steepest = np.log(_LARGEST_LOGIT * unit / max(float(np.abs(distance).max()), 1e-12))
+    steepest = np.log(12 * unit / max(float(np.abs(distance).max()), 1e-12))
     log_slope = minimize_scalar(loss, bounds=(steepest - 9, steepest), method="bounded").x
     return Rule(name, threshold, float(np.exp(log_slope) / unit))
 
@@ -242,6 +240,18 @@ def _threshold(scores: np.ndarray, truth: np.ndarray) -> tuple[float, float]:
 
 
 # Learning by several learners whose probabilities are averaged.
+
+
+class Mean(nn.Module):
+    """The mean of several pipelines."""
+
+    def __init__(self, members: Sequence[nn.Module]) -> None:
+        super().__init__()
+        self.members = nn.ModuleList(members)
+
+    def forward(self, readings: Tensor, valid: Tensor) -> Tensor:
+        """Return probabilities (B, L) of readings (B, T, S), N, and valid (B, T, S), bool."""
+        return torch.stack([member(readings, valid) for member in self.members]).mean(dim=0)
 
 
 class Ensemble(AbstractLearner):
@@ -292,18 +302,15 @@ class Ensemble(AbstractLearner):
 
     def pipeline(self, positions: Tensor) -> nn.Module:
         """Return the mean of the members' pipelines."""
-        from skin.learning.network import Mean
-
         return Mean([member.pipeline(positions) for member in self._members])
 
     def save(self, folder: Path) -> Path:
         """Write what each member learned to a numbered folder in ``folder/members``; return that."""
-        whole = Path(folder) / "members"
+        members = Path(folder) / "members"
         for number, member in enumerate(self._members):
-            place = whole / str(number)
-            place.mkdir(parents=True)
-            member.save(place)
-        return whole
+            (members / str(number)).mkdir(parents=True)
+            member.save(members / str(number))
+        return members
 
     def load(self, data: "FrameMaker", path: Path) -> None:
         """Load the folder that :meth:`save` wrote."""

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
-from itertools import pairwise
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Any
@@ -18,7 +17,7 @@ from skin.device.touches import Touches
 from skin.errors import InputError
 from skin.learning.fusion import AbstractFusion
 from skin.learning.learner import AbstractLearner
-from skin.learning.model import make_activation
+from skin.learning.model import Activation, dense_layers
 from skin.learning.representation import AbstractRepresentation, FrameMaker, Frames
 from skin.touch.labels import Task
 
@@ -39,8 +38,8 @@ def probabilities(logits: Tensor, task: Task) -> Tensor:
         return logits
     if task.kind == "exclusive":
         return logits.softmax(dim=-1)
-    chances = logits.sigmoid()
-    return torch.cat([chances[:, :-2], 2 * chances[:, -2:] - 1], dim=1) if task.direction else chances
+    values = logits.sigmoid()
+    return torch.cat([values[:, :-2], 2 * values[:, -2:] - 1], dim=1) if task.direction else values
 
 
 class TouchClassifier(nn.Module):
@@ -58,7 +57,7 @@ class TouchClassifier(nn.Module):
         task: its length is the number of logits, its kind determines the loss.
         hidden: widths of the dense layers before the last one.
         activation: relu, elu or silu, after each of them.
-        dropout: share of the embedding and of the first dense layer that is dropped in training.
+        dropout: fraction of the embedding and of the first dense layer that is dropped in training.
         summary: number of numbers about the whole window.
     """
 
@@ -67,7 +66,7 @@ class TouchClassifier(nn.Module):
         fusion: AbstractFusion,
         task: Task,
         hidden: Sequence[int],
-        activation: str,
+        activation: Activation,
         dropout: float = 0.0,
         summary: int = 0,
     ) -> None:
@@ -75,12 +74,7 @@ class TouchClassifier(nn.Module):
         self.fusion = fusion
         self.summary = _Summary(summary, fusion.width, activation) if summary else None
         widths = [fusion.width * (2 if summary else 1), *hidden]
-        layers: list[nn.Module] = []
-        for before, after in pairwise(widths):
-            # Without dropout there is no layer, so that older weights keep their names.
-            dropped = [nn.Dropout(dropout)] if dropout else []
-            layers += [*dropped, nn.Linear(before, after), make_activation(activation)]
-        layers.append(nn.Linear(widths[-1], len(task)))
+        layers = [*dense_layers(widths, activation, dropout), nn.Linear(widths[-1], len(task))]
         if task.kind == "regression":
             layers.append(_Targets(len(task)))
         self.head = nn.Sequential(*layers)
@@ -124,22 +118,19 @@ class TouchClassifier(nn.Module):
             right = (logits.argmax(dim=-1) == labels.argmax(dim=-1)) & counts[:, 0]
             return {"accuracy": right.sum() / counts[:, 0].sum().clamp(min=1)}
         right = ((logits > 0) == (labels > 0.5)) & counts
-        shares = right.sum(dim=0) / counts.sum(dim=0).clamp(min=1)
-        label_shares = dict(zip(self.task.binary, shares, strict=False))
-        overall = torch.stack([label_shares[name] for name in self.task.gated]).mean()
-        return {"accuracy": overall} | {f"accuracy_{name}": share for name, share in label_shares.items()}
+        fractions = right.sum(dim=0) / counts.sum(dim=0).clamp(min=1)
+        accuracies = dict(zip(self.task.binary, fractions, strict=False))
+        overall = torch.stack([accuracies[name] for name in self.task.gated]).mean()
+        return {"accuracy": overall} | {f"accuracy_{name}": value for name, value in accuracies.items()}
 
 
 class _Targets(nn.Module):
     """Maps outputs of the size of 1 to targets in their units."""
 
-    mean: Tensor
-    deviation: Tensor
-
     def __init__(self, targets: int) -> None:
         super().__init__()
-        self.register_buffer("mean", torch.zeros(targets))
-        self.register_buffer("deviation", torch.ones(targets))
+        self.mean = nn.Buffer(torch.zeros(targets))
+        self.deviation = nn.Buffer(torch.ones(targets))
 
     def forward(self, x: Tensor) -> Tensor:
         """Return targets (B, L) of outputs (B, L)."""
@@ -169,14 +160,11 @@ class _Standardised(nn.BatchNorm1d):
 class _Summary(nn.Module):
     """Two dense layers on numbers of any unit, each standardised first."""
 
-    def __init__(self, numbers: int, width: int, activation: str) -> None:
+    def __init__(self, numbers: int, width: int, activation: Activation) -> None:
         super().__init__()
         self.layers = nn.Sequential(
             _Standardised(numbers, affine=False, momentum=None),
-            nn.Linear(numbers, width),
-            make_activation(activation),
-            nn.Linear(width, width),
-            make_activation(activation),
+            *dense_layers([numbers, width, width], activation),
         )
 
     def forward(self, summary: Tensor | None) -> Tensor:
@@ -199,9 +187,6 @@ class Pipeline(nn.Module):
         geometry: (S, G) of the sensors (:data:`skin.device.touches.GEOMETRY`); None if not needed.
     """
 
-    positions: Tensor
-    geometry: Tensor | None
-
     def __init__(
         self,
         representation: AbstractRepresentation,
@@ -211,8 +196,8 @@ class Pipeline(nn.Module):
     ) -> None:
         super().__init__()
         self.representation = representation
-        self.register_buffer("positions", positions)
-        self.register_buffer("geometry", geometry)
+        self.positions = nn.Buffer(positions)
+        self.geometry = None if geometry is None else nn.Buffer(geometry)
         self.classifier = classifier
 
     def forward(self, readings: Tensor, valid: Tensor) -> Tensor:
@@ -223,21 +208,13 @@ class Pipeline(nn.Module):
         return probabilities(logits, self.classifier.task)
 
 
-class Mean(nn.Module):
-    """The mean of several pipelines."""
-
-    def __init__(self, members: Sequence[nn.Module]) -> None:
-        super().__init__()
-        self.members = nn.ModuleList(members)
-
-    def forward(self, readings: Tensor, valid: Tensor) -> Tensor:
-        """Return probabilities (B, L) of readings (B, T, S), N, and valid (B, T, S), bool."""
-        return torch.stack([member(readings, valid) for member in self.members]).mean(dim=0)
-
-
 LAST = "last.ckpt"
 """Name of the checkpoint that continues an unfinished training."""
-CHUNK = 64  # touches at a time when predicting: fastest, and bounds memory to a few hundred MB
+
+
+def _load_weights(classifier: TouchClassifier, path: Path) -> None:
+    check_archive(path)
+    classifier.load_state_dict(torch.load(path, weights_only=True, map_location="cpu"))
 
 
 class Network(AbstractLearner):
@@ -250,7 +227,7 @@ class Network(AbstractLearner):
         trainer: settings of pytorch_lightning.Trainer: max_epochs, accelerator, ...
         hidden: widths of the dense layers between embedding and labels.
         activation: relu, elu or silu, after each of them.
-        warmup: share of the training in which the learning rate rises to that of the optimizer; it then
+        warmup: fraction of the training in which the learning rate rises to that of the optimizer; it then
             decays to 0 along a cosine. None: constant.
         dropout: probability of dropout for the embedding and the dense layers.
         start: file ``weights.pt`` of the same network, from which the training goes on; None: drawn weights.
@@ -265,7 +242,7 @@ class Network(AbstractLearner):
         optimizer: Callable[..., Any],
         trainer: dict[str, Any],
         hidden: Sequence[Annotated[int, Ge(1)]] = (32,),
-        activation: str = "relu",
+        activation: Activation = "relu",
         warmup: Annotated[float, Ge(0), Le(1)] | None = None,
         dropout: Annotated[float, Ge(0), Lt(1)] = 0.0,
         start: str | None = None,
@@ -335,10 +312,8 @@ class Network(AbstractLearner):
             return
         if not self._start.is_file():
             raise InputError(f"learner.start={self._start}: no such file")
-        check_archive(self._start)
-        weights = torch.load(self._start, weights_only=True, map_location="cpu")
         try:
-            classifier.load_state_dict(weights)
+            _load_weights(classifier, self._start)
         except RuntimeError as error:
             raise InputError(
                 f"learner.start={self._start} is of another network: {one_line(error)}"
@@ -372,15 +347,20 @@ class Network(AbstractLearner):
         pipeline = Pipeline(data.representation_for(positions), classifier, positions, data.geometry)
         return pipeline.cpu().eval()
 
-    def _map(self, touches: Touches, function: Callable[[TouchClassifier, Frames], Tensor]) -> Tensor:
+    def _map(
+        self,
+        touches: Touches,
+        function: Callable[[TouchClassifier, Frames], Tensor],
+        chunk: int = 64,  # touches at a time: fastest, and bounds memory to a few hundred MB
+    ) -> Tensor:
         """Return a function of the classifier and frames, (B, ...), computed in chunks."""
         classifier, data = self.learned
-        classifier.eval()
-        parts = []
+        device = next(classifier.eval().parameters()).device
         with torch.inference_mode():
-            for start in range(0, len(touches), CHUNK):
-                part = touches[start : start + CHUNK].to(next(classifier.parameters()).device)
-                parts.append(function(classifier, data.show(part)).cpu())
+            parts = [
+                function(classifier, data.show(touches[start : start + chunk].to(device))).cpu()
+                for start in range(0, len(touches), chunk)
+            ]
         return torch.cat(parts)
 
     def save(self, folder: Path) -> Path:
@@ -391,8 +371,7 @@ class Network(AbstractLearner):
 
     def load(self, data: FrameMaker, path: Path) -> None:
         """Load the weights that :meth:`save` wrote; ``data`` gives the shapes as in :meth:`fit`."""
-        check_archive(path)
-        self.build(data).load_state_dict(torch.load(path, weights_only=True, map_location="cpu"))
+        _load_weights(self.build(data), path)
 
     def build(self, data: FrameMaker) -> TouchClassifier:
         """Return the untrained network for the frames of ``data``, drawn from torch's random state.

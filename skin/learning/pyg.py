@@ -8,6 +8,7 @@ import torch
 from annotated_types import Ge
 from torch import Tensor
 from torch_geometric.nn.models.basic_gnn import BasicGNN
+from torch_geometric.utils import dense_to_sparse
 
 from skin.errors import InputError
 from skin.learning.model import POOLINGS, AbstractModel, Kind, Pooling
@@ -61,8 +62,7 @@ class Pyg(AbstractModel):
 
     def forward(self, x: Tensor, adjacency: Tensor | None) -> Tensor:
         """Return the embeddings (N, E) of graphs x (N, S, F) with their adjacency."""
-        if adjacency is None:
-            raise ValueError("a graph needs its adjacency, got None")
+        assert adjacency is not None  # of a graph
         count, sensors, _ = x.shape
         edges, weights = self._edges(adjacency, count)
         extra = {"edge_weight": weights} if self._weighted else {}
@@ -71,13 +71,7 @@ class Pyg(AbstractModel):
 
     def _edges(self, adjacency: Tensor, count: int) -> tuple[Tensor, Tensor]:
         """Return the edges (2, E) of all graphs as one, and their weights (E,)."""
-        linked = adjacency != 0
         if not self._weighted:  # the others count a node itself by themselves
-            linked = linked & ~torch.eye(adjacency.shape[-1], dtype=torch.bool, device=adjacency.device)
-        if adjacency.ndim == 3:
-            graph, first, second = linked.nonzero(as_tuple=True)
-            offset = graph * adjacency.shape[-1]
-            return torch.stack([first + offset, second + offset]), adjacency[linked]
-        edges = linked.nonzero().T
-        offsets = adjacency.shape[-1] * torch.arange(count, device=adjacency.device)
-        return (edges[:, None] + offsets[:, None]).flatten(1), adjacency[linked].repeat(count)
+            loops = torch.eye(adjacency.shape[-1], dtype=torch.bool, device=adjacency.device)
+            adjacency = adjacency.masked_fill(loops, 0)
+        return dense_to_sparse(adjacency.expand(count, -1, -1).contiguous())

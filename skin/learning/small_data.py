@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 import torch
-from annotated_types import Ge
-from pydantic import PositiveFloat, PositiveInt
+from pydantic import Field, PositiveFloat, PositiveInt
 from scipy.optimize import minimize
 from scipy.spatial.distance import cdist
 from scipy.special import expit, log_expit, log_softmax, softmax
@@ -395,7 +394,7 @@ class BestByCrossValidation(SmallDataLearner):
     def __init__(
         self,
         members: Mapping[str, Callable[..., SmallDataLearner]],
-        folds: Annotated[int, Ge(2)] = 5,
+        folds: Annotated[int, Field(ge=2)] = 5,
         seed: int = 0,
     ) -> None:
         super().__init__(seed)

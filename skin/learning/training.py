@@ -38,7 +38,7 @@ class Training(LightningModule):
     Args:
         network: what is trained, in place.
         optimizer: partial; takes the parameters.
-        warmup: share of the steps in which the learning rate rises to the optimizer's; it then falls to
+        warmup: fraction of the steps in which the learning rate rises to the optimizer's; it then falls to
             nothing along a cosine (Smith and Topin, 2018). None keeps it constant.
     """
 

@@ -65,7 +65,7 @@ def test_the_weights_of_the_best_validation_loss_are_kept(configured, made_up_de
         ),
         (["fusion=linked"], "fusion=linked needs representation=graph, got image: add representation=graph"),
         (["model.channels=[8,8,8,8,8,8]"], "6 blocks from an image of 64 x 64 pixels"),
-        (["learner.activation=sine"], "activation=relu, elu or silu"),
+        (["learner.activation=sine"], "learner.activation=sine must be 'relu', 'elu' or 'silu'"),
         (["fusion.head=sum"], "fusion.head=sum must be 'mean'"),
         (["learner.hidden=[8,0]"], r"learner.hidden=\[8, 0\] must be greater than or equal to 1"),
         (["learner.hidden=8"], "learner.hidden=8 must be a list"),

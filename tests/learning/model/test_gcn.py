@@ -109,7 +109,7 @@ def test_a_graph_of_one_sensor_can_be_normed():
         ({"widths": []}, "model.widths="),
         ({"pooling": "set3set"}, "model.pooling=set3set must be 'max', 'mean', 'attention' or 'set2set'"),
         ({"norm": "group"}, "model.norm=group must be 'none', 'layer', 'batch' or 'instance'"),
-        ({"activation": "tanh"}, "activation=relu, elu or silu"),
+        ({"activation": "tanh"}, "model.activation=tanh must be 'relu', 'elu' or 'silu'"),
     ],
 )
 def test_bad_options_are_refused(options, words):

@@ -20,15 +20,13 @@ from torch import Tensor
 from skin.core.safe_loading import check_archive
 from skin.device.touches import Touches
 from skin.errors import InputError
+from skin.learning.data import TouchData
 from skin.learning.features import feature_matrix
 from skin.learning.learner import AbstractLearner
 from skin.touch.labels import Task
 
 if TYPE_CHECKING:
     from pytorch_lightning.loggers import Logger
-
-    from skin.learning.data import TouchData
-    from skin.learning.representation import FrameMaker
 
 _TRUSTED = [
     f"{TreePredictor.__module__}.{TreePredictor.__qualname__}",
@@ -98,7 +96,7 @@ class FeatureLearner(AbstractLearner):
         dump(self.learned[0], path, compression=ZIP_DEFLATED)
         return path
 
-    def load(self, data: "FrameMaker", path: Path) -> None:
+    def load(self, data: TouchData, path: Path) -> None:
         """Load the models that :meth:`save` wrote.
 
         Raises:
@@ -187,7 +185,7 @@ class BoostedTrees(FeatureLearner):
             "early_stopping": True,
         }
 
-    def fit(self, data: "TouchData", logger: "Logger | None" = None) -> None:
+    def fit(self, data: TouchData, logger: "Logger | None" = None) -> None:
         """Grow the trees on the training split; the validation loss decides how many.
 
         Raises:

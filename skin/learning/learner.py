@@ -16,15 +16,14 @@ from torch import Tensor, nn
 from skin.core.safe_loading import TEXT, parse_json, read_file
 from skin.device.touches import Touches
 from skin.errors import InputError
+from skin.learning.data import TouchData
 from skin.learning.features import engineered_features
 from skin.touch.labels import Task
 
 if TYPE_CHECKING:
     from pytorch_lightning.loggers import Logger
 
-    from skin.learning.data import TouchData
     from skin.learning.network import TouchClassifier
-    from skin.learning.representation import FrameMaker
 
 
 class AbstractLearner(ABC):
@@ -53,11 +52,11 @@ class AbstractLearner(ABC):
             raise RuntimeError("fit or load the learner first")
         return self._learned
 
-    def check(self, data: "TouchData") -> None:  # noqa: B027 - most have nothing that could be missing
+    def check(self, data: TouchData) -> None:  # noqa: B027 - most have nothing that could be missing
         """Raise InputError if the learner cannot be fitted, before anything is logged."""
 
     @abstractmethod
-    def fit(self, data: "TouchData", logger: "Logger | None" = None) -> None:
+    def fit(self, data: TouchData, logger: "Logger | None" = None) -> None:
         """Fit to the training split of ``data``; model selection uses its validation split only."""
 
     @abstractmethod
@@ -102,7 +101,7 @@ class AbstractLearner(ABC):
         """Write what was learned to a file in ``folder`` and return its path."""
 
     @abstractmethod
-    def load(self, data: "FrameMaker", path: Path) -> None:
+    def load(self, data: TouchData, path: Path) -> None:
         """Load the file that :meth:`save` wrote; ``data`` gives the shapes as in :meth:`fit`."""
 
 
@@ -150,7 +149,7 @@ class Rules(AbstractLearner):
     def __init__(self, seed: int = 0) -> None:
         """Accept a seed as every learner does: nothing is drawn."""
 
-    def fit(self, data: "TouchData", logger: "Logger | None" = None) -> None:
+    def fit(self, data: TouchData, logger: "Logger | None" = None) -> None:
         """Tune the thresholds.
 
         Raises:
@@ -185,7 +184,7 @@ class Rules(AbstractLearner):
         path.write_text(json.dumps({name: asdict(rule) for name, rule in self.learned.items()}, indent=2))
         return path
 
-    def load(self, data: "FrameMaker", path: Path) -> None:
+    def load(self, data: TouchData, path: Path) -> None:
         """Load the rules that :meth:`save` wrote.
 
         Raises:
@@ -283,12 +282,12 @@ class Ensemble(AbstractLearner):
             raise InputError("learner=ensemble has no member: set learner.copies.network=1 or more")
         self._members = [make(seed=1000 * seed + number) for number, make in enumerate(makers)]
 
-    def check(self, data: "TouchData") -> None:
+    def check(self, data: TouchData) -> None:
         """Check every member."""
         for member in self._members:
             member.check(data)
 
-    def fit(self, data: "TouchData", logger: "Logger | None" = None) -> None:
+    def fit(self, data: TouchData, logger: "Logger | None" = None) -> None:
         """Train one member after the other; the last one's training is logged."""
         for member in self._members[:-1]:
             member.fit(data)
@@ -312,7 +311,7 @@ class Ensemble(AbstractLearner):
             member.save(members / str(number))
         return members
 
-    def load(self, data: "FrameMaker", path: Path) -> None:
+    def load(self, data: TouchData, path: Path) -> None:
         """Load the folder that :meth:`save` wrote."""
         for number, member in enumerate(self._members):
             (file,) = (Path(path) / str(number)).iterdir()

@@ -15,16 +15,15 @@ from skin.core.messages import one_line
 from skin.core.safe_loading import check_archive
 from skin.device.touches import Touches
 from skin.errors import InputError
+from skin.learning.data import TouchData
 from skin.learning.fusion import AbstractFusion
 from skin.learning.learner import AbstractLearner
 from skin.learning.model import Activation, dense_layers
-from skin.learning.representation import AbstractRepresentation, FrameMaker, Frames
+from skin.learning.representation import AbstractRepresentation, Frames
 from skin.touch.labels import Task
 
 if TYPE_CHECKING:
     from pytorch_lightning.loggers import Logger
-
-    from skin.learning.data import TouchData
 
 MakeOptimizer = Callable[[Iterable[nn.Parameter]], torch.optim.Optimizer]
 
@@ -254,7 +253,7 @@ class Network(AbstractLearner):
         self._hidden, self._activation, self._seed = hidden, activation, seed
         self._warmup, self._dropout = None if warmup is None else float(warmup), dropout
 
-    def check(self, data: "TouchData") -> None:
+    def check(self, data: TouchData) -> None:
         """Build and use network, optimizer and trainer once, so that errors are reported early.
 
         Raises:
@@ -279,7 +278,7 @@ class Network(AbstractLearner):
         except (TypeError, ValueError) as error:
             raise InputError(f"the optimizer refuses its settings: {error}") from error
 
-    def fit(self, data: "TouchData", logger: "Logger | None" = None) -> None:
+    def fit(self, data: TouchData, logger: "Logger | None" = None) -> None:
         """Train on the training split; the validation loss chooses the epoch.
 
         With several processes, only the first has the trained weights; they continue no earlier training.
@@ -296,10 +295,10 @@ class Network(AbstractLearner):
             if data.task.kind == "regression":
                 classifier.targets.scale(torch.cat([part.known_labels for part in data.parts("train")]))
             self._begin(classifier)
-            training = Training(classifier, self._optimizer, self._warmup)
+            training = Training(classifier, data, self._optimizer, self._warmup)
             folder = self.unfinished or Path(temporary)
             self.seconds_per_epoch = train_network(
-                training, data, self._trainer, logger, folder, self.unfinished is not None
+                training, self._trainer, logger, folder, self.unfinished is not None
             )
 
     def _begin(self, classifier: TouchClassifier) -> None:
@@ -369,11 +368,11 @@ class Network(AbstractLearner):
         torch.save(self.network.state_dict(), path)
         return path
 
-    def load(self, data: FrameMaker, path: Path) -> None:
+    def load(self, data: TouchData, path: Path) -> None:
         """Load the weights that :meth:`save` wrote; ``data`` gives the shapes as in :meth:`fit`."""
         _load_weights(self.build(data), path)
 
-    def build(self, data: FrameMaker) -> TouchClassifier:
+    def build(self, data: TouchData) -> TouchClassifier:
         """Return the untrained network for the frames of ``data``, drawn from torch's random state.
 
         Raises:

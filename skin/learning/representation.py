@@ -1,10 +1,8 @@
 """Representations: how readings are shown to a network."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
-from dataclasses import replace
-from functools import cached_property
-from typing import Annotated, Any, ClassVar, Literal, NamedTuple
+from collections.abc import Sequence
+from typing import Annotated, ClassVar, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -16,11 +14,9 @@ from torch.nn.functional import pad
 
 from skin.body.base import GEOMETRY
 from skin.core.settings import checked
-from skin.device.base import AbstractDevice, Split
 from skin.device.touches import Touches
 from skin.errors import InputError
 from skin.learning.features import engineered_features, feature_blocks
-from skin.touch.labels import Task
 
 
 class Frames(NamedTuple):
@@ -467,93 +463,3 @@ def _engineered(touches: Touches) -> Tensor:
     features = engineered_features(touches)
     selected = [value for name, value in features.items() if not name.startswith(changed)]
     return torch.stack([value.to(touches.readings) for value in selected], dim=1).asinh()
-
-
-# The frames of any touches of a device.
-
-
-Batch = tuple[Frames, Tensor]
-MakeRepresentation = Callable[[Tensor, tuple[float, float]], AbstractRepresentation]
-
-
-class FrameMaker:
-    """Makes the frames of touches of a device.
-
-    Args:
-        device: whose touches have the window, and the sensors if all touches need the same ones.
-        representation: partial; takes positions (S, 3), m, and size (x, y), m.
-        geometry: returns that of the configured skin, (S, G), for touches that do not tell it (of a port or a
-            file); None: there is none.
-
-    Attributes:
-        device: as given.
-        make: the representation, as given.
-        make_geometry: the geometry, as given.
-    """
-
-    def __init__(
-        self,
-        device: AbstractDevice,
-        representation: MakeRepresentation,
-        geometry: Callable[[], Tensor] | None = None,
-    ) -> None:
-        super().__init__()
-        self.device, self.make, self.make_geometry = device, representation, geometry
-        self._known: tuple[Tensor, AbstractRepresentation] | None = None
-
-    @property
-    def task(self) -> Task:
-        """What the labels mean."""
-        return self.device.task
-
-    @cached_property
-    def example(self) -> Touches:
-        """The first touch of the training split."""
-        parts = self.device.parts("train")
-        if parts is not None and not parts:
-            raise InputError("there are no touches to train on: generate or record more")
-        touches = self.touches("train") if parts is None else parts[0].make().touches
-        return touches[torch.tensor([0])]
-
-    def touches(self, split: Split, epoch: int = 0) -> Touches:
-        """Return the touches of a split."""
-        return self.device.touches(split, epoch)
-
-    def representation_for(self, positions: Tensor) -> AbstractRepresentation:
-        """Return the representation of a layout with positions (S, 3), m; that of the last layout is kept.
-
-        Raises:
-            InputError: positions that change with time, (B, T, S, 3); motion is told beside the layout.
-        """
-        if self._known is not None and self._layout_free:
-            return self._known[1]
-        if positions.ndim != 2 and not self._layout_free:
-            raise InputError(
-                "representations are built for one layout, got positions per frame: give one position "
-                "(x, y, z) per sensor, and how far it moves as Touches.motion"
-            )
-        if self._known is None or not torch.equal(self._known[0], positions):
-            self._known = (positions, self.make(positions, self.device.size).requires_grad_(False))
-        return self._known[1]
-
-    def frames(self, touches: Touches) -> Batch:
-        """Return the frames of touches and their labels (B, L), on the touches' device."""
-        return self.show(touches), touches.known_labels
-
-    def show(self, touches: Touches) -> Frames:
-        """Return the frames of touches, on the touches' device."""
-        place = touches.readings.device
-        representation = self.representation_for(touches.positions.cpu()).to(place)
-        if touches.geometry is None and self.geometry is not None:
-            touches = replace(touches, geometry=self.geometry.to(place))
-        return representation.show(touches)
-
-    @cached_property
-    def geometry(self) -> Tensor | None:
-        """The geometry of the configured skin, (S, G); None if it is unknown, or not needed."""
-        return self.make_geometry() if self._layout_free and self.make_geometry is not None else None
-
-    @property
-    def _layout_free(self) -> bool:
-        make: Any = getattr(self.make, "func", self.make)
-        return bool(make.layout_free)

@@ -19,13 +19,12 @@ from torch import Tensor
 from skin.device.touches import Touches
 from skin.errors import InputError
 from skin.learning.boosted_trees import FeatureLearner, check_trees
+from skin.learning.data import TouchData
 from skin.learning.features import course_features, feature_matrix
 from skin.touch.labels import Task
 
 if TYPE_CHECKING:
     from pytorch_lightning.loggers import Logger
-
-    from skin.learning.data import TouchData
 
 Kind = Literal["binary", "exclusive", "regression"]
 
@@ -53,7 +52,7 @@ class SmallDataLearner(FeatureLearner):
         """Fit features (B, D) to labels (B, K): one label or target, or K classes."""
         raise NotImplementedError
 
-    def fit(self, data: "TouchData", logger: "Logger | None" = None) -> None:
+    def fit(self, data: TouchData, logger: "Logger | None" = None) -> None:
         """Fit to the training and the validation split, since nothing else needs the latter."""
         began = time.perf_counter()
         splits = [data.touches(split) for split in ("train", "validation")]

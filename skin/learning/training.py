@@ -23,10 +23,10 @@ from torch import Tensor
 from torch.optim.lr_scheduler import OneCycleLR
 
 from skin.core.messages import PARENT, one_line
+from skin.device.touches import Touches
 from skin.errors import InputError
-from skin.learning.data import TouchData
+from skin.learning.data import Batch, TouchData
 from skin.learning.network import LAST, MakeOptimizer, TouchClassifier
-from skin.learning.representation import Batch
 
 
 class Training(LightningModule):
@@ -37,17 +37,35 @@ class Training(LightningModule):
 
     Args:
         network: what is trained, in place.
+        data: of the training, which gives the frames of a batch.
         optimizer: partial; takes the parameters.
         warmup: fraction of the steps in which the learning rate rises to the optimizer's; it then falls to
             nothing along a cosine (Smith and Topin, 2018). None keeps it constant.
     """
 
     def __init__(
-        self, network: TouchClassifier, optimizer: MakeOptimizer, warmup: float | None = None
+        self,
+        network: TouchClassifier,
+        data: TouchData,
+        optimizer: MakeOptimizer,
+        warmup: float | None = None,
     ) -> None:
         super().__init__()
-        self.network, self._make_optimizer, self._warmup = network, optimizer, warmup
+        self.network, self.data = network, data
+        self._make_optimizer, self._warmup = optimizer, warmup
         self._batches: dict[str, list[tuple[int, dict[str, Tensor]]]] = {"train": [], "val": []}
+
+    def setup(self, stage: str) -> None:
+        """Let the data know the Trainer, for its epoch and its processes."""
+        self.data.trainer = self.trainer
+
+    def teardown(self, stage: str) -> None:
+        """Let the data forget the Trainer, which has ended."""
+        self.data.trainer = None
+
+    def on_after_batch_transfer(self, batch: Touches, dataloader_idx: int) -> Batch:
+        """Return the frames and labels of a batch that has arrived where the network is."""
+        return self.data.frames(batch) if isinstance(batch, Touches) else batch
 
     def _step(self, batch: Batch, stage: str) -> Tensor:
         frames, labels = batch
@@ -101,7 +119,6 @@ class Training(LightningModule):
 
 def train_network(
     training: Training,
-    data: TouchData,
     settings: dict[str, Any],
     logger: Logger | None,
     folder: Path,
@@ -111,7 +128,6 @@ def train_network(
 
     Args:
         training: of the network.
-        data: of the training.
         settings: of Lightning's trainer.
         logger: of the metrics; None: they are not logged.
         folder: for checkpoints; a training that was interrupted in it is continued.
@@ -136,7 +152,8 @@ def train_network(
     with warnings.catch_warnings():
         # Lightning 2.6 asks torch 2.13 for a deprecated class
         warnings.filterwarnings("ignore", ".*treespec, LeafSpec", FutureWarning)
-        trainer.fit(training, datamodule=data, ckpt_path=again, weights_only=True)
+        loaders = training.data.train_dataloader(), training.data.val_dataloader()
+        trainer.fit(training, *loaders, ckpt_path=again, weights_only=True)
     if not trainer.is_global_zero:
         return math.nan
     weights = torch.load(best.best_model_path, weights_only=True, map_location="cpu")

@@ -115,8 +115,11 @@ class FeatureLearner(AbstractLearner):
             raise ValueError(" ".join(str(error).split()) or "it is cut off") from error
         task, kinds = data.task, self._kinds(data.task)
         features = self._features(data.example, task)
-        same = isinstance(models, list) and len(models) == len(kinds)
-        if not same or not all(map(isinstance, models, kinds)):
+        if (
+            not isinstance(models, list)
+            or len(models) != len(kinds)
+            or not all(map(isinstance, models, kinds))
+        ):
             raise ValueError(f"it does not hold {len(kinds)} models of this learner")
         for model in models:
             if model.n_features_in_ != features.shape[1]:

@@ -190,11 +190,10 @@ class Cnn(AbstractModel):
 
     def forward(self, x: Tensor, adjacency: Tensor | None) -> Tensor:
         """Return the embeddings (N, E) of images (N, C, H, W)."""
-        if torch.compiler.is_exporting():  # an exported graph cannot depend on the values
-            return self._dense(x)
-        active = x.abs().amax(dim=(0, 1)) != 0
-        if self.sparse * int(active.sum()) < active.numel():
-            return self._sparse(x, active)
+        if not torch.compiler.is_exporting():  # an exported graph cannot depend on the values
+            active = x.abs().amax(dim=(0, 1)) != 0
+            if self.sparse * int(active.sum()) < active.numel():
+                return self._sparse(x, active)
         return self._dense(x)
 
     def _weights(self) -> list[tuple[Tensor, Tensor]]:

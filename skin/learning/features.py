@@ -30,10 +30,9 @@ def engineered_features(touches: Touches) -> dict[str, Tensor]:
     newtons rise with the noise of the touch: by three times what exceeds ``NOISE``, so that noise alone does
     not pass them. Their names give the levels of a device with that noise.
     """
-    blocks = feature_blocks(touches)
     return {
         name: column
-        for names, values in blocks
+        for names, values in feature_blocks(touches)
         for name, column in zip(names, values.unbind(dim=1), strict=True)
     }
 
@@ -238,9 +237,8 @@ def _spread(x: Tensor, positions: Tensor, rise: Tensor) -> Iterable[Block]:
     for name, values in {"strongest frame": strongest, "maxima": x.amax(dim=1)}.items():
         weight = _fractions((values - 0.1 - rise[:, None]).clamp(min=0))
         # In single precision the breadth of sensors in a line would be the root of rounding errors.
-        fraction, position = weight.double(), positions.double()
-        fraction = fraction / fraction.sum(dim=1, keepdim=True).clamp(min=0.5)
-        offset = position - fraction[:, None] @ position
+        fraction = weight.double() / weight.double().sum(dim=1, keepdim=True).clamp(min=0.5)
+        offset = positions.double() - fraction[:, None] @ positions.double()
         moments = torch.einsum("bs,bsi,bsj->bij", fraction, offset, offset)
         axes = torch.linalg.eigvalsh(moments).clamp(min=0).sqrt().flip(1).to(x.dtype)
         evenness = weight.square().sum(dim=1, keepdim=True).clamp(min=1e-6).reciprocal()
@@ -333,12 +331,10 @@ def sensor_features(touches: Touches) -> dict[str, Tensor]:
 
 def feature_matrix(touches: Touches, task: Task) -> np.ndarray:
     """Return the features that a task needs, (B, D), float32."""
-    moved = touches.to("cpu")
-    columns = engineered_features(moved)
-    if task.direction:
-        columns |= direction_features(moved)
-    if task.kind == "regression":
-        columns |= sensor_features(moved)
+    touches = touches.to("cpu")
+    columns = engineered_features(touches)
+    columns |= direction_features(touches) if task.direction else {}
+    columns |= sensor_features(touches) if task.kind == "regression" else {}
     return torch.stack([column.to(torch.float32) for column in columns.values()], dim=1).numpy()
 
 

@@ -2,10 +2,10 @@
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Annotated, Any, ClassVar
+from typing import Any, ClassVar
 
 import torch
-from annotated_types import Ge
+from pydantic import PositiveInt
 from torch import Tensor
 from torch_geometric.nn.models.basic_gnn import BasicGNN
 from torch_geometric.utils import dense_to_sparse
@@ -40,18 +40,17 @@ class Pyg(AbstractModel):
         kind: Kind,
         shape: Sequence[int],
         network: Callable[..., BasicGNN],
-        width: Annotated[int, Ge(1)] = 64,
-        layers: Annotated[int, Ge(1)] = 2,
+        width: PositiveInt = 64,
+        layers: PositiveInt = 2,
         pooling: Pooling = "attention",
-        degree: Annotated[int, Ge(1)] = 7,
+        degree: PositiveInt = 7,
     ) -> None:
         super().__init__(kind)
-        keywords: dict[str, Any] = network.keywords if isinstance(network, partial) else {}
-        made = network.func if isinstance(network, partial) else network
-        self._weighted = bool(getattr(made, "supports_edge_weight", False))
+        given = network if isinstance(network, partial) else partial(network)
+        self._weighted = bool(getattr(given.func, "supports_edge_weight", False))
         # The adjacency is normalised already.
         defaults: dict[str, Any] = {"normalize": False, "add_self_loops": False} if self._weighted else {}
-        if "scalers" in keywords:
+        if "scalers" in given.keywords:
             defaults["deg"] = torch.nn.functional.one_hot(torch.tensor(degree), degree + 1)
         try:
             self.network = network(shape[-1], width, layers, **defaults)
@@ -74,4 +73,8 @@ class Pyg(AbstractModel):
         if not self._weighted:  # the others count a node itself by themselves
             loops = torch.eye(adjacency.shape[-1], dtype=torch.bool, device=adjacency.device)
             adjacency = adjacency.masked_fill(loops, 0)
-        return dense_to_sparse(adjacency.expand(count, -1, -1).contiguous())
+        edges, weights = dense_to_sparse(adjacency.contiguous())
+        if adjacency.ndim == 3:
+            return edges, weights
+        offsets = adjacency.shape[-1] * torch.arange(count, device=adjacency.device)
+        return (edges[:, None] + offsets[:, None]).flatten(1), weights.repeat(count)

@@ -66,9 +66,9 @@ def plan_convolution(active: Tensor) -> Plan:
     windows = slot.unfold(0, 4, 2).unfold(1, 4, 2).flatten(2)
     seen = (windows < count).any(dim=-1)
     inputs, positions = windows[seen].sort(dim=-1)  # the empty slot sorts last
-    most = int((inputs < count).sum(dim=-1).amax()) if count else 0
-    inputs = inputs[:, :most]
-    taps = _tap_table().to(active.device)[:, positions[:, :most]].transpose(0, 1)
+    largest = int((inputs < count).sum(dim=-1).amax()) if count else 0
+    inputs = inputs[:, :largest]
+    taps = _tap_table().to(active.device)[:, positions[:, :largest]].transpose(0, 1)
     taps = torch.where((inputs < count)[:, None], taps, 9)
     return Plan(inputs, F.one_hot(taps, 10)[..., :9], seen)
 
@@ -76,14 +76,14 @@ def plan_convolution(active: Tensor) -> Plan:
 def convolve_and_pool(cells: Cells, steps: Plan, weight: Tensor, bias: Tensor) -> Cells:
     """Return the 2x2 maximum of the 3x3 convolution of ``cells``, weight (O, C, 3, 3) and bias (O,)."""
     width, channels = weight.shape[:2]
-    count, most = steps.inputs.shape
+    count, size = steps.inputs.shape
     images = cells.difference.shape[-1]
     kernel = weight.flatten(2).permute(2, 0, 1).flatten(1)
-    local = (steps.taps.to(weight.dtype) @ kernel).view(count, 4, most, width, channels)
-    local = local.transpose(2, 3).reshape(count, 4 * width, most * channels)
+    local = (steps.taps.to(weight.dtype) @ kernel).view(count, 4, size, width, channels)
+    local = local.transpose(2, 3).reshape(count, 4 * width, size * channels)
     padded = torch.cat([cells.difference, cells.difference.new_zeros(1, channels, images)])
     # not padded[...]: the gradient of that is summed in an order that changes from run to run
-    inputs = padded.index_select(0, steps.inputs.flatten()).view(count, most * channels, images)
+    inputs = padded.index_select(0, steps.inputs.flatten()).view(count, size * channels, images)
     pooled = _FirstMaximum.apply(torch.bmm(local, inputs).view(count, 4, width, images))
     # the background is the same at all four positions, so that it may be added after the maximum
     background = weight.sum(dim=(2, 3)) @ cells.background + bias[:, None]
@@ -305,7 +305,7 @@ def find_weights(weights: str) -> Path:
             itself would keep it.
 
     Raises:
-        InputError: there is no such file.
+        InputError: the file does not exist.
     """
     if weights == "imagenet":
         folder = Path(torch.hub.get_dir()).expanduser() / "checkpoints"
@@ -332,7 +332,7 @@ def load_weights(module: nn.Module, path: Path, spare: tuple[str, ...]) -> None:
         spare: names that the file may hold and the module has no use for.
 
     Raises:
-        InputError: the file cannot be read, is no state dict, or holds other weights than the module has.
+        InputError: the file cannot be read, is not a state dict, or holds other weights than the module has.
     """
     needed = f"model=efficientnet needs the state dict of torchvision's efficientnet_b0; {_WAYS}"
     try:
@@ -382,7 +382,7 @@ class EfficientNet(AbstractModel):
         chunk: images at a time where no gradient is asked for: bounds memory to a few hundred MB.
 
     Raises:
-        InputError: not an image, a number of channels that three is no multiple of, or no fitting weights.
+        InputError: not an image, neither 1 nor 3 channels, or no fitting weights.
     """
 
     takes: ClassVar[Kind] = "image"

@@ -218,7 +218,7 @@ class TouchData:
         return _Batches(self, "validation")
 
     def representation_for(self, positions: Tensor) -> AbstractRepresentation:
-        """Return the representation of a layout with positions (S, 3), m; that of the last layout is kept.
+        """Return the representation of a layout with positions (S, 3), m; the last one is kept.
 
         Raises:
             InputError: positions that change with time, (B, T, S, 3); motion is given beside the layout.

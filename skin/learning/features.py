@@ -375,7 +375,7 @@ def direction_features(touches: Touches, force: float = 0.1) -> dict[str, Tensor
 def _ways(push: Tensor, positions: Tensor, peak: Tensor, fraction: float) -> dict[str, Tensor]:
     """Return vectors (B, 2), m or m per frame, of the motion of the centre of ``push`` (B, T, S).
 
-    A frame is active where its largest reading ``peak`` (B, T), N, exceeds a fraction of that of the touch.
+    A frame is active where its largest reading ``peak`` (B, T), N, exceeds a fraction of the touch's peak.
     """
     total = push.sum(dim=2)
     centre = torch.einsum("bts,btsi->bti", push, positions) / total.clamp(min=1e-6)[..., None]

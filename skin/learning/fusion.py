@@ -91,7 +91,7 @@ class Early(AbstractFusion):
 def link(adjacency: Tensor, window: int) -> Tensor:
     """Return the normalised adjacency (T S, T S) of a graph that holds one copy of a sensor graph per frame.
 
-    Every sensor has an edge of weight 1 (that of distance 0) to itself in the following frame, directed: row
+    Every sensor has an edge of weight 1 (as at distance 0) to itself in the following frame, directed: row
     (t, s) gathers from (t - 1, s). Normalised with the rows' sums D as D^-1/2 (A + I) D^-1/2.
 
     Args:

@@ -63,8 +63,9 @@ def adjacency(positions: np.ndarray, linked: np.ndarray, weight: Weight) -> np.n
 
     With d the distance and d0 the typical one (:func:`typical_distance`): ``exp`` is exp(-d / d0),
     ``distance`` is d / d0 (the report's edge value, free of the unit of length), ``none`` is 1. ``stiffness``
-    is that of the strip of skin between the two sensors, k = E h w / d summed over layers, over that of a
-    strip of length d0 ("other physical information", report, 2.2.1): d0 / d, whatever w and the layers.
+    is the stiffness k = E h w / d, summed over layers, of the strip of skin between the two sensors, divided
+    by the stiffness of a strip of length d0 ("other physical information", report, 2.2.1): d0 / d, whatever w
+    and the layers.
 
     Distances are those along the surface, on a sheet and on an arm alike: a straight line of the chart is the
     shortest way on a cylinder too, and the strip of skin along it is the one that is stretched.

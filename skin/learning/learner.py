@@ -78,7 +78,7 @@ class AbstractLearner(ABC):
             positions: (S, 3), m.
 
         Raises:
-            InputError: this learner is no network.
+            InputError: this learner is not a network.
         """
         raise InputError(
             f"learner {type(self).__name__} cannot be exported: give a run of learner=network, or of an "
@@ -90,7 +90,7 @@ class AbstractLearner(ABC):
         """The trained network; what changes its weights changes the learner.
 
         Raises:
-            InputError: this learner is no network.
+            InputError: this learner is not a network.
         """
         raise InputError(
             f"{type(self).__name__} has no network to fine-tune: give a run of a network, such as best_fresh"
@@ -192,7 +192,7 @@ class Rules(AbstractLearner):
         """
         stored = parse_json(read_file(Path(path), TEXT))
         self._set({name: Rule(**stored[name]) for name in data.task.names})
-        self.probabilities(data.example)  # refuses unknown measurements and what is no number
+        self.probabilities(data.example)  # refuses unknown measurements and values that are not numbers
 
     def _set(self, rules: dict[str, Rule]) -> None:
         self._learned = rules

@@ -305,7 +305,7 @@ class Network(AbstractLearner):
         """Give a network the weights of ``start``.
 
         Raises:
-            InputError: there is no such file, or it is of another network.
+            InputError: the file does not exist, or is of another network.
         """
         if self._start is None:
             return

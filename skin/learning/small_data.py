@@ -2,10 +2,11 @@
 
 import sys
 import time
+from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 import numpy as np
 import torch
@@ -43,10 +44,14 @@ class SmallDataLearner(FeatureLearner):
     """
 
     _features = staticmethod(small_data_features)
-    _kind: ClassVar[Any]
 
     def __init__(self, seed: int = 0) -> None:
         self._seed = seed
+
+    @property
+    @abstractmethod
+    def _kind(self) -> Any:
+        """Type of the models, or a union of types."""
 
     def _fit(self, matrix: np.ndarray, labels: np.ndarray, kind: Kind) -> "Kernel | Forest":
         """Fit features (B, D) to labels (B, K): one label or target, or K classes."""

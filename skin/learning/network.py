@@ -273,9 +273,9 @@ class Network(AbstractLearner):
                 f"{one_line(error)}"
             ) from error
         make_trainer(self._trainer)
-        settings = self._optimizer.keywords if isinstance(self._optimizer, partial) else {}
-        if text := [name for name, value in settings.items() if isinstance(value, str)]:
-            raise InputError(f"optimizer.{text[0]}={settings[text[0]]} is text, and must be a number")
+        settings = getattr(self._optimizer, "keywords", {}).items()
+        if text := [f"{name}={value}" for name, value in settings if isinstance(value, str)]:
+            raise InputError(f"optimizer.{text[0]} is text, and must be a number")
         try:
             self._optimizer(network.parameters())
         except (TypeError, ValueError) as error:

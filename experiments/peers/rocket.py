@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from pytorch_lightning.loggers import Logger
 
     from skin.learning.data import TouchData
-    from skin.learning.representation import FrameMaker
 
 WORKER = "experiments.peers.worker"
 _PART = 8192  # touches
@@ -71,7 +70,7 @@ class Rocket(AbstractLearner):
         highest = torch.nn.functional.pad(highest, (0, self._largest - highest.shape[2]))
         return torch.cat([highest, x.sum(dim=2, keepdim=True)], dim=2).mT
 
-    def check(self, data: "FrameMaker") -> None:
+    def check(self, data: "TouchData") -> None:
         """Raise InputError if the environment or labels are not available."""
         _python()
         if data.task.kind != "binary" or data.task.gate or data.task.direction:
@@ -117,7 +116,7 @@ class Rocket(AbstractLearner):
         self._ask("save", path)
         return path
 
-    def load(self, data: "FrameMaker", path: Path) -> None:
+    def load(self, data: "TouchData", path: Path) -> None:
         """Load the model that :meth:`save` wrote."""
         self.check(data)
         load_npz(path)

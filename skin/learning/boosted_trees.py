@@ -1,6 +1,8 @@
-"""Gradient-boosted trees on engineered features."""
+"""Learners on features of touches, stored by skops; of them gradient-boosted trees."""
 
 import time
+from abc import abstractmethod
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 from zipfile import ZIP_DEFLATED
@@ -8,9 +10,7 @@ from zipfile import ZIP_DEFLATED
 import numpy as np
 import torch
 from annotated_types import Ge, Gt
-from sklearn._loss import HalfBinomialLoss, HalfSquaredError
 from sklearn.ensemble import HistGradientBoostingClassifier, HistGradientBoostingRegressor
-from sklearn.ensemble._hist_gradient_boosting.binning import _BinMapper
 from sklearn.ensemble._hist_gradient_boosting.common import PREDICTOR_RECORD_DTYPE
 from sklearn.ensemble._hist_gradient_boosting.predictor import TreePredictor
 from skops.io import dump, load
@@ -20,6 +20,7 @@ from torch import Tensor
 from skin.core.safe_loading import check_archive
 from skin.device.touches import Touches
 from skin.errors import InputError
+from skin.learning.data import TouchData
 from skin.learning.features import feature_matrix
 from skin.learning.learner import AbstractLearner
 from skin.touch.labels import Task
@@ -27,20 +28,136 @@ from skin.touch.labels import Task
 if TYPE_CHECKING:
     from pytorch_lightning.loggers import Logger
 
-    from skin.learning.data import TouchData
-    from skin.learning.representation import FrameMaker
-
-Trees: TypeAlias = HistGradientBoostingClassifier | HistGradientBoostingRegressor
-_KINDS: dict[bool, type[Trees]] = {
-    True: HistGradientBoostingClassifier,
-    False: HistGradientBoostingRegressor,
-}
-_LOSSES = {HistGradientBoostingClassifier: HalfBinomialLoss, HistGradientBoostingRegressor: HalfSquaredError}
-_TRUSTED = [f"{TreePredictor.__module__}.{TreePredictor.__qualname__}"]
+_TRUSTED = [
+    f"{TreePredictor.__module__}.{TreePredictor.__qualname__}",
+    "skin.learning.small_data.Forest",
+    "skin.learning.small_data.Kernel",
+]
 """Types that a file may have besides those of scikit-learn and NumPy that skops knows as harmless."""
 
 
-class BoostedTrees(AbstractLearner):
+class FeatureLearner(AbstractLearner):
+    """Base class of learners that fit models to features of touches.
+
+    ``learned`` is a list of models, which have an attribute ``n_features_in_`` as in scikit-learn, and the
+    task.
+    """
+
+    _features = staticmethod(feature_matrix)
+
+    @abstractmethod
+    def _predict(self, model: Any, matrix: np.ndarray) -> np.ndarray:
+        """Return what a model predicts of features (B, D): (B,) or (B, K)."""
+
+    @abstractmethod
+    def _kinds(self, task: Task) -> Sequence[Any]:
+        """Return the type of each model, or a union of types."""
+
+    @abstractmethod
+    def _check(self, model: Any) -> None:
+        """Raise a ValueError if predictions of a stored model could crash or never end."""
+
+    @abstractmethod
+    def _size(self, model: Any) -> int:
+        """Return the number of fitted numbers."""
+
+    def _set(self, models: list[Any], task: Task) -> None:
+        self._learned = models, task
+        self.parameters = sum(map(self._size, models))
+
+    def predict(self, matrix: np.ndarray) -> np.ndarray:
+        """Return probabilities or targets (B, L) of features (B, D).
+
+        Raises:
+            InputError: other features than those of the training, as targets of a regression depend on the
+                number of sensors.
+        """
+        models, _ = self.learned
+        if matrix.shape[1] != (count := models[0].n_features_in_):
+            raise InputError(
+                f"these touches have {matrix.shape[1]} features, the learner was trained on {count}: give "
+                "touches of the sensors of the training"
+            )
+        return np.column_stack([self._predict(model, matrix) for model in models])
+
+    def probabilities(self, touches: Touches) -> Tensor:
+        """Return the probability of each label, (B, L); targets of a regression, cosines of a direction.
+
+        Raises:
+            InputError: targets of a regression for other sensors than those of the training.
+        """
+        _, task = self.learned
+        result = torch.from_numpy(self.predict(self._features(touches, task))).float()
+        return result.clamp(-1, 1) if task.direction else result  # of the cosines
+
+    def save(self, folder: Path) -> Path:
+        """Write the models to ``models.skops`` and return its path: skops stores no code and no pickles."""
+        path = Path(folder) / "models.skops"
+        dump(self.learned[0], path, compression=ZIP_DEFLATED)
+        return path
+
+    def load(self, data: TouchData, path: Path) -> None:
+        """Load the models that :meth:`save` wrote.
+
+        Raises:
+            InputError: they are of an earlier version.
+            ValueError, TypeError, AttributeError: the file is damaged or holds something else.
+        """
+        if path.suffix != ".skops":
+            raise InputError(
+                f"{path.name} was stored by an earlier version: train the run again, with "
+                "tracking.resume=false"
+            )
+        try:
+            check_archive(path)
+            models = load(path, trusted=_TRUSTED)
+        except Exception as error:  # whatever zipfile, zlib, JSON, numpy and skops raise
+            raise ValueError(" ".join(str(error).split()) or "it is cut off") from error
+        task, kinds = data.task, self._kinds(data.task)
+        features = self._features(data.example, task)
+        if (
+            not isinstance(models, list)
+            or len(models) != len(kinds)
+            or not all(map(isinstance, models, kinds))
+        ):
+            raise ValueError(f"it does not hold {len(kinds)} models of this learner")
+        for model in models:
+            if model.n_features_in_ != features.shape[1]:
+                raise ValueError(f"it was trained on other features than these {features.shape[1]}")
+            self._check(model)
+        self._set(models, task)
+        outputs = self.predict(features)
+        if outputs.shape != (1, len(task)) or not np.isfinite(outputs).all():
+            raise ValueError(f"it does not predict a number for each of {', '.join(task.names)}")
+
+
+def check_trees(
+    leaves: np.ndarray, features: np.ndarray, children: np.ndarray, values: np.ndarray, limit: int
+) -> None:
+    """Check stored trees: each path has to end in them, at a finite value.
+
+    Args:
+        leaves: (N,), whether a node is a leaf.
+        features: (N,), number of the feature that a node compares.
+        children: (N, 2), numbers of the nodes that follow, behind their parent.
+        values: (N, ...), of leaves.
+        limit: number of features.
+
+    Raises:
+        ValueError: a path leads out of the trees or the features, or in a circle.
+    """
+    ahead = (children > np.arange(len(leaves))[:, None]) & (children < len(leaves))
+    known = ahead.all(axis=1) & (features >= 0) & (features < limit)
+    if not len(leaves) or len(values) != len(leaves) or not (known | leaves).all():
+        raise ValueError("it holds a tree that leads nowhere")
+    if not np.isfinite(values).all():
+        raise ValueError("it holds a tree without finite values")
+
+
+Trees: TypeAlias = HistGradientBoostingClassifier | HistGradientBoostingRegressor
+
+
+class BoostedTrees(FeatureLearner):
     """Gradient-boosted decision trees on about 130 engineered features, one ensemble per label.
 
     This is the baseline that a network should beat. The features (:mod:`skin.learning.features`) do not
@@ -70,17 +187,36 @@ class BoostedTrees(AbstractLearner):
             "random_state": seed,
             "early_stopping": True,
         }
-        self._models: list[Trees] = []
-        self._task: Task | None = None
 
-    def fit(self, data: "TouchData", logger: "Logger | None" = None) -> None:
-        """Grow the trees on the training split; the validation loss decides how many."""
-        table: dict[str, np.ndarray] = {}
-        for split in ("train", "validation"):
-            touches = data.touches(split)
-            labels = touches.known_labels.cpu().numpy()
-            table |= {split: feature_matrix(touches, data.task), f"{split}_labels": labels}
-        self._grow(table, data.task)
+    def fit(self, data: TouchData, logger: "Logger | None" = None) -> None:
+        """Grow the trees on the training split; the validation loss decides how many.
+
+        Raises:
+            InputError: a label has one value only, or no validation touch has it.
+        """
+        splits = [data.touches(split) for split in ("train", "validation")]
+        matrices = [feature_matrix(touches, data.task) for touches in splits]
+        labels = [touches.known_labels.cpu() for touches in splits]
+        began = time.perf_counter()
+        models = list[Trees]()
+        for label, (name, kind) in enumerate(zip(data.task.names, self._kinds(data.task), strict=True)):
+            # Each label is trained on the touches for which it is defined.
+            defined = [data.task.counts(split)[:, label].numpy() for split in labels]
+            train, validation = (
+                (matrix[rows], split[rows, label].numpy())
+                for matrix, split, rows in zip(matrices, labels, defined, strict=True)
+            )
+            if len(np.unique(train[1])) < 2:
+                raise InputError(
+                    f"all training touches have the same label {name}: give more touches, or "
+                    "touches of every label, as touch=gestures draws them"
+                )
+            if not len(validation[1]):
+                raise InputError(f"no validation touch has a label {name}: give more touches")
+            with threadpool_limits(torch.get_num_threads(), "openmp"):  # a job's share of the cores
+                models.append(kind(**self._settings).fit(*train, X_val=validation[0], y_val=validation[1]))
+        self.seconds_per_epoch = time.perf_counter() - began
+        self._set(models, data.task)
 
     def probabilities(self, touches: Touches) -> Tensor:
         """Return the probability of each label, (B, L), for touches of any layout; cosines of a direction.
@@ -88,123 +224,29 @@ class BoostedTrees(AbstractLearner):
         Raises:
             InputError: targets of a regression for other sensors than those of the training.
         """
-        if self._task is None:
-            raise RuntimeError("fit or load the learner first")
-        matrix = feature_matrix(touches, self._task)
-        if matrix.shape[1] != (count := self._models[0].n_features_in_):
-            raise InputError(
-                f"these touches have {matrix.shape[1]} features, the trees were trained on {count}: give "
-                "touches of the sensors of the training"
-            )
-        columns = [_predict(model, matrix) for model in self._models]
-        result = torch.from_numpy(np.stack(columns, axis=1)).to(torch.float32)
-        if self._task.kind == "exclusive":
-            return result / result.sum(dim=1, keepdim=True)
-        return result.clamp(-1, 1) if self._task.direction else result  # of the cosines
+        result = super().probabilities(touches)
+        return result / result.sum(dim=1, keepdim=True) if self.learned[1].kind == "exclusive" else result
 
-    def save(self, folder: Path) -> Path:
-        """Write the trees to ``trees.skops`` and return its path: skops stores no code and no pickles."""
-        if self._task is None:
-            raise RuntimeError("fit or load the learner first")
-        path = Path(folder) / "trees.skops"
-        dump(self._models, path, compression=ZIP_DEFLATED)
-        return path
+    def _predict(self, model: Trees, matrix: np.ndarray) -> np.ndarray:
+        if isinstance(model, HistGradientBoostingRegressor):
+            return model.predict(matrix)
+        return model.predict_proba(matrix)[:, 1]
 
-    def load(self, data: "FrameMaker", path: Path) -> None:
-        """Load the trees that :meth:`save` wrote.
+    def _kinds(self, task: Task) -> "list[type[Trees]]":
+        kinds = HistGradientBoostingRegressor, HistGradientBoostingClassifier
+        return [kinds[name in task.binary] for name in task.names]
 
-        Raises:
-            InputError: they are of an earlier version.
-            ValueError, TypeError: the file is damaged or holds something else.
-        """
-        if path.suffix == ".npz":
-            raise InputError(
-                f"{path.name} holds the training data of trees, from which an earlier version grew them: "
-                "train the run again, with tracking.resume=false"
-            )
-        try:
-            check_archive(path)
-            models = load(path, trusted=_TRUSTED)
-        except Exception as error:  # whatever zipfile, zlib, JSON, numpy and skops raise
-            raise ValueError(" ".join(str(error).split()) or "it is cut off") from error
-        task, example = data.task, feature_matrix(data.example, data.task)
-        if not isinstance(models, list) or len(models) != len(task):
-            raise ValueError(f"it has no trees for each of {', '.join(task.names)}")
-        for model, name in zip(models, task.names, strict=True):
-            _check(model, _KINDS[name in task.binary], example.shape[1])
-            if not np.isfinite(_predict(model, example)).all():
-                raise ValueError(f"it predicts no number for {name}")
-        self._models, self._task = models, task
-        self._count()
+    def _check(self, model: Trees) -> None:
+        """Check stored trees, which scikit-learn follows without looking where they lead."""
+        for (tree,) in model._predictors:
+            nodes = tree.nodes
+            plain = type(tree) is TreePredictor and nodes.dtype == PREDICTOR_RECORD_DTYPE
+            if not plain or nodes["is_categorical"].any() or model._preprocessor is not None:
+                raise ValueError("it holds something else than trees of numbers")
+            children = np.column_stack([nodes["left"], nodes["right"]])
+            leaves = nodes["is_leaf"] != 0
+            check_trees(leaves, nodes["feature_idx"], children, nodes["value"], model.n_features_in_)
 
-    def _grow(self, table: dict[str, np.ndarray], task: Task) -> None:
-        began = time.perf_counter()
-        self._models = []
-        # Each label is trained on the touches for which it is defined.
-        trained, checked = (
-            task.counts(torch.from_numpy(table[f"{split}_labels"])).numpy()
-            for split in ("train", "validation")
-        )
-        for label, name in enumerate(task.names):
-            rows, held = trained[:, label], checked[:, label]
-            truth = table["train_labels"][rows, label]
-            if len(np.unique(truth)) < 2:
-                raise InputError(
-                    f"all training touches have the same label {name}: give more touches, or "
-                    "touches of every label, as touch=gestures draws them"
-                )
-            if not held.any():
-                raise InputError(f"no validation touch has a label {name}: give more touches")
-            model = _KINDS[name in task.binary](**self._settings)
-            validation = {
-                "X_val": table["validation"][held],
-                "y_val": table["validation_labels"][held, label],
-            }
-            with threadpool_limits(torch.get_num_threads(), "openmp"):  # a job's share of the cores
-                self._models.append(model.fit(table["train"][rows], truth, **validation))
-        self._task = task
-        self.seconds_per_epoch = time.perf_counter() - began
-        self._count()
-
-    def _count(self) -> None:
-        # One number per leaf; scikit-learn has no public count of leaves.
-        trees = [tree for model in self._models for trees in model._predictors for tree in trees]
-        self.parameters = sum(tree.get_n_leaf_nodes() for tree in trees)
-
-
-def _check(model: Any, kind: "type[Trees]", columns: int) -> None:
-    """Check stored trees, which scikit-learn follows without looking where they lead.
-
-    Args:
-        model: as it was loaded.
-        kind: of the model that its label needs.
-        columns: number of features.
-
-    Raises:
-        ValueError, TypeError, AttributeError: no such model, or a tree leads out of itself or the features.
-    """
-    parts = type(model), type(model._loss), type(model._bin_mapper)
-    categories = model._preprocessor, model.is_categorical_
-    if parts != (kind, _LOSSES[kind], _BinMapper) or categories != (None, None):
-        raise ValueError(f"it holds something else than a {kind.__name__} of numbers")
-    if model.n_features_in_ != columns:
-        raise ValueError(f"it was trained on {model.n_features_in_} features, not {columns}")
-    for (tree,) in model._predictors:
-        nodes = tree.nodes
-        if type(tree) is not TreePredictor or nodes.dtype != PREDICTOR_RECORD_DTYPE or not len(nodes):
-            raise ValueError("it holds something else than trees")
-        place = np.flatnonzero(nodes["is_leaf"] == 0)
-        inner = nodes[place]
-        # A child behind its parent: each path ends.
-        first, last = np.minimum(inner["left"], inner["right"]), np.maximum(inner["left"], inner["right"])
-        feature, category = inner["feature_idx"], inner["is_categorical"]
-        ahead = (first > place) & (last < len(nodes)) & (feature >= 0) & (feature < columns)
-        if not ahead.all() or category.any():
-            raise ValueError("it holds a tree that leads nowhere")
-
-
-def _predict(model: Trees, matrix: np.ndarray) -> np.ndarray:
-    """Return the predicted probability (B,), or the predicted cosine or target."""
-    if isinstance(model, HistGradientBoostingRegressor):
-        return model.predict(matrix)
-    return model.predict_proba(matrix)[:, 1]
+    def _size(self, model: Trees) -> int:
+        """Return the number of leaves, of which scikit-learn has no public count."""
+        return sum(tree.get_n_leaf_nodes() for (tree,) in model._predictors)

@@ -10,15 +10,13 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from skin.core.files import candidates
+from skin.core.messages import one_line
 from skin.errors import InputError
 from skin.learning.model import AbstractModel, Kind
 
 # Sparse convolution and pooling. The 25 pixels of 25 sensors touch 100 of 961 cells after a 3x3 convolution
 # and a 2x2 pooling; every other cell holds the same value in all images, the *background*. A layer computes
 # both: the same mathematics as the dense layer, which a test compares, at about a quarter of its time.
-
-TAPS = 9  # of a 3x3 kernel
-WINDOW = 4  # a pooled cell sees 4x4 inputs
 
 
 class Cells(NamedTuple):
@@ -52,11 +50,12 @@ class Plan(NamedTuple):
 
 
 def _tap_table() -> Tensor:
-    """Return which tap (4, 16) takes each input of a window to each pooled position; 9 where none does."""
-    offset = torch.arange(WINDOW)[None, :] - torch.arange(2)[:, None]
+    """Return which of the 9 taps (4, 16) takes each of the 4x4 inputs of a pooled cell to each of its 2x2
+    positions; 9 where none does."""
+    offset = torch.arange(4)[None, :] - torch.arange(2)[:, None]
     inside = (offset >= 0) & (offset <= 2)
     tap = 3 * offset[:, None, :, None] + offset[None, :, None, :]
-    return torch.where(inside[:, None, :, None] & inside[None, :, None, :], tap, TAPS).reshape(4, WINDOW**2)
+    return torch.where(inside[:, None, :, None] & inside[None, :, None, :], tap, 9).reshape(4, 16)
 
 
 def plan_convolution(active: Tensor) -> Plan:
@@ -64,27 +63,27 @@ def plan_convolution(active: Tensor) -> Plan:
     count = int(active.sum())
     slot = torch.full(active.shape, count, device=active.device)
     slot[active] = torch.arange(count, device=active.device)
-    windows = slot.unfold(0, WINDOW, 2).unfold(1, WINDOW, 2).flatten(2)
+    windows = slot.unfold(0, 4, 2).unfold(1, 4, 2).flatten(2)
     seen = (windows < count).any(dim=-1)
-    inputs, place = windows[seen].sort(dim=-1)  # the empty slot sorts last
-    most = int((inputs < count).sum(dim=-1).amax()) if count else 0
-    inputs, place = inputs[:, :most], place[:, :most]
-    taps = _tap_table().to(active.device)[:, place].transpose(0, 1)
-    taps = torch.where((inputs < count)[:, None], taps, TAPS)
-    return Plan(inputs, nn.functional.one_hot(taps, TAPS + 1)[..., :TAPS], seen)
+    inputs, positions = windows[seen].sort(dim=-1)  # the empty slot sorts last
+    largest = int((inputs < count).sum(dim=-1).amax()) if count else 0
+    inputs = inputs[:, :largest]
+    taps = _tap_table().to(active.device)[:, positions[:, :largest]].transpose(0, 1)
+    taps = torch.where((inputs < count)[:, None], taps, 9)
+    return Plan(inputs, F.one_hot(taps, 10)[..., :9], seen)
 
 
 def convolve_and_pool(cells: Cells, steps: Plan, weight: Tensor, bias: Tensor) -> Cells:
     """Return the 2x2 maximum of the 3x3 convolution of ``cells``, weight (O, C, 3, 3) and bias (O,)."""
     width, channels = weight.shape[:2]
-    count, most = steps.inputs.shape
+    count, size = steps.inputs.shape
     images = cells.difference.shape[-1]
     kernel = weight.flatten(2).permute(2, 0, 1).flatten(1)
-    local = (steps.taps.to(weight.dtype) @ kernel).view(count, 4, most, width, channels)
-    local = local.transpose(2, 3).reshape(count, 4 * width, most * channels)
+    local = (steps.taps.to(weight.dtype) @ kernel).view(count, 4, size, width, channels)
+    local = local.transpose(2, 3).reshape(count, 4 * width, size * channels)
     padded = torch.cat([cells.difference, cells.difference.new_zeros(1, channels, images)])
     # not padded[...]: the gradient of that is summed in an order that changes from run to run
-    inputs = padded.index_select(0, steps.inputs.flatten()).view(count, most * channels, images)
+    inputs = padded.index_select(0, steps.inputs.flatten()).view(count, size * channels, images)
     pooled = _FirstMaximum.apply(torch.bmm(local, inputs).view(count, 4, width, images))
     # the background is the same at all four positions, so that it may be added after the maximum
     background = weight.sum(dim=(2, 3)) @ cells.background + bias[:, None]
@@ -108,11 +107,11 @@ def linear(cells: Cells, weight: Tensor, bias: Tensor) -> Tensor:
         bias: (O,).
     """
     width, channels = len(weight), len(cells.background)
-    places = weight.view(width * channels, -1)
+    pixels = weight.view(width * channels, -1)
     # a product with 0 and 1: the gradient of an index would be scattered one number at a time
-    chosen = torch.eye(places.shape[1], dtype=weight.dtype, device=weight.device)[:, cells.active.flatten()]
-    active = (places @ chosen).view(width, channels, -1).transpose(1, 2).reshape(width, -1)
-    background = places.sum(dim=1).view(width, channels) @ cells.background
+    chosen = torch.eye(pixels.shape[1], dtype=weight.dtype, device=weight.device)[:, cells.active.flatten()]
+    active = (pixels @ chosen).view(width, channels, -1).transpose(1, 2).reshape(width, -1)
+    background = pixels.sum(dim=1).view(width, channels) @ cells.background
     return (active @ cells.difference.flatten(0, 1) + background + bias[:, None]).T
 
 
@@ -140,9 +139,6 @@ class _FirstMaximum(torch.autograd.Function):
         return result
 
 
-SPARSE = 32  # images with fewer than one active pixel in so many go the short way
-
-
 class Cnn(AbstractModel):
     """Blocks of 3x3 convolution, 2x2 max pooling, ReLU and spatial dropout (report, 3.2.3 and 3.2.5).
 
@@ -157,7 +153,8 @@ class Cnn(AbstractModel):
             one convolution with summed weights.
         embedding: width of a dense layer on the flattened blocks; None: the flattened blocks are the
             embedding.
-        dropout: share of channels dropped after each block in training.
+        dropout: fraction of channels dropped after each block in training.
+        sparse: images with fewer than one active pixel in so many are computed by the faster method.
 
     Raises:
         InputError: not an image, no block, or an image too small for the blocks.
@@ -173,9 +170,10 @@ class Cnn(AbstractModel):
         repeat: int = 1,
         embedding: int | None = None,
         dropout: float = 0.2,
+        sparse: float = 32,
     ) -> None:
         super().__init__(kind)
-        self.repeat, self.dropout = repeat, dropout
+        self.repeat, self.dropout, self.sparse = repeat, dropout, sparse
         size = list(shape[1:])
         for _ in channels:
             size = [(edge - 2) // 2 for edge in size]
@@ -192,11 +190,10 @@ class Cnn(AbstractModel):
 
     def forward(self, x: Tensor, adjacency: Tensor | None) -> Tensor:
         """Return the embeddings (N, E) of images (N, C, H, W)."""
-        if torch.compiler.is_exporting():  # an exported graph cannot depend on the values
-            return self._dense(x)
-        active = x.abs().amax(dim=(0, 1)) != 0
-        if SPARSE * int(active.sum()) < active.numel():
-            return self._sparse(x, active)
+        if not torch.compiler.is_exporting():  # an exported graph cannot depend on the values
+            active = x.abs().amax(dim=(0, 1)) != 0
+            if self.sparse * int(active.sum()) < active.numel():
+                return self._sparse(x, active)
         return self._dense(x)
 
     def _weights(self) -> list[tuple[Tensor, Tensor]]:
@@ -266,7 +263,7 @@ class Bottleneck(nn.Module):
         kernel: of the channels' filters.
         stride: of the channels' filters.
         ratio: by which the channels are widened.
-        skipped: share of images for which a residual block does nothing in training (Huang et al., 2016).
+        skipped: fraction of images for which a residual block does nothing in training (Huang et al., 2016).
     """
 
     def __init__(
@@ -296,7 +293,6 @@ class Bottleneck(nn.Module):
 
 
 _OFFICIAL = "efficientnet_b0_rwightman-7f5810bc.pth"
-_SOURCE = f"https://download.pytorch.org/models/{_OFFICIAL}"
 _WAYS = "model.weights=random trains from scratch"
 
 
@@ -309,26 +305,21 @@ def find_weights(weights: str) -> Path:
             itself would keep it.
 
     Raises:
-        InputError: there is no such file.
+        InputError: the file does not exist.
     """
     if weights == "imagenet":
         folder = Path(torch.hub.get_dir()).expanduser() / "checkpoints"
         # the official one first, then older or newer ones
-        named = [folder / _OFFICIAL, *sorted(folder.glob("efficientnet_b0*.pth"))]
-        missing = (
-            f"model.weights=imagenet needs {_OFFICIAL} in {folder}, which is not there: "
-            f"put it there from {_SOURCE}, or give model.weights=FILE.pth; {_WAYS}"
-        )
+        files = [folder / _OFFICIAL, *sorted(folder.glob("efficientnet_b0*.pth"))]
+        advice = f"put {_OFFICIAL} there from https://download.pytorch.org/models/{_OFFICIAL}"
     else:
-        named = candidates(weights)
-        looked = " and ".join(dict.fromkeys(map(str, named)))
-        missing = (
-            f"no weights file {weights}: looked for {looked}; "
-            f"give model.weights=FILE.pth or model.weights=imagenet; {_WAYS}"
-        )
-    file = next((path for path in named if path.is_file()), None)
+        files, advice = candidates(weights), "give model.weights=imagenet"
+    file = next((path for path in files if path.is_file()), None)
     if file is None:
-        raise InputError(missing)
+        tried = " and ".join(dict.fromkeys(map(str, files)))
+        raise InputError(
+            f"model.weights={weights}: no weights file {tried}: {advice}, or model.weights=FILE.pth; {_WAYS}"
+        )
     return file
 
 
@@ -336,52 +327,28 @@ def load_weights(module: nn.Module, path: Path, spare: tuple[str, ...]) -> None:
     """Give a module the weights of a file, without running code that the file may hold.
 
     Args:
-        module: takes all of them or none.
+        module: takes the weights.
         path: of a state dict.
         spare: names that the file may hold and the module has no use for.
 
     Raises:
-        InputError: the file cannot be read, is no state dict, or holds other weights than the module has.
+        InputError: the file cannot be read, is not a state dict, or holds other weights than the module has.
     """
-    content, state = _read(path), module.state_dict()
-    if wrong := _unfit(content, state, spare):
-        raise InputError(
-            f"the weights file {path} {wrong}: model=efficientnet needs the state dict of torchvision's "
-            f"efficientnet_b0; {_WAYS}"
-        )
-    module.load_state_dict(state | {name: content[name] for name in content if name not in spare})
-
-
-def _read(path: Path) -> Any:
+    needed = f"model=efficientnet needs the state dict of torchvision's efficientnet_b0; {_WAYS}"
     try:
-        return torch.load(path, weights_only=True, map_location="cpu")
+        content = torch.load(path, weights_only=True, map_location="cpu")
     except Exception as error:  # torch raises nearly anything on a file that it cannot read
         # torch's own words would advise to run the code in the file
         reason = error.strerror if isinstance(error, OSError) else "it is damaged, or holds more than tensors"
         raise InputError(f"cannot read the weights file {path}: {reason}; get it again; {_WAYS}") from error
-
-
-def _unfit(content: Any, state: dict[str, Tensor], spare: tuple[str, ...]) -> str:
-    """Return what is wrong with the content of a file; empty if it fits."""
-    if not isinstance(content, dict) or not all(isinstance(value, Tensor) for value in content.values()):
-        return "is no state dict (names and tensors)"
-    stored = {name: value for name, value in content.items() if name not in spare}
-    # they count batches for a momentum that is not used; files older than torch 0.4.1 have none
-    missing = [name for name in state if name not in stored and not name.endswith("num_batches_tracked")]
-    foreign = [name for name in stored if name not in state]
-    if missing or foreign:
-        return " and ".join(filter(None, [_listed("lacks", missing), _listed("has the unknown", foreign)]))
-    for name, value in stored.items():
-        if value.shape != state[name].shape:
-            return f"has {name} of shape {tuple(value.shape)} where {tuple(state[name].shape)} is needed"
-        if not value.isfinite().all():
-            return f"has numbers in {name} that are not finite"
-    return ""
-
-
-def _listed(verb: str, names: list[str]) -> str:
-    remainder = f" and {len(names) - 3} more" if len(names) > 3 else ""
-    return f"{verb} {', '.join(names[:3])}{remainder}" if names else ""
+    try:
+        module.load_state_dict({name: value for name, value in content.items() if name not in spare})
+    except (AttributeError, RuntimeError, TypeError) as error:
+        raise InputError(
+            f"the weights file {path} does not fit: {one_line(error)[:300]}; {needed}"
+        ) from error
+    if wrong := [name for name, value in module.state_dict().items() if not value.isfinite().all()]:
+        raise InputError(f"the weights file {path} has numbers in {wrong[0]} that are not finite; {needed}")
 
 
 # Table 1 of Tan and Le (2019): ratio, kernel, stride of the first block, channels, blocks
@@ -394,10 +361,7 @@ STAGES = (
     (6, 5, 2, 192, 4),
     (6, 3, 1, 320, 1),
 )
-WIDTH = 1280
-SKIPPED = 0.2  # share of images that would skip a block after the last one
 HEAD = ("classifier.1.weight", "classifier.1.bias")  # of the thousand classes, not used here
-CHUNK = 256  # images at a time where no gradient is asked for: bounds memory to a few hundred MB
 
 
 class EfficientNet(AbstractModel):
@@ -413,15 +377,16 @@ class EfficientNet(AbstractModel):
         weights: ``imagenet`` (torchvision's file, see :func:`skin.learning.cnn.find_weights`;
             nothing is downloaded), the path of such a file, or ``random``.
         frozen: keep the weights and the statistics of batch norm as they are.
-        dropout: share of the embedding dropped in training.
+        dropout: fraction of the embedding dropped in training.
+        skipped: fraction of images that would skip a block after the last one; 0.2 in torchvision.
+        chunk: images at a time where no gradient is asked for: bounds memory to a few hundred MB.
 
     Raises:
-        InputError: not an image, a number of channels that three is no multiple of, or no fitting weights.
+        InputError: not an image, neither 1 nor 3 channels, or no fitting weights.
     """
 
     takes: ClassVar[Kind] = "image"
-    mean: Tensor
-    spread: Tensor
+    width = 1280
 
     def __init__(
         self,
@@ -430,6 +395,8 @@ class EfficientNet(AbstractModel):
         weights: str = "imagenet",
         frozen: bool = False,
         dropout: float = 0.2,
+        skipped: float = 0.2,
+        chunk: int = 256,
     ) -> None:
         super().__init__(kind)
         if shape[0] not in (1, 3):
@@ -437,11 +404,11 @@ class EfficientNet(AbstractModel):
                 f"model=efficientnet needs images of 1 or 3 channels, got {shape[0]}: "
                 "set fusion=late and representation.mask=false"
             )
-        self.frozen, self.dropout, self.width = frozen, dropout, WIDTH
+        self.frozen, self.dropout, self.chunk = frozen, dropout, chunk
         # of ImageNet's photographs: what the weights were trained on
-        self.register_buffer("mean", torch.tensor([0.485, 0.456, 0.406])[:, None, None], persistent=False)
-        self.register_buffer("spread", torch.tensor([0.229, 0.224, 0.225])[:, None, None], persistent=False)
-        self.features = nn.Sequential(unit(3, 32, 3, 2), *_stages(), unit(STAGES[-1][3], WIDTH))
+        self.mean = nn.Buffer(torch.tensor([0.485, 0.456, 0.406])[:, None, None], persistent=False)
+        self.deviation = nn.Buffer(torch.tensor([0.229, 0.224, 0.225])[:, None, None], persistent=False)
+        self.features = nn.Sequential(unit(3, 32, 3, 2), *_stages(skipped), unit(STAGES[-1][3], self.width))
         if weights == "random":
             self.features.apply(_start)
         else:
@@ -457,22 +424,22 @@ class EfficientNet(AbstractModel):
 
     def forward(self, x: Tensor, adjacency: Tensor | None) -> Tensor:
         """Return the embeddings (N, 1280) of images (N, C, H, W)."""
-        parts = [x] if self.features.training else x.split(CHUNK)
+        parts = [x] if self.features.training else x.split(self.chunk)
         return F.dropout(torch.cat([self._encode(part) for part in parts]), self.dropout, self.training)
 
     def _encode(self, x: Tensor) -> Tensor:
-        x = (x - self.mean) / self.spread  # a single channel becomes three
+        x = (x - self.mean) / self.deviation  # a single channel becomes three
         # With the channels last, 1.7 times faster.
         return self.features(x.contiguous(memory_format=torch.channels_last)).mean(dim=(2, 3))
 
 
-def _stages() -> Iterator[nn.Sequential]:
+def _stages(skipped: float) -> Iterator[nn.Sequential]:
     total, number, inputs = sum(stage[-1] for stage in STAGES), 0, 32
     for ratio, kernel, stride, outputs, count in STAGES:
         blocks = []
         for first in (True, *[False] * (count - 1)):
             step = stride if first else 1
-            blocks.append(Bottleneck(inputs, outputs, kernel, step, ratio, SKIPPED * number / total))
+            blocks.append(Bottleneck(inputs, outputs, kernel, step, ratio, skipped * number / total))
             inputs, number = outputs, number + 1
         yield nn.Sequential(*blocks)
 

@@ -1,13 +1,13 @@
-"""The LightningDataModule: touches as batches of frames."""
+"""Touches as frames of a representation, and as batches of a training."""
 
 import itertools
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from hashlib import sha256
+from typing import TYPE_CHECKING, Any
 
-import pytorch_lightning as pl
 import torch
 from pydantic import NonNegativeFloat, PositiveInt
 from torch import Tensor
@@ -16,12 +16,16 @@ from skin.core.settings import checked
 from skin.device.base import AbstractDevice, Split, in_background, one_ahead
 from skin.device.touches import Touches, touches_hash
 from skin.errors import InputError
-from skin.learning.representation import Batch, FrameMaker, MakeRepresentation, idle_level
+from skin.learning.representation import AbstractRepresentation, Frames, idle_level
+from skin.touch.labels import Task
+
+if TYPE_CHECKING:
+    from pytorch_lightning import Trainer
+
+Batch = tuple[Frames, Tensor]
+MakeRepresentation = Callable[[Tensor, tuple[float, float]], AbstractRepresentation]
 
 # Data augmentation: changes of a touch that keep its labels.
-
-
-_MARGIN = 2  # frames that a touch may last beyond what stands out
 
 
 @checked("data.augment")
@@ -62,33 +66,30 @@ class Augmentation:
         if self.reverse:
             turned = torch.rand(count, generator=generator) < 0.5
             order = torch.where(turned[:, None], order.flip(1), order)
-        order = order[..., None].expand(-1, -1, sensors)
-        readings, valid = touches.readings.gather(1, order), touches.valid.gather(1, order)
+        rows = torch.arange(count)[:, None]
+        frames = {name: getattr(touches, name) for name in ("readings", "valid", "saturated", "contacts")}
+        moved = {name: values[rows, order] for name, values in frames.items() if values is not None}
         if self.gain:
-            readings = readings * (self.gain * torch.randn(count, 1, sensors, generator=generator)).exp()
+            moved["readings"] *= (self.gain * torch.randn(count, 1, sensors, generator=generator)).exp()
         if self.noise:
-            readings = readings + self.noise * torch.randn(readings.shape, generator=generator)
-        saturated = None if touches.saturated is None else touches.saturated.gather(1, order)
-        contacts = touches.contacts
-        if contacts is not None:
-            contacts = contacts.gather(1, order[..., :1, None].expand(-1, -1, *contacts.shape[2:]))
-        return replace(touches, readings=readings, valid=valid, saturated=saturated, contacts=contacts)
+            moved["readings"] += self.noise * torch.randn(touches.readings.shape, generator=generator)
+        return replace(touches, **moved)
 
     def _shifts(self, touches: Touches, generator: torch.Generator) -> Tensor:
         """Draw the shift of each touch, (B,), frames, such that none is cut."""
         raw = touches.readings * touches.valid
         force = (raw - idle_level(raw)).clamp(min=0).sum(dim=2)
         touched = (force > 0.12 * force.amax(dim=1, keepdim=True)).int()
-        first = touched.argmax(dim=1) - _MARGIN
-        last = raw.shape[1] - touched.flip(1).argmax(dim=1) - 1 + _MARGIN
-        early, late = first.clamp(min=0), (raw.shape[1] - 1 - last).clamp(min=0)
-        chance = torch.rand(len(raw), generator=generator)
-        return (chance * (early + late + 1)).floor().long() - early
+        margin = 2  # frames that a touch may last beyond what stands out
+        early = (touched.argmax(dim=1) - margin).clamp(min=0)
+        late = (touched.flip(1).argmax(dim=1) - margin).clamp(min=0)
+        fraction = torch.rand(len(raw), generator=generator)
+        return (fraction * (early + late + 1)).floor().long() - early
 
 
 @checked("data")
-class TouchData(FrameMaker, pl.LightningDataModule):
-    """Data module with batches of a device's touches in a representation.
+class TouchData:
+    """A device's touches in a representation, whole or as batches.
 
     Batches are slices of tensors; the representation runs on whole batches, on the accelerator where there is
     one. A device that draws fresh gestures is called again every epoch. If a device makes its touches in
@@ -99,20 +100,23 @@ class TouchData(FrameMaker, pl.LightningDataModule):
     labels on the CPU.
 
     Args:
-        device: source of touches.
+        device: source of touches, which have the window, and the sensors if all touches need the same ones.
         representation: partial; takes positions (S, 3), m, and size (x, y), m.
         batch_size: gestures per batch.
         seed: of the order of gestures and of their augmentation; epoch e uses (seed, e).
         augmentation: changes the touches of training batches; None leaves them.
-        geometry: returns that of the configured skin, (S, G), for touches that do not tell it (of a port or a
+        geometry: returns that of the configured skin, (S, G), for touches that do not have it (of a port or a
             file); None: there is none.
 
     Attributes:
         device: as given.
-        task: the labels.
-        window: number of frames per touch.
+        make: the representation, as given.
+        make_geometry: the geometry, as given.
+        trainer: the Trainer that is training on the data.
         passes: counts the passes over training batches without a Trainer.
     """
+
+    trainer: "Trainer | None" = None
 
     def __init__(
         self,
@@ -123,18 +127,31 @@ class TouchData(FrameMaker, pl.LightningDataModule):
         augmentation: Augmentation | None = None,
         geometry: Callable[[], Tensor] | None = None,
     ) -> None:
-        super().__init__(device, representation, geometry)
         if augmentation is not None and augmentation.reverse and device.task.direction:
             raise InputError(
                 "a touch that runs backwards slides the other way: set data.augment.reverse=false where "
                 "data.direction=true"
             )
+        self.device, self.make, self.make_geometry = device, representation, geometry
         self.batch_size, self.seed = batch_size, seed
         # An augmentation without effect must not draw random numbers.
         self.augmentation = None if augmentation == Augmentation() else augmentation
+        self._known: tuple[Tensor, AbstractRepresentation] | None = None
         self._drawn: dict[str, Touches] = {}
         self._ahead: dict[int, Future[Touches]] = {}
         self.passes = itertools.count()
+
+    @property
+    def task(self) -> Task:
+        """What the labels mean."""
+        return self.device.task
+
+    @cached_property
+    def example(self) -> Touches:
+        """The first touch of the training split."""
+        for touches in self.parts("train"):
+            return touches[torch.tensor([0])]
+        raise InputError("there are no touches to train on: generate or record more")
 
     @property
     def hash(self) -> str:
@@ -192,10 +209,6 @@ class TouchData(FrameMaker, pl.LightningDataModule):
     def _fresh(self) -> bool:
         return bool(getattr(self.device, "fresh", False))
 
-    def teardown(self, stage: str) -> None:
-        """Forget the Trainer, which has ended."""
-        self.trainer = None
-
     def train_dataloader(self) -> "_Batches":
         """Return the batches of the training split, in another order each epoch."""
         return _Batches(self, "train")
@@ -204,9 +217,44 @@ class TouchData(FrameMaker, pl.LightningDataModule):
         """Return the batches of the validation split."""
         return _Batches(self, "validation")
 
-    def on_after_batch_transfer(self, batch: Touches | Batch, dataloader_idx: int) -> Batch:
-        """Return the frames and labels of a batch that has arrived where the network is."""
-        return self.frames(batch) if isinstance(batch, Touches) else batch
+    def representation_for(self, positions: Tensor) -> AbstractRepresentation:
+        """Return the representation of a layout with positions (S, 3), m; the last one is kept.
+
+        Raises:
+            InputError: positions that change with time, (B, T, S, 3); motion is given beside the layout.
+        """
+        if self._known is not None and self._layout_free:
+            return self._known[1]
+        if positions.ndim != 2 and not self._layout_free:
+            raise InputError(
+                "representations are built for one layout, got positions per frame: give one position "
+                "(x, y, z) per sensor, and how far it moves as Touches.motion"
+            )
+        if self._known is None or not torch.equal(self._known[0], positions):
+            self._known = (positions, self.make(positions, self.device.size).requires_grad_(False))
+        return self._known[1]
+
+    def frames(self, touches: Touches) -> Batch:
+        """Return the frames of touches and their labels (B, L), on the touches' device."""
+        return self.show(touches), touches.known_labels
+
+    def show(self, touches: Touches) -> Frames:
+        """Return the frames of touches, on the touches' device."""
+        device = touches.readings.device
+        representation = self.representation_for(touches.positions.cpu()).to(device)
+        if touches.geometry is None and self.geometry is not None:
+            touches = replace(touches, geometry=self.geometry.to(device))
+        return representation.show(touches)
+
+    @cached_property
+    def geometry(self) -> Tensor | None:
+        """The geometry of the configured skin, (S, G); None if it is unknown, or not needed."""
+        return self.make_geometry() if self._layout_free and self.make_geometry is not None else None
+
+    @property
+    def _layout_free(self) -> bool:
+        make: Any = getattr(self.make, "func", self.make)
+        return bool(make.layout_free)
 
 
 class _Batches:

@@ -2,7 +2,8 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from typing import Literal, Protocol
+from functools import partial
+from typing import Literal
 
 import torch
 from pydantic import PositiveInt
@@ -13,11 +14,8 @@ from skin.errors import InputError
 from skin.learning.model import AbstractModel, Kind, Reduced, encoder
 from skin.learning.representation import Frames
 
-
-class MakeModel(Protocol):
-    """A model without the arguments that the data decide."""
-
-    def __call__(self, kind: Kind, shape: Sequence[int]) -> AbstractModel: ...
+MakeModel = Callable[[Kind, Sequence[int]], AbstractModel]
+"""A model without the arguments that the data decide: kind and shape."""
 
 
 class AbstractFusion(nn.Module, ABC):
@@ -93,7 +91,7 @@ class Early(AbstractFusion):
 def link(adjacency: Tensor, window: int) -> Tensor:
     """Return the normalised adjacency (T S, T S) of a graph that holds one copy of a sensor graph per frame.
 
-    Every sensor has an edge of weight 1 (that of distance 0) to itself in the following frame, directed: row
+    Every sensor has an edge of weight 1 (as at distance 0) to itself in the following frame, directed: row
     (t, s) gathers from (t - 1, s). Normalised with the rows' sums D as D^-1/2 (A + I) D^-1/2.
 
     Args:
@@ -138,8 +136,7 @@ class Linked(AbstractFusion):
     def forward(self, frames: Frames) -> Tensor:
         """Return the embeddings (B, E) of windows of any length."""
         x, adjacency = frames.x, self.common(frames.adjacency)
-        if adjacency is None:
-            raise ValueError("fusion=linked needs a graph, got frames without")
+        assert adjacency is not None  # of a graph
         return self.model(x.flatten(1, 2), link(adjacency, x.shape[1]))
 
 
@@ -163,30 +160,22 @@ class Convolution(nn.Module):
 
 
 class Recurrent(nn.Module):
-    """The last state of a recurrent layer."""
+    """The last state of a recurrent layer.
 
-    def __init__(self, layer: nn.GRU | nn.LSTM) -> None:
+    With attention the mean of its states, weighted by a softmax over a learned score of each.
+    """
+
+    def __init__(self, layer: type[nn.GRU | nn.LSTM], width: int, hidden: int, attention: bool) -> None:
         super().__init__()
-        self.layer = layer
-        self.width = layer.hidden_size
-
-    def forward(self, x: Tensor) -> Tensor:
-        """Return (B, hidden) of x (B, T, E)."""
-        return self.layer(x)[0][:, -1]
-
-
-class AttentionGru(nn.Module):
-    """The mean of a GRU's states, weighted by a softmax over a learned score of each."""
-
-    def __init__(self, width: int, hidden: int) -> None:
-        super().__init__()
-        self.layer = nn.GRU(width, hidden, batch_first=True)
-        self.score = nn.Linear(hidden, 1)
+        self.layer = layer(width, hidden, batch_first=True)
+        self.score = nn.Linear(hidden, 1) if attention else None
         self.width = hidden
 
     def forward(self, x: Tensor) -> Tensor:
         """Return (B, hidden) of x (B, T, E)."""
         states = self.layer(x)[0]
+        if self.score is None:
+            return states[:, -1]
         return (self.score(states).softmax(dim=1) * states).sum(dim=1)
 
 
@@ -245,9 +234,9 @@ HEADS: dict[Head, Callable[[int, int], nn.Module]] = {
     "mean": lambda width, hidden: Reduced(width, torch.mean, 1),
     "max": lambda width, hidden: Reduced(width, torch.amax, 1),
     "conv": Convolution,
-    "lstm": lambda width, hidden: Recurrent(nn.LSTM(width, hidden, batch_first=True)),
-    "gru": lambda width, hidden: Recurrent(nn.GRU(width, hidden, batch_first=True)),
-    "attention+gru": AttentionGru,
+    "lstm": partial(Recurrent, nn.LSTM, attention=False),
+    "gru": partial(Recurrent, nn.GRU, attention=False),
+    "attention+gru": partial(Recurrent, nn.GRU, attention=True),
     "residual": Residual,
     "transformer": TransformerHead,
 }

@@ -7,7 +7,7 @@ import torch
 from pydantic import PositiveInt
 from scipy.spatial import Delaunay, QhullError, cKDTree
 from scipy.spatial.distance import cdist
-from torch import Tensor
+from torch import Tensor, nn
 
 from skin.core.settings import checked
 from skin.device.touches import Touches
@@ -49,12 +49,12 @@ def neighbours(positions: np.ndarray, edges: Edges, count: int = 6) -> np.ndarra
 def typical_distance(positions: np.ndarray) -> float:
     """Return d0, the median distance of sensors (S, 3), m, to their nearest neighbours elsewhere, m.
 
-    Channels of a sensor with three axes are at one place. Of a single place it is 1.
+    Channels of a sensor with three axes have one position. Of a single position it is 1.
     """
-    places = np.unique(positions, axis=0)
-    if len(places) < 2:
+    points = np.unique(positions, axis=0)
+    if len(points) < 2:
         return 1.0
-    distance = cdist(places, places)
+    distance = cdist(points, points)
     return float(np.median((distance + np.diag(np.full(len(distance), np.inf))).min(axis=1)))
 
 
@@ -63,8 +63,9 @@ def adjacency(positions: np.ndarray, linked: np.ndarray, weight: Weight) -> np.n
 
     With d the distance and d0 the typical one (:func:`typical_distance`): ``exp`` is exp(-d / d0),
     ``distance`` is d / d0 (the report's edge value, free of the unit of length), ``none`` is 1. ``stiffness``
-    is that of the strip of skin between the two sensors, k = E h w / d summed over layers, over that of a
-    strip of length d0 ("other physical information", report, 2.2.1): d0 / d, whatever w and the layers.
+    is the stiffness k = E h w / d, summed over layers, of the strip of skin between the two sensors, divided
+    by the stiffness of a strip of length d0 ("other physical information", report, 2.2.1): d0 / d, whatever w
+    and the layers.
 
     Distances are those along the surface, on a sheet and on an arm alike: a straight line of the chart is the
     shortest way on a cylinder too, and the strip of skin along it is the one that is stretched.
@@ -119,10 +120,6 @@ class Graph(AbstractRepresentation):
     """
 
     kind: ClassVar[Literal["image", "graph", "readings"]] = "graph"
-    adjacency: Tensor
-    layout: Tensor
-    size: Tensor
-    pairs: Tensor
 
     def __init__(
         self,
@@ -145,14 +142,13 @@ class Graph(AbstractRepresentation):
                 "representation.positions=deformed changes nothing at representation.weight=none: set "
                 "representation.weight=exp, or representation.positions=layout"
             )
-        places = layout.cpu().numpy().astype(float)
-        weights = adjacency(places, neighbours(places, edges, count), weight)
-        first, second = np.nonzero(np.triu(weights))
-        self.unit = typical_distance(places)
-        self.register_buffer("adjacency", torch.from_numpy(normalised(weights)).to(torch.float32))
-        self.register_buffer("layout", torch.from_numpy(places).to(torch.float32))
-        self.register_buffer("size", torch.tensor(size, dtype=torch.float32))
-        self.register_buffer("pairs", torch.from_numpy(np.stack([first, second])))
+        points = layout.cpu().numpy().astype(float)
+        weights = adjacency(points, neighbours(points, edges, count), weight)
+        self.unit = typical_distance(points)
+        self.adjacency = nn.Buffer(torch.from_numpy(normalised(weights)).to(torch.float32))
+        self.layout = nn.Buffer(torch.from_numpy(points).to(torch.float32))
+        self.size = nn.Buffer(torch.tensor(size, dtype=torch.float32))
+        self.pairs = nn.Buffer(torch.from_numpy(np.stack(np.nonzero(np.triu(weights)))))
 
     def forward(self, readings: Tensor, valid: Tensor, motion: Tensor | None = None) -> Frames:
         """Return frames (B, T, S, F) and the adjacency (S, S) or (B, T, S, S) of readings (B, T, S), N.
@@ -160,41 +156,38 @@ class Graph(AbstractRepresentation):
         Args:
             readings: (B, T, S), N.
             valid: (B, T, S), bool.
-            motion: (B, T, S, 3), m, displacement of each sensor from its place in the layout; only
+            motion: (B, T, S, 3), m, displacement of each sensor from its position in the layout; only
                 ``positions=deformed`` needs it.
 
         Raises:
             InputError: the motion is needed and not known.
         """
-        places, matrix = self.layout, self.adjacency
-        if self.positions == "deformed":
-            if motion is None:
-                raise InputError(
-                    "representation.positions=deformed needs touches with displacements of sensors: give "
-                    "Touches(motion=...), or set representation.positions=layout"
-                )
-            places = self.layout + motion
-            matrix = self.adjacency if self.weight == "none" else self._adjacency_at(places)
+        deformed = self.positions == "deformed"
+        if deformed and motion is None:
+            raise InputError(
+                "representation.positions=deformed needs touches with displacements of sensors: give "
+                "Touches(motion=...), or set representation.positions=layout"
+            )
+        positions = self.layout + motion if deformed and motion is not None else self.layout
+        matrix = self._adjacency_at(positions) if deformed and self.weight != "none" else self.adjacency
         x = channels(readings, valid, self.scale, self.mask)
         if self.coordinates:
-            where = (places[..., :2] / self.size).to(x.dtype).expand(*x.shape[:-1], 2)
-            x = torch.cat([x, where], dim=-1)
+            coordinates = (positions[..., :2] / self.size).to(x.dtype).expand(*x.shape[:-1], 2)
+            x = torch.cat([x, coordinates], dim=-1)
         return Frames(x, matrix)
 
     def show(self, touches: Touches) -> Frames:
         """Return the frames of touches, with the sensors at their displaced positions if these are known."""
         return self(touches.readings, touches.valid, touches.motion)
 
-    def _adjacency_at(self, places: Tensor) -> Tensor:
-        """Return the normalised adjacency (B, T, S, S) of sensors at places (B, T, S, 3), m."""
+    def _adjacency_at(self, positions: Tensor) -> Tensor:
+        """Return the normalised adjacency (B, T, S, S) of sensors at positions (B, T, S, 3), m."""
         first, second = self.pairs
-        distance = (places.index_select(-2, first) - places.index_select(-2, second)).norm(dim=-1)
-        if self.weight == "stiffness":
-            weights = self.unit / distance
-        else:
-            share = distance / self.unit
-            weights = (-share).exp() if self.weight == "exp" else share
-        looped = torch.eye(places.shape[-2], device=places.device).expand(*places.shape[:-1], -1).clone()
+        distance = (positions.index_select(-2, first) - positions.index_select(-2, second)).norm(dim=-1)
+        ratio = distance / self.unit
+        weights = {"stiffness": self.unit / distance, "exp": (-ratio).exp(), "distance": ratio}[self.weight]
+        loops = torch.eye(positions.shape[-2], device=positions.device)
+        looped = loops.expand(*positions.shape[:-1], -1).clone()
         looped[..., first, second] = looped[..., second, first] = weights
         root = looped.sum(dim=-1).sqrt()
         return looped / (root[..., :, None] * root[..., None, :])

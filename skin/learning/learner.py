@@ -3,10 +3,10 @@
 import json
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -16,15 +16,14 @@ from torch import Tensor, nn
 from skin.core.safe_loading import TEXT, parse_json, read_file
 from skin.device.touches import Touches
 from skin.errors import InputError
+from skin.learning.data import TouchData
 from skin.learning.features import engineered_features
 from skin.touch.labels import Task
 
 if TYPE_CHECKING:
     from pytorch_lightning.loggers import Logger
 
-    from skin.learning.data import TouchData
     from skin.learning.network import TouchClassifier
-    from skin.learning.representation import FrameMaker
 
 
 class AbstractLearner(ABC):
@@ -40,12 +39,24 @@ class AbstractLearner(ABC):
     parameters: int
     seconds_per_epoch: float
     unfinished: Path | None = None
+    _learned: Any = None
 
-    def check(self, data: "TouchData") -> None:  # noqa: B027 - most have nothing that could be missing
+    @property
+    def learned(self) -> Any:
+        """What was fitted or loaded.
+
+        Raises:
+            RuntimeError: before ``fit`` or ``load``.
+        """
+        if self._learned is None:
+            raise RuntimeError("fit or load the learner first")
+        return self._learned
+
+    def check(self, data: TouchData) -> None:  # noqa: B027 - most have nothing that could be missing
         """Raise InputError if the learner cannot be fitted, before anything is logged."""
 
     @abstractmethod
-    def fit(self, data: "TouchData", logger: "Logger | None" = None) -> None:
+    def fit(self, data: TouchData, logger: "Logger | None" = None) -> None:
         """Fit to the training split of ``data``; model selection uses its validation split only."""
 
     @abstractmethod
@@ -67,7 +78,7 @@ class AbstractLearner(ABC):
             positions: (S, 3), m.
 
         Raises:
-            InputError: this learner is no network.
+            InputError: this learner is not a network.
         """
         raise InputError(
             f"learner {type(self).__name__} cannot be exported: give a run of learner=network, or of an "
@@ -79,7 +90,7 @@ class AbstractLearner(ABC):
         """The trained network; what changes its weights changes the learner.
 
         Raises:
-            InputError: this learner is no network.
+            InputError: this learner is not a network.
         """
         raise InputError(
             f"{type(self).__name__} has no network to fine-tune: give a run of a network, such as best_fresh"
@@ -90,7 +101,7 @@ class AbstractLearner(ABC):
         """Write what was learned to a file in ``folder`` and return its path."""
 
     @abstractmethod
-    def load(self, data: "FrameMaker", path: Path) -> None:
+    def load(self, data: TouchData, path: Path) -> None:
         """Load the file that :meth:`save` wrote; ``data`` gives the shapes as in :meth:`fit`."""
 
 
@@ -105,8 +116,6 @@ LOOK_AT = {
     "touch": ("sensor maximum 1",),
 }
 """Label -> beginnings of the names of the features that its rule may use."""
-
-_LARGEST_LOGIT = 12.0
 
 _Split = tuple[dict[str, Tensor], np.ndarray]
 
@@ -138,9 +147,9 @@ class Rules(AbstractLearner):
     """
 
     def __init__(self, seed: int = 0) -> None:
-        self._rules: dict[str, Rule] = {}
+        """Accept a seed as every learner does: nothing is drawn."""
 
-    def fit(self, data: "TouchData", logger: "Logger | None" = None) -> None:
+    def fit(self, data: TouchData, logger: "Logger | None" = None) -> None:
         """Tune the thresholds.
 
         Raises:
@@ -152,58 +161,48 @@ class Rules(AbstractLearner):
                 "use learner=boosted_trees"
             )
         began = time.perf_counter()
-        train, validation = data.touches("train"), data.touches("validation")
-        train_features, validation_features = (
-            engineered_features(train.to("cpu")),
-            engineered_features(validation.to("cpu")),
-        )
-        self._set(
-            {
-                name: _tune(
-                    name,
-                    _select_defined(train_features, train.known_labels, data.task, i),
-                    _select_defined(validation_features, validation.known_labels, data.task, i),
-                )
-                for i, name in enumerate(data.task.names)
-            }
-        )
+        splits = [data.touches(split).to("cpu") for split in ("train", "validation")]
+        features = [engineered_features(touches) for touches in splits]
+        rules = {}
+        for label, name in enumerate(data.task.names):
+            known = [
+                _select_defined(values, touches.known_labels, data.task, label)
+                for values, touches in zip(features, splits, strict=True)
+            ]
+            rules[name] = _tune(name, *known)
+        self._set(rules)
         self.seconds_per_epoch = time.perf_counter() - began
 
     def probabilities(self, touches: Touches) -> Tensor:
         """Return the probability of each label, (B, L), for touches of any layout."""
-        if not self._rules:
-            raise RuntimeError("fit or load the learner first")
-        values = engineered_features(touches.to("cpu"))
-        return torch.stack([rule.probability(values) for rule in self._rules.values()], dim=1)
+        rules, values = self.learned.values(), engineered_features(touches.to("cpu"))
+        return torch.stack([rule.probability(values) for rule in rules], dim=1)
 
     def save(self, folder: Path) -> Path:
         """Write the rules to ``rules.json`` in ``folder`` and return its path."""
-        if not self._rules:
-            raise RuntimeError("fit or load the learner first")
         path = Path(folder) / "rules.json"
-        path.write_text(json.dumps({name: asdict(rule) for name, rule in self._rules.items()}, indent=2))
+        path.write_text(json.dumps({name: asdict(rule) for name, rule in self.learned.items()}, indent=2))
         return path
 
-    def load(self, data: "FrameMaker", path: Path) -> None:
-        """Load the rules that :meth:`save` wrote."""
+    def load(self, data: TouchData, path: Path) -> None:
+        """Load the rules that :meth:`save` wrote.
+
+        Raises:
+            ValueError, LookupError, TypeError: they are damaged, or of other labels or features.
+        """
         stored = parse_json(read_file(Path(path), TEXT))
-        rules = {name: Rule(**stored[name]) for name in data.task.names}
-        features = engineered_features(data.example.to("cpu"))
-        for name, rule in rules.items():
-            numbers = all(isinstance(value, int | float) for value in (rule.threshold, rule.slope))
-            if rule.measurement not in features or not numbers:
-                raise ValueError(f"the rule of {name} is {asdict(rule)}")
-        self._set(rules)
+        self._set({name: Rule(**stored[name]) for name in data.task.names})
+        self.probabilities(data.example)  # refuses unknown measurements and values that are not numbers
 
     def _set(self, rules: dict[str, Rule]) -> None:
-        self._rules = rules
+        self._learned = rules
         self.parameters = 2 * len(rules)
 
 
 def _select_defined(values: dict[str, Tensor], labels: Tensor, task: Task, label: int) -> _Split:
     """Return the features and one label of the touches for which that label is defined."""
-    rows = task.counts(labels)[:, label].cpu()
-    return {name: column[rows] for name, column in values.items()}, labels[:, label].cpu()[rows].numpy()
+    rows = task.counts(labels)[:, label]
+    return {name: column[rows] for name, column in values.items()}, labels[rows, label].numpy()
 
 
 def _tune(label: str, train: _Split, validation: _Split) -> Rule:
@@ -221,7 +220,7 @@ def _tune(label: str, train: _Split, validation: _Split) -> Rule:
         return float(np.logaddexp(0, np.exp(log_slope) * distance / unit * (1 - 2 * truth)).mean())
 
     # The slope is limited so that float32 probabilities have no ties, which would change the ranking.
-    steepest = np.log(_LARGEST_LOGIT * unit / max(float(np.abs(distance).max()), 1e-12))
+    steepest = np.log(12 * unit / max(float(np.abs(distance).max()), 1e-12))
     log_slope = minimize_scalar(loss, bounds=(steepest - 9, steepest), method="bounded").x
     return Rule(name, threshold, float(np.exp(log_slope) / unit))
 
@@ -240,6 +239,18 @@ def _threshold(scores: np.ndarray, truth: np.ndarray) -> tuple[float, float]:
 
 
 # Learning by several learners whose probabilities are averaged.
+
+
+class Mean(nn.Module):
+    """The mean of several pipelines."""
+
+    def __init__(self, members: Sequence[nn.Module]) -> None:
+        super().__init__()
+        self.members = nn.ModuleList(members)
+
+    def forward(self, readings: Tensor, valid: Tensor) -> Tensor:
+        """Return probabilities (B, L) of readings (B, T, S), N, and valid (B, T, S), bool."""
+        return torch.stack([member(readings, valid) for member in self.members]).mean(dim=0)
 
 
 class Ensemble(AbstractLearner):
@@ -271,12 +282,12 @@ class Ensemble(AbstractLearner):
             raise InputError("learner=ensemble has no member: set learner.copies.network=1 or more")
         self._members = [make(seed=1000 * seed + number) for number, make in enumerate(makers)]
 
-    def check(self, data: "TouchData") -> None:
+    def check(self, data: TouchData) -> None:
         """Check every member."""
         for member in self._members:
             member.check(data)
 
-    def fit(self, data: "TouchData", logger: "Logger | None" = None) -> None:
+    def fit(self, data: TouchData, logger: "Logger | None" = None) -> None:
         """Train one member after the other; the last one's training is logged."""
         for member in self._members[:-1]:
             member.fit(data)
@@ -290,20 +301,17 @@ class Ensemble(AbstractLearner):
 
     def pipeline(self, positions: Tensor) -> nn.Module:
         """Return the mean of the members' pipelines."""
-        from skin.learning.network import Mean
-
         return Mean([member.pipeline(positions) for member in self._members])
 
     def save(self, folder: Path) -> Path:
         """Write what each member learned to a numbered folder in ``folder/members``; return that."""
-        whole = Path(folder) / "members"
+        members = Path(folder) / "members"
         for number, member in enumerate(self._members):
-            place = whole / str(number)
-            place.mkdir(parents=True)
-            member.save(place)
-        return whole
+            (members / str(number)).mkdir(parents=True)
+            member.save(members / str(number))
+        return members
 
-    def load(self, data: "FrameMaker", path: Path) -> None:
+    def load(self, data: TouchData, path: Path) -> None:
         """Load the folder that :meth:`save` wrote."""
         for number, member in enumerate(self._members):
             (file,) = (Path(path) / str(number)).iterdir()

@@ -7,8 +7,7 @@ from itertools import pairwise
 from typing import Annotated, ClassVar, Literal
 
 import torch
-from annotated_types import MinLen
-from pydantic import PositiveInt
+from pydantic import Field, PositiveInt
 from torch import Tensor, nn
 
 from skin.core.settings import checked, option_name
@@ -58,16 +57,23 @@ class AbstractModel(nn.Module, ABC):
 # The activations that the report compares, by name.
 
 
-def make_activation(name: str) -> nn.Module:
-    """Return relu, elu or silu as a module.
+Activation = Literal["relu", "elu", "silu"]
+ACTIVATIONS: dict[Activation, Callable[[], nn.Module]] = {"relu": nn.ReLU, "elu": nn.ELU, "silu": nn.SiLU}
 
-    Raises:
-        InputError: another name.
+
+def dense_layers(widths: Sequence[int], activation: Activation, dropout: float = 0.0) -> list[nn.Module]:
+    """Return dense layers of some widths, the first of which is that of the input, with activations.
+
+    Args:
+        widths: of the input and of each layer.
+        activation: after each layer.
+        dropout: fraction of the input of each layer that is dropped in training.
     """
-    activations = {"relu": nn.ReLU, "elu": nn.ELU, "silu": nn.SiLU}
-    if name not in activations:
-        raise InputError(f"unknown activation {name!r}: set activation=relu, elu or silu")
-    return activations[name]()
+    layers: list[nn.Module] = []
+    for pair in pairwise(widths):
+        # Without dropout there is no such layer, so that older weights keep their names.
+        layers += [*([nn.Dropout(dropout)] if dropout else []), nn.Linear(*pair), ACTIVATIONS[activation]()]
+    return layers
 
 
 # The transformer encoder that models and heads over time share.
@@ -85,7 +91,7 @@ def encoder(
         heads: of attention in each layer; they share the width.
         layers: their number.
         feedforward: width of the hidden layer in each of them.
-        dropout: share of values dropped in training.
+        dropout: fraction of values dropped in training.
         setting: the override that sets the width, named where it does not fit.
 
     Raises:
@@ -110,8 +116,6 @@ def encoder(
 # to 1.2 (attention) and 1.0 to 1.3 (set2set) times as long, and 0.7 s to import.
 
 Pooling = Literal["max", "mean", "attention", "set2set"]
-
-STEPS = 3  # of Set2Set
 
 
 class Reduced(nn.Module):
@@ -142,27 +146,27 @@ class Attention(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Return (N, E) of nodes x (S, N, E)."""
-        share = self.gate(x).softmax(dim=0)
-        return torch.bmm(share.permute(1, 2, 0), x.transpose(0, 1)).squeeze(1)
+        weights = self.gate(x).softmax(dim=0)
+        return torch.bmm(weights.permute(1, 2, 0), x.transpose(0, 1)).squeeze(1)
 
 
 class Set2Set(nn.Module):
     """A recurrent query that reads the nodes by attention, step after step (Vinyals et al., 2016)."""
 
-    def __init__(self, width: int) -> None:
+    def __init__(self, width: int, steps: int = 3) -> None:
         super().__init__()
         self.lstm = nn.LSTMCell(2 * width, width)
-        self.width = 2 * width
+        self.width, self.steps = 2 * width, steps
 
     def forward(self, x: Tensor) -> Tensor:
         """Return the last query and what it read, (N, 2 E), of nodes x (S, N, E)."""
         nodes = x.transpose(0, 1)
         query = memory = x.new_zeros(x.shape[1:])
         read = query
-        for _ in range(STEPS):
+        for _ in range(self.steps):
             query, memory = self.lstm(torch.cat([query, read], dim=-1), (query, memory))
-            share = torch.bmm(nodes, query[:, :, None]).softmax(dim=1)
-            read = torch.bmm(share.mT, nodes).squeeze(1)
+            weights = torch.bmm(nodes, query[:, :, None]).softmax(dim=1)
+            read = torch.bmm(weights.mT, nodes).squeeze(1)
         return torch.cat([query, read], dim=-1)
 
 
@@ -178,6 +182,7 @@ POOLINGS: dict[Pooling, Callable[[int], nn.Module]] = {
 # A plain multi-layer perceptron on the readings.
 
 
+@checked("model")
 class Mlp(AbstractModel):
     """Dense layers on the vector of readings, for one layout only.
 
@@ -192,13 +197,15 @@ class Mlp(AbstractModel):
     takes: ClassVar[Kind] = "readings"
 
     def __init__(
-        self, kind: Kind, shape: Sequence[int], widths: Sequence[int] = (64, 64), activation: str = "relu"
+        self,
+        kind: Kind,
+        shape: Sequence[int],
+        widths: Sequence[int] = (64, 64),
+        activation: Activation = "relu",
     ) -> None:
         super().__init__(kind)
         sizes = [*shape, *widths]
-        self.layers = nn.Sequential(
-            *(layer for pair in pairwise(sizes) for layer in (nn.Linear(*pair), make_activation(activation)))
-        )
+        self.layers = nn.Sequential(*dense_layers(sizes, activation))
         self.inputs, self.width = sizes[0], sizes[-1]
 
     def forward(self, x: Tensor, adjacency: Tensor | None) -> Tensor:
@@ -232,7 +239,7 @@ class Transformer(AbstractModel):
         layers: number of encoder layers.
         heads: of attention in each layer; they share the width.
         feedforward: width of the hidden layer in each encoder layer.
-        dropout: share of values dropped in training, as everywhere in torch's encoder layer.
+        dropout: fraction of values dropped in training, as everywhere in torch's encoder layer.
         pooling: over the sensors: mean or max.
 
     Raises:
@@ -323,23 +330,22 @@ class Gcn(AbstractModel):
         self,
         kind: Kind,
         shape: Sequence[int],
-        widths: Annotated[Sequence[PositiveInt], MinLen(1)] = (32, 128),
-        activation: str = "silu",
+        widths: Annotated[Sequence[PositiveInt], Field(min_length=1)] = (32, 128),
+        activation: Activation = "silu",
         norm: Norm = "none",
         pooling: Pooling = "max",
     ) -> None:
         super().__init__(kind)
         sizes = [shape[-1], *widths]
         self.convolutions = nn.ModuleList(_Convolution(*pair) for pair in pairwise(sizes))
-        self.activation = make_activation(activation)
+        self.activation = ACTIVATIONS[activation]()
         self.norms = nn.ModuleList(_NORMS[norm](width) for width in widths[:-1])
         self.pooling = POOLINGS[pooling](sizes[-1])
         self.width = int(self.pooling.width)  # type: ignore[arg-type]
 
     def forward(self, x: Tensor, adjacency: Tensor | None) -> Tensor:
         """Return the embeddings (N, E) of graphs x (N, S, F) with their adjacency."""
-        if adjacency is None:
-            raise ValueError("a graph needs its adjacency, got None")
+        assert adjacency is not None  # of a graph
         nodes = x.transpose(0, 1).contiguous()  # nodes first: mixing them is then one product for all graphs
         for convolution, norm in zip(self.convolutions, [*self.norms, nn.Identity()], strict=True):
             nodes = self.activation(norm(convolution(nodes, adjacency)))

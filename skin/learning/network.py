@@ -1,9 +1,7 @@
 """Networks: the module with its loss, and the learner that trains it (:mod:`skin.learning.training`)."""
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
-from itertools import pairwise
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Any
@@ -17,16 +15,15 @@ from skin.core.messages import one_line
 from skin.core.safe_loading import check_archive
 from skin.device.touches import Touches
 from skin.errors import InputError
+from skin.learning.data import TouchData
 from skin.learning.fusion import AbstractFusion
 from skin.learning.learner import AbstractLearner
-from skin.learning.model import AbstractModel, make_activation
-from skin.learning.representation import AbstractRepresentation, FrameMaker, Frames
+from skin.learning.model import Activation, dense_layers
+from skin.learning.representation import AbstractRepresentation, Frames
 from skin.touch.labels import Task
 
 if TYPE_CHECKING:
     from pytorch_lightning.loggers import Logger
-
-    from skin.learning.data import TouchData
 
 MakeOptimizer = Callable[[Iterable[nn.Parameter]], torch.optim.Optimizer]
 
@@ -40,8 +37,8 @@ def probabilities(logits: Tensor, task: Task) -> Tensor:
         return logits
     if task.kind == "exclusive":
         return logits.softmax(dim=-1)
-    chances = logits.sigmoid()
-    return torch.cat([chances[:, :-2], 2 * chances[:, -2:] - 1], dim=1) if task.direction else chances
+    values = logits.sigmoid()
+    return torch.cat([values[:, :-2], 2 * values[:, -2:] - 1], dim=1) if task.direction else values
 
 
 class TouchClassifier(nn.Module):
@@ -59,7 +56,7 @@ class TouchClassifier(nn.Module):
         task: its length is the number of logits, its kind determines the loss.
         hidden: widths of the dense layers before the last one.
         activation: relu, elu or silu, after each of them.
-        dropout: share of the embedding and of the first dense layer that is dropped in training.
+        dropout: fraction of the embedding and of the first dense layer that is dropped in training.
         summary: number of numbers about the whole window.
     """
 
@@ -68,7 +65,7 @@ class TouchClassifier(nn.Module):
         fusion: AbstractFusion,
         task: Task,
         hidden: Sequence[int],
-        activation: str,
+        activation: Activation,
         dropout: float = 0.0,
         summary: int = 0,
     ) -> None:
@@ -76,12 +73,7 @@ class TouchClassifier(nn.Module):
         self.fusion = fusion
         self.summary = _Summary(summary, fusion.width, activation) if summary else None
         widths = [fusion.width * (2 if summary else 1), *hidden]
-        layers: list[nn.Module] = []
-        for before, after in pairwise(widths):
-            # Without dropout there is no layer, so that older weights keep their names.
-            dropped = [nn.Dropout(dropout)] if dropout else []
-            layers += [*dropped, nn.Linear(before, after), make_activation(activation)]
-        layers.append(nn.Linear(widths[-1], len(task)))
+        layers = [*dense_layers(widths, activation, dropout), nn.Linear(widths[-1], len(task))]
         if task.kind == "regression":
             layers.append(_Targets(len(task)))
         self.head = nn.Sequential(*layers)
@@ -90,20 +82,14 @@ class TouchClassifier(nn.Module):
     @property
     def targets(self) -> "_Targets":
         """The last layer of a regression."""
-        layer = self.head[-1]
-        assert isinstance(layer, _Targets)
-        return layer
+        return self.head[-1]  # type: ignore[return-value]
 
     def forward(self, frames: Frames) -> Tensor:
         """Return the logits (B, L) of frames; the targets of a regression."""
-        return self.head(self.embed(frames))
-
-    def embed(self, frames: Frames) -> Tensor:
-        """Return the input of the dense layers: the embedding (B, E), with that of the summary if any."""
         embedding = self.fusion(frames)
-        if self.summary is None:
-            return embedding
-        return torch.cat([embedding, self.summary(frames.summary)], dim=1)
+        if self.summary is not None:
+            embedding = torch.cat([embedding, self.summary(frames.summary)], dim=1)
+        return self.head(embedding)
 
     def loss(self, logits: Tensor, labels: Tensor) -> Tensor:
         """Return the mean loss of logits (B, L) given labels (B, L), 0 or 1, or the cosines of a direction.
@@ -131,22 +117,19 @@ class TouchClassifier(nn.Module):
             right = (logits.argmax(dim=-1) == labels.argmax(dim=-1)) & counts[:, 0]
             return {"accuracy": right.sum() / counts[:, 0].sum().clamp(min=1)}
         right = ((logits > 0) == (labels > 0.5)) & counts
-        shares = right.sum(dim=0) / counts.sum(dim=0).clamp(min=1)
-        label_shares = dict(zip(self.task.binary, shares, strict=False))
-        overall = torch.stack([label_shares[name] for name in self.task.gated]).mean()
-        return {"accuracy": overall} | {f"accuracy_{name}": share for name, share in label_shares.items()}
+        fractions = right.sum(dim=0) / counts.sum(dim=0).clamp(min=1)
+        accuracies = dict(zip(self.task.binary, fractions, strict=False))
+        overall = torch.stack([accuracies[name] for name in self.task.gated]).mean()
+        return {"accuracy": overall} | {f"accuracy_{name}": value for name, value in accuracies.items()}
 
 
 class _Targets(nn.Module):
     """Maps outputs of the size of 1 to targets in their units."""
 
-    mean: Tensor
-    deviation: Tensor
-
     def __init__(self, targets: int) -> None:
         super().__init__()
-        self.register_buffer("mean", torch.zeros(targets))
-        self.register_buffer("deviation", torch.ones(targets))
+        self.mean = nn.Buffer(torch.zeros(targets))
+        self.deviation = nn.Buffer(torch.ones(targets))
 
     def forward(self, x: Tensor) -> Tensor:
         """Return targets (B, L) of outputs (B, L)."""
@@ -176,14 +159,11 @@ class _Standardised(nn.BatchNorm1d):
 class _Summary(nn.Module):
     """Two dense layers on numbers of any unit, each standardised first."""
 
-    def __init__(self, numbers: int, width: int, activation: str) -> None:
+    def __init__(self, numbers: int, width: int, activation: Activation) -> None:
         super().__init__()
         self.layers = nn.Sequential(
             _Standardised(numbers, affine=False, momentum=None),
-            nn.Linear(numbers, width),
-            make_activation(activation),
-            nn.Linear(width, width),
-            make_activation(activation),
+            *dense_layers([numbers, width, width], activation),
         )
 
     def forward(self, summary: Tensor | None) -> Tensor:
@@ -206,9 +186,6 @@ class Pipeline(nn.Module):
         geometry: (S, G) of the sensors (:data:`skin.device.touches.GEOMETRY`); None if not needed.
     """
 
-    positions: Tensor
-    geometry: Tensor | None
-
     def __init__(
         self,
         representation: AbstractRepresentation,
@@ -218,8 +195,8 @@ class Pipeline(nn.Module):
     ) -> None:
         super().__init__()
         self.representation = representation
-        self.register_buffer("positions", positions)
-        self.register_buffer("geometry", geometry)
+        self.positions = nn.Buffer(positions)
+        self.geometry = None if geometry is None else nn.Buffer(geometry)
         self.classifier = classifier
 
     def forward(self, readings: Tensor, valid: Tensor) -> Tensor:
@@ -230,21 +207,13 @@ class Pipeline(nn.Module):
         return probabilities(logits, self.classifier.task)
 
 
-class Mean(nn.Module):
-    """The mean of several pipelines."""
-
-    def __init__(self, members: Sequence[nn.Module]) -> None:
-        super().__init__()
-        self.members = nn.ModuleList(members)
-
-    def forward(self, readings: Tensor, valid: Tensor) -> Tensor:
-        """Return probabilities (B, L) of readings (B, T, S), N, and valid (B, T, S), bool."""
-        return torch.stack([member(readings, valid) for member in self.members]).mean(dim=0)
-
-
 LAST = "last.ckpt"
 """Name of the checkpoint that continues an unfinished training."""
-CHUNK = 64  # touches at a time when predicting: fastest, and bounds memory to a few hundred MB
+
+
+def _load_weights(classifier: TouchClassifier, path: Path) -> None:
+    check_archive(path)
+    classifier.load_state_dict(torch.load(path, weights_only=True, map_location="cpu"))
 
 
 class Network(AbstractLearner):
@@ -257,7 +226,7 @@ class Network(AbstractLearner):
         trainer: settings of pytorch_lightning.Trainer: max_epochs, accelerator, ...
         hidden: widths of the dense layers between embedding and labels.
         activation: relu, elu or silu, after each of them.
-        warmup: share of the training in which the learning rate rises to that of the optimizer; it then
+        warmup: fraction of the training in which the learning rate rises to that of the optimizer; it then
             decays to 0 along a cosine. None: constant.
         dropout: probability of dropout for the embedding and the dense layers.
         start: file ``weights.pt`` of the same network, from which the training goes on; None: drawn weights.
@@ -272,7 +241,7 @@ class Network(AbstractLearner):
         optimizer: Callable[..., Any],
         trainer: dict[str, Any],
         hidden: Sequence[Annotated[int, Ge(1)]] = (32,),
-        activation: str = "relu",
+        activation: Activation = "relu",
         warmup: Annotated[float, Ge(0), Le(1)] | None = None,
         dropout: Annotated[float, Ge(0), Lt(1)] = 0.0,
         start: str | None = None,
@@ -283,27 +252,36 @@ class Network(AbstractLearner):
         self._optimizer, self._trainer = optimizer, dict(trainer)
         self._hidden, self._activation, self._seed = hidden, activation, seed
         self._warmup, self._dropout = None if warmup is None else float(warmup), dropout
-        self._data: FrameMaker | None = None
-        self._classifier: TouchClassifier | None = None
 
-    def check(self, data: "TouchData") -> None:
-        """Build network, optimizer and trainer once, so that errors in the settings are reported early."""
+    def check(self, data: TouchData) -> None:
+        """Build and use network, optimizer and trainer once, so that errors are reported early.
+
+        Raises:
+            InputError: the settings do not fit each other or the data, or a part gives wrong shapes.
+        """
         from skin.learning.training import make_trainer
 
         with torch.random.fork_rng():
             network = self.build(data)
         self._begin(network)
-        _check_widths(network, data.frames(data.example)[0])
+        try:
+            with torch.no_grad():
+                network.eval()(data.show(data.example))
+        except RuntimeError as error:
+            raise InputError(
+                "model and fusion must return embeddings (N, E), as wide as their attribute width says: "
+                f"{one_line(error)}"
+            ) from error
         make_trainer(self._trainer)
-        settings = self._optimizer.keywords if isinstance(self._optimizer, partial) else {}
-        if text := [name for name, value in settings.items() if isinstance(value, str)]:
-            raise InputError(f"optimizer.{text[0]}={settings[text[0]]} is text, and must be a number")
+        settings = getattr(self._optimizer, "keywords", {}).items()
+        if text := [f"{name}={value}" for name, value in settings if isinstance(value, str)]:
+            raise InputError(f"optimizer.{text[0]} is text, and must be a number")
         try:
             self._optimizer(network.parameters())
         except (TypeError, ValueError) as error:
             raise InputError(f"the optimizer refuses its settings: {error}") from error
 
-    def fit(self, data: "TouchData", logger: "Logger | None" = None) -> None:
+    def fit(self, data: TouchData, logger: "Logger | None" = None) -> None:
         """Train on the training split; the validation loss chooses the epoch.
 
         With several processes, only the first has the trained weights; they continue no earlier training.
@@ -314,31 +292,30 @@ class Network(AbstractLearner):
         # Imported here because Lightning takes seconds and a prediction does not need it.
         from skin.learning.training import Training, train_network
 
-        with torch.random.fork_rng(), self._folder() as folder:
+        with torch.random.fork_rng(), TemporaryDirectory() as temporary:
             torch.manual_seed(self._seed)
             classifier = self.build(data)
             if data.task.kind == "regression":
                 classifier.targets.scale(torch.cat([part.known_labels for part in data.parts("train")]))
             self._begin(classifier)
-            training = Training(classifier, self._optimizer, self._warmup)
+            training = Training(classifier, data, self._optimizer, self._warmup)
+            folder = self.unfinished or Path(temporary)
             self.seconds_per_epoch = train_network(
-                training, data, self._trainer, logger, folder, self.unfinished is not None
+                training, self._trainer, logger, folder, self.unfinished is not None
             )
 
     def _begin(self, classifier: TouchClassifier) -> None:
         """Give a network the weights of ``start``.
 
         Raises:
-            InputError: there is no such file, or it is of another network.
+            InputError: the file does not exist, or is of another network.
         """
         if self._start is None:
             return
         if not self._start.is_file():
             raise InputError(f"learner.start={self._start}: no such file")
-        check_archive(self._start)
-        weights = torch.load(self._start, weights_only=True, map_location="cpu")
         try:
-            classifier.load_state_dict(weights)
+            _load_weights(classifier, self._start)
         except RuntimeError as error:
             raise InputError(
                 f"learner.start={self._start} is of another network: {one_line(error)}"
@@ -346,15 +323,6 @@ class Network(AbstractLearner):
         for module in classifier.modules():
             if isinstance(module, nn.BatchNorm1d):
                 module.reset_running_stats()
-
-    @contextmanager
-    def _folder(self) -> Iterator[Path]:
-        """Yield the folder for checkpoints: the one that outlives this process, or a temporary one."""
-        if self.unfinished:
-            yield self.unfinished
-            return
-        with TemporaryDirectory() as folder:
-            yield Path(folder)
 
     def probabilities(self, touches: Touches) -> Tensor:
         """Return the probability of each label, (B, L), for touches of any layout that the model accepts."""
@@ -373,27 +341,28 @@ class Network(AbstractLearner):
         Raises:
             RuntimeError: before ``fit`` or ``load``.
         """
-        if self._classifier is None:
-            raise RuntimeError("fit or load the learner first")
-        return self._classifier
+        return self.learned[0]
 
     def pipeline(self, positions: Tensor) -> nn.Module:
         """Return representation and network as one module, in evaluation mode."""
-        if self._classifier is None or self._data is None:
-            raise RuntimeError("fit or load the learner first")
-        data = self._data
-        pipeline = Pipeline(data.representation_for(positions), self._classifier, positions, data.geometry)
+        classifier, data = self.learned
+        pipeline = Pipeline(data.representation_for(positions), classifier, positions, data.geometry)
         return pipeline.cpu().eval()
 
-    def _map(self, touches: Touches, function: Callable[[TouchClassifier, Frames], Tensor]) -> Tensor:
+    def _map(
+        self,
+        touches: Touches,
+        function: Callable[[TouchClassifier, Frames], Tensor],
+        chunk: int = 64,  # touches at a time: fastest, and bounds memory to a few hundred MB
+    ) -> Tensor:
         """Return a function of the classifier and frames, (B, ...), computed in chunks."""
-        classifier = self.network.eval()
-        assert self._data is not None
-        parts = []
+        classifier, data = self.learned
+        device = next(classifier.eval().parameters()).device
         with torch.inference_mode():
-            for start in range(0, len(touches), CHUNK):
-                part = touches[start : start + CHUNK].to(next(classifier.parameters()).device)
-                parts.append(function(classifier, self._data.show(part)).cpu())
+            parts = [
+                function(classifier, data.show(touches[start : start + chunk].to(device))).cpu()
+                for start in range(0, len(touches), chunk)
+            ]
         return torch.cat(parts)
 
     def save(self, folder: Path) -> Path:
@@ -402,12 +371,11 @@ class Network(AbstractLearner):
         torch.save(self.network.state_dict(), path)
         return path
 
-    def load(self, data: FrameMaker, path: Path) -> None:
+    def load(self, data: TouchData, path: Path) -> None:
         """Load the weights that :meth:`save` wrote; ``data`` gives the shapes as in :meth:`fit`."""
-        check_archive(path)
-        self.build(data).load_state_dict(torch.load(path, weights_only=True, map_location="cpu"))
+        _load_weights(self.build(data), path)
 
-    def build(self, data: FrameMaker) -> TouchClassifier:
+    def build(self, data: TouchData) -> TouchClassifier:
         """Return the untrained network for the frames of ``data``, drawn from torch's random state.
 
         Raises:
@@ -424,31 +392,6 @@ class Network(AbstractLearner):
             self._dropout,
             0 if frames.summary is None else frames.summary.shape[1],
         )
-        self._data, self._classifier = data, classifier
+        self._learned = classifier, data
         self.parameters = sum(p.numel() for p in classifier.parameters() if p.requires_grad)
         return classifier
-
-
-def _check_widths(network: TouchClassifier, frames: Frames) -> None:
-    """Check that the model and the fusion of a network give embeddings as wide as they say.
-
-    Raises:
-        InputError: one does not.
-    """
-
-    def compare(part: AbstractModel | AbstractFusion, inputs: tuple[Tensor | Frames], output: Tensor) -> None:
-        if output.shape != (expected := (len(getattr(inputs[0], "x", inputs[0])), part.width)):
-            raise InputError(
-                f"{type(part).__name__}.forward returned {tuple(output.shape)}, and must return embeddings "
-                f"{expected}, as wide as its attribute width says"
-            )
-
-    hooks = [
-        part.register_forward_hook(compare)
-        for part in network.modules()
-        if isinstance(part, AbstractModel | AbstractFusion)
-    ]
-    with torch.no_grad():
-        network.eval()(frames)
-    for hook in hooks:
-        hook.remove()

@@ -2,12 +2,13 @@
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Annotated, Any, ClassVar
+from typing import Any, ClassVar
 
 import torch
-from annotated_types import Ge
+from pydantic import PositiveInt
 from torch import Tensor
 from torch_geometric.nn.models.basic_gnn import BasicGNN
+from torch_geometric.utils import dense_to_sparse
 
 from skin.errors import InputError
 from skin.learning.model import POOLINGS, AbstractModel, Kind, Pooling
@@ -39,18 +40,17 @@ class Pyg(AbstractModel):
         kind: Kind,
         shape: Sequence[int],
         network: Callable[..., BasicGNN],
-        width: Annotated[int, Ge(1)] = 64,
-        layers: Annotated[int, Ge(1)] = 2,
+        width: PositiveInt = 64,
+        layers: PositiveInt = 2,
         pooling: Pooling = "attention",
-        degree: Annotated[int, Ge(1)] = 7,
+        degree: PositiveInt = 7,
     ) -> None:
         super().__init__(kind)
-        keywords: dict[str, Any] = network.keywords if isinstance(network, partial) else {}
-        made = network.func if isinstance(network, partial) else network
-        self._weighted = bool(getattr(made, "supports_edge_weight", False))
+        given = network if isinstance(network, partial) else partial(network)
+        self._weighted = bool(getattr(given.func, "supports_edge_weight", False))
         # The adjacency is normalised already.
         defaults: dict[str, Any] = {"normalize": False, "add_self_loops": False} if self._weighted else {}
-        if "scalers" in keywords:
+        if "scalers" in given.keywords:
             defaults["deg"] = torch.nn.functional.one_hot(torch.tensor(degree), degree + 1)
         try:
             self.network = network(shape[-1], width, layers, **defaults)
@@ -61,8 +61,7 @@ class Pyg(AbstractModel):
 
     def forward(self, x: Tensor, adjacency: Tensor | None) -> Tensor:
         """Return the embeddings (N, E) of graphs x (N, S, F) with their adjacency."""
-        if adjacency is None:
-            raise ValueError("a graph needs its adjacency, got None")
+        assert adjacency is not None  # of a graph
         count, sensors, _ = x.shape
         edges, weights = self._edges(adjacency, count)
         extra = {"edge_weight": weights} if self._weighted else {}
@@ -71,13 +70,11 @@ class Pyg(AbstractModel):
 
     def _edges(self, adjacency: Tensor, count: int) -> tuple[Tensor, Tensor]:
         """Return the edges (2, E) of all graphs as one, and their weights (E,)."""
-        linked = adjacency != 0
         if not self._weighted:  # the others count a node itself by themselves
-            linked = linked & ~torch.eye(adjacency.shape[-1], dtype=torch.bool, device=adjacency.device)
+            loops = torch.eye(adjacency.shape[-1], dtype=torch.bool, device=adjacency.device)
+            adjacency = adjacency.masked_fill(loops, 0)
+        edges, weights = dense_to_sparse(adjacency.contiguous())
         if adjacency.ndim == 3:
-            graph, first, second = linked.nonzero(as_tuple=True)
-            offset = graph * adjacency.shape[-1]
-            return torch.stack([first + offset, second + offset]), adjacency[linked]
-        edges = linked.nonzero().T
+            return edges, weights
         offsets = adjacency.shape[-1] * torch.arange(count, device=adjacency.device)
-        return (edges[:, None] + offsets[:, None]).flatten(1), adjacency[linked].repeat(count)
+        return (edges[:, None] + offsets[:, None]).flatten(1), weights.repeat(count)

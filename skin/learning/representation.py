@@ -1,15 +1,12 @@
 """Representations: how readings are shown to a network."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
-from dataclasses import replace
-from functools import cached_property
-from typing import Annotated, Any, ClassVar, Literal, NamedTuple
+from collections.abc import Sequence
+from typing import Annotated, ClassVar, Literal, NamedTuple
 
 import numpy as np
 import torch
-from annotated_types import Ge, MinLen
-from pydantic import PositiveFloat, PositiveInt
+from pydantic import Field, PositiveFloat, PositiveInt
 from scipy.interpolate import CloughTocher2DInterpolator, LinearNDInterpolator, NearestNDInterpolator
 from scipy.spatial import QhullError
 from torch import Tensor, nn
@@ -17,11 +14,9 @@ from torch.nn.functional import pad
 
 from skin.body.base import GEOMETRY
 from skin.core.settings import checked
-from skin.device.base import AbstractDevice, Split
 from skin.device.touches import Touches
 from skin.errors import InputError
 from skin.learning.features import engineered_features, feature_blocks
-from skin.touch.labels import Task
 
 
 class Frames(NamedTuple):
@@ -111,12 +106,9 @@ class Readings(AbstractRepresentation):
 # Readings above their idle level, with engineered features of the window.
 
 
-_IDLE = 8  # frames
-
-
-def idle_level(raw: Tensor) -> Tensor:
+def idle_level(raw: Tensor, frames: int = 8) -> Tensor:
     """Return the mean of each sensor's lowest frames, (B, 1, S), N, of readings (B, T, S)."""
-    return raw.topk(min(_IDLE, raw.shape[1]), dim=1, largest=False).values.mean(dim=1, keepdim=True)
+    return raw.topk(min(frames, raw.shape[1]), dim=1, largest=False).values.mean(dim=1, keepdim=True)
 
 
 class Features(AbstractRepresentation):
@@ -136,7 +128,6 @@ class Features(AbstractRepresentation):
 
     kind: ClassVar[Literal["image", "graph", "readings"]] = "readings"
     windowed: ClassVar[bool] = True
-    positions: Tensor
 
     def __init__(
         self,
@@ -148,7 +139,7 @@ class Features(AbstractRepresentation):
     ) -> None:
         super().__init__()
         self.scale, self.finest, self.mask = scale, finest, mask
-        self.register_buffer("positions", positions)
+        self.positions = nn.Buffer(positions)
 
     def forward(self, readings: Tensor, valid: Tensor) -> Frames:
         """Return frames (B, T, 2 S), or (B, T, 3 S) with the mask, and the summary (B, D), as asinh.
@@ -167,7 +158,7 @@ class Features(AbstractRepresentation):
 # The pixel grid that covers the sheet, shared by the image representations.
 
 
-Pixels = Annotated[int, Ge(8)]
+Pixels = Annotated[int, Field(ge=8)]
 """Edge length of a square image."""
 
 
@@ -205,8 +196,6 @@ class Image(AbstractRepresentation):
     """
 
     kind: ClassVar[Literal["image", "graph", "readings"]] = "image"
-    where: Tensor
-    average: Tensor
 
     def __init__(
         self,
@@ -218,16 +207,16 @@ class Image(AbstractRepresentation):
     ) -> None:
         super().__init__()
         self.pixels, self.scale, self.mask = pixels, scale, mask
-        where, place = np.unique(pixel_of(positions.cpu().numpy(), size, pixels), return_inverse=True)
-        share = np.eye(len(where))[place]
-        self.register_buffer("where", torch.from_numpy(where))
-        self.register_buffer("average", torch.from_numpy(share / share.sum(axis=0)).to(torch.float32))
+        used, numbers = np.unique(pixel_of(positions.cpu().numpy(), size, pixels), return_inverse=True)
+        members = np.eye(len(used))[numbers]
+        self.pixels_used = nn.Buffer(torch.from_numpy(used))
+        self.average = nn.Buffer(torch.from_numpy(members / members.sum(axis=0)).to(torch.float32))
 
     def forward(self, readings: Tensor, valid: Tensor) -> Frames:
         """Return frames (B, T, C, pixels, pixels) of readings (B, T, S), N."""
         values = channels(readings, valid, self.scale, self.mask).mT @ self.average
         blank = values.new_zeros((*values.shape[:-1], self.pixels**2))
-        image = blank.scatter(-1, self.where.expand_as(values), values)
+        image = blank.scatter(-1, self.pixels_used.expand_as(values), values)
         return Frames(image.unflatten(-1, (self.pixels, self.pixels)), None)
 
 
@@ -286,13 +275,12 @@ class Interpolation(AbstractRepresentation):
     """
 
     kind: ClassVar[Literal["image", "graph", "readings"]] = "image"
-    matrix: Tensor
 
     def __init__(
         self,
         positions: Tensor,
         size: tuple[float, float],
-        method: Method | Annotated[Sequence[Method], MinLen(1)] = "linear",
+        method: Method | Annotated[Sequence[Method], Field(min_length=1)] = "linear",
         pixels: Pixels = 64,
         scale: float = 10.0,
         mask: bool = False,
@@ -302,7 +290,7 @@ class Interpolation(AbstractRepresentation):
         methods: Sequence = method if isinstance(method, list | tuple) else [method]
         points, targets = positions[:, :2].cpu().numpy(), centres(size, pixels)
         matrix = np.concatenate([weights(points, targets, method) for method in methods])
-        self.register_buffer("matrix", torch.from_numpy(matrix).to(torch.float32))
+        self.matrix = nn.Buffer(torch.from_numpy(matrix).to(torch.float32))
 
     def forward(self, readings: Tensor, valid: Tensor) -> Frames:
         """Return frames (B, T, C, pixels, pixels) of readings (B, T, S), N."""
@@ -354,18 +342,6 @@ class Fourier(AbstractRepresentation):
 # Readings averaged onto virtual sites: the same input for any number and order of sensors.
 
 
-_LEAST = 1e-3  # N and m, smallest response and extent to divide by
-_COVERED = 1e-6
-_COUNTING = (
-    "raw sensor maximum",
-    "sensor sum",
-    "longest run of the sum",
-)  # change with the number of dead sensors
-_X, _Y, _WIDTH, _HEIGHT, _DIRECT = (
-    GEOMETRY.index(name) for name in ("x", "y", "width", "height", "response_0mm")
-)
-
-
 @checked("representation")
 class Sites(AbstractRepresentation):
     """Averages readings onto a grid of virtual sites and gives the largest ones in order.
@@ -381,7 +357,7 @@ class Sites(AbstractRepresentation):
         positions: not used.
         size: not used.
         sites: rows and columns of the grid.
-        spreads: standard deviations of the Gaussian weights, as shares of width and height.
+        spreads: standard deviations of the Gaussian weights, as fractions of width and height.
         strongest: number of the largest readings.
         scale: N; readings on the linear scale are divided by it.
         finest: N; the logarithmic scales are linear below it.
@@ -390,23 +366,20 @@ class Sites(AbstractRepresentation):
     kind: ClassVar[Literal["image", "graph", "readings"]] = "readings"
     windowed: ClassVar[bool] = True
     layout_free: ClassVar[bool] = True
-    centres: Tensor
 
     def __init__(
         self,
         positions: Tensor,
         size: tuple[float, float],
         sites: tuple[PositiveInt, PositiveInt] = (6, 6),
-        spreads: Annotated[Sequence[PositiveFloat], MinLen(1)] = (0.08, 0.16, 0.32),
-        strongest: Annotated[int, Ge(1)] = 10,
+        spreads: Annotated[Sequence[PositiveFloat], Field(min_length=1)] = (0.08, 0.16, 0.32),
+        strongest: PositiveInt = 10,
         scale: PositiveFloat = 3.0,
         finest: PositiveFloat = 0.2,
     ) -> None:
         super().__init__()
         y, x = ((torch.arange(count) + 0.5) / count for count in sites)
-        self.register_buffer(
-            "centres", torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1).flatten(0, 1)
-        )
+        self.centres = nn.Buffer(torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1).flatten(0, 1))
         self.spreads, self.strongest = tuple(spreads), strongest
         self.scale, self.finest = scale, finest
 
@@ -416,7 +389,7 @@ class Sites(AbstractRepresentation):
         Raises:
             InputError: always.
         """
-        raise _no_geometry()
+        return self.show(Touches(readings, valid, torch.zeros(readings.shape[2], 3), None, 1.0))
 
     def show(self, touches: Touches) -> Frames:
         """Return frames (B, T, F) and a summary of the skin (B, D).
@@ -425,43 +398,46 @@ class Sites(AbstractRepresentation):
             InputError: the geometry of the sensors is not known.
         """
         if touches.geometry is None:
-            raise _no_geometry()
+            raise InputError(
+                "representation=sites needs to know what each sensor responds to, and this device has no "
+                "mechanics: use device=simulated, device=serial, a recording with positions: layout, or "
+                "another representation"
+            )
         batch, _, sensors = touches.readings.shape
         geometry = touches.geometry.expand(batch, sensors, len(GEOMETRY))
         values = self._scaled(touches, geometry)
         weights = self._weights(geometry)
-        works = touches.valid.to(values)
-        shares = torch.einsum("bvs,bts->btv", weights, works)
-        means = torch.einsum("bvs,btsc->btvc", weights, values) / (shares + _COVERED)[..., None]
+        working = touches.valid.to(values)
+        coverage = torch.einsum("bvs,bts->btv", weights, working)
+        means = torch.einsum("bvs,btsc->btvc", weights, values) / (coverage + 1e-6)[..., None]
         sums = values[..., 0].sum(2, keepdim=True)
-        order = [self._largest(values[..., channel], touches.valid) for channel in (1, 2)]
-        x = torch.cat([means.flatten(2), *order, sums, sums.asinh()], dim=-1)
-        summary = torch.cat([self._summary(geometry, works, shares), _engineered(touches)], dim=1)
+        largest = [self._largest(values[..., channel], touches.valid) for channel in (1, 2)]
+        x = torch.cat([means.flatten(2), *largest, sums, sums.asinh()], dim=-1)
+        summary = torch.cat([self._summary(geometry, working, coverage), _engineered(touches)], dim=1)
         return Frames(x, None, summary)
 
     def _scaled(self, touches: Touches, geometry: Tensor) -> Tensor:
         """Return readings above idle on three scales, and whether they are at their limit, (B, T, S, 4)."""
         raw = torch.where(touches.valid, touches.readings, touches.readings.new_zeros(()))
         excess = (raw - idle_level(raw)) * touches.valid
-        direct = geometry[..., _DIRECT].clamp(min=_LEAST)[:, None]
-        limited = (
-            touches.valid & touches.saturated
-            if touches.saturated is not None
-            else torch.zeros_like(touches.valid)
-        )
-        views = [
+        # of a fingertip of 1 N; a sensor that responds to nothing must not divide by 0
+        response = geometry[..., GEOMETRY.index("response_0mm")].clamp(min=1e-3)[:, None]
+        saturated = torch.zeros_like(touches.valid) if touches.saturated is None else touches.saturated
+        scales = [
             excess / self.scale,
             torch.asinh(excess / self.finest) / 2,
-            torch.asinh(excess / direct) / 2,
-            limited.to(excess),
+            torch.asinh(excess / response) / 2,
+            (touches.valid & saturated).to(excess),
         ]
-        return torch.stack(views, dim=-1)
+        return torch.stack(scales, dim=-1)
 
     def _weights(self, geometry: Tensor) -> Tensor:
         """Return the weight of each sensor at each site for each spread, (B, V, S)."""
+        x, y, width, height = (geometry[..., GEOMETRY.index(name)] for name in ("x", "y", "width", "height"))
         # sensors that fill up a small skin have no extent
-        places = geometry[..., [_X, _Y]] / geometry[..., [_WIDTH, _HEIGHT]].clamp(min=_LEAST)
-        squares = (self.centres[:, None] - places[:, None]).square().sum(-1)
+        extent = torch.stack([width, height], dim=-1).clamp(min=1e-3)
+        positions = torch.stack([x, y], dim=-1) / extent
+        squares = (self.centres[:, None] - positions[:, None]).square().sum(-1)
         return torch.cat([(-squares / (2 * spread**2)).exp() for spread in self.spreads], dim=1)
 
     def _largest(self, values: Tensor, valid: Tensor) -> Tensor:
@@ -470,122 +446,20 @@ class Sites(AbstractRepresentation):
         strongest = working.topk(min(self.strongest, values.shape[2]), dim=2).values
         return pad(strongest.masked_fill(strongest.isinf(), 0), (0, self.strongest - strongest.shape[2]))
 
-    def _summary(self, geometry: Tensor, works: Tensor, shares: Tensor) -> Tensor:
-        """Return number and mean, least and largest geometry of working sensors, and coverage, (B, D)."""
-        alive = (works > 0).any(dim=1)[..., None]
+    def _summary(self, geometry: Tensor, working: Tensor, coverage: Tensor) -> Tensor:
+        """Return number and mean, minimum and maximum geometry of working sensors, and coverage, (B, D)."""
+        alive = (working > 0).any(dim=1)[..., None]
         count = alive.sum(1).clamp(min=1)
         mean = (geometry * alive).sum(1) / count
-        least = geometry.masked_fill(~alive, torch.inf).amin(1)
-        most = geometry.masked_fill(~alive, -torch.inf).amax(1)
-        columns = [mean, least, most]
-        finite = [torch.where(column.isfinite(), column, 0) for column in columns]
-        return torch.cat([count.to(mean).log(), *finite, (shares.amax(1) + 1e-3).log()], dim=1)
+        minimum = geometry.masked_fill(~alive, torch.inf).amin(1)
+        maximum = geometry.masked_fill(~alive, -torch.inf).amax(1)
+        finite = [torch.where(column.isfinite(), column, 0) for column in (mean, minimum, maximum)]
+        return torch.cat([count.to(mean).log(), *finite, (coverage.amax(1) + 1e-3).log()], dim=1)
 
 
 def _engineered(touches: Touches) -> Tensor:
     """Return the engineered features that a dead sensor does not change, (B, D), as asinh."""
+    changed = ("raw sensor maximum", "sensor sum", "longest run of the sum")
     features = engineered_features(touches)
-    selected = [value for name, value in features.items() if not name.startswith(_COUNTING)]
+    selected = [value for name, value in features.items() if not name.startswith(changed)]
     return torch.stack([value.to(touches.readings) for value in selected], dim=1).asinh()
-
-
-def _no_geometry() -> InputError:
-    return InputError(
-        "representation=sites needs to know what each sensor responds to, and this device has no mechanics: "
-        "use device=simulated, device=serial, a recording with positions: layout, or another representation"
-    )
-
-
-# The frames of any touches of a device.
-
-
-Batch = tuple[Frames, Tensor]
-MakeRepresentation = Callable[[Tensor, tuple[float, float]], AbstractRepresentation]
-
-
-class FrameMaker:
-    """Makes the frames of touches of a device.
-
-    Args:
-        device: whose touches have the window, and the sensors if all touches need the same ones.
-        representation: partial; takes positions (S, 3), m, and size (x, y), m.
-        geometry: returns that of the configured skin, (S, G), for touches that do not tell it (of a port or a
-            file); None: there is none.
-
-    Attributes:
-        device: as given.
-        make: the representation, as given.
-        make_geometry: the geometry, as given.
-    """
-
-    def __init__(
-        self,
-        device: AbstractDevice,
-        representation: MakeRepresentation,
-        geometry: Callable[[], Tensor] | None = None,
-    ) -> None:
-        super().__init__()
-        self.device, self.make, self.make_geometry = device, representation, geometry
-        self._known: tuple[Tensor, AbstractRepresentation] | None = None
-
-    @property
-    def task(self) -> Task:
-        """What the labels mean."""
-        return self.device.task
-
-    @property
-    def window(self) -> int:
-        """Number of frames per touch."""
-        return self.example.readings.shape[1]
-
-    @cached_property
-    def example(self) -> Touches:
-        """The first touch of the training split."""
-        parts = self.device.parts("train")
-        if parts is not None and not parts:
-            raise InputError("there are no touches to train on: generate or record more")
-        touches = self.touches("train") if parts is None else parts[0].make().touches
-        return touches[torch.tensor([0])]
-
-    def touches(self, split: Split, epoch: int = 0) -> Touches:
-        """Return the touches of a split."""
-        return self.device.touches(split, epoch)
-
-    def representation_for(self, positions: Tensor) -> AbstractRepresentation:
-        """Return the representation of a layout with positions (S, 3), m; that of the last layout is kept.
-
-        Raises:
-            InputError: positions that change with time, (B, T, S, 3); motion is told beside the layout.
-        """
-        if self._known is not None and self._layout_free:
-            return self._known[1]
-        if positions.ndim != 2 and not self._layout_free:
-            raise InputError(
-                "representations are built for one layout, got positions per frame: give one position "
-                "(x, y, z) per sensor, and how far it moves as Touches.motion"
-            )
-        if self._known is None or not torch.equal(self._known[0], positions):
-            self._known = (positions, self.make(positions, self.device.size).requires_grad_(False))
-        return self._known[1]
-
-    def frames(self, touches: Touches) -> Batch:
-        """Return the frames of touches and their labels (B, L), on the touches' device."""
-        return self.show(touches), touches.known_labels
-
-    def show(self, touches: Touches) -> Frames:
-        """Return the frames of touches, on the touches' device."""
-        place = touches.readings.device
-        representation = self.representation_for(touches.positions.cpu()).to(place)
-        if touches.geometry is None and self.geometry is not None:
-            touches = replace(touches, geometry=self.geometry.to(place))
-        return representation.show(touches)
-
-    @cached_property
-    def geometry(self) -> Tensor | None:
-        """The geometry of the configured skin, (S, G); None if it is unknown, or not needed."""
-        return self.make_geometry() if self._layout_free and self.make_geometry is not None else None
-
-    @property
-    def _layout_free(self) -> bool:
-        make: Any = getattr(self.make, "func", self.make)
-        return bool(make.layout_free)

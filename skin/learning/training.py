@@ -23,10 +23,10 @@ from torch import Tensor
 from torch.optim.lr_scheduler import OneCycleLR
 
 from skin.core.messages import PARENT, one_line
+from skin.device.touches import Touches
 from skin.errors import InputError
-from skin.learning.data import TouchData
+from skin.learning.data import Batch, TouchData
 from skin.learning.network import LAST, MakeOptimizer, TouchClassifier
-from skin.learning.representation import Batch
 
 
 class Training(LightningModule):
@@ -37,17 +37,35 @@ class Training(LightningModule):
 
     Args:
         network: what is trained, in place.
+        data: of the training, which gives the frames of a batch.
         optimizer: partial; takes the parameters.
-        warmup: share of the steps in which the learning rate rises to the optimizer's; it then falls to
+        warmup: fraction of the steps in which the learning rate rises to the optimizer's; it then falls to
             nothing along a cosine (Smith and Topin, 2018). None keeps it constant.
     """
 
     def __init__(
-        self, network: TouchClassifier, optimizer: MakeOptimizer, warmup: float | None = None
+        self,
+        network: TouchClassifier,
+        data: TouchData,
+        optimizer: MakeOptimizer,
+        warmup: float | None = None,
     ) -> None:
         super().__init__()
-        self.network, self._make_optimizer, self._warmup = network, optimizer, warmup
+        self.network, self.data = network, data
+        self._make_optimizer, self._warmup = optimizer, warmup
         self._batches: dict[str, list[tuple[int, dict[str, Tensor]]]] = {"train": [], "val": []}
+
+    def setup(self, stage: str) -> None:
+        """Let the data know the Trainer, for its epoch and its processes."""
+        self.data.trainer = self.trainer
+
+    def teardown(self, stage: str) -> None:
+        """Let the data forget the Trainer, which has ended."""
+        self.data.trainer = None
+
+    def on_after_batch_transfer(self, batch: Touches, dataloader_idx: int) -> Batch:
+        """Return the frames and labels of a batch that has arrived where the network is."""
+        return self.data.frames(batch) if isinstance(batch, Touches) else batch
 
     def _step(self, batch: Batch, stage: str) -> Tensor:
         frames, labels = batch
@@ -101,7 +119,6 @@ class Training(LightningModule):
 
 def train_network(
     training: Training,
-    data: TouchData,
     settings: dict[str, Any],
     logger: Logger | None,
     folder: Path,
@@ -111,7 +128,6 @@ def train_network(
 
     Args:
         training: of the network.
-        data: of the training.
         settings: of Lightning's trainer.
         logger: of the metrics; None: they are not logged.
         folder: for checkpoints; a training that was interrupted in it is continued.
@@ -125,23 +141,24 @@ def train_network(
         InputError: the trainer refuses its settings, or the loss is not a number.
     """
     best = ModelCheckpoint(folder, monitor="val_loss", save_weights_only=True)
-    clock, last = Clock(folder / "seconds.json"), folder / LAST
-    trainer = make_trainer(settings, logger, [best, clock], folder)
+    progress, last = Progress(folder / "seconds.json"), folder / LAST
+    trainer = make_trainer(settings, logger, [best, progress], folder)
     alone = trainer.world_size == 1
     if resumable and alone:
         # Behind `best`, whose state it saves; several processes would have to save together.
         every = ModelCheckpoint(folder, last.stem, enable_version_counter=False)
-        trainer.callbacks += [RandomState(), every]  # type: ignore[attr-defined]
+        trainer.callbacks.append(every)  # type: ignore[attr-defined]
     again = last if alone and last.is_file() else None
     with warnings.catch_warnings():
         # Lightning 2.6 asks torch 2.13 for a deprecated class
         warnings.filterwarnings("ignore", ".*treespec, LeafSpec", FutureWarning)
-        trainer.fit(training, datamodule=data, ckpt_path=again, weights_only=True)
+        loaders = training.data.train_dataloader(), training.data.val_dataloader()
+        trainer.fit(training, *loaders, ckpt_path=again, weights_only=True)
     if not trainer.is_global_zero:
         return math.nan
     weights = torch.load(best.best_model_path, weights_only=True, map_location="cpu")
     training.load_state_dict(weights["state_dict"])
-    return clock.median()
+    return progress.median()
 
 
 def make_trainer(
@@ -199,8 +216,10 @@ def _check(trainer: Trainer) -> None:
         )
 
 
-class Clock(Callback):
+class Progress(Callback):
     """Measures the training part of every epoch, from its start to the end of its last batch.
+
+    Checkpoints also keep torch's random state: a continued training drops out the same units.
 
     Args:
         path: of a file that keeps the durations; the process that trains may be another one.
@@ -210,6 +229,7 @@ class Clock(Callback):
         self._path = path
         self._seconds: list[float] = []
         self._began = 0.0
+        self._state: Tensor | None = None
 
     def median(self) -> float:
         """Return the median duration of an epoch after the training, s; validation is left out."""
@@ -230,30 +250,15 @@ class Clock(Callback):
         if trainer.is_global_zero:
             self._path.write_text(json.dumps(self._seconds))
 
-    def state_dict(self) -> dict[str, list[float]]:
-        """Return the durations, for a checkpoint."""
-        return {"seconds": self._seconds}
+    def state_dict(self) -> dict[str, Any]:
+        """Return the durations and the random state, for a checkpoint."""
+        return {"seconds": self._seconds, "state": torch.get_rng_state()}
 
-    def load_state_dict(self, state_dict: dict[str, list[float]]) -> None:
-        """Take the durations of a checkpoint."""
-        self._seconds = state_dict["seconds"]
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Take the durations and the random state of a checkpoint."""
+        self._seconds, self._state = state_dict["seconds"], state_dict["state"]
 
-
-class RandomState(Callback):
-    """Keeps torch's random state in checkpoints: a continued training drops out the same units."""
-
-    def __init__(self) -> None:
-        self._state: Tensor | None = None
-
-    def state_dict(self) -> dict[str, Tensor]:
-        """Return the state, for a checkpoint."""
-        return {"state": torch.get_rng_state()}
-
-    def load_state_dict(self, state_dict: dict[str, Tensor]) -> None:
-        """Take the state of a checkpoint."""
-        self._state = state_dict["state"]
-
-    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+    def on_train_start(self, *_: Any) -> None:
         """Set the state, after the last use of random numbers by the start itself."""
         if self._state is not None:
             torch.set_rng_state(self._state)

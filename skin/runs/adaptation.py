@@ -9,9 +9,9 @@ The lowest of many losses is too low by chance. So the result is judged on each 
 the lowest loss on the other folds. The network is changed only if this loss is lower than that of the
 original network by more than two standard errors of the difference, and the accuracy is not lower.
 
-Learners from scratch (:mod:`skin.learning.few`) are compared on the same folds. The one with the lowest loss
-on held-out gestures takes the place of the network under the same two conditions, and if its loss is lower
-than that of the fine-tuned network, too.
+Learners from scratch (:mod:`skin.learning.small_data`) are compared on the same folds. The one with the
+lowest loss on held-out gestures takes the place of the network under the same two conditions, and if its loss
+is lower than that of the fine-tuned network, too.
 """
 
 import sys
@@ -41,8 +41,14 @@ from skin.evaluation.operating_point import OperatingPoint
 from skin.evaluation.report import evaluate, metrics_table
 from skin.evaluation.settings import check_evaluation
 from skin.learning.data import TouchData
-from skin.learning.few import AbstractFew, few_features, predict_held_out, split_folds, touch_losses
 from skin.learning.network import TouchClassifier, probabilities
+from skin.learning.small_data import (
+    SmallDataLearner,
+    predict_held_out,
+    small_data_features,
+    split_folds,
+    touch_losses,
+)
 from skin.runs.build import build_data, build_device, build_learner, default_option
 from skin.runs.configuration import Config
 from skin.runs.run import TAG, FinishedRun
@@ -260,7 +266,7 @@ class Scratch:
     """
 
     name: str
-    learner: AbstractFew
+    learner: SmallDataLearner
     settings: dict[str, Any]
     chances: Tensor
 
@@ -287,7 +293,7 @@ def learn_from_scratch(
         if options:
             print(f"from scratch: not compared, too few gestures tell {lacking}", file=sys.stderr)
         return None
-    matrix, truth = few_features(touches, task), labels.numpy()
+    matrix, truth = small_data_features(touches, task), labels.numpy()
     kept = adaptation.after if adaptation.better else adaptation.before
     losses, held = {"": touch_losses(kept.numpy(), truth, task)}, dict[str, Tensor]()
     for name, option in options.items():
@@ -299,12 +305,12 @@ def learn_from_scratch(
     gain = torch.from_numpy(touch_losses(adaptation.before.numpy(), truth, task) - losses[best])
     if not best or not _is_clear(gain, adaptation.before, held[best], labels, task):
         return None
-    learner: AbstractFew = instantiate(options[best], seed=settings.seed)
+    learner: SmallDataLearner = instantiate(options[best], seed=settings.seed)
     return Scratch(best, learner.learn(matrix, truth, task), options[best], held[best])
 
 
 def _scratch_options(names: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """Return the settings of learners for few touches by name.
+    """Return the settings of learners for small data by name.
 
     Raises:
         InputError: a name is of no such learner.
@@ -312,8 +318,8 @@ def _scratch_options(names: Sequence[str]) -> dict[str, dict[str, Any]]:
     options = {name: default_option("learner", name) for name in names}
     for name, option in options.items():
         kind = import_target(option["_target_"], "adapt.scratch")
-        if not (isinstance(kind, type) and issubclass(kind, AbstractFew)):
-            raise InputError(f"adapt.scratch={name} is no learner for few touches: kernel_ridge, extra_trees")
+        if not (isinstance(kind, type) and issubclass(kind, SmallDataLearner)):
+            raise InputError(f"adapt.scratch={name} is no learner for small data: kernel_ridge, extra_trees")
     return options
 
 

@@ -18,15 +18,13 @@ from skin.core.messages import one_line, to_input_error
 from skin.core.settings import check_groups, configured
 from skin.device.base import AbstractDevice
 from skin.errors import InputError
+from skin.learning.data import Augmentation, TouchData
 from skin.learning.learner import AbstractLearner
-from skin.learning.representation import FrameMaker
 from skin.mechanics.simulator.base import AbstractSimulator
 from skin.runs.configuration import Config, iterate_leaves, validate_config
 
 if TYPE_CHECKING:
     from torch import Tensor
-
-    from skin.learning.data import TouchData
 
 
 @dataclass(frozen=True)
@@ -80,25 +78,22 @@ def build_device(config: Config) -> AbstractDevice:
     return device
 
 
-def build_frames(config: Config, device: AbstractDevice) -> FrameMaker:
+def build_frames(config: Config, device: AbstractDevice) -> TouchData:
     """Return what makes the frames of touches in the configured representation: enough to predict."""
     _check_options(config, "representation")
     geometry = partial(_geometry, config) if device.configured else None
-    return FrameMaker(device, instantiate(config.representation), geometry)
+    return TouchData(device, instantiate(config.representation), geometry=geometry)
 
 
-def build_data(config: Config, device: AbstractDevice) -> "TouchData":
-    """Return the data module of a device's touches in the configured representation."""
-    # Imported here because Lightning takes seconds and commands without training do not need it.
-    from skin.learning.data import Augmentation, TouchData
-
+def build_data(config: Config, device: AbstractDevice) -> TouchData:
+    """Return the data of a device's touches in the configured representation."""
     assert config.data is not None
     augmentation = configured(Augmentation, config.data.augment, "data.augment")
     made, batch_size = build_frames(config, device), config.data.batch_size
     return TouchData(device, made.make, batch_size, config.seed, augmentation, made.make_geometry)
 
 
-def training_data(settings: Mapping[str, Any] | None = None, /, **groups: Any) -> "TouchData":
+def training_data(settings: Mapping[str, Any] | None = None, /, **groups: Any) -> TouchData:
     """Return the data of a training, for a loop of your own or a Trainer; nothing is simulated yet.
 
     A pass over ``train_dataloader()`` is an epoch, and yields (:class:`skin.learning.representation.Frames`,

@@ -34,7 +34,7 @@ from skin.runs.configuration import Config, Tracking, recompose, reveal_password
 if TYPE_CHECKING:
     from mlflow.entities import Run
 
-    from skin.learning.representation import FrameMaker
+    from skin.learning.data import TouchData
     from skin.runs.store import Store
 
 TAG = "operating_point"
@@ -145,7 +145,7 @@ class FinishedRun:
                 f"{_reason(cause or error)}"
             ) from error
 
-    def load_weights(self, learner: AbstractLearner, data: "FrameMaker") -> None:
+    def load_weights(self, learner: AbstractLearner, data: "TouchData") -> None:
         """Load the weights into a learner.
 
         Raises:

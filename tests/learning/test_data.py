@@ -14,6 +14,7 @@ from skin.device.touches import Part, Recording, Touches
 from skin.errors import InputError
 from skin.learning.data import Augmentation, TouchData
 from skin.learning.representation import Frames, Readings
+from skin.learning.training import Training
 from skin.runs.build import build_data, build_device
 from skin.touch.labels import TOUCH_SLIDING
 
@@ -101,7 +102,8 @@ def test_one_thread_trains_while_another_draws_the_next_epoch(make, monkeypatch)
     data.trainer.strategy = SimpleNamespace(root_device=torch.device("cpu"))
     for epoch in range(3):
         data.trainer.current_epoch = other.trainer.current_epoch = epoch
-        batches = [data.on_after_batch_transfer(batch, 0) for batch in data.train_dataloader()]
+        training = Training(torch.nn.Identity(), data, torch.optim.SGD)
+        batches = [training.on_after_batch_transfer(batch, 0) for batch in data.train_dataloader()]
         expected = [other.frames(batch) for batch in other.train_dataloader()]
         assert len(batches) == len(expected) == 5
         for batch, (frames, labels) in zip(batches, expected, strict=True):
@@ -150,7 +152,7 @@ def test_validation_in_parts_keeps_its_order(make):
     data = make(kind=InParts)
     assert flat(data.val_dataloader()) == list(range(23))
     assert len(data.val_dataloader()) == 6
-    assert data.window == 6
+    assert data.example.readings.shape[1] == 6
 
 
 def test_the_hash_is_of_all_parts(make, monkeypatch):
@@ -190,10 +192,10 @@ def test_fresh_gestures_are_drawn_every_epoch(make):
 def test_a_batch_arrives_as_frames_and_labels(make):
     data = make()
     touches = next(iter(data.train_dataloader()))
-    frames, labels = data.on_after_batch_transfer(touches, 0)
+    frames, labels = Training(torch.nn.Identity(), data, torch.optim.SGD).on_after_batch_transfer(touches, 0)
     assert torch.equal(frames.x, touches.readings)
     assert labels.shape == (5, 4)
-    assert data.window == 6
+    assert data.example.readings.shape[1] == 6
 
 
 def test_a_layout_is_represented_once(make):
@@ -221,7 +223,7 @@ def test_without_a_trainer_each_pass_is_the_next_epoch(make, fresh):
 
 
 @pytest.mark.filterwarnings("ignore")  # Lightning's advice
-def test_a_loop_after_a_trainer_has_its_own_epochs(make, tmp_path):
+def test_a_trainer_of_ones_own_is_a_loop_of_ones_own(make, tmp_path):
     class Constant(LightningModule):
         def __init__(self):
             super().__init__()
@@ -235,11 +237,12 @@ def test_a_loop_after_a_trainer_has_its_own_epochs(make, tmp_path):
             return torch.optim.SGD(self.parameters())
 
     data = make(fresh=True)
+    data.trainer = None
     quiet = {"logger": False, "enable_progress_bar": False, "enable_checkpointing": False}
     quiet |= {"enable_model_summary": False, "accelerator": "cpu", "default_root_dir": tmp_path}
-    Fit(max_epochs=2, limit_val_batches=0, **quiet).fit(Constant(), datamodule=data)
+    Fit(max_epochs=2, limit_val_batches=0, **quiet).fit(Constant(), data.train_dataloader())
     firsts = [next(iter(data.train_dataloader()))[0].x.max() // 1000 for _ in range(2)]
-    assert firsts == [0, 1]
+    assert firsts == [2, 3]
 
 
 def test_what_cannot_be_batched_is_refused(make):

@@ -9,7 +9,7 @@ from hydra.utils import instantiate
 
 from skin.errors import InputError
 from skin.learning.data import TouchData
-from skin.learning.few import split_folds
+from skin.learning.small_data import split_folds
 from skin.runs.adaptation import FineTuning, Folds, Trial, fine_tune
 from skin.runs.build import build_learner
 

@@ -109,7 +109,7 @@ def whole(tmp_path_factory):
     """What learners save: the name of the file -> its content."""
     found = {}
     for name, learner in (
-        ("trees.skops", ["learner=boosted_trees", "learner.rounds=2", "data.gestures=200"]),
+        ("models.skops", ["learner=boosted_trees", "learner.rounds=2", "data.gestures=200"]),
         ("rules.json", ["learner=rules"]),
     ):
         config = validate_config(composed(*SKIN, *learner))
@@ -162,24 +162,25 @@ class Stranger:
 
 
 DAMAGED = {
-    "cut": ("trees.skops", lambda content: content[:-100]),
-    "almost empty": ("trees.skops", lambda content: content[:3]),
-    "a byte": ("trees.skops", lambda content: content[:200] + b"\0\1\2\3" + content[204:]),
-    "text": ("trees.skops", lambda content: b"no archive"),
-    "larger than memory": ("trees.skops", claimed((250_000_000, 240))),
-    "an endless shape": ("trees.skops", claimed((10**400,))),
-    "other content": ("trees.skops", stored(lambda models: {"a": 1})),
-    "a stranger": ("trees.skops", stored(lambda models: [Stranger()] * 4)),
-    "another estimator": ("trees.skops", stored(lambda models: [LinearRegression()] * 4)),
-    "regressors": ("trees.skops", stored(lambda models: [
+    "cut": ("models.skops", lambda content: content[:-100]),
+    "almost empty": ("models.skops", lambda content: content[:3]),
+    "a byte": ("models.skops", lambda content: content[:200] + b"\0\1\2\3" + content[204:]),
+    "text": ("models.skops", lambda content: b"no archive"),
+    "larger than memory": ("models.skops", claimed((250_000_000, 240))),
+    "an endless shape": ("models.skops", claimed((10**400,))),
+    "other content": ("models.skops", stored(lambda models: {"a": 1})),
+    "a stranger": ("models.skops", stored(lambda models: [Stranger()] * 4)),
+    "another estimator": ("models.skops", stored(lambda models: [LinearRegression()] * 4)),
+    "regressors": ("models.skops", stored(lambda models: [
         HistGradientBoostingRegressor(max_iter=1).fit(np.eye(60), np.arange(60))] * 4)),
-    "other features": ("trees.skops", stored(lambda models: [
+    "other features": ("models.skops", stored(lambda models: [
         HistGradientBoostingClassifier(max_iter=1).fit(np.eye(60), np.arange(60) % 2)] * 4)),
-    "other labels": ("trees.skops", stored(lambda models: models[:2])),
-    "a loop": ("trees.skops", stored(nodes(left=0))),
-    "a missing child": ("trees.skops", stored(nodes(right=10_000))),
-    "a missing feature": ("trees.skops", stored(nodes(feature_idx=-7))),
-    "a category": ("trees.skops", stored(nodes(is_categorical=1))),
+    "other labels": ("models.skops", stored(lambda models: models[:2])),
+    "a loop": ("models.skops", stored(nodes(left=0))),
+    "a missing child": ("models.skops", stored(nodes(right=10_000))),
+    "a missing feature": ("models.skops", stored(nodes(feature_idx=-7))),
+    "a category": ("models.skops", stored(nodes(is_categorical=1))),
+    "no number": ("models.skops", stored(nodes(value=np.nan))),
     "a list": ("rules.json", lambda content: b"[]"),
     "other rules": ("rules.json", lambda content: b"{}"),
     "cut rules": ("rules.json", lambda content: content[:40]),
@@ -195,7 +196,7 @@ DAMAGED = {
 @pytest.mark.parametrize("case", DAMAGED)
 def test_what_was_learned_is_refused_where_it_is_damaged_or_foreign(case, store, whole, tmp_path):
     name, damage = DAMAGED[case]
-    kind = {"trees.skops": "boosted_trees", "rules.json": "rules", "weights.pt": "network"}[name]
+    kind = {"models.skops": "boosted_trees", "rules.json": "rules", "weights.pt": "network"}[name]
     config = validate_config(composed(*SKIN, f"learner={kind}"))
     path = tmp_path / name
     path.write_bytes(damage(whole[name]))

@@ -25,7 +25,8 @@ CHEAP = {
         "trainer.max_epochs=15",
     ],
     "boosted_trees": ["learner.rounds=20"],
-    "chosen": ["learner.folds=2"],
+    "chosen": ["learner.folds=2", "learner.members.extra_trees.trees=30"],
+    "extra_trees": ["learner.trees=30"],
     "ensemble": [
         "representation=readings",
         "model=mlp",
@@ -36,9 +37,6 @@ CHEAP = {
         "learner.copies.network=2",
     ],
 }
-
-
-pytestmark = pytest.mark.usefixtures("few_trees")
 
 
 SEVERAL = {"chosen", "ensemble"}

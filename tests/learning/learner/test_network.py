@@ -10,7 +10,21 @@ from skin.errors import InputError
 from skin.learning.data import TouchData
 from skin.learning.fusion import Early, Late
 from skin.learning.model import Mlp
+from skin.learning.training import Progress
 from skin.runs.build import build_data, build_device, build_learner
+
+DENSE = ("representation=readings", "model=mlp", "fusion=early")
+
+
+@pytest.fixture
+def build(configured, made_up_device):
+    """Return a function of overrides that returns the learner and the data of a made-up device."""
+
+    def make(*overrides):
+        config = configured(*overrides)
+        return build_learner(config), TouchData(made_up_device, instantiate(config.representation), 32)
+
+    return make
 
 
 def curve(folder):
@@ -40,12 +54,8 @@ def test_it_learns_touches_of_the_naive_skin_and_takes_another_layout(configured
         assert right.float().mean() > 0.65
 
 
-def test_the_weights_of_the_best_validation_loss_are_kept(configured, made_up_device, tmp_path):
-    config = configured(
-        "representation=readings", "model=mlp", "fusion=early", "optimizer.lr=0.1", "trainer.max_epochs=12"
-    )
-    data = TouchData(made_up_device, instantiate(config.representation), 32)
-    learner = build_learner(config)
+def test_the_weights_of_the_best_validation_loss_are_kept(build, made_up_device, tmp_path):
+    learner, data = build(*DENSE, "optimizer.lr=0.1", "trainer.max_epochs=12")
     learner.fit(data, CSVLogger(tmp_path))
     validation, _ = curve(tmp_path)
     assert min(validation) < validation[-1]  # a rate so high that the last epoch is not the best
@@ -65,7 +75,7 @@ def test_the_weights_of_the_best_validation_loss_are_kept(configured, made_up_de
         ),
         (["fusion=linked"], "fusion=linked needs representation=graph, got image: add representation=graph"),
         (["model.channels=[8,8,8,8,8,8]"], "6 blocks from an image of 64 x 64 pixels"),
-        (["learner.activation=sine"], "activation=relu, elu or silu"),
+        (["learner.activation=sine"], "learner.activation=sine must be 'relu', 'elu' or 'silu'"),
         (["fusion.head=sum"], "fusion.head=sum must be 'mean'"),
         (["learner.hidden=[8,0]"], r"learner.hidden=\[8, 0\] must be greater than or equal to 1"),
         (["learner.hidden=8"], "learner.hidden=8 must be a list"),
@@ -82,34 +92,28 @@ def test_choices_that_do_not_fit_are_refused(overrides, words, configured, made_
         build_learner(config).fit(data)
 
 
-def test_a_model_whose_answers_are_no_numbers_is_refused(configured, made_up_device, monkeypatch):
-    config = configured("representation=readings", "model=mlp", "fusion=early", "trainer.max_epochs=1")
+def test_a_model_whose_answers_are_not_numbers_is_refused(build, monkeypatch):
+    learner, data = build(*DENSE, "trainer.max_epochs=1")
     forward = Mlp.forward
     monkeypatch.setattr(Mlp, "forward", lambda *arguments: forward(*arguments) * float("nan"))
     with pytest.raises(InputError, match=r"the loss is nan: lower optimizer\.lr"):
-        build_learner(config).fit(TouchData(made_up_device, instantiate(config.representation)))
+        learner.fit(data)
 
 
 @pytest.mark.parametrize(
     ("fusion", "part"), [("early", Mlp), ("late", Mlp), ("early", Early), ("late", Late)]
 )
-def test_an_embedding_that_is_not_as_wide_as_it_says_is_refused(
-    configured, made_up_device, monkeypatch, fusion, part
-):
-    config = configured("representation=readings", "model=mlp", f"fusion={fusion}")
-    data = TouchData(made_up_device, instantiate(config.representation))
-    learner = build_learner(config)
+def test_an_embedding_that_is_not_as_wide_as_it_says_is_refused(build, monkeypatch, fusion, part):
+    learner, data = build("representation=readings", "model=mlp", f"fusion={fusion}")
     learner.check(data)
     forward = part.forward
     monkeypatch.setattr(part, "forward", lambda *arguments: forward(*arguments)[:, 1:])
-    with pytest.raises(InputError, match=rf"{part.__name__}.forward returned \(\d+, \d+\), and must return"):
+    with pytest.raises(InputError, match=r"as wide as their attribute width says: .*\d"):
         learner.check(data)
 
 
-def test_readings_of_another_number_of_sensors_are_refused(configured, made_up_device):
-    config = configured("representation=readings", "model=mlp", "trainer.max_epochs=1")
-    data = TouchData(made_up_device, instantiate(config.representation))
-    learner = build_learner(config)
+def test_readings_of_another_number_of_sensors_are_refused(build, made_up_device):
+    learner, data = build("representation=readings", "model=mlp", "trainer.max_epochs=1")
     learner.fit(data)
     touches = made_up_device.touches("test")
     fewer = type(touches)(
@@ -121,10 +125,8 @@ def test_readings_of_another_number_of_sensors_are_refused(configured, made_up_d
         learner.probabilities(fewer)
 
 
-def test_probabilities_are_the_dense_layers_on_the_embedding(configured, made_up_device):
-    config = configured("representation=graph", "model=gcn", "fusion.hidden=24", "trainer.max_epochs=1")
-    data = TouchData(made_up_device, instantiate(config.representation))
-    learner = build_learner(config)
+def test_probabilities_are_the_dense_layers_on_the_embedding(build, made_up_device):
+    learner, data = build("representation=graph", "model=gcn", "fusion.hidden=24", "trainer.max_epochs=1")
     with pytest.raises(RuntimeError, match="fit or load"):
         learner.embeddings(made_up_device.touches("test"))
     classifier = learner.build(data)
@@ -136,14 +138,11 @@ def test_probabilities_are_the_dense_layers_on_the_embedding(configured, made_up
     assert torch.allclose(learner.probabilities(touches), expected, atol=1e-6)
 
 
-def test_callbacks_and_loggers_of_the_trainer_join_ours(configured, made_up_device, tmp_path):
+def test_callbacks_and_loggers_of_the_trainer_join_ours(build, tmp_path):
     stop = "{_target_: pytorch_lightning.callbacks.EarlyStopping, monitor: val_loss, stopping_threshold: 100}"
     log = f"{{_target_: pytorch_lightning.loggers.CSVLogger, save_dir: {tmp_path}, name: theirs}}"
-    config = configured(
-        "representation=readings", "model=mlp", f"+trainer.callbacks=[{stop}]", f"+trainer.logger={log}"
-    )
-    data = TouchData(made_up_device, instantiate(config.representation))
-    build_learner(config).fit(data, CSVLogger(tmp_path, name="ours"))
+    learner, data = build(*DENSE, f"+trainer.callbacks=[{stop}]", f"+trainer.logger={log}")
+    learner.fit(data, CSVLogger(tmp_path, name="ours"))
     for name in ("ours", "theirs"):
         lines = next((tmp_path / name).rglob("metrics.csv")).read_text().splitlines()
         assert len(lines) == 3  # validation and training of the first epoch, in which it stops
@@ -159,32 +158,35 @@ def test_callbacks_and_loggers_of_the_trainer_join_ours(configured, made_up_devi
         ["representation=graph", "model=transformer", "fusion.head=transformer"],
     ],
 )
-def test_it_trains_with_half_of_the_bits(configured, made_up_device, overrides):
-    config = configured(*overrides, "trainer.max_epochs=1", "trainer.precision=bf16-mixed")
-    learner = build_learner(config)
-    learner.fit(TouchData(made_up_device, instantiate(config.representation), 32))
+def test_it_trains_with_half_of_the_bits(build, made_up_device, overrides):
+    learner, data = build(*overrides, "trainer.max_epochs=1", "trainer.precision=bf16-mixed")
+    learner.fit(data)
     found = learner.probabilities(made_up_device.touches("test"))
     assert found.dtype == torch.float32
     assert found.isfinite().all()
 
 
-def test_a_learning_rate_may_fall_from_the_start(configured, made_up_device):
-    config = configured("representation=readings", "model=mlp", "trainer.max_epochs=1", "learner.warmup=0")
-    build_learner(config).fit(TouchData(made_up_device, instantiate(config.representation)))
+def test_a_learning_rate_may_fall_from_the_start(build):
+    learner, data = build("representation=readings", "model=mlp", "trainer.max_epochs=1", "learner.warmup=0")
+    learner.fit(data)
 
 
-def test_a_training_goes_on_from_weights(configured, made_up_device, tmp_path):
-    words = "representation=readings", "model=mlp", "fusion=early", "trainer.max_epochs=1"
-    config = configured(*words)
-    data = TouchData(made_up_device, instantiate(config.representation), 32)
-    first = build_learner(config)
+def test_a_training_goes_on_from_weights(build, tmp_path):
+    words = *DENSE, "trainer.max_epochs=1"
+    first, data = build(*words)
     first.fit(data)
     path = first.save(tmp_path)
-    second = build_learner(configured(*words, f"learner.start={path}", "optimizer.lr=1e-12"))
+    second, data = build(*words, f"learner.start={path}", "optimizer.lr=1e-12")
     second.fit(data)
     for name, weights in second.network.state_dict().items():
         torch.testing.assert_close(weights, first.network.state_dict()[name], rtol=0, atol=1e-6)
     for start, words in ((tmp_path / "none.pt", "no such file"), (path, "of another network")):
-        other = configured("representation=readings", "model=mlp", f"learner.start={start}")
+        other, data = build("representation=readings", "model=mlp", f"learner.start={start}")
         with pytest.raises(InputError, match=words):
-            build_learner(other).check(data)
+            other.check(data)
+
+
+def test_progress_from_a_checkpoint_of_a_complete_training_knows_its_epochs(tmp_path):
+    progress = Progress(tmp_path / "seconds.json")
+    progress.load_state_dict({"seconds": [1.0, 5.0, 2.0], "state": None})
+    assert progress.median() == 2.0

@@ -17,9 +17,9 @@ def scattered(channels=1, pixels=64, sensors=25, count=5, seed=0):
     return x.unflatten(-1, (pixels, pixels))
 
 
-def embed(model, x, monkeypatch, share):
-    """Return embeddings and gradients on the way that the share of active pixels chooses."""
-    monkeypatch.setattr(module, "SPARSE", share)
+def embed(model, x, sparse):
+    """Return embeddings and gradients by the method that ``sparse`` chooses."""
+    model.sparse = sparse
     model.zero_grad()
     result = model(x, None)
     result.square().sum().backward()
@@ -45,9 +45,9 @@ def test_few_pixels_give_what_all_pixels_give(given, options, monkeypatch):
     monkeypatch.setattr(
         module, "plan_convolution", lambda a, plan=module.plan_convolution: taken.append(1) or plan(a)
     )
-    short, short_gradients = embed(model, given, monkeypatch, 32)
+    short, short_gradients = embed(model, given, 32)
     assert len(taken) == len(options["channels"])
-    long, long_gradients = embed(model, given, monkeypatch, float("inf"))
+    long, long_gradients = embed(model, given, float("inf"))
     assert len(taken) == len(options["channels"])
     assert (short - long).abs().max() < 1e-5
     for ours, theirs in zip(short_gradients, long_gradients, strict=True):
@@ -65,12 +65,11 @@ def test_it_is_the_network_that_the_report_describes():
     torch.testing.assert_close(model(x, None), F.relu(model.embedding(wanted)), atol=1e-5, rtol=1e-5)
 
 
-@pytest.mark.parametrize("share", [32, float("inf")], ids=["short", "long"])
-def test_dropout_takes_whole_channels_of_single_images(share, monkeypatch):
-    monkeypatch.setattr(module, "SPARSE", share)
+@pytest.mark.parametrize("sparse", [32, float("inf")], ids=["short", "long"])
+def test_dropout_takes_whole_channels_of_single_images(sparse):
     torch.manual_seed(0)
     x = scattered(count=40)
-    model = Cnn("image", (1, 64, 64), channels=[10], dropout=0.2)
+    model = Cnn("image", (1, 64, 64), channels=[10], dropout=0.2, sparse=sparse)
     kept = model.eval()(x, None).unflatten(1, (10, -1))
     dropped = model.train()(x, None).unflatten(1, (10, -1))
     gone = (dropped == 0).all(dim=2)

@@ -85,11 +85,9 @@ def test_one_channel_is_fed_three_times(file):
     torch.testing.assert_close(loaded(file, (1, 48, 48)).eval()(images, None), three)
 
 
-def test_many_images_are_encoded_in_parts(file, monkeypatch):
-    images, model = noise((7, 1, 32, 32), 0).float(), loaded(file).eval()
-    whole = model(images, None)
-    monkeypatch.setattr("skin.learning.cnn.CHUNK", 3)
-    torch.testing.assert_close(model(images, None), whole)
+def test_many_images_are_encoded_in_parts(file):
+    images = noise((7, 1, 32, 32), 0).float()
+    torch.testing.assert_close(loaded(file, chunk=3).eval()(images, None), loaded(file).eval()(images, None))
 
 
 def test_a_frozen_encoder_stays_as_it_is(file, official):
@@ -137,7 +135,7 @@ def test_without_imagenet_a_sentence_says_where_to_put_it(tmp_path, monkeypatch)
     with pytest.raises(InputError) as error:
         EfficientNet("image", (1, 64, 64))
     for words in (
-        f"efficientnet_b0_rwightman-7f5810bc.pth in {tmp_path}/hub/checkpoints",
+        f"no weights file {tmp_path}/hub/checkpoints/efficientnet_b0_rwightman-7f5810bc.pth: put",
         "model.weights=FILE.pth",
         "model.weights=random trains from scratch",
     ):
@@ -145,9 +143,7 @@ def test_without_imagenet_a_sentence_says_where_to_put_it(tmp_path, monkeypatch)
 
 
 def test_a_file_that_is_not_there_is_refused(tmp_path):
-    with pytest.raises(
-        InputError, match=r"no weights file .*none\.pth: looked for .*model\.weights=FILE\.pth"
-    ):
+    with pytest.raises(InputError, match=r"no weights file .*none\.pth: give .*model\.weights=FILE\.pth"):
         loaded(tmp_path / "none.pth")
 
 
@@ -190,14 +186,14 @@ def altered(name, tensor):
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (lacking, r"lacks features\.7.*and 1\d more"),
-        (altered("layer4.bias", torch.zeros(3)), r"has the unknown layer4\.bias"),
-        (lambda state: {"state_dict": state}, "is no state dict"),
-        (lambda state: list(state), "is no state dict"),
-        (lambda state: {}, "lacks features"),
+        (lacking, r"Missing key.*features\.7"),
+        (altered("layer4.bias", torch.zeros(3)), r"Unexpected key.*layer4\.bias"),
+        (lambda state: {"state_dict": state}, "Missing key.*features"),
+        (lambda state: list(state), "does not fit: .*items"),
+        (lambda state: {}, "Missing key.*features"),
         (
             altered("features.0.0.weight", torch.zeros(40, 3, 3, 3)),
-            r"shape \(40, 3, 3, 3\) where \(32, 3, 3, 3\) is needed",
+            r"size mismatch for features\.0\.0\.weight: .*40, 3, 3, 3.*32, 3, 3, 3",
         ),
         (altered("features.0.1.bias", torch.full((32,), math.nan)), r"features\.0\.1\.bias.* not finite"),
     ],
@@ -221,5 +217,5 @@ def test_the_command_line_ends_with_code_2_and_the_sentence(run, tmp_path, monke
     few = ["simulator=naive", "data.gestures=20", "device.test_gestures=20"]
     done = run(tmp_path, "train.py", "model=efficientnet", *few)
     assert done.returncode == 2, done.stderr
-    assert "put it there from https://download.pytorch.org/models/" in done.stderr
+    assert "there from https://download.pytorch.org/models/" in done.stderr
     assert "Traceback" not in done.stderr

@@ -47,7 +47,7 @@ def test_neighbours_are_those_of_the_graph():
     ("overrides", "said"),
     [
         (["+model.network.headz=4"], "model.network refuses its settings: .*headz"),
-        (["model.width=0"], "model.width=0 must be greater than or equal to 1"),
+        (["model.width=0"], "model.width=0 must be greater than 0"),
         (["model.pooling=sum"], "model.pooling=sum must be 'max', 'mean'"),
     ],
 )

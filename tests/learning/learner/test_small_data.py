@@ -1,26 +1,34 @@
-"""Learners for few touches: labels, classes and targets, the choice among them, and damaged files."""
+"""Learners for small data: labels, classes and targets, the choice among them, and damaged files."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 import pytest
 import torch
-from hydra.utils import instantiate
 from scipy.spatial.distance import cdist
 from sklearn.ensemble import ExtraTreesClassifier
 from sklearn.kernel_ridge import KernelRidge as SklearnKernelRidge
+from skops.io import dump
 
 from skin.device.base import AbstractDevice
 from skin.device.touches import Touches, one_hot
 from skin.errors import InputError
 from skin.learning.data import TouchData
 from skin.learning.features import above_idle, course_features
-from skin.learning.few import Chosen, ExtraTrees, KernelRidge, few_features, touch_losses
+from skin.learning.representation import Readings
+from skin.learning.small_data import (
+    BestByCrossValidation,
+    ExtraTrees,
+    KernelRidge,
+    small_data_features,
+    touch_losses,
+)
 from skin.touch.labels import TOUCH, Task
 
 PLACE = Task(("x", "force"), "regression")
 GESTURES = Task(("pat", "hold", "tap"), "exclusive")
+FewTrees = partial(ExtraTrees, 30)  # those of 300 take minutes
 
 
 @dataclass
@@ -53,15 +61,10 @@ class Presses(AbstractDevice):
         return Touches(readings, torch.ones_like(readings).bool(), positions, labels, 10.0)
 
 
-def data_of(task, configured) -> TouchData:
-    return TouchData(Presses(task), instantiate(configured("representation=readings").representation), 32)
-
-
-@pytest.mark.usefixtures("few_trees")
-@pytest.mark.parametrize("make", [KernelRidge, ExtraTrees])
-def test_classes_and_targets_are_learned_and_stored(make, configured, tmp_path):
+@pytest.mark.parametrize("make", [KernelRidge, FewTrees])
+def test_classes_and_targets_are_learned_and_stored(make, tmp_path):
     for task in (GESTURES, PLACE):
-        data = data_of(task, configured)
+        data = TouchData(Presses(task), Readings)
         learner = make()
         learner.fit(data)
         touches = data.touches("test")
@@ -81,17 +84,15 @@ def test_classes_and_targets_are_learned_and_stored(make, configured, tmp_path):
         assert torch.equal(other.probabilities(touches), result)
 
 
-def test_the_leave_one_out_errors_are_those_of_trainings_without_the_touch(configured, monkeypatch):
-    monkeypatch.setattr("skin.learning.few._SCALES", (1.0,))
-    monkeypatch.setattr("skin.learning.few._RIDGES", np.array([0.1]))
+def test_the_leave_one_out_errors_are_those_of_trainings_without_the_touch(monkeypatch):
     outputs = []
     monkeypatch.setattr(
-        "skin.learning.few._fit_link", lambda held, labels: outputs.append(held) or np.ones(2)
+        "skin.learning.small_data._fit_link", lambda held, labels: outputs.append(held) or np.ones(2)
     )
     values = np.random.default_rng(0)
     matrix, labels = values.normal(size=(30, 5)), (values.random((30, 1)) > 0.5).astype(float)
-    learner = KernelRidge().learn(matrix, labels, Task(("press",)))
-    kernel = learner._fitted[0]
+    learner = KernelRidge((1.0,), (0.1,)).learn(matrix, labels, Task(("press",)))
+    kernel = learner.learned[0][0]
     if kernel.scale == 0:
         gram = kernel.vectors @ kernel.vectors.T / 5
     else:
@@ -115,60 +116,99 @@ def test_the_trees_are_those_of_scikit_learn():
     np.testing.assert_allclose(learner.predict(matrix[40:])[:, 0], plain.predict_proba(matrix[40:])[:, 1])
 
 
-@pytest.mark.usefixtures("few_trees")
-def test_the_member_with_the_lower_held_out_loss_is_kept(configured, tmp_path, capsys):
-    data = data_of(GESTURES, configured)
-    members = {"kernel_ridge": partial(KernelRidge), "extra_trees": partial(ExtraTrees)}
-    learner = Chosen(members, folds=4)
+def test_the_member_with_the_lower_held_out_loss_is_kept(tmp_path, capsys):
+    data = TouchData(Presses(GESTURES), Readings)
+    members = {"kernel_ridge": partial(KernelRidge), "extra_trees": FewTrees}
+    learner = BestByCrossValidation(members, folds=4)
     learner.fit(data)
     best = min(learner.losses, key=learner.losses.get)
     assert capsys.readouterr().err.strip().endswith(f": {best}")
     path = learner.save(tmp_path)
-    assert [folder.name for folder in path.iterdir()] == [best]
-    other = Chosen(members)
-    other.load(data, path)
     touches = data.touches("test")
-    assert torch.equal(other.probabilities(touches), learner.probabilities(touches))
-    with pytest.raises(ValueError, match="it holds none of extra"):
-        Chosen({"extra": partial(ExtraTrees)}).load(data, path)
+    for other in (BestByCrossValidation(members), members[best]()):
+        other.load(data, path)
+        assert torch.equal(other.probabilities(touches), learner.probabilities(touches))
     with pytest.raises(InputError, match="learner=chosen has no member"):
-        Chosen({})
+        BestByCrossValidation({})
 
 
-@pytest.mark.parametrize("make", [KernelRidge, ExtraTrees])
+@pytest.mark.parametrize("make", [KernelRidge, FewTrees])
 def test_a_single_class_is_refused(make):
     matrix = np.random.default_rng(0).normal(size=(20, 3))
     with pytest.raises(InputError, match="all training touches have the same label press: give more"):
         make().learn(matrix, np.ones((20, 1)), Task(("press",)))
 
 
-@pytest.mark.usefixtures("few_trees")
-@pytest.mark.parametrize(
-    ("make", "name", "change"),
-    [
-        (KernelRidge, "0_weights", lambda array: array[:-1]),
-        (KernelRidge, "0_vectors", lambda array: array[:, 1:]),
-        (KernelRidge, "0_mean", lambda array: array * np.nan),
-        (KernelRidge, "0_typical", lambda array: array.astype(str)),
-        (ExtraTrees, "0_left", lambda array: array * 0),
-        (ExtraTrees, "0_right", lambda array: array + 10**6),
-        (ExtraTrees, "0_feature", lambda array: array + 1000),
-        (ExtraTrees, "0_roots", lambda array: array - 1),
-        (ExtraTrees, "0_values", lambda array: array.astype(object)),
-        (ExtraTrees, "0_values", None),
-    ],
-)
-def test_damaged_files_are_refused(make, name, change, configured, tmp_path):
-    data = data_of(PLACE, configured)
+@pytest.mark.parametrize(("make", "other"), [(KernelRidge, FewTrees), (FewTrees, KernelRidge)])
+def test_damaged_and_foreign_files_are_refused(make, other, tmp_path):
+    data = TouchData(Presses(PLACE), Readings)
     learner = make()
     learner.fit(data)
     path = learner.save(tmp_path)
-    with np.load(path) as stored:
-        content = {key: stored[key] for key in stored.files}
-    array = content.pop(name)
-    np.savez_compressed(path, **content | ({} if change is None else {name: change(array)}))
-    with pytest.raises((ValueError, TypeError)):
+    with pytest.raises(ValueError, match=r"it does not hold \d models of this learner"):
+        other().load(data, path)
+    with pytest.raises(ValueError, match=r"it does not hold \d models of this learner"):
+        make().load(TouchData(Presses(GESTURES), Readings), path)
+    content = path.read_bytes()
+    for damaged in (content[:-100], content[:200] + b"\0\1\2\3" + content[204:]):
+        path.write_bytes(damaged)
+        with pytest.raises(ValueError, match=r"."):
+            make().load(data, path)
+
+
+FORGED = [
+    (FewTrees, "children", np.zeros_like),  # a circle
+    (FewTrees, "children", lambda array: array - 1),
+    (FewTrees, "children", lambda array: array + 10**6),
+    (FewTrees, "feature", lambda array: array + 1000),
+    (FewTrees, "roots", lambda array: array + 10**6),
+    (FewTrees, "values", lambda array: array[:-1]),
+    (FewTrees, "values", lambda array: array * np.inf),
+    (FewTrees, "values", lambda array: np.hstack([array, array])),
+    (FewTrees, "threshold", lambda array: array.astype(str)),
+    (FewTrees, "n_features_in_", lambda count: count + 1),
+    (KernelRidge, "weights", lambda array: array[:-1]),
+    (KernelRidge, "vectors", lambda array: array[:, 1:]),
+    (KernelRidge, "mean", lambda array: array * np.nan),
+    (KernelRidge, "typical", lambda array: array.astype(str)),
+]
+
+
+@pytest.fixture(scope="module")
+def learned():
+    """Return learners of a position by their maker."""
+    data = TouchData(Presses(PLACE), Readings)
+    learners = {make: make() for make in (FewTrees, KernelRidge)}
+    for learner in learners.values():
+        learner.fit(data)
+    return data, learners
+
+
+@pytest.mark.parametrize(("make", "name", "change"), FORGED)
+def test_forged_files_are_refused_before_they_are_used(make, name, change, learned, tmp_path):
+    data, learners = learned
+    path = tmp_path / "models.skops"
+    models = learners[make].learned[0]
+    dump([replace(model, **{name: change(getattr(model, name))}) for model in models], path)
+    with pytest.raises((ValueError, TypeError, IndexError)):
         make().load(data, path)
+
+
+@pytest.mark.parametrize("name", ["forest.npz", "kernel.npz", "features.npz", "chosen"])
+def test_files_of_an_earlier_version_are_refused(name, learned, tmp_path):
+    with pytest.raises(InputError, match=rf"^{name} was stored by an earlier version: train the run again"):
+        FewTrees().load(learned[0], tmp_path / name)
+
+
+@pytest.mark.parametrize("make", [KernelRidge, FewTrees])
+def test_touches_of_other_sensors_are_refused(make):
+    data = TouchData(Presses(PLACE), Readings)
+    learner = make()
+    learner.fit(data)
+    touches = data.touches("test")
+    fewer = Touches(touches.readings[..., :3], touches.valid[..., :3], touches.positions[:3], None, 10.0)
+    with pytest.raises(InputError, match=r"the learner was trained on \d+: give touches of the sensors"):
+        learner.probabilities(fewer)
 
 
 def test_losses_leave_out_what_is_unknown():
@@ -197,5 +237,5 @@ def test_repeated_contacts_are_counted():
     assert features["contacts above 0.3 of the sum"].item() == 3
     assert features["mean contact above 0.3 of the sum"].item() == 2
     assert features["span above 0.3 of the sum"].item() == 18
-    matrix = few_features(touches, TOUCH)
+    matrix = small_data_features(touches, TOUCH)
     assert np.isfinite(matrix).all()

@@ -1,4 +1,4 @@
-"""Graph networks against the laws of graphs and against PyTorch Geometric."""
+"""Graph networks against the laws of graphs and against PyTorch Geometric, and the perceptron."""
 
 import warnings
 from contextlib import contextmanager
@@ -9,7 +9,7 @@ import torch
 
 from skin.errors import InputError
 from skin.learning.graph import adjacency, neighbours, normalised
-from skin.learning.model import POOLINGS, Gcn, _InstanceNorm
+from skin.learning.model import POOLINGS, Gcn, Mlp, _InstanceNorm
 
 PLACES = 0.1 * np.random.default_rng(0).random((8, 3))
 EDGES = adjacency(PLACES, neighbours(PLACES, "knn", 3), "exp")
@@ -109,9 +109,23 @@ def test_a_graph_of_one_sensor_can_be_normed():
         ({"widths": []}, "model.widths="),
         ({"pooling": "set3set"}, "model.pooling=set3set must be 'max', 'mean', 'attention' or 'set2set'"),
         ({"norm": "group"}, "model.norm=group must be 'none', 'layer', 'batch' or 'instance'"),
-        ({"activation": "tanh"}, "activation=relu, elu or silu"),
+        ({"activation": "tanh"}, "model.activation=tanh must be 'relu', 'elu' or 'silu'"),
     ],
 )
 def test_bad_options_are_refused(options, words):
     with pytest.raises(InputError, match=words):
         gcn(**options)
+
+
+def test_no_layer_leaves_the_readings_as_they_are():
+    model = Mlp("readings", (5,), widths=[])
+    x = torch.randn(3, 5)
+    assert torch.equal(model(x, None), x)
+    assert model.width == 5
+
+
+def test_every_sensor_has_weights_of_its_own():
+    torch.manual_seed(0)
+    model = Mlp("readings", (5,), widths=[8])
+    x = torch.randn(3, 5)
+    assert not torch.allclose(model(x.flip(1), None), model(x, None))

@@ -17,7 +17,6 @@ from skin.device.base import AbstractDevice, Split, in_background, one_ahead
 from skin.device.touches import Touches, touches_hash
 from skin.errors import InputError
 from skin.learning.representation import AbstractRepresentation, Frames, idle_level
-from skin.touch.labels import Task
 
 if TYPE_CHECKING:
     from pytorch_lightning import Trainer
@@ -110,6 +109,7 @@ class TouchData:
 
     Attributes:
         device: as given.
+        task: what the labels mean.
         make: the representation, as given.
         make_geometry: the geometry, as given.
         trainer: the Trainer that is training on the data.
@@ -133,6 +133,9 @@ class TouchData:
                 "data.direction=true"
             )
         self.device, self.make, self.make_geometry = device, representation, geometry
+        self.task, self._fresh = device.task, bool(getattr(device, "fresh", False))
+        kind: Any = getattr(representation, "func", representation)
+        self._layout_free = bool(kind.layout_free)
         self.batch_size, self.seed = batch_size, seed
         # An augmentation without effect must not draw random numbers.
         self.augmentation = None if augmentation == Augmentation() else augmentation
@@ -140,11 +143,6 @@ class TouchData:
         self._drawn: dict[str, Touches] = {}
         self._ahead: dict[int, Future[Touches]] = {}
         self.passes = itertools.count()
-
-    @property
-    def task(self) -> Task:
-        """What the labels mean."""
-        return self.device.task
 
     @cached_property
     def example(self) -> Touches:
@@ -205,10 +203,6 @@ class TouchData:
         here = self.trainer is not None and self.trainer.strategy.root_device.type == "cpu"
         return here and self._fresh and torch.get_num_threads() == 1
 
-    @property
-    def _fresh(self) -> bool:
-        return bool(getattr(self.device, "fresh", False))
-
     def train_dataloader(self) -> "_Batches":
         """Return the batches of the training split, in another order each epoch."""
         return _Batches(self, "train")
@@ -250,11 +244,6 @@ class TouchData:
     def geometry(self) -> Tensor | None:
         """The geometry of the configured skin, (S, G); None if it is unknown, or not needed."""
         return self.make_geometry() if self._layout_free and self.make_geometry is not None else None
-
-    @property
-    def _layout_free(self) -> bool:
-        make: Any = getattr(self.make, "func", self.make)
-        return bool(make.layout_free)
 
 
 class _Batches:

@@ -298,10 +298,10 @@ class Network(AbstractLearner):
             if data.task.kind == "regression":
                 classifier.targets.scale(torch.cat([part.known_labels for part in data.parts("train")]))
             self._begin(classifier)
-            training = Training(classifier, data, self._optimizer, self._warmup)
+            training = Training(classifier, self._optimizer, self._warmup)
             folder = self.unfinished or Path(temporary)
             self.seconds_per_epoch = train_network(
-                training, self._trainer, logger, folder, self.unfinished is not None
+                training, data, self._trainer, logger, folder, self.unfinished is not None
             )
 
     def _begin(self, classifier: TouchClassifier) -> None:

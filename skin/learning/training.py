@@ -8,13 +8,13 @@ import math
 import os
 import time
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from statistics import median
 from typing import Any
 
 import torch
-from pytorch_lightning import Callback, LightningModule, Trainer
+from pytorch_lightning import Callback, LightningDataModule, LightningModule, Trainer
 from pytorch_lightning.callbacks import ModelCheckpoint
 from pytorch_lightning.loggers import Logger
 from pytorch_lightning.strategies.launchers import _MultiProcessingLauncher, _SubprocessScriptLauncher
@@ -29,31 +29,16 @@ from skin.learning.data import Batch, TouchData
 from skin.learning.network import LAST, MakeOptimizer, TouchClassifier
 
 
-class Training(LightningModule):
-    """Trains a network.
-
-    Logs ``{train,val}_loss``, ``{train,val}_accuracy`` and, of binary tasks, ``{train,val}_accuracy_<label>``
-    per epoch.
+class TouchDataModule(LightningDataModule):
+    """Touches as frames for a Trainer, with any LightningModule.
 
     Args:
-        network: what is trained, in place.
-        data: of the training, which gives the frames of a batch.
-        optimizer: partial; takes the parameters.
-        warmup: fraction of the steps in which the learning rate rises to the optimizer's; it then falls to
-            nothing along a cosine (Smith and Topin, 2018). None keeps it constant.
+        data: gives the batches, and their frames where the network is.
     """
 
-    def __init__(
-        self,
-        network: TouchClassifier,
-        data: TouchData,
-        optimizer: MakeOptimizer,
-        warmup: float | None = None,
-    ) -> None:
+    def __init__(self, data: TouchData) -> None:
         super().__init__()
-        self.network, self.data = network, data
-        self._make_optimizer, self._warmup = optimizer, warmup
-        self._batches: dict[str, list[tuple[int, dict[str, Tensor]]]] = {"train": [], "val": []}
+        self.data = data
 
     def setup(self, stage: str) -> None:
         """Let the data know the Trainer, for its epoch and its processes."""
@@ -63,9 +48,42 @@ class Training(LightningModule):
         """Let the data forget the Trainer, which has ended."""
         self.data.trainer = None
 
+    def train_dataloader(self) -> Iterable[Touches | Batch]:
+        """Return the batches of the training split, in another order each epoch."""
+        return self.data.train_dataloader()
+
+    def val_dataloader(self) -> Iterable[Touches | Batch]:
+        """Return the batches of the validation split."""
+        return self.data.val_dataloader()
+
     def on_after_batch_transfer(self, batch: Touches, dataloader_idx: int) -> Batch:
         """Return the frames and labels of a batch that has arrived where the network is."""
         return self.data.frames(batch) if isinstance(batch, Touches) else batch
+
+
+class Training(LightningModule):
+    """Trains a network.
+
+    Logs ``{train,val}_loss``, ``{train,val}_accuracy`` and, of binary tasks, ``{train,val}_accuracy_<label>``
+    per epoch.
+
+    Args:
+        network: what is trained, in place.
+        optimizer: partial; takes the parameters.
+        warmup: fraction of the steps in which the learning rate rises to the optimizer's; it then falls to
+            nothing along a cosine (Smith and Topin, 2018). None keeps it constant.
+    """
+
+    def __init__(
+        self,
+        network: TouchClassifier,
+        optimizer: MakeOptimizer,
+        warmup: float | None = None,
+    ) -> None:
+        super().__init__()
+        self.network = network
+        self._make_optimizer, self._warmup = optimizer, warmup
+        self._batches: dict[str, list[tuple[int, dict[str, Tensor]]]] = {"train": [], "val": []}
 
     def _step(self, batch: Batch, stage: str) -> Tensor:
         frames, labels = batch
@@ -112,13 +130,15 @@ class Training(LightningModule):
         if self._warmup is None:
             return optimizer
         steps = int(self.trainer.estimated_stepping_batches)
-        rate = optimizer.defaults["lr"]
-        schedule = OneCycleLR(optimizer, rate, steps, pct_start=self._warmup, cycle_momentum=False)
+        schedule = OneCycleLR(
+            optimizer, optimizer.defaults["lr"], steps, pct_start=self._warmup, cycle_momentum=False
+        )
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
 
 def train_network(
     training: Training,
+    data: TouchData,
     settings: dict[str, Any],
     logger: Logger | None,
     folder: Path,
@@ -128,6 +148,7 @@ def train_network(
 
     Args:
         training: of the network.
+        data: of the training.
         settings: of Lightning's trainer.
         logger: of the metrics; None: they are not logged.
         folder: for checkpoints; a training that was interrupted in it is continued.
@@ -148,16 +169,15 @@ def train_network(
         # Behind `best`, whose state it saves; several processes would have to save together.
         every = ModelCheckpoint(folder, last.stem, enable_version_counter=False)
         trainer.callbacks.append(every)  # type: ignore[attr-defined]
-    again = last if alone and last.is_file() else None
+    module, begun = TouchDataModule(data), last if alone and last.is_file() else None
     with warnings.catch_warnings():
         # Lightning 2.6 asks torch 2.13 for a deprecated class
         warnings.filterwarnings("ignore", ".*treespec, LeafSpec", FutureWarning)
-        loaders = training.data.train_dataloader(), training.data.val_dataloader()
-        trainer.fit(training, *loaders, ckpt_path=again, weights_only=True)
+        trainer.fit(training, datamodule=module, ckpt_path=begun, weights_only=True)
     if not trainer.is_global_zero:
         return math.nan
-    weights = torch.load(best.best_model_path, weights_only=True, map_location="cpu")
-    training.load_state_dict(weights["state_dict"])
+    checkpoint = torch.load(best.best_model_path, weights_only=True, map_location="cpu")
+    training.load_state_dict(checkpoint["state_dict"])
     return progress.median()
 
 
@@ -228,7 +248,6 @@ class Progress(Callback):
     def __init__(self, path: Path) -> None:
         self._path = path
         self._seconds: list[float] = []
-        self._began = 0.0
         self._state: Tensor | None = None
 
     def median(self) -> float:

@@ -116,7 +116,7 @@ def test_the_head_is_as_wide_as_the_task():
 
 def test_what_an_epoch_logs(monkeypatch):
     network = classifier(hidden=())
-    training, logged = Training(network, None, torch.optim.Adam), {}
+    training, logged = Training(network, torch.optim.Adam), {}
     monkeypatch.setattr(training, "log", lambda name, value, **_: logged.update({name: value.item()}))
     with torch.no_grad():
         network.head[0].weight.zero_()
@@ -183,7 +183,7 @@ def test_numbers_of_any_unit_are_standardised():
 
 @pytest.mark.parametrize(("step", "share"), [(0, 0.04), (19, 1.0), (99, 0.0)])
 def test_the_learning_rate_rises_and_falls(step, share):
-    training = Training(classifier(), None, torch.optim.Adam, warmup=0.2)
+    training = Training(classifier(), torch.optim.Adam, warmup=0.2)
     training._trainer = type("Trainer", (), {"estimated_stepping_batches": 100})()
     chosen = training.configure_optimizers()
     assert chosen["lr_scheduler"]["interval"] == "step"

@@ -14,7 +14,7 @@ from skin.device.touches import Part, Recording, Touches
 from skin.errors import InputError
 from skin.learning.data import Augmentation, TouchData
 from skin.learning.representation import Frames, Readings
-from skin.learning.training import Training
+from skin.learning.training import TouchDataModule
 from skin.runs.build import build_data, build_device
 from skin.touch.labels import TOUCH_SLIDING
 
@@ -102,8 +102,8 @@ def test_one_thread_trains_while_another_draws_the_next_epoch(make, monkeypatch)
     data.trainer.strategy = SimpleNamespace(root_device=torch.device("cpu"))
     for epoch in range(3):
         data.trainer.current_epoch = other.trainer.current_epoch = epoch
-        training = Training(torch.nn.Identity(), data, torch.optim.SGD)
-        batches = [training.on_after_batch_transfer(batch, 0) for batch in data.train_dataloader()]
+        module = TouchDataModule(data)
+        batches = [module.on_after_batch_transfer(batch, 0) for batch in data.train_dataloader()]
         expected = [other.frames(batch) for batch in other.train_dataloader()]
         assert len(batches) == len(expected) == 5
         for batch, (frames, labels) in zip(batches, expected, strict=True):
@@ -192,7 +192,7 @@ def test_fresh_gestures_are_drawn_every_epoch(make):
 def test_a_batch_arrives_as_frames_and_labels(make):
     data = make()
     touches = next(iter(data.train_dataloader()))
-    frames, labels = Training(torch.nn.Identity(), data, torch.optim.SGD).on_after_batch_transfer(touches, 0)
+    frames, labels = TouchDataModule(data).on_after_batch_transfer(touches, 0)
     assert torch.equal(frames.x, touches.readings)
     assert labels.shape == (5, 4)
     assert data.example.readings.shape[1] == 6

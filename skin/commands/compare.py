@@ -57,10 +57,13 @@ def _compare_predictions(
 
     from skin.device.base import Blank
     from skin.record.comparison import Agreement
-    from skin.runs.run import FinishedRun
+    from skin.runs.run import find_run
     from skin.runs.torch_model import load_model
 
-    run, blank = FinishedRun.named(name, config), Blank.of(device.task, device.size, comparison.touches[0])
+    run, blank = (
+        find_run(config.tracking, name, config.trust),
+        Blank.of(device.task, device.size, comparison.touches[0]),
+    )
     if (learned := run.stored.simulator["_target_"]) != config.simulator["_target_"]:
         print(
             f"run {run.identity} was trained with {learned}: add simulator= to simulate the session with it\n"

@@ -19,7 +19,7 @@ from annotated_types import Ge, Gt, MinLen
 from skin.commands._command import command
 from skin.core.files import results
 from skin.errors import InputError
-from skin.runs.configuration import Config, overrides
+from skin.runs.configuration import Config, overrides, settings_of
 
 if TYPE_CHECKING:
     from skin.core.messages import Steps
@@ -86,10 +86,10 @@ def main(
 def _export_folder(run: str, config: Config, name: str | None, licence: str | None) -> None:
     """Write the files of a pretrained model, all or none."""
     from skin.runs.card import check_folder, write_folder
-    from skin.runs.run import FinishedRun
+    from skin.runs.run import find_run
 
     folder = check_folder(name, licence)
-    write_folder(FinishedRun.named(run, config), folder, str(licence))
+    write_folder(find_run(config.tracking, run, config.trust), folder, str(licence))
     print(folder)
 
 
@@ -105,7 +105,7 @@ def _export_file(
     from skin.evaluation.alarm import choose_alarm_threshold
     from skin.live.engine import DebounceSettings
     from skin.runs.model import describe_skin
-    from skin.runs.run import FinishedRun
+    from skin.runs.run import find_run
     from skin.runs.torch_model import equation10_warning, load_model
 
     try:
@@ -115,14 +115,14 @@ def _export_file(
             "skin export needs onnx, onnxscript and onnxruntime: pip install 'tactile-skin[export]'"
         ) from error
     quiet()
-    run = FinishedRun.named(name, config)
+    run = find_run(config.tracking, name, config.trust)
     whole = run.configured(overrides())
     model = load_model(run, whole, touch=settings.touch, one_skin=True)
     module = model.learner.pipeline(model.places)  # refused before anything else is simulated
     if advice := equation10_warning(run.stored):
         print(advice, file=sys.stderr)
     steps.begin("tuning the contact threshold")
-    described = replace(model.describe(), skin=describe_skin(whole, model.positions))
+    described = replace(model.describe(), skin=describe_skin(settings_of(whole), model.positions))
     if "simulator" in run.stored.device and model.threshold is not None:
         steps.begin(_THRESHOLDS)
         patience = DebounceSettings().alarm

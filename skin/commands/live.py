@@ -81,7 +81,7 @@ def emulated_skin(words: Sequence[str]) -> Iterator[list[str]]:
 
     from skin.core.messages import quiet
     from skin.runs.build import build_device
-    from skin.runs.run import FinishedRun
+    from skin.runs.run import find_run
     from skin.wire.emulator import Emulator, EmulatorSettings, Faults, open_port
 
     quiet()
@@ -89,7 +89,8 @@ def emulated_skin(words: Sequence[str]) -> Iterator[list[str]]:
         raise InputError(f"demo=true emulates a skin at a port: leave out {devices[0]}, or demo=true")
     words, touched = _demo_overrides(words)
     composed = compose("live", words)
-    run = FinishedRun.named(composed.run, validate_config(composed))
+    config = validate_config(composed)
+    run = find_run(config.tracking, composed.run, config.trust)
     device = build_device(run.configured(touched))
     port = open_port("tcp:0", None)
     emulator = Emulator(device.simulated("a skin is emulated"), port, EmulatorSettings(), Faults())

@@ -30,7 +30,7 @@ from omegaconf.errors import OmegaConfBaseException
 from skin import __version__
 from skin.core.files import BUNDLED, CONF, MANIFEST, ROOT, candidates
 from skin.core.messages import one_line
-from skin.core.settings import check_settings, walk_settings
+from skin.core.settings import check_settings, import_target, option_name, walk_settings
 from skin.errors import InputError
 from skin.evaluation.settings import Evaluation
 
@@ -154,6 +154,8 @@ _PASSWORD = re.compile(r"""([a-z][\w+.-]*://[^/@:\s]*:)(?!\d+/|\*\*\*@)(\S*)(@[^
 _PORTS = {"http": 80, "https": 443, "postgresql": 5432, "mysql": 3306, "mssql": 1433}
 # Settings without effect on results.
 _STEERING = ("shard", "tracking", "trust")
+NETWORK = ("representation", "model", "fusion", "optimizer", "trainer")
+"""Groups that a network consists of."""
 
 
 @dataclass
@@ -183,6 +185,8 @@ class Tracking:
 
     def __post_init__(self) -> None:
         self.uri = self.uri and hide_password(self.uri)
+        if self.threads is not None and self.threads < 1:
+            raise InputError(f"tracking.threads={self.threads} must be at least 1, or null")
 
 
 @dataclass(frozen=True)
@@ -368,6 +372,75 @@ def fingerprint(config: Config) -> str:
     """Return a hash of everything that results depend on: configuration, files it names, version."""
     # Unset keys belong to other commands; a new command must not change the fingerprint of finished runs.
     return config_hash({key: value for key, value in settings_of(config).items() if key not in _STEERING})
+
+
+def tags(config: Config) -> dict[str, str]:
+    """Return the tags that identify a run."""
+    return {
+        "fingerprint": fingerprint(config),
+        "row": str(config.row),
+        "simulator": simulator(config.device),
+        "seed": str(config.seed),
+    }
+
+
+def simulator(device: Mapping[str, Any]) -> str:
+    """Return the name of the simulator of a device, in its settings; without one, of the device."""
+    name = "simulator" if "simulator" in device else "device"
+    return name_option(device["simulator"] if name == "simulator" else device, name)
+
+
+def name_option(part: Mapping[str, Any], name: str) -> str:
+    """Return the name of the option that a part of a configuration, called ``name``, builds."""
+    if "_target_" not in part:
+        raise InputError(f"{name} chooses no option: leave it out, or give one that --help lists")
+    return option_name(import_target(part["_target_"], name))
+
+
+def name_run(identity: Mapping[str, str], changes: Mapping[str, str]) -> str:
+    """Return the name of a run: its row, simulator, other changes and seed.
+
+    Args:
+        identity: as of :func:`tags`.
+        changes: as of :func:`relevant_overrides`.
+    """
+    # The first ones are in the name in any case; the others choose the machine.
+    omitted = ("experiment", "row", "seed", "simulator", *(f"trainer.{name}" for name in MACHINE))
+    words = [f"{key.split('.')[-1]}={value}" for key, value in changes.items() if key not in omitted]
+    name = " ".join(filter(None, (identity["row"], identity["simulator"], *words)))
+    return shorten(name, f" seed {identity['seed']}")
+
+
+def shorten(name: str, end: str = "") -> str:
+    """Return the name of a run with its end, in at most 80 characters; other names stay other ones.
+
+    The table of runs and the legends of charts show 80 characters.
+    """
+    other = f" {hashlib.sha256(name.encode()).hexdigest()[:8]}{end}"
+    return name + end if len(name + end) <= 80 else name[: 80 - len(other)] + other
+
+
+def relevant_overrides(learner: Mapping[str, Any]) -> dict[str, str]:
+    """Return the overrides of the running command that affect its result; empty without a command.
+
+    Args:
+        learner: settings of its learner.
+    """
+    if not HydraConfig.initialized():
+        return {}
+    unused = unused_groups(learner)
+    return {
+        override.key_or_group: override.get_value_element_as_str()
+        for override in OverridesParser.create().parse_overrides(overrides())
+        if not override.is_delete()
+        and not override.key_or_group.startswith(("hydra", "sweep", *_STEERING))
+        and override.key_or_group.split(".")[0] not in unused
+    }
+
+
+def unused_groups(learner: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return the groups that have no part in a run, because its learner holds no network."""
+    return () if any("model" in path for path, _ in walk_settings(learner)) else NETWORK
 
 
 def overrides() -> list[str]:

@@ -73,16 +73,6 @@ class FinishedRun:
     run: "Run"
     trust: bool = False
 
-    @classmethod
-    def named(cls, run: str, config: Config) -> "FinishedRun":
-        """Return the run that a command names with ``run=``, as :func:`find_run` does.
-
-        Args:
-            run: its name.
-            config: of the command; its ``tracking`` and ``trust`` count.
-        """
-        return find_run(config.tracking, run, config.trust)
-
     @property
     def identity(self) -> str:
         """The id of the run."""

@@ -20,7 +20,7 @@ NAIVE = ["simulator=naive", "layout=grid", "layout.rows=2", "layout.columns=2"]
 
 @pytest.mark.parametrize(("count", "budget"), [(8, 10), (16, 20), (48, 60), (49, 62), (3230, 4038)])
 def test_the_training_split_of_the_budget_is_large_enough(count, budget):
-    assert simulated_budget(count) == budget
+    assert simulated_budget(FineTuning(gestures=count))["gestures"] == budget
     assert split_slices(budget)["train"].stop in (count, count + 1)
 
 

@@ -14,10 +14,9 @@ import pytest
 
 from skin.core.files import ROOT
 from skin.errors import InputError
-from skin.runs import store as tracking
 from skin.runs.configuration import Tracking, hide_password, reveal_password, source_tags
 from skin.runs.run import FinishedRun
-from skin.runs.store import TAGS, Store, print_table_link
+from skin.runs.store import Store, print_table_link
 from skin.runs.torch_model import load_run
 from tests.budget import free
 
@@ -111,27 +110,18 @@ def test_a_second_signal_does_not_interrupt_the_end_of_a_run(store, monkeypatch)
     assert ended == ["KILLED"]
 
 
-def test_a_run_whose_process_is_gone_is_called_killed(settings, store):
-    here, number, started = json.loads(tracking._identify_process())
-    with subprocess.Popen([sys.executable, "-c", ""]) as ended:
-        pass
-    tags = {
-        "gone": json.dumps([here, ended.pid, started]),
-        "number given anew": json.dumps([here, number, started - 3600]),
-        "another machine": json.dumps(["elsewhere", ended.pid, started]),
-        "no process": "x",
-    }
-    runs = {
-        name: store.client.create_run(store.experiment, run_name=name, tags={"process": process})
-        for name, process in tags.items()
-    }
-    with store.run("mine", {}) as runs["mine"]:
+def test_a_run_without_a_process_is_closed(settings, store):
+    """One whose lock is not here is one of another machine."""
+    abandoned, elsewhere = (store.create(name, {}) for name in ("abandoned", "elsewhere"))
+    (store.folder / f"{abandoned.info.run_id}.lock").touch()
+    with store.run("mine", {}) as mine:
         Store.open(settings)
-        found = {name: status(store, run) for name, run in runs.items()}
-    killed = {name for name, said in found.items() if said == "KILLED"}
-    assert killed == {"gone", "number given anew"}
-    assert set(found.values()) == {"KILLED", "RUNNING"}
-    assert status(store, runs["mine"]) == "FINISHED"
+        assert [status(store, run) for run in (abandoned, elsewhere, mine)] == [
+            "KILLED",
+            "RUNNING",
+            "RUNNING",
+        ]
+    assert not (store.folder / f"{mine.info.run_id}.lock").exists()
 
 
 def test_a_child_knows_its_parent(store):
@@ -177,13 +167,6 @@ def test_the_experiment_has_the_tags_of_the_run_table(store):
     assert tags["mlflow.experimentKind"] == "custom_model_development"
     view = json.loads(tags["mlflow.sharedViewState.skin"])
     assert "metrics.`same/overall/accuracy`" in view["selectedColumns"]
-
-
-def test_an_experiment_of_an_earlier_version_gets_the_tags(store, settings):
-    for name in TAGS:
-        store.client.delete_experiment_tag(store.experiment, name)
-    assert not store.client.get_experiment(store.experiment).tags
-    assert Store.open(settings).client.get_experiment(store.experiment).tags == TAGS
 
 
 def test_the_link_opens_the_runs_of_the_experiment(tmp_path, monkeypatch, capsys):

@@ -9,6 +9,7 @@ from hydra import initialize_config_dir
 from skin.core.files import CONF
 from skin.core.safe_loading import KEY as CHECKSUM
 from skin.errors import InputError
+from skin.runs.configuration import settings_of
 from skin.runs.model import check_overrides, describe_skin
 
 onnx = pytest.importorskip("onnx")
@@ -22,7 +23,7 @@ def model(untrained, configured, tmp_path_factory):
     from skin.runs.onnx_writer import write_model
 
     of = untrained("representation=readings", "model=mlp", "fusion=early")
-    skin = describe_skin(configured("simulator=naive", *SIZES), of.positions)
+    skin = describe_skin(settings_of(configured("simulator=naive", *SIZES)), of.positions)
     path = tmp_path_factory.mktemp("identity") / "skin.onnx"
     module = of.learner.pipeline(of.places)
     metadata = replace(of.describe(), skin=skin)
@@ -107,4 +108,4 @@ def test_a_file_may_not_name_code(model, tmp_path):
 def test_sensors_of_a_recording_are_not_described(configured):
     import numpy as np
 
-    assert describe_skin(configured(*SIZES), np.zeros((4, 3))) is None
+    assert describe_skin(settings_of(configured(*SIZES)), np.zeros((4, 3))) is None

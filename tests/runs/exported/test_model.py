@@ -65,7 +65,7 @@ def test_other_files_are_refused(tmp_path):
     with pytest.raises(InputError, match="there is no file"):
         OnnxModel(tmp_path / "none.onnx")
     (tmp_path / "text.onnx").write_text("no model")
-    with pytest.raises(InputError, match="no model that ONNX Runtime can load"):
+    with pytest.raises(InputError, match="ONNX Runtime cannot load"):
         OnnxModel(tmp_path / "text.onnx")
     with pytest.raises(InputError, match="was not written by skin export"):
         ModelMetadata.parse({}, "x.onnx")

@@ -2,7 +2,7 @@
 
 import math
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -23,6 +23,7 @@ from skin.core.files import json_text, write
 from skin.core.rng import Stream, generator
 from skin.core.settings import RISING, checked
 from skin.design.precision import Sensitivity, local_covariance, sensitivity
+from skin.device.base import AbstractDevice
 from skin.errors import InputError
 from skin.inference.candidates import CandidateReadings, FingertipPrior, disc_readings
 from skin.inference.contact import Cloud, blur_first, one_contact
@@ -30,8 +31,7 @@ from skin.inference.likelihood import Observation
 from skin.inference.noise import Noise
 from skin.mechanics.geometry import Fingertip
 from skin.mechanics.simulator.base import AbstractSimulator
-from skin.runs.build import SkinModel, build_skin
-from skin.runs.configuration import Config
+from skin.runs.build import SkinModel
 
 _UNITS = {
     **dict.fromkeys(("radii", "rim", "margin"), "_m"),
@@ -160,15 +160,14 @@ class ExpectedPosterior:
     touches: Annotated[int, Ge(16)] = 512
     seed: Annotated[int, Ge(0)] = 0
 
-    def run(self, config: Config, folder: Path) -> None:
-        """Write design.json and design.png for the configured skin, and print a table.
+    def run(self, skin: SkinModel, make_device: Callable[[], AbstractDevice], folder: Path) -> None:
+        """Write design.json and design.png for a skin, and print a table; no device is needed.
 
         Raises:
             InputError: a skin that cannot be built, or a margin that leaves no place.
         """
         from skin.design.drawing import draw_expected, print_expected
 
-        skin = build_skin(config)
         simulator = skin.simulator(skin.body, skin.sensors)
         trials = self.trials(simulator, skin.body)
         findings = self.find(simulator, skin.body, trials)
@@ -344,8 +343,8 @@ class Sweep(ExpectedPosterior):
     footprint: Footprint = (0.01, 0.01)
     height: PositiveFloat = 0.0005
 
-    def run(self, config: Config, folder: Path) -> None:
-        """Write design_sweep.csv and design_sweep.png.
+    def run(self, skin: SkinModel, make_device: Callable[[], AbstractDevice], folder: Path) -> None:
+        """Write design_sweep.csv and design_sweep.png; no device is needed.
 
         Raises:
             InputError: a skin that cannot be built, a simulator without mechanics, or sensors outside the
@@ -353,7 +352,6 @@ class Sweep(ExpectedPosterior):
         """
         from skin.design.drawing import draw_sweep, print_sweep
 
-        skin = build_skin(config)
         cases = [
             (thickness, (rows, columns)) for thickness in self.thicknesses for rows, columns in self.grids
         ]

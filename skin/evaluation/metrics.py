@@ -59,7 +59,7 @@ def compute_metrics(
         right = ((chance > 0.5) == (label > 0)).float()
         values[f"{name}/accuracy"] = float(right.mean())
         values[f"{name}/balanced_accuracy"] = math.nan
-        if _has_both(label):
+        if 0 < int(label.sum()) < len(label):
             recall, specificity = right[label > 0].mean(), right[label == 0].mean()
             values[f"{name}/balanced_accuracy"] = float((recall + specificity) / 2)
         values[f"{name}/ece"] = calibration_error(chance, label)
@@ -119,11 +119,6 @@ def measure_angles(probabilities: Tensor, labels: Tensor, task: Task) -> Tensor:
     (x, y), (cos, sin) = probabilities[rows, -2:].double().T, labels[rows, -2:].double().T
     angle = torch.atan2(x * sin - y * cos, x * cos + y * sin).abs() * 180 / math.pi
     return angle.where((x != 0) | (y != 0), 90)
-
-
-def _has_both(label: Tensor) -> bool:
-    """Return whether a label (B,) has both classes."""
-    return bool(label.any()) and not bool(label.all())
 
 
 def count_confusions(probabilities: Tensor, labels: Tensor, task: Task | None = None) -> Tensor:

@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from skin.device.touches import Touches
 
 LABEL = "dangerous"
-_HIDDEN = 0.25  # share of dangerous touches that a threshold may hide
 
 
 class Predictor(Protocol):
@@ -116,9 +115,8 @@ class OperatingPoint:
     @property
     def useless(self) -> bool:
         """Whether it is silent, or more than a quarter of the dangerous touches raise no alarm when live."""
-        return self.silent or (
-            self.rate is not None and self.dangerous - self.found > _HIDDEN * self.dangerous
-        )
+        hidden = self.dangerous - self.found
+        return self.silent or (self.rate is not None and hidden > 0.25 * self.dangerous)
 
     def alarm(self, chance: "Tensor") -> "Tensor":
         """Return which probabilities raise the alarm, bool, in the shape of ``chance``."""
@@ -196,8 +194,8 @@ def parse_operating_point(text: str) -> OperatingPoint | None:
             int(stored["found"]),
         )
         usable = stored["label"] == LABEL and point.threshold > 0 and 0 < point.target < 1
-        counted = 0 <= point.raised <= point.safe and 0 <= point.found <= point.dangerous
-        if not usable or not counted or not math.isfinite(point.threshold):
+        usable &= 0 <= point.raised <= point.safe and 0 <= point.found <= point.dangerous
+        if not usable or not math.isfinite(point.threshold):
             raise ValueError(text)
     except (ValueError, TypeError, KeyError, OverflowError, RecursionError) as error:
         raise InputError(

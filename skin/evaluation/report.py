@@ -26,8 +26,6 @@ from skin.evaluation.settings import Evaluation
 from skin.plot.figures import confusions, save_figure
 from skin.touch.labels import Task
 
-# Neither the default device (0) nor any layout of data/layouts is among them.
-_FIRST_DEVICE, _FIRST_LAYOUT = 1, 101
 PERCENTAGES = ("/accuracy", "/alarm_recall", "/false_alarm_rate")
 """Suffixes of the metrics that are shown in per cent."""
 _SHOWN = (*PERCENTAGES, "/degrees", "/r2", "/rms", "/rms_mm", "/rms_N")
@@ -62,13 +60,20 @@ class Report:
     outcomes: np.ndarray | None = None
     split: str = ""
 
+    @property
+    def notes(self) -> list[str]:
+        """How the alarm was raised, and why values are missing."""
+        point, reached = self.point, self.reached
+        alarm = [f"{point.sentence()}; {reached.sentence()}"] if point and reached else []
+        return [*alarm, *(f"{column}: {reason}" for column, reason in self.cannot.items())]
+
 
 def touch_sets(device: AbstractDevice, settings: Evaluation) -> dict[str, Iterator[Touches]]:
     """Return the sets of touches of each further column of a report, drawn lazily.
 
     Those of ``unseen_layout`` raise InputError where the sensors cannot form a grid.
     """
-    sets = {"holdout": _holdout(device)}
+    sets: dict[str, Iterator[Touches]] = {"holdout": (device.touches("holdout") for _ in range(1))}
     if (simulation := device.simulation) is not None:
         sets["device_shift"] = _devices(simulation, settings)
         sets["unseen_layout"] = _layouts(simulation, settings)
@@ -89,7 +94,8 @@ def evaluate(
     task, metrics, cannot = device.task, dict[str, float](), dict[str, str]()
     same, drawn = _test(device)
     chances = learner.probabilities(same)
-    metrics |= _add_prefix("same", compute_metrics(chances, same.known_labels, task, point))
+    computed = compute_metrics(chances, same.known_labels, task, point)
+    metrics |= {f"same/{name}": value for name, value in computed.items()}
     for column, sets in touch_sets(device, settings).items():
         try:
             pairs = [(learner.probabilities(touches), touches.known_labels) for touches in sets]
@@ -98,7 +104,8 @@ def evaluate(
             continue
         if pairs:
             predicted, true = (torch.cat(parts) for parts in zip(*pairs, strict=True))
-            metrics |= _add_prefix(column, compute_metrics(predicted, true, task, point))
+            computed = compute_metrics(predicted, true, task, point)
+            metrics |= {f"{column}/{name}": value for name, value in computed.items()}
     never = same.known_labels.isnan().all(dim=0)
     if unknown := [name for name, missing in zip(task.names, never, strict=True) if missing]:
         cannot["labels"] = f"the touches of the test tell nothing of {', '.join(unknown)}"
@@ -120,15 +127,11 @@ def _test(device: AbstractDevice) -> tuple[Touches, dict[str, Tensor]]:
     return recording.touches, recording.parameters
 
 
-def _holdout(device: AbstractDevice) -> Iterator[Touches]:
-    yield device.touches("holdout")
-
-
 def _devices(device: AbstractSimulated, settings: Evaluation) -> Iterator[Touches]:
     """Yield the share of the test touches that each of some other devices of the same kind measures."""
     for number in range(settings.devices):
-        sibling = device.replace(seed=_FIRST_DEVICE + number)
-        yield _share(sibling.touches("test"), number, settings.devices)
+        sibling = device.replace(seed=1 + number)  # the default device has 0
+        yield sibling.touches("test")[number :: settings.devices]
 
 
 def _layouts(device: AbstractSimulated, settings: Evaluation) -> Iterator[Touches]:
@@ -137,7 +140,7 @@ def _layouts(device: AbstractSimulated, settings: Evaluation) -> Iterator[Touche
     A gesture whose dangerous pressure no sensor of a layout would feel takes another path there.
     """
     for number, other in enumerate(scattered_devices(device, settings.layouts)):
-        yield _share(other.touches("test"), number, settings.layouts)
+        yield other.touches("test")[number :: settings.layouts]
 
 
 def scattered_devices(device: AbstractSimulated, count: int) -> Iterator[AbstractSimulated]:
@@ -154,21 +157,12 @@ def scattered_devices(device: AbstractSimulated, count: int) -> Iterator[Abstrac
         layout = Scattered(
             rows,
             sensors // rows,
-            seed=_FIRST_LAYOUT + number,
+            seed=101 + number,  # none of data/layouts
             footprint=device.sensors.footprint,
             depth=device.sensors.positions[:, 2],
             normals=device.sensors.normals,
         )
         yield device.replace(layout=layout)
-
-
-def _share(touches: Touches, number: int, count: int) -> Touches:
-    """Return one of ``count`` shares of touches, which together are all of them."""
-    return touches[torch.arange(number, len(touches), count)]
-
-
-def _add_prefix(column: str, values: dict[str, float]) -> dict[str, float]:
-    return {f"{column}/{name}": value for name, value in values.items()}
 
 
 def _predictions(chances: Tensor, touches: Touches, task: Task, drawn: dict[str, Tensor]) -> pa.Table:
@@ -191,13 +185,8 @@ def print_report(report: Report, title: str, console: Console | None = None) -> 
     """
     console = console or Console()
     console.print(metrics_table(report.metrics, title))
-    if report.split:
-        console.print(f"split: {report.split}", markup=False, highlight=False, soft_wrap=True)
-    if report.point is not None and report.reached is not None:
-        sentence = f"{report.point.sentence()}; {report.reached.sentence()}"
-        console.print(sentence, markup=False, highlight=False, soft_wrap=True)
-    for column, reason in report.cannot.items():
-        console.print(f"{column}: {reason}", markup=False)
+    for note in [f"split: {report.split}"] * bool(report.split) + report.notes:
+        console.print(note, markup=False, highlight=False, soft_wrap=True)
 
 
 def metrics_table(metrics: Mapping[str, float], title: str) -> Table:
@@ -243,9 +232,7 @@ def evaluation_markdown(report: Report, task: Task, title: str, about: str) -> s
     lines += ["" if task.kind == "regression" else "Per cent:", "", f"| | {' | '.join(columns)} |"]
     lines.append("|---" * (len(columns) + 1) + "|")
     lines += [f"| {' | '.join(row)} |" for row in rows]
-    if report.point is not None and report.reached is not None:
-        lines += ["", f"{report.point.sentence()}; {report.reached.sentence()}."]
-    lines += [f"\n{column}: {reason}" for column, reason in report.cannot.items()]
+    lines += [f"\n{note}" for note in report.notes]
     if report.confusion is not None:
         lines += [
             "",

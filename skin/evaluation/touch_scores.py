@@ -18,10 +18,6 @@ from skin.evaluation.operating_point import Predictor
 from skin.touch.labels import RELEASE
 from skin.touch.movie import Movie
 
-_TOUCHES = 50  # touches
-_WINDOWS = 500  # windows that are classified at once
-_AFTER = 1.0  # s that are simulated behind the window of a touch
-
 
 @torch.inference_mode()
 def touch_scores(
@@ -48,8 +44,8 @@ def touch_scores(
     """
     device = device.replace(padded=False, stream=False)
     scores = list[Tensor]()
-    for first in range(0, len(labels), _TOUCHES):
-        batch, draw = labels[first : first + _TOUCHES], generator(Stream.ALARM, seed, 2, first)
+    for first in range(0, len(labels), 50):
+        batch, draw = labels[first : first + 50], generator(Stream.ALARM, seed, 2, first)
         movie = device.sampler.sample(len(batch), draw, batch)
         readings, valid, contact = _decision_windows(device, movie, live, draw)
         chances = torch.zeros(contact.shape)
@@ -102,7 +98,7 @@ def _measure_touches(
 ) -> tuple[Tensor, Tensor]:
     """Return what devices read of touches after a window of rest, (B, F, S), N, and their valid sensors."""
     force = device.model.respond(movie, displacement=False).readings
-    before, after = device.window, ceil(_AFTER * device.model_rate)
+    before, after = device.window, ceil(1.0 * device.model_rate)  # a second behind the window of a touch
     padded, rate = pad(force, (0, 0, before, after)), _round_rate(device, live)
     if rate > device.model_rate or not live.aligned:
         padded = between_frames(padded, device.model_rate, rate, draw.random(len(padded)))
@@ -131,6 +127,6 @@ def _classify_windows(
     mask = valid[:, None].expand_as(readings)
     parts = [
         learner.probabilities(Touches(*part, positions, None, device.model_rate))[:, live.column]
-        for part in zip(readings.split(_WINDOWS), mask.split(_WINDOWS), strict=True)
+        for part in zip(readings.split(500), mask.split(500), strict=True)
     ]
     return torch.cat(parts).nan_to_num(1.0) if parts else torch.zeros(0)

@@ -25,11 +25,11 @@ from annotated_types import Ge, Le, MinLen
 from hydra.utils import instantiate
 from pydantic import NonNegativeInt, PositiveFloat, PositiveInt
 from rich.console import Console
-from torch import Tensor, nn
+from torch import nn
 
 from skin.core.messages import Steps
 from skin.core.rng import Stream, generator
-from skin.core.settings import checked, configured, import_target
+from skin.core.settings import checked, configured
 from skin.device.base import AbstractDevice, Blank
 from skin.device.touches import Touches, touches_hash
 from skin.errors import InputError
@@ -57,7 +57,7 @@ LEAST = 8
 _COMMAND = ("adapt", "data", "evaluation")  # groups that are taken from the command, not from the run
 # Expected seconds of each step, for the fraction in the progress.
 _STEPS = {"loading the run": 10.0, "reading or simulating the gestures": 15.0}
-_STEPS |= {"choosing the threshold of the alarm": 15.0, "fine-tuning": 60.0, "evaluating the result": 40.0}
+_STEPS |= {"choosing the threshold of the alarm": 15.0, "fine-tuning, and evaluating the result": 100.0}
 
 
 @checked("adapt")
@@ -73,7 +73,7 @@ class FineTuning:
     patience: PositiveInt = 10
     batch_size: PositiveInt = 32
     seed: NonNegativeInt = 0
-    scratch: Sequence[str] = ("kernel_ridge", "extra_trees")
+    scratch: Sequence[Literal["kernel_ridge", "extra_trees"]] = ("kernel_ridge", "extra_trees")
 
 
 @dataclass(frozen=True)
@@ -95,8 +95,8 @@ class Candidate:
 
 def fine_tune(
     learner: AbstractLearner, data: TouchData, touches: Touches, settings: FineTuning
-) -> Iterator[Candidate]:
-    """Yield the network as it is, and fine-tuned after each epoch until the held-out loss rises.
+) -> list[Candidate]:
+    """Return the network as it is, and fine-tuned after each epoch until the held-out loss rises.
 
     Args:
         learner: of the run, with a network; :attr:`Candidate.train` changes it.
@@ -109,8 +109,7 @@ def fine_tune(
     """
     network, labels = learner.network.eval(), touches.known_labels
     fold = split_folds(labels, settings.folds, settings.seed)
-    unchanged = _predict(network, data, touches)
-    yield Candidate("", unchanged, lambda: learner)
+    candidates = [Candidate("", _predict(network, data, touches), lambda: learner)]
 
     def finish(layers: str, lr: float, epochs: int) -> AbstractLearner:
         with torch.random.fork_rng():
@@ -119,21 +118,24 @@ def fine_tune(
             network.load_state_dict(next(islice(steps, epochs - 1, None)).state_dict())
         return learner
 
-    for layers, lr in product(settings.layers, settings.lr):
-        trainings = [
-            _train(network, data, touches[fold != number], settings, (layers, lr, number))
-            for number in range(settings.folds)
-        ]
-        losses = [float(touch_losses(unchanged, labels.numpy(), network.task).mean())]
-        while len(losses) <= settings.epochs and len(losses) - np.argmin(losses) <= settings.patience:
-            chances = np.empty_like(unchanged)
-            for number, training in enumerate(trainings):
-                chances[fold == number] = _predict(next(training), data, touches[fold == number])
-            name = f"layers={layers} lr={lr:g} epochs={len(losses)}"
-            yield Candidate(name, chances, partial(finish, layers, lr, len(losses)))
-            losses.append(float(touch_losses(chances, labels.numpy(), network.task).mean()))
-        text = f"layers={layers} lr={lr:g}: held-out loss {losses[0]:.4f} before, {min(losses):.4f} after"
-        print(f"{text} {np.argmin(losses)} epochs", file=sys.stderr, flush=True)
+    with torch.random.fork_rng():
+        torch.manual_seed(settings.seed)
+        for layers, lr in product(settings.layers, settings.lr):
+            trainings = [
+                _train(network, data, touches[fold != number], settings, (layers, lr, number))
+                for number in range(settings.folds)
+            ]
+            losses = [float(touch_losses(candidates[0].chances, labels.numpy(), network.task).mean())]
+            while len(losses) <= settings.epochs and len(losses) - np.argmin(losses) <= settings.patience:
+                chances = np.empty_like(candidates[0].chances)
+                for number, training in enumerate(trainings):
+                    chances[fold == number] = _predict(next(training), data, touches[fold == number])
+                choice = f"layers={layers} lr={lr:g} epochs={len(losses)}"
+                candidates.append(Candidate(choice, chances, partial(finish, layers, lr, len(losses))))
+                losses.append(float(touch_losses(chances, labels.numpy(), network.task).mean()))
+            text = f"layers={layers} lr={lr:g}: held-out loss {losses[0]:.4f} before, {min(losses):.4f} after"
+            print(f"{text} {np.argmin(losses)} epochs", file=sys.stderr, flush=True)
+    return candidates
 
 
 def _train(
@@ -205,7 +207,7 @@ def learn_from_scratch(
 
 
 def choose_candidate(
-    candidates: Sequence[Candidate], touches: Touches, task: Task, fold: Tensor
+    candidates: Sequence[Candidate], touches: Touches, task: Task, settings: FineTuning
 ) -> tuple[Candidate, np.ndarray]:
     """Return the best candidate, and probabilities (B, L) of the gestures by candidates not chosen on them.
 
@@ -213,12 +215,13 @@ def choose_candidate(
         candidates: the first one changes nothing, and is returned if no other one is clearly better.
         touches: B labelled gestures.
         task: the labels; of a regression r2 takes the place of the accuracy.
-        fold: of each gesture, (B,).
+        settings: whose folds were held out.
     """
     labels, before = touches.known_labels, candidates[0]
+    fold = split_folds(labels, settings.folds, settings.seed)
     losses = np.stack([touch_losses(one.chances, labels.numpy(), task) for one in candidates])
     judged = np.empty_like(before.chances)
-    for number in range(int(fold.max()) + 1):
+    for number in range(settings.folds):
         held = (fold == number).numpy()
         judged[held] = candidates[losses[:, ~held].mean(axis=1).argmin()].chances[held]
     gain = losses[0] - touch_losses(judged, labels.numpy(), task)
@@ -231,39 +234,9 @@ def choose_candidate(
     return candidates[losses.mean(axis=1).argmin()], judged
 
 
-def _scratch_options(names: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """Return the settings of learners for few touches by name.
-
-    Raises:
-        InputError: a name does not name such a learner.
-    """
-    options = {name: default_option("learner", name) for name in names}
-    for name, option in options.items():
-        kind = import_target(option["_target_"], "adapt.scratch")
-        if not (isinstance(kind, type) and issubclass(kind, AbstractFew)):
-            raise InputError(f"adapt.scratch={name} needs many touches: give kernel_ridge, extra_trees")
-    return options
-
-
-@dataclass(frozen=True)
-class Target:
-    """A skin to adapt a run to.
-
-    Attributes:
-        device: the skin, or its recording.
-        twin: a simulated device with the body and layout of the skin. Its imperfections are those of the run,
-            or of ``evaluation.profile``.
-        config: of the adapted run.
-    """
-
-    device: AbstractDevice
-    twin: AbstractDevice
-    config: Config
-
-
 def find_target(
     parent: FinishedRun, command: Config, settings: FineTuning, overrides: Sequence[str]
-) -> Target:
+) -> tuple[AbstractDevice, AbstractDevice, Config]:
     """Return the skin that a command describes.
 
     Args:
@@ -271,6 +244,10 @@ def find_target(
         command: its configuration: the evaluation, and the augmentation of the gestures.
         settings: of the fine-tuning.
         overrides: of the command line.
+
+    Returns:
+        The skin, or its recording; a simulated device with the body and layout of the skin, whose
+        imperfections are those of the run, or of ``evaluation.profile``; configuration of the adapted run.
 
     Raises:
         InputError: no skin is given, or its gestures have other labels than the run.
@@ -284,9 +261,11 @@ def find_target(
     words = [word for word in words if groups[word] not in ("device", "profile")]
     words += [] if "simulator" in parent.stored.device else ["device=simulated"]
     simulated = replace(parent.configured(words), evaluation=command.evaluation)
-    trained = simulated.device
-    build = device_on_skin(simulated, simulated)
-    device = build_device(measured)
+    device, trained, build = (
+        build_device(measured),
+        simulated.device,
+        device_on_skin(simulated, vars(simulated)),
+    )
     twin = threshold_device(AlarmSource("", command.evaluation, None, trained, trained, build=build))
     _check(parent, device, twin)
     device, drawn = device.with_labels(twin.task), device.simulation is not None
@@ -303,7 +282,7 @@ def find_target(
         device=adapted.device | gestures,
         evaluation=command.evaluation,
     )
-    return Target(device, twin, adapted)
+    return device, twin, adapted
 
 
 def _check(parent: FinishedRun, device: AbstractDevice, twin: AbstractDevice) -> None:
@@ -365,76 +344,74 @@ def adapt(config: Config, run: str, overrides: Sequence[str]) -> None:
     Nothing is done if a run with the same fingerprint has finished, unless ``tracking.resume=false``.
 
     Args:
-        config: of ``skin adapt``.
-        run: name of the run.
-        overrides: of the command line.
+        config, run, overrides: configuration, name of the run, and overrides of ``skin adapt``.
 
     Raises:
         InputError: the run has no network or does not fit the skin, the gestures have no labels, or there are
             fewer than wanted.
     """
     settings, tracking = configured(FineTuning, config.adapt, "adapt"), config.tracking
-    options = _scratch_options(settings.scratch)
-    if tracking.threads:
-        torch.set_num_threads(tracking.threads)
+    options = {str(name): default_option("learner", name) for name in settings.scratch}
+    torch.set_num_threads(tracking.threads or torch.get_num_threads())
     with Steps(_STEPS) as steps:
         parent = find_run(tracking, run, config.trust)
-        target = find_target(parent, config, settings, overrides)
-        identity = tags(target.config) | {ADAPTED: parent.identity, "target": " ".join(overrides)}
+        device, twin, target = find_target(parent, config, settings, overrides)
+        identity = tags(target) | {ADAPTED: parent.identity, "target": " ".join(overrides)}
         if tracking.resume and find_finished(Store.existing(tracking), identity["fingerprint"]):
             return
-        learner, data = build_learner(target.config), build_data(target.config, target.device.blank())
+        learner, data = build_learner(target), build_data(target, device.blank())
         parent.load_weights(learner, data)
         learner.network  # noqa: B018 - refuses another learner before gestures are read from a port
         steps.begin("reading or simulating the gestures")
-        steps.silent = target.device.real
-        touches, others = choose_gestures(target.device, settings)
+        steps.silent = device.real
+        touches, others = choose_gestures(device, settings)
         steps.silent = False
-        name = f"{target.config.row} {identity['simulator']} {len(touches)} gestures seed {settings.seed}"
-        task, evaluation = target.twin.task, check_evaluation(target.config.evaluation)
         steps.begin("choosing the threshold of the alarm")
-        source = replace(alarm_source(parent, learner, target.config), device=target.twin)
-        point = choose_alarm_threshold(source, one_skin=True)
+        source, task = replace(alarm_source(parent, learner, target), device=twin), twin.task
+        choose = partial(choose_alarm_threshold, one_skin=True)
+        point = choose(source)
         figures: dict[str, float] = {}
         if others is not None:
             tests = others.touches("test")
-            figures = _figures("before", learner.probabilities(tests), tests, task, point)
+            figures = _figures("before", learner.probabilities(tests).numpy(), tests, task, point)
+        name = f"{target.row} {identity['simulator']} {len(touches)} gestures seed {settings.seed}"
         store = Store.open(tracking)
         with store.run(name, identity, parent.identity) as made:
-            steps.begin("fine-tuning")
-            with torch.random.fork_rng():
-                torch.manual_seed(settings.seed)
-                candidates = [*fine_tune(learner, data, touches, settings)]
+            steps.begin("fine-tuning, and evaluating the result")
+            candidates = fine_tune(learner, data, touches, settings)
             candidates += learn_from_scratch(touches, task, settings, options)
-            fold = split_folds(touches.known_labels, settings.folds, settings.seed)
-            best, after = choose_candidate(candidates, touches, task, fold)
-            chosen = target.config if not best.settings else replace(target.config, learner=best.settings)
+            best, after = choose_candidate(candidates, touches, task, settings)
             learner = best.train()
+            chosen = replace(target, learner=best.settings or target.learner)
             log_configuration(store, made.info.run_id, settings_of(chosen), touches_hash(touches))
             log_learner(store, made, learner)
-            steps.begin("evaluating the result")
             if best.name and point is not None:
-                point = choose_alarm_threshold(replace(source, learner=learner), anew=True)
-            for column, chances in (("validation_before", candidates[0].chances), ("validation", after)):
-                figures |= _figures(column, torch.from_numpy(chances), touches, task)
+                point = choose(replace(source, learner=learner), anew=True)
+            figures |= _figures("validation_before", candidates[0].chances, touches, task)
+            figures |= _figures("validation", after, touches, task)
             if others is None:
                 store.client.set_tag(made.info.run_id, TAG, "null" if point is None else point.text())
                 store.log_metrics(made, figures)
             else:
-                report = evaluate(learner, others, evaluation, point)
+                report = evaluate(learner, others, check_evaluation(target.evaluation), point)
                 log_report(store, made, report, task, figures)
                 figures |= {key: value for key, value in report.metrics.items() if key.startswith("same/")}
             store.client.set_tag(made.info.run_id, "chosen", best.name)
-    Console().print(metrics_table(figures, f"{name}, run {made.info.run_id}"))
+    _announce(figures, f"{name}, run {made.info.run_id}", others is not None, best.name, parent.identity)
+
+
+def _announce(figures: dict[str, float], title: str, reported: bool, chosen: str, parent: str) -> None:
+    """Print a table of metrics, what its columns mean, and which model was kept."""
+    Console().print(metrics_table(figures, title))
     meaning = "validation: the gestures to adapt on, each predicted by a model that was not trained on it"
-    print(meaning, "; before, same: other gestures of the skin" if others is not None else "", sep="")
-    unchanged = "nothing is better on held-out gestures: the new run keeps the weights of run "
-    print(f"chosen: {best.name}" if best.name else f"{unchanged}{parent.identity}")
+    print(meaning, "; before, same: other gestures of the skin" if reported else "", sep="")
+    unchanged = f"nothing is better on held-out gestures: the new run keeps the weights of run {parent}"
+    print(f"chosen: {chosen}" if chosen else unchanged)
 
 
 def _figures(
-    column: str, chances: Tensor, touches: Touches, task: Task, point: OperatingPoint | None = None
+    column: str, chances: np.ndarray, touches: Touches, task: Task, point: OperatingPoint | None = None
 ) -> dict[str, float]:
     """Return the metrics of predictions (B, L) of gestures, as ``column/name``."""
-    figures = compute_metrics(chances, touches.known_labels, task, point)
+    figures = compute_metrics(torch.from_numpy(chances), touches.known_labels, task, point)
     return {f"{column}/{name}": value for name, value in figures.items()}

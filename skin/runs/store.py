@@ -31,7 +31,6 @@ from filelock import FileLock, Timeout
 from mlflow import MlflowClient
 from mlflow.entities import Metric, Run, ViewType
 from mlflow.exceptions import MlflowException, RestException
-from mlflow.protos.databricks_pb2 import RESOURCE_ALREADY_EXISTS, ErrorCode
 from mlflow.store.tracking import SEARCH_MAX_RESULTS_THRESHOLD
 from mlflow.utils.mlflow_tags import MLFLOW_PARENT_RUN_ID
 from sqlalchemy.exc import SQLAlchemyError
@@ -60,22 +59,18 @@ _PATIENT = {"MLFLOW_HTTP_REQUEST_MAX_RETRIES": "9", "MLFLOW_HTTP_REQUEST_BACKOFF
 
 # The table of runs in the UI of MLflow: the shared view of a link, with widths of its columns in pixels.
 _VIEW = "skin"
-_NAME = "attributes.`Run Name`"
 _COLUMNS = {
-    _NAME: 420,
     "metrics.`same/overall/accuracy`": 180,
     "metrics.`same/dangerous/alarm_recall`": 230,
     "metrics.`same/dangerous/false_alarm_rate`": 250,
 }
-_SHOWN = {
-    "selectedColumns": [name for name in _COLUMNS if name != _NAME],
-    "columnOrder": list(_COLUMNS),
-    "columnWidths": _COLUMNS,
-}
+_WIDTHS = {"attributes.`Run Name`": 420} | _COLUMNS
 TAGS = {
     # Which of its two interfaces MLflow shows. 3.17 takes it from the link instead.
     "mlflow.experimentKind": "custom_model_development",
-    f"mlflow.sharedViewState.{_VIEW}": json.dumps(_SHOWN),
+    f"mlflow.sharedViewState.{_VIEW}": json.dumps(
+        {"selectedColumns": list(_COLUMNS), "columnOrder": list(_WIDTHS), "columnWidths": _WIDTHS}
+    ),
 }
 """Tags of an experiment that holds runs of this package."""
 
@@ -114,11 +109,12 @@ class Store:
                 served = is_server(uri) and settings.artifacts is None
                 location = None if served else (artifacts / settings.experiment).resolve().as_uri()
                 identity = _experiment(client, settings.experiment, location)
-        except (MlflowException, SQLAlchemyError, CommandError, sqlite3.Error, OSError) as error:
+        except (ImportError, MlflowException, SQLAlchemyError, CommandError, sqlite3.Error, OSError) as error:
             reason = next(iter(str(error.__cause__ or error).splitlines()), type(error).__name__)
             raise InputError(
                 f"cannot use the runs in {uri}: {reason.replace(reveal_password(uri), uri)}: give another "
-                "place, as in tracking.uri=sqlite:////FOLDER/runs.db"
+                "place, as in tracking.uri=sqlite:////FOLDER/runs.db, or for postgresql+pg8000://... "
+                'pip install "tactile-skin[server]"'
             ) from error
         store = cls(client, uri, identity, artifacts.resolve() / "unfinished")
         for run in store.find("RUNNING"):
@@ -267,14 +263,14 @@ def _patience() -> Iterator[None]:
 
 
 def _experiment(client: MlflowClient, name: str, location: str | None) -> str:
-    """Return the id of an experiment, made if it is missing, perhaps by another process at the same time."""
+    """Return the id of an experiment, made if it is missing."""
     if (experiment := client.get_experiment_by_name(name)) is None:
         try:
             return client.create_experiment(name, artifact_location=location, tags=TAGS)
-        except MlflowException as error:
-            if error.error_code != ErrorCode.Name(RESOURCE_ALREADY_EXISTS):
+        except MlflowException:
+            # Perhaps another process made it at the same time.
+            if (experiment := client.get_experiment_by_name(name)) is None:
                 raise
-            return _experiment(client, name, location)
     return str(experiment.experiment_id)
 
 

@@ -23,11 +23,10 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemaining
 from skin.core.messages import PARENT, to_input_error
 from skin.errors import InputError
 from skin.runs.configuration import (
-    Config,
     check_server,
+    fingerprint,
     refuse_unknown,
     shorten,
-    tags,
     validate_config,
 )
 
@@ -144,9 +143,9 @@ class SweepCallback(Callback):
         self._wanted, self._runs = parent, runs
         self._store: Store | None = None
         self._held = ExitStack()  # the lock of the parent
-        self._resume = True
-        self._jobs: dict[int, str] = {}  # number of a job of this shard -> fingerprint
-        self._searched, self._swept = False, list[str]()
+        self._jobs: list[int] = []  # numbers of the jobs of this shard; empty: unknown
+        self._open: set[int] = set()  # those that have not ended
+        self._swept: list[str] = []
 
     def on_run_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Refuse to divide a single job."""
@@ -157,69 +156,64 @@ class SweepCallback(Callback):
         """Open the parent run, and pass it to the jobs."""
         try:
             if self._wanted:
-                self._open(config)
+                self._begin(config)
         except Exception as error:
             refused = to_input_error(error)
             if refused is None:
                 raise
             _refuse(refused)
 
-    def _open(self, config: DictConfig) -> None:
+    def _begin(self, config: DictConfig) -> None:
         """Choose the jobs, and make the folder that Hydra writes to, and the parent run."""
         words = _words(config)
         # Swept or not, Hydra lists only what belongs to jobs here.
-        self._searched = not config.hydra.sweeper._target_.endswith(f".{BasicSweeper.__name__}")
-        jobs = [] if self._searched else sweep_jobs(words, config.hydra.sweeper.params or {})
-        self._swept = [key for key in (jobs or [{}])[0] if len({job[key] for job in jobs}) > 1]
-        if self._searched:
-            parsed = OverridesParser.create().parse_overrides(words)
+        if config.hydra.sweeper._target_.endswith(f".{BasicSweeper.__name__}"):
+            jobs = sweep_jobs(words, config.hydra.sweeper.params or {})
+            self._swept = [key for key in jobs[0] if len({job[key] for job in jobs}) > 1]
+        elif config.get("shard") is not None:
+            raise InputError(f"shard={config.shard} divides a list of jobs, which this sweeper does not have")
+        else:
+            jobs, parsed = [], OverridesParser.create().parse_overrides(words)
             self._swept = [override.get_key_element() for override in parsed if override.is_sweep_override()]
-            if config.get("shard") is not None:
-                raise InputError(
-                    f"shard={config.shard} divides a list of jobs, which this sweeper does not have"
-                )
         if "tracking" not in config:
-            self._choose(config.get("shard"), ["" for _ in jobs], jobs)
+            self._choose(config, jobs)
             return
-        trains = config.hydra.job.config_name == "train"
-        if trains:
+        if config.hydra.job.config_name == "train":
             refuse_unknown(config)
         settings = validate_config(config).tracking
         check_server(settings.uri)
         config.tracking.uri = settings.uri  # without its password, for the file that Hydra writes
-        composed = [_compose_job(config, job) for job in jobs]
+        self._choose(config, jobs)
         Path(config.hydra.sweep.dir).mkdir(parents=True, exist_ok=True)
 
         from skin.runs.store import Store
 
-        fingerprints = [tags(job)["fingerprint"] if job and trains else "" for job in composed]
-        self._choose(config.get("shard"), fingerprints, jobs)
-        self._store, self._resume = Store.open(settings), settings.resume
         title = sweep_title(jobs or [_parse_choices(words)], self._swept)
         name = shorten(config.hydra.runtime.choices.get("sweep") or title or "sweep")
+        self._store = Store.open(settings)
         self._parent = self._store.create(name, {"sweep": name}).info.run_id
         self._held.enter_context(self._store.hold(self._parent))
         atexit.register(self._close)
         os.environ[PARENT] = self._parent
         _share_cores(config.hydra.launcher)
         bar = "{task.description}", BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
-        self._bar = Progress(
-            *bar, console=Console(stderr=True), transient=True, redirect_stdout=sys.stdout.isatty()
-        )
+        console, redirect = Console(stderr=True), sys.stdout.isatty()
+        self._bar = Progress(*bar, console=console, transient=True, redirect_stdout=redirect)
         self._task = self._bar.add_task(name, total=len(self._jobs) or None)
 
-    def _choose(self, shard: str | None, fingerprints: list[str], jobs: list[dict[str, str]]) -> None:
+    def _choose(self, config: DictConfig, jobs: Sequence[Mapping[str, str]]) -> None:
         """Choose the jobs of this shard, and tell the others that they have nothing to do."""
-        # A job without a fingerprint is refused, or is no training; its overrides identify it.
-        names = [fingerprint or str(job) for fingerprint, job in zip(fingerprints, jobs, strict=True)]
-        chosen = (
-            Shard.parse("1/1" if shard is None else shard).part(names) if self._runs is None else self._runs
-        )
-        self._jobs = {n: fingerprints[n] for n, name in enumerate(names) if name in chosen}
-        os.environ[LEFT_OUT] = " ".join(str(n) for n in range(len(names)) if n not in self._jobs)
+        shard = Shard.parse(config.shard) if config.get("shard") is not None else None
+        names = [str(job) for job in jobs]
+        if (shard or self._runs is not None) and config.hydra.job.config_name == "train":
+            names = [_identify_job(config, job) for job in jobs]
+        chosen = self._runs if self._runs is not None else (shard or Shard(1, 1)).part(names)
+        self._jobs = [number for number, name in enumerate(names) if name in chosen]
+        self._open = {*self._jobs}
+        os.environ[LEFT_OUT] = " ".join(str(n) for n in range(len(names)) if n not in self._open)
         if jobs and not self._jobs:
             if self._runs is None:
-                print(f"shard {shard} has no job: the sweep has only {len(set(names))}")
+                print(f"shard {config.shard} has no job: the sweep has only {len(set(names))}")
             sys.exit(0)
 
     def on_job_start(self, config: DictConfig, **kwargs: Any) -> None:
@@ -229,55 +223,39 @@ class SweepCallback(Callback):
 
     def on_job_end(self, config: DictConfig, job_return: JobReturn, **kwargs: Any) -> None:
         """Print how a job ended."""
-        number = config.hydra.job.num
-        if self._store is None or not (self._searched or number in self._jobs):
+        number, value = config.hydra.job.num, job_return._return_value
+        if self._store is None or (self._jobs and number not in self._jobs):
             return
         self._bar.advance(self._task)
         self._bar.stop()
-        count = f"{number + 1}" if self._searched else f"{[*self._jobs].index(number) + 1}/{len(self._jobs)}"
-        job, value = _parse_choices(_words(config)), job_return._return_value
+        count = f"{self._jobs.index(number) + 1}/{len(self._jobs)}" if self._jobs else f"{number + 1}"
+        job = _parse_choices(_words(config))
         label = f"[{count}] {' '.join(f'{key}={job[key]}' for key in self._swept or job)}"
         if job_return.status != JobStatus.FAILED:
             print(f"{label}: done", flush=True)
+            self._open.discard(number)
             return
         print(f"{label}: {value}", file=sys.stderr, flush=True)
         if isinstance(value, InputError):
+            self._open.discard(number)
             self._store.client.set_tag(self._parent, f"refused_{number}", f"{label}: {value}"[:500])
 
     def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
-        """Close the parent run."""
+        """Close the parent run: no job has failed."""
         self._close(ended=True)
 
     def _close(self, ended: bool = False) -> None:
-        """End the parent run, once: FAILED if a job that was not refused, or every job, has no finished run.
-
-        One without children is deleted. Without a list of jobs, the sweeper must have ended by itself.
-        """
+        """End the parent run, once: FINISHED if each job ended or was refused; delete it without children."""
         store, self._store = self._store, None
         # Errors of the database were reported before; the next start closes the run.
-        with suppress(Exception):
+        with suppress(Exception), self._held:
             if store is not None:
-                self._conclude(store, ended)
-        self._held.close()
+                from mlflow.utils.mlflow_tags import MLFLOW_PARENT_RUN_ID
 
-    def _conclude(self, store: "Store", ended: bool) -> None:
-        from mlflow.utils.mlflow_tags import MLFLOW_PARENT_RUN_ID
-
-        from skin.runs.store import note_reuse
-
-        children = {MLFLOW_PARENT_RUN_ID: self._parent}
-        notes = store.client.get_run(self._parent).data.tags
-        wanted = {value for number, value in self._jobs.items() if f"refused_{number}" not in notes}
-        # A run that was finished before counts, unless it was to be repeated.
-        own = {} if self._resume else children
-        results = [store.find("FINISHED", fingerprint=value, **own) for value in wanted]
-        for run, *_ in filter(None, results):
-            note_reuse(run)  # jobs in other processes warn of nothing
-        if self._searched:
-            results = [store.find("FINISHED", **children)] if ended else []
-        store.client.set_terminated(self._parent, "FINISHED" if results and all(results) else "FAILED")
-        if not store.find(**children):
-            store.client.delete_run(self._parent)
+                complete = ended or (self._jobs and not self._open)
+                store.client.set_terminated(self._parent, "FINISHED" if complete else "FAILED")
+                if not store.find(**{MLFLOW_PARENT_RUN_ID: self._parent}):
+                    store.client.delete_run(self._parent)
 
 
 def _refuse(error: InputError) -> NoReturn:
@@ -286,14 +264,14 @@ def _refuse(error: InputError) -> NoReturn:
     sys.exit(2)
 
 
-def _compose_job(config: DictConfig, job: Mapping[str, str]) -> Config | None:
-    """Return the configuration of a job; None where it will be refused."""
+def _identify_job(config: DictConfig, job: Mapping[str, str]) -> str:
+    """Return the fingerprint of a training; of one that will be refused, its overrides."""
     words = [f"{key}={value}" for key, value in job.items()]
-    whole = GlobalHydra.instance().config_loader().load_sweep_config(config, words)
     try:
-        return validate_config(whole)
+        whole = GlobalHydra.instance().config_loader().load_sweep_config(config, words)
+        return fingerprint(validate_config(whole))
     except InputError:
-        return None
+        return str(job)
 
 
 def _share_cores(launcher: DictConfig) -> None:

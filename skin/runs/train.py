@@ -52,7 +52,7 @@ from skin.runs.configuration import (
     tags,
     unused_groups,
 )
-from skin.runs.run import TAG, FinishedRun, find_run
+from skin.runs.run import TAG, find_run
 from skin.runs.store import Store, note_reuse
 from skin.runs.torch_model import device_on_skin, load_model
 from skin.touch.labels import Task
@@ -89,17 +89,20 @@ def train(config: Config) -> float:
     device = build_device(config)
     data, learner = build_data(config, device), build_learner(config)
     source = AlarmSource(
-        "this run", settings, learner, config.device, config.device, build=device_on_skin(config, config)
+        "this run",
+        settings,
+        learner,
+        config.device,
+        config.device,
+        build=device_on_skin(config, vars(config)),
     )
     source = replace(source, device=device if settings.profile is None else threshold_device(source))
     learner.check(data)
-    labels = data.example.known_labels
-    _objective(tracking.objective, _score(data.task, labels, labels))  # refuses a name that no metric has
+    _objective(tracking.objective, _score(data.task, *[data.example.known_labels] * 2))  # refuses other names
     report_balance(device, shown=PARENT not in os.environ)
     name = name_run(identity, relevant_overrides(config.learner))
     store = Store.open(tracking)
     with store.hold(identity["fingerprint"]):
-        # By a process that began earlier.
         if tracking.resume and (finished := find_finished(store, identity["fingerprint"])):
             return _objective(tracking.objective, finished.data.metrics)
         again = find_unfinished(store, identity["fingerprint"]) if tracking.resume else None
@@ -112,9 +115,9 @@ def train(config: Config) -> float:
             report = evaluate(learner, device, settings, point)
             parts = [(learner.probabilities(p), p.known_labels) for p in data.parts("validation") if len(p)]
             scores = _score(data.task, *map(torch.cat, zip(*parts, strict=True))) if parts else {}
-            values = {"seconds_per_epoch": learner.seconds_per_epoch, "parameters": learner.parameters}
             log_learner(store, run, learner)
-            log_report(store, run, report, device.task, values | scores)
+            figures = {"seconds_per_epoch": learner.seconds_per_epoch, "parameters": learner.parameters}
+            log_report(store, run, report, device.task, figures | scores)
         shutil.rmtree(learner.unfinished, ignore_errors=True)
     if PARENT not in os.environ:
         show(report, f"{name}, run {run.info.run_id}")
@@ -257,20 +260,15 @@ def log_report(store: Store, run: Run, report: Report, task: Task, values: dict[
     store.client.set_tag(run.info.run_id, "split", report.split)
     store.log_metrics(run, report.metrics | values)
     with tempfile.TemporaryDirectory() as folder:
-        _write(report, task, Path(folder))
+        pq.write_table(report.predictions, Path(folder) / "predictions.parquet")
+        if report.outcomes is not None:
+            np.save(Path(folder) / OUTCOMES, report.outcomes)
+        if report.confusion is not None:
+            named = dict(zip(task.binary, report.confusion.numpy(), strict=True))
+            save_figure(confusions(named, ("no", "yes")), Path(folder) / "confusion.png")
         store.client.log_artifacts(run.info.run_id, folder)
     for column, reason in report.cannot.items():
         store.client.set_tag(run.info.run_id, f"cannot_{column}", reason)
-
-
-def _write(report: Report, task: Task, folder: Path) -> None:
-    """Write predictions, and confusion matrices as a picture."""
-    pq.write_table(report.predictions, folder / "predictions.parquet")
-    if report.outcomes is not None:
-        np.save(folder / OUTCOMES, report.outcomes)
-    if report.confusion is not None:
-        named = dict(zip(task.binary, report.confusion.numpy(), strict=True))
-        save_figure(confusions(named, ("no", "yes")), folder / "confusion.png")
 
 
 # Evaluate a finished run again.
@@ -297,38 +295,33 @@ def evaluate_run(name: str, tracking: Tracking, trust: bool, folder: Path, chang
     """
     quiet()
     with Steps(_STEPS) as steps:
-        _evaluate(find_run(tracking, name, trust), folder, changes, steps)
-
-
-def _evaluate(run: FinishedRun, folder: Path, changes: Sequence[str], steps: Steps) -> None:
-    config = run.configured(changes)
-    settings = check_evaluation(config.evaluation)
-    model = load_model(run, config)
-    device, learner, point = model.device, model.learner, model.point
-    steps.begin("reading or simulating the touches")
-    steps.silent = device.real
-    touches = device.touches("test")  # read before anything is logged, because a port may fail
-    steps.silent = False
-    steps.begin("evaluating them")
-    title, tags = f"{run.title} ({run.identity})", {"evaluated": run.identity, "overrides": " ".join(changes)}
-    store = Store.open(config.tracking)
-    with store.run(f"evaluation of {run.title}", tags, run.identity) as evaluation:
-        identity = evaluation.info.run_id
-        # Evaluations do not overwrite each other's files.
-        path = folder / f"evaluation_{option_name(device)}_{identity[:8]}.md"
-        if touches.labels is None:
-            written = [path.with_suffix(".csv")]
-            print(
-                title, write_chances(learner.probabilities(touches), device.task, point, *written), sep="\n"
-            )
-        else:
-            report = evaluate(learner, device, settings, point)
-            log_report(store, evaluation, report, device.task, {})
-            description = describe_evaluation(title, changes, len(report.predictions))
-            written = publish_evaluation(path, report, device.task, run.title, description)
-            show(report, title)
-        for file in written:
-            store.client.log_artifact(identity, str(file))
+        run = find_run(tracking, name, trust)
+        config = run.configured(changes)
+        settings, model = check_evaluation(config.evaluation), load_model(run, config)
+        device, learner, point = model.device, model.learner, model.point
+        steps.begin("reading or simulating the touches")
+        steps.silent = device.real
+        touches = device.touches("test")  # read before anything is logged, because a port may fail
+        steps.silent = False
+        steps.begin("evaluating them")
+        title = f"{run.title} ({run.identity})"
+        identity = {"evaluated": run.identity, "overrides": " ".join(changes)}
+        store = Store.open(config.tracking)
+        with store.run(f"evaluation of {run.title}", identity, run.identity) as evaluation:
+            # Evaluations do not overwrite each other's files.
+            path = folder / f"evaluation_{option_name(device)}_{evaluation.info.run_id[:8]}.md"
+            if touches.labels is None:
+                written = [path.with_suffix(".csv")]
+                chances = learner.probabilities(touches)
+                print(title, write_chances(chances, device.task, point, *written), sep="\n")
+            else:
+                report = evaluate(learner, device, settings, point)
+                log_report(store, evaluation, report, device.task, {})
+                description = describe_evaluation(title, changes, len(report.predictions))
+                written = publish_evaluation(path, report, device.task, run.title, description)
+                show(report, title)
+            for file in written:
+                store.client.log_artifact(evaluation.info.run_id, str(file))
     print(*written, sep="\n")
 
 

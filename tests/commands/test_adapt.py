@@ -186,7 +186,7 @@ def bad(run, folder, session):
         (None, ["adapt.gestures=7"], "adapt.gestures=7 must be greater than or equal to 8"),
         (None, ["device=recording", "device.path={enough}", "adapt.gestures=61"], "use adapt.gestures=60"),
         (None, ["adapt.rate=1"], "rate"),
-        (None, ["adapt.scratch=[rules]"], "adapt.scratch=rules is no learner for few touches"),
+        (None, ["adapt.scratch=[rules]"], "adapt.scratch.0=rules must be"),
         (None, ["learner.dropout=0.5"], "learner.dropout was fixed when the run was trained"),
     ],
 )

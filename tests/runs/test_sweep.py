@@ -231,7 +231,7 @@ def test_a_shard_of_a_search_is_refused(tmp_path, monkeypatch):
     sweeper = {"_target_": "hydra_plugins.x.Search"}
     hydra = {"sweeper": sweeper, "overrides": {"task": ["seed=interval(0,3)"]}}
     with pytest.raises(InputError, match=r"^shard=1/2 divides a list of jobs, which this sweeper does not"):
-        SweepCallback()._open(OmegaConf.create({"shard": "1/2", "hydra": hydra}))
+        SweepCallback()._begin(OmegaConf.create({"shard": "1/2", "hydra": hydra}))
 
 
 @pytest.mark.slow("trains several runs")

@@ -53,7 +53,7 @@ def changed(path, folder, change):
         (lambda known: known.update(rate="fast"), "rate=fast"),
         (lambda known: known.update(labels=[]), "labels"),
         (lambda known: known.update(sensors=7), "6 positions for 7 sensors"),
-        (lambda known: known.update(window=20), "not readings and valid of"),
+        (lambda known: known.update(window=20), "not readings .float. and valid .bool. of"),
     ],
 )
 def test_a_wrong_description_is_refused(exported, tmp_path, change, message):

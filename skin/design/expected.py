@@ -173,10 +173,14 @@ class ExpectedPosterior:
         findings = self.find(simulator, skin.body, trials)
         print_expected(findings)
         settings = {name + _UNITS.get(name, ""): value for name, value in asdict(self).items()}
-        about = {"sensors": len(skin.sensors), "settings": settings, "expected": list(map(asdict, findings))}
+        content = {
+            "sensors": len(skin.sensors),
+            "settings": settings,
+            "expected": list(map(asdict, findings)),
+        }
         maps = {force: self.expected_map(trial, skin.body) for force, trial in trials.items()}
         print(
-            write(json_text(about), folder / "design.json"),
+            write(json_text(content), folder / "design.json"),
             draw_expected(skin.body, skin.sensors, maps, folder / "design.png"),
             sep="\n",
         )
@@ -190,13 +194,15 @@ class ExpectedPosterior:
         places = self.sample(body)
         priors = {force: FingertipPrior(force, radii=self.radii, rim=self.rim) for force in self.forces}
         candidates = CandidateReadings(simulator, body, next(iter(priors.values())))
-        felt = disc_readings(simulator, body, places, self.rim)
+        responses = disc_readings(simulator, body, places, self.rim)
         trials = dict[float, Trials]()
         for number, (force, prior) in enumerate(priors.items()):
             rng = generator(Stream.DESIGN, self.seed, number)
             drawn = force * np.exp(prior.spread * rng.standard_normal(len(places)))
             touches = np.column_stack([places, drawn])
-            trials[force] = try_touches(candidates, prior, self._noise, touches, felt * drawn[:, None], rng)
+            trials[force] = try_touches(
+                candidates, prior, self._noise, touches, responses * drawn[:, None], rng
+            )
         return trials
 
     def find(
@@ -213,17 +219,19 @@ class ExpectedPosterior:
         """
         trials = trials or self.trials(simulator, body)
         unit = torch.from_numpy(np.column_stack([self.sample(body), np.ones(self.touches)]))
-        felt = sensitivity(simulator, Fingertip(body, self.rim, simulator.smooth), unit)
+        responses = sensitivity(simulator, Fingertip(body, self.rim, simulator.smooth), unit)
         simulator.float()
         area = math.prod(self._extent(body))
         return [
-            _findings(force, trial, area, self._local_precision(felt.of_force(force), force, body))
+            _findings(force, trial, area, self._local_precision(responses.of_force(force), force, body))
             for force, trial in trials.items()
         ]
 
-    def _local_precision(self, felt: Sensitivity, force: float, body: AbstractBody) -> float:
+    def _local_precision(self, responses: Sensitivity, force: float, body: AbstractBody) -> float:
         """Return the median local precision of the place, m."""
-        variances = local_covariance(felt, self._noise, self.priors(force, body)).diagonal(dim1=1, dim2=2)
+        variances = local_covariance(responses, self._noise, self.priors(force, body)).diagonal(
+            dim1=1, dim2=2
+        )
         return float(variances[:, :2].mean(1).sqrt().median())
 
     @property
@@ -320,8 +328,8 @@ class Step:
         """Yield one line of a table per force."""
         rows, columns = self.grid
         for finding in self.findings:
-            about = {"thickness_m": self.thickness, "rows": rows, "columns": columns, "pitch_m": self.pitch}
-            yield about | asdict(finding)
+            case = {"thickness_m": self.thickness, "rows": rows, "columns": columns, "pitch_m": self.pitch}
+            yield case | asdict(finding)
 
 
 @checked("design")

@@ -208,7 +208,7 @@ def threshold_device(source: AlarmSource) -> "AbstractSimulated":
     if profile is not None:
         sampled = {name: source.used[name] for name in ("rate", "aligned") if name in source.used}
         own = _imperfections(source.used) if profile == _DEVICE else sampled | profile_settings(profile)
-        # Drawn skins draw a device for every gesture without being told.
+        # Drawn skins draw a device for each gesture already.
         every = {} if "skins" in device else {"randomise": True, "calibration": None}
         device |= _EVERY | own
         device = {name: value for name, value in device.items() if name != "randomise"} | every
@@ -274,13 +274,13 @@ def _on_gestures(learner: Predictor, device: "AbstractDevice", settings: Evaluat
     if LABEL not in device.task.names:
         return None
     touches, target = threshold_gestures(device, settings), settings.false_alarm_rate
-    labels, chances = touches.known_labels, learner.probabilities(touches)
-    chance, dangerous = dangerous_column(chances, labels, device.task)
+    labels, probabilities = touches.known_labels, learner.probabilities(touches)
+    probability, dangerous = dangerous_column(probabilities, labels, device.task)
     if dangerous.all():
         return OperatingPoint.default(target)
     seed = None if device.simulation is None else device.simulation.data_seed
-    point = OperatingPoint(_lowest_threshold(chance[~dangerous], target), target, 0, 0, seed)
-    return replace(point, **asdict(point.reached(chances, labels, device.task)))
+    point = OperatingPoint(_lowest_threshold(probability[~dangerous], target), target, 0, 0, seed)
+    return replace(point, **asdict(point.reached(probabilities, labels, device.task)))
 
 
 def threshold_gestures(device: "AbstractDevice", settings: Evaluation) -> "Touches":

@@ -109,15 +109,15 @@ def measure_margins(
         "test", complete=False
     )
     touches, labels = recording.touches, recording.touches.known_labels
-    places = [device.task.names.index(name) for name in TOUCH.names]
-    chances = learner.probabilities(touches)[:, places]
-    predicted, parameters = chances > 0.5, recording.parameters
+    columns = [device.task.names.index(name) for name in TOUCH.names]
+    probabilities = learner.probabilities(touches)[:, columns]
+    predicted, parameters = probabilities > 0.5, recording.parameters
     measures = Measures(*(parameters[name] for name in Measures._fields))
     settings = simulation.sampler.settings
     shares = _shares(measures, settings.thresholds, settings.frames.duration)
     spans = {name: find_spans(predicted[:, n], shares[:, n]) for n, name in enumerate(TOUCH.names)}
     danger = TOUCH.names.index(LABEL)
-    spans[ALARM_NAME] = find_spans(point.alarm(chances[:, danger]), shares[:, danger])
+    spans[ALARM_NAME] = find_spans(point.alarm(probabilities[:, danger]), shares[:, danger])
     wrong = predicted != (labels > 0.5)
     faint = [
         Faint(
@@ -128,8 +128,8 @@ def measure_margins(
         )
         for low, high, inside in _split_ranges(_STRENGTHS, above_idle(touches).amax(dim=(1, 2)))
     ]
-    overall = compute_metrics(chances, labels, TOUCH, point)
-    return MarginReport(spans, faint, point, point.reached(chances, labels, TOUCH), overall)
+    overall = compute_metrics(probabilities, labels, TOUCH, point)
+    return MarginReport(spans, faint, point, point.reached(probabilities, labels, TOUCH), overall)
 
 
 def find_spans(predicted: Tensor, shares: Tensor) -> list[Span]:

@@ -118,14 +118,14 @@ class OperatingPoint:
         hidden = self.dangerous - self.found
         return self.silent or (self.rate is not None and hidden > 0.25 * self.dangerous)
 
-    def alarm(self, chance: "Tensor") -> "Tensor":
-        """Return which probabilities raise the alarm, bool, in the shape of ``chance``."""
-        return chance > self.threshold
+    def alarm(self, probability: "Tensor") -> "Tensor":
+        """Return which probabilities raise the alarm, bool, in the shape of ``probability``."""
+        return probability > self.threshold
 
-    def reached(self, chances: "Tensor", labels: "Tensor", task: Task) -> Reached:
+    def reached(self, probabilities: "Tensor", labels: "Tensor", task: Task) -> Reached:
         """Return the alarms on gestures with probabilities (B, L) and labels (B, L)."""
-        chance, dangerous = dangerous_column(chances, labels, task)
-        alarm = self.alarm(chance)
+        probability, dangerous = dangerous_column(probabilities, labels, task)
+        alarm = self.alarm(probability)
         counts = dangerous.sum(), (alarm & dangerous).sum(), (~dangerous).sum(), (alarm & ~dangerous).sum()
         return Reached(*(int(count) for count in counts))
 
@@ -205,8 +205,8 @@ def parse_operating_point(text: str) -> OperatingPoint | None:
     return point
 
 
-def dangerous_column(chances: "Tensor", labels: "Tensor", task: Task) -> "tuple[Tensor, Tensor]":
+def dangerous_column(probabilities: "Tensor", labels: "Tensor", task: Task) -> "tuple[Tensor, Tensor]":
     """Return probabilities (B',) and truth (B',), bool, of the gestures for which the label is defined."""
-    place = task.names.index(LABEL)
-    rows = task.counts(labels)[:, place]
-    return chances[rows, place], labels[rows, place] > 0.5
+    column = task.names.index(LABEL)
+    rows = task.counts(labels)[:, column]
+    return probabilities[rows, column], labels[rows, column] > 0.5

@@ -93,8 +93,8 @@ def evaluate(
     """
     task, metrics, cannot = device.task, dict[str, float](), dict[str, str]()
     same, drawn = _test(device)
-    chances = learner.probabilities(same)
-    computed = compute_metrics(chances, same.known_labels, task, point)
+    probabilities = learner.probabilities(same)
+    computed = compute_metrics(probabilities, same.known_labels, task, point)
     metrics |= {f"same/{name}": value for name, value in computed.items()}
     for column, sets in touch_sets(device, settings).items():
         try:
@@ -112,10 +112,12 @@ def evaluate(
         hidden = [*unknown, *(["direction"] if task.direction and never[-1] else [])]
         metrics = {name: value for name, value in metrics.items() if name.split("/")[1] not in hidden}
     cannot |= {name: _UNDEFINED for name, value in metrics.items() if isnan(value) and name.endswith(_SHOWN)}
-    table = count_confusions(chances, same.known_labels, task) if task.kind == "binary" else None
-    reached = None if point is None or LABEL in unknown else point.reached(chances, same.known_labels, task)
-    outcomes = encode(chances, same.known_labels, task, point)
-    predictions = _predictions(chances, same, task, drawn)
+    table = count_confusions(probabilities, same.known_labels, task) if task.kind == "binary" else None
+    reached = (
+        None if point is None or LABEL in unknown else point.reached(probabilities, same.known_labels, task)
+    )
+    outcomes = encode(probabilities, same.known_labels, task, point)
+    predictions = _predictions(probabilities, same, task, drawn)
     return Report(metrics, cannot, table, predictions, point, reached, outcomes, device.split)
 
 
@@ -165,12 +167,12 @@ def scattered_devices(device: AbstractSimulated, count: int) -> Iterator[Abstrac
         yield device.replace(layout=layout)
 
 
-def _predictions(chances: Tensor, touches: Touches, task: Task, drawn: dict[str, Tensor]) -> pa.Table:
+def _predictions(probabilities: Tensor, touches: Touches, task: Task, drawn: dict[str, Tensor]) -> pa.Table:
     columns: dict[str, Any] = {}
-    for name, label, chance in zip(task.names, touches.known_labels.T, chances.T, strict=True):
+    for name, label, probability in zip(task.names, touches.known_labels.T, probabilities.T, strict=True):
         kind = pa.int8() if name in task.binary else pa.float32()
         truth = pa.array(label.numpy(), kind, mask=label.isnan().numpy(), safe=False)  # null where unknown
-        columns |= {name: truth, f"p_{name}": chance.numpy()}
+        columns |= {name: truth, f"p_{name}": probability.numpy()}
     columns |= {name: np.asarray(values) for name, values in drawn.items() if np.ndim(values) == 1}
     return pa.table(columns)
 
@@ -218,17 +220,17 @@ def format_number(value: float | None, unit: float = 100, digits: int = 1) -> st
     return "" if value is None else "-" if isnan(value) else f"{unit * value:.{digits}f}"
 
 
-def evaluation_markdown(report: Report, task: Task, title: str, about: str) -> str:
+def evaluation_markdown(report: Report, task: Task, title: str, description: str) -> str:
     """Return a page in Markdown: accuracies in per cent, and how often each label was taken for what.
 
     Args:
         report: what an evaluation found.
         task: the labels.
         title: of the page.
-        about: a sentence on where the touches came from.
+        description: a sentence on where the touches came from.
     """
     (_, *columns), *rows = metric_rows(report.metrics, "°")
-    lines = [f"# {title}", "", about, "", *([f"Split {report.split}.", ""] if report.split else [])]
+    lines = [f"# {title}", "", description, "", *([f"Split {report.split}.", ""] if report.split else [])]
     lines += ["" if task.kind == "regression" else "Per cent:", "", f"| | {' | '.join(columns)} |"]
     lines.append("|---" * (len(columns) + 1) + "|")
     lines += [f"| {' | '.join(row)} |" for row in rows]
@@ -244,20 +246,20 @@ def evaluation_markdown(report: Report, task: Task, title: str, about: str) -> s
     return "\n".join(lines) + "\n"
 
 
-def publish_evaluation(path: Path, report: Report, task: Task, title: str, about: str) -> list[Path]:
+def publish_evaluation(path: Path, report: Report, task: Task, title: str, description: str) -> list[Path]:
     """Write ``path`` (.md), and the confusion matrices beside it (.png), each whole."""
-    written = [write(evaluation_markdown(report, task, title, about), path)]
+    written = [write(evaluation_markdown(report, task, title, description), path)]
     if report.confusion is not None:
         named = dict(zip(task.binary, report.confusion.numpy(), strict=True))
         written.append(save_figure(confusions(named, ("no", "yes")), path.with_suffix(".png")))
     return written
 
 
-def write_chances(chances: Tensor, task: Task, point: OperatingPoint | None, path: Path) -> str:
+def write_chances(probabilities: Tensor, task: Task, point: OperatingPoint | None, path: Path) -> str:
     """Write the probability of each label, gesture by gesture, where nobody knows the truth.
 
     Args:
-        chances: (B, L); of a direction the mean cosines.
+        probabilities: (B, L); of a direction the mean cosines.
         task: the labels.
         point: where the alarm is raised; a gesture is said to be dangerous there, as ``live`` says it.
         path: x.csv.
@@ -265,18 +267,18 @@ def write_chances(chances: Tensor, task: Task, point: OperatingPoint | None, pat
     Returns:
         lines for a person.
     """
-    columns = {f"p_{name}": values.numpy() for name, values in zip(task.names, chances.T, strict=True)}
+    columns = {f"p_{name}": values.numpy() for name, values in zip(task.names, probabilities.T, strict=True)}
     with whole(path) as partial:
-        pa.csv.write_csv(pa.table({"gesture": np.arange(len(chances)), **columns}), partial)
+        pa.csv.write_csv(pa.table({"gesture": np.arange(len(probabilities)), **columns}), partial)
     levels = dict.fromkeys(task.binary, 0.5) | ({} if point is None else {LABEL: point.threshold})
     lines = [
         f"gesture {number}: "
         + ", ".join(
-            f"{'' if chance > levels[name] else 'not '}{name} ({chance:.2f})"
-            for name, chance in zip(task.binary, row, strict=False)
+            f"{'' if probability > levels[name] else 'not '}{name} ({probability:.2f})"
+            for name, probability in zip(task.binary, row, strict=False)
         )
         + (_slide(row, task) if task.direction else "")
-        for number, row in enumerate(chances.tolist())
+        for number, row in enumerate(probabilities.tolist())
     ]
     return "\n".join(lines)
 

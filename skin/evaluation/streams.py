@@ -80,12 +80,12 @@ class ContactThreshold:
 def gates(threshold: ContactThreshold, task: Task) -> dict[str, Gate]:
     """Return the gates by name: ``none`` lets all through; ``learned`` only where the task has a gate."""
     gates: dict[str, Gate] = {
-        "none": lambda touches, chances: torch.ones(len(touches), dtype=torch.bool),
-        "threshold": lambda touches, chances: threshold.touched(touches),
+        "none": lambda touches, probabilities: torch.ones(len(touches), dtype=torch.bool),
+        "threshold": lambda touches, probabilities: threshold.touched(touches),
     }
     if task.gate is not None:
         gate = task.names.index(task.gate)
-        gates["learned"] = lambda touches, chances: chances[:, gate] > 0.5
+        gates["learned"] = lambda touches, probabilities: probabilities[:, gate] > 0.5
     return gates
 
 
@@ -248,10 +248,10 @@ def evaluate_windows(
     all_gates = gates(threshold, device.task)
     recording = streamed.recording("test")
     touches, labels = recording.touches, recording.touches.known_labels
-    chances = learner.probabilities(touches)
-    answers = {name: gate(touches, chances) for name, gate in all_gates.items() if name != "none"}
+    probabilities = learner.probabilities(touches)
+    answers = {name: gate(touches, probabilities) for name, gate in all_gates.items() if name != "none"}
     return WindowReport(
-        bin_by_share(chances, labels, recording.parameters["share"], device.task),
+        bin_by_share(probabilities, labels, recording.parameters["share"], device.task),
         {name: count_confusions(gate[:, None].float(), labels[:, -1:])[0] for name, gate in answers.items()},
         threshold.least,
         _listen(learner, streamed, device.task, all_gates, settings, point, track),
@@ -263,7 +263,7 @@ def evaluate_windows(
 
 
 def bin_by_share(
-    chances: Tensor,
+    probabilities: Tensor,
     labels: Tensor,
     share: Tensor,
     task: Task,
@@ -272,7 +272,7 @@ def bin_by_share(
     """Return accuracies by the share of the touch in the window, for windows that show a touch.
 
     Args:
-        chances: (W, L), probabilities of the labels of ``task``.
+        probabilities: (W, L), probabilities of the labels of ``task``.
         labels: (W, 5), of ``TOUCH_OR_NOT``.
         share: (W,), fraction of the touch in the window; 0 without touch.
         task: task of the learner.
@@ -280,7 +280,7 @@ def bin_by_share(
     """
     names = TOUCH_OR_NOT.gated
     truth = labels[:, : len(names)] > 0.5
-    right = (chances[:, [task.names.index(name) for name in names]] > 0.5) == truth
+    right = (probabilities[:, [task.names.index(name) for name in names]] > 0.5) == truth
     group = torch.bucketize(share, torch.tensor(edges)).where(share < 1, len(edges) + 1)
     ends = [0.0, *edges, 1.0]
     titles = [*(f"{low:g}-{high:g}" for low, high in pairwise(ends)), "whole"]
@@ -315,9 +315,9 @@ def _listen(
     raised: dict[str, list[Tensor]] = {name: [] for name in all_gates}
     for part in track(starts.split(1024)):
         touches = stream.cut(part, device.window).touches
-        chances = learner.probabilities(touches)
+        probabilities = learner.probabilities(touches)
         for name, gate in all_gates.items():
-            raised[name].append(point.alarm(chances[:, dangerous]) & gate(touches, chances))
+            raised[name].append(point.alarm(probabilities[:, dangerous]) & gate(touches, probabilities))
     gesture = stream.timeline.window_content(starts, device.window)[0]
     truth = stream.timeline.movie.labels[:, TOUCH_OR_NOT.names.index("dangerous")] > 0.5
     hours = stride / rate / 3600

@@ -33,7 +33,7 @@ def touch_scores(
     Args:
         learner: trained.
         device: simulates and measures the touches; with ``randomise``, each with another device.
-        live: how they are watched.
+        live: conditions of the live view.
         labels: (B, 4), bool, of the touches.
         seed: of the touches and their devices.
         report: called with the number of touches that are done.
@@ -48,12 +48,12 @@ def touch_scores(
         batch, draw = labels[first : first + 50], generator(Stream.ALARM, seed, 2, first)
         movie = device.sampler.sample(len(batch), draw, batch)
         readings, valid, contact = _decision_windows(device, movie, live, draw)
-        chances = torch.zeros(contact.shape)
-        chances[contact] = _classify_windows(
+        probabilities = torch.zeros(contact.shape)
+        probabilities[contact] = _classify_windows(
             learner, device, live, readings[contact], valid[contact.nonzero()[:, 0]]
         )
         row = live.decisions(_round_rate(device, live))
-        least = -max_pool1d(-pad(chances, (row - 1, 0)), row, 1) if row > 1 else chances
+        least = -max_pool1d(-pad(probabilities, (row - 1, 0)), row, 1) if row > 1 else probabilities
         scores.append(least.amax(dim=1))
         if report is not None:
             report(first + len(batch))
@@ -76,11 +76,11 @@ def _decision_windows(
     readings, valid = _measure_touches(device, movie, live, draw)
     rate, window = _round_rate(device, live), device.window
     ratio = round(rate / device.model_rate)
-    # Each place holds the maximum over the interval of the model that begins there.
+    # Each frame holds the maximum over the interval of the model that begins there.
     highest = max_pool1d(readings.transpose(1, 2), ratio, 1).transpose(1, 2)
     end = _draw_decisions(readings.shape, ratio * window, max(1.0, rate / DECISIONS), draw)
-    place = end[:, :, None] - ratio * torch.arange(window, 0, -1) + 1
-    windows = highest[torch.arange(len(end))[:, None, None], place]
+    frames = end[:, :, None] - ratio * torch.arange(window, 0, -1) + 1
+    windows = highest[torch.arange(len(end))[:, None, None], frames]
     risen = (windows >= live.contact) & valid[:, None, None]
     recent = max(1, ceil(RELEASE * device.model_rate - 1e-9))
     contact = risen[:, :, -recent:].flatten(2).any(dim=2)

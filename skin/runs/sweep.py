@@ -146,6 +146,11 @@ class SweepCallback(Callback):
         self._jobs: list[int] = []  # numbers of the jobs of this shard; empty: unknown
         self._open: set[int] = set()  # those that have not ended
         self._swept: list[str] = []
+        self._bar: Progress | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what jobs in other processes need: they print how they ended."""
+        return vars(self) | {"_held": None, "_bar": None}
 
     def on_run_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Refuse to divide a single job."""
@@ -218,7 +223,7 @@ class SweepCallback(Callback):
 
     def on_job_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Show the bar, where standard error is a terminal."""
-        if self._store and self._bar.console.is_terminal:
+        if self._bar and self._bar.console.is_terminal:
             self._bar.start()
 
     def on_job_end(self, config: DictConfig, job_return: JobReturn, **kwargs: Any) -> None:
@@ -226,8 +231,9 @@ class SweepCallback(Callback):
         number, value = config.hydra.job.num, job_return._return_value
         if self._store is None or (self._jobs and number not in self._jobs):
             return
-        self._bar.advance(self._task)
-        self._bar.stop()
+        if self._bar:
+            self._bar.advance(self._task)
+            self._bar.stop()
         count = f"{self._jobs.index(number) + 1}/{len(self._jobs)}" if self._jobs else f"{number + 1}"
         job = _parse_choices(_words(config))
         label = f"[{count}] {' '.join(f'{key}={job[key]}' for key in self._swept or job)}"

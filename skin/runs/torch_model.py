@@ -82,10 +82,10 @@ class TorchModel(Model):
         touch: contact threshold, N; None: tuned on simulated streams of the device, and the learned label
             ``touch`` counts, too.
         run: the run; None: it was trained in this process.
-        watched: configuration of the run with the skin, the device and the profile that it is used on.
+        used: configuration of the run with the skin, the device and the profile that it is used on.
 
     Attributes:
-        device, learner, point, run, config: as above; ``config`` is ``watched``.
+        device, learner, point, run, config: as above; ``config`` is ``used``.
         places: :attr:`positions` as a tensor.
     """
 
@@ -97,17 +97,17 @@ class TorchModel(Model):
         point: OperatingPoint | None = None,
         touch: float | None = None,
         run: FinishedRun | None = None,
-        watched: Config | None = None,
+        used: Config | None = None,
     ) -> None:
-        self.device, self.learner, self.point, self.run, self.config = device, learner, point, run, watched
+        self.device, self.learner, self.point, self.run, self.config = device, learner, point, run, used
         self.identity, self.title = ("none", "untrained") if run is None else (run.identity, run.title)
         self.task, self.size = device.task, device.size
         self.window, self.rate = example.readings.shape[1], example.rate
         self.places, self.positions = example.positions, example.positions.numpy()
         self.threshold = None if point is None else point.threshold
         self.learned, self._touch = touch is None and self.task.gate is not None, touch
-        if run is not None and watched is not None:
-            self.alarm = alarm_source(run, learner, watched)
+        if run is not None and used is not None:
+            self.alarm = alarm_source(run, learner, used)
 
     @cached_property
     def contact(self) -> float:  # type: ignore[override]
@@ -261,7 +261,7 @@ def load_run(
 def load_model(
     run: FinishedRun,
     config: Config | None = None,
-    watched: Config | None = None,
+    used: Config | None = None,
     device: AbstractDevice | None = None,
     touch: float | None = None,
     one_skin: bool = False,
@@ -272,7 +272,7 @@ def load_model(
     Args:
         run: the run.
         config: its configuration, changed as :meth:`FinishedRun.configured` does; None: not changed.
-        watched: its configuration with the device that a live view watches; None: ``config``.
+        used: its configuration with the device that a live view watches; None: ``config``.
         device: to use it on; None: that of ``config``.
         touch: as in :class:`TorchModel`.
         one_skin: as in :func:`alarm_point`.
@@ -291,7 +291,7 @@ def load_model(
     run.load_weights(learner, data)
     source = alarm_source(run, learner, config) if alarm else None
     point = choose_alarm_threshold(source, one_skin=one_skin) if source else None
-    return TorchModel(device, learner, data.example, point, touch, run, watched or config)
+    return TorchModel(device, learner, data.example, point, touch, run, used or config)
 
 
 def _with_labels(stored: Config, device: AbstractDevice) -> AbstractDevice:
@@ -341,7 +341,7 @@ def equation10_warning(stored: Config, device: AbstractDevice | None = None) -> 
 
     Args:
         stored: the run's configuration.
-        device: the watched device; None: a real skin.
+        device: the device in use; None: a real skin.
     """
     reading = (stored.device.get("simulator") or {}).get("reading")
     if reading != "equation10" or (device is not None and not device.real):

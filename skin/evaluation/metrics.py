@@ -134,8 +134,7 @@ def count_confusions(probabilities: Tensor, labels: Tensor, task: Task | None = 
 def _pairs(probabilities: Tensor, labels: Tensor, task: Task | None) -> Iterator[tuple[Tensor, Tensor]]:
     """Yield the probabilities and labels (B',) of each label, for the touches for which it is defined."""
     counts = torch.ones_like(labels, dtype=torch.bool) if task is None else task.counts(labels)
-    last = probabilities.shape[1] if task is None else len(task.binary)
-    for i in range(last):
+    for i in range(probabilities.shape[1] if task is None else len(task.binary)):
         yield probabilities[counts[:, i], i], labels[counts[:, i], i].long()
 
 

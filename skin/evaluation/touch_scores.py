@@ -124,9 +124,8 @@ def _classify_windows(
 ) -> Tensor:
     """Return the probability of ``dangerous`` of windows (W, T, S) with valid sensors (W, S), (W,)."""
     positions = torch.from_numpy(device.sensors.positions).float()
-    mask = valid[:, None].expand_as(readings)
     parts = [
         learner.probabilities(Touches(*part, positions, None, device.model_rate))[:, live.column]
-        for part in zip(readings.split(500), mask.split(500), strict=True)
+        for part in zip(readings.split(500), valid[:, None].expand_as(readings).split(500), strict=True)
     ]
     return torch.cat(parts).nan_to_num(1.0) if parts else torch.zeros(0)

@@ -121,7 +121,7 @@ class Store:
             # Without a file of its lock here, the run is one of another machine, or of another folder.
             if (store.folder / f"{run.info.run_id}.lock").exists():
                 with suppress(InputError), store.hold(run.info.run_id):
-                    client.set_terminated(run.info.run_id, "KILLED")
+                    store.end(run.info.run_id, "KILLED")
         return store
 
     @classmethod
@@ -181,7 +181,6 @@ class Store:
         try:
             yield
         finally:
-            Path(lock.lock_file).unlink(missing_ok=True)
             lock.release()
 
     @contextmanager
@@ -208,11 +207,11 @@ class Store:
             for key, value in (tags | {PROCESS: str(os.getpid())}).items():
                 self.client.set_tag(run.info.run_id, key, value)
         status = "KILLED"
-        with self.hold(run.info.run_id), ends_on_signal(lambda: self._end(run, status)):
+        with self.hold(run.info.run_id), ends_on_signal(lambda: self.end(run.info.run_id, status)):
             try:
                 with _patience():
                     yield run
-                    self.client.set_terminated(run.info.run_id, "FINISHED")
+                    self.client.set_terminated(run.info.run_id, "FINISHED")  # waits for the server
                 status = "FINISHED"
             except Exception as error:
                 if self._lost(error):
@@ -226,8 +225,7 @@ class Store:
                     self.client.set_tag(run.info.run_id, "error", text[:500])
                 raise
             finally:
-                if status != "FINISHED":
-                    self._end(run, status)
+                self.end(run.info.run_id, status)
 
     def _lost(self, error: Exception) -> bool:
         """Return whether an error means that the server gives no answer; what it answers is another one."""
@@ -238,10 +236,14 @@ class Store:
             and str(error).startswith("API request to")
         )
 
-    def _end(self, run: Run, status: str) -> None:
-        """End a run; without the server it stays RUNNING until the next start closes it."""
+    def end(self, run: str, status: str) -> None:
+        """End a run, and remove its lock; the caller holds it.
+
+        Without the server the run stays RUNNING until the next start closes it.
+        """
         if answers(self.uri):
-            self.client.set_terminated(run.info.run_id, status)
+            self.client.set_terminated(run, status)
+            (self.folder / f"{run}.lock").unlink(missing_ok=True)
 
     def log_metrics(self, run: Run, values: dict[str, float]) -> None:
         """Log final metrics, 1000 in one transaction; what is not defined (NaN) is left out."""

@@ -201,10 +201,11 @@ class SweepCallback(Callback):
         atexit.register(self._close)
         os.environ[PARENT] = self._parent
         _share_cores(config.hydra.launcher)
-        bar = "{task.description}", BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
-        console, redirect = Console(stderr=True), sys.stdout.isatty()
-        self._bar = Progress(*bar, console=console, transient=True, redirect_stdout=redirect)
-        self._task = self._bar.add_task(name, total=len(self._jobs) or None)
+        if (console := Console(stderr=True)).is_terminal:
+            columns = "{task.description}", BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
+            redirect = sys.stdout.isatty()
+            self._bar = Progress(*columns, console=console, transient=True, redirect_stdout=redirect)
+            self._task = self._bar.add_task(name, total=len(self._jobs) or None)
 
     def _choose(self, config: DictConfig, jobs: Sequence[Mapping[str, str]]) -> None:
         """Choose the jobs of this shard, and tell the others that they have nothing to do."""
@@ -223,14 +224,14 @@ class SweepCallback(Callback):
 
     def on_job_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Show the bar, where standard error is a terminal."""
-        if self._bar and self._bar.console.is_terminal:
+        if self._bar:
             self._bar.start()
 
     def on_job_end(self, config: DictConfig, job_return: JobReturn, **kwargs: Any) -> None:
         """Print how a job ended."""
-        number, value = config.hydra.job.num, job_return._return_value
-        if self._store is None or (self._jobs and number not in self._jobs):
+        if self._store is None or (self._jobs and config.hydra.job.num not in self._jobs):
             return
+        number, value = config.hydra.job.num, job_return._return_value
         if self._bar:
             self._bar.advance(self._task)
             self._bar.stop()
@@ -259,7 +260,7 @@ class SweepCallback(Callback):
                 from mlflow.utils.mlflow_tags import MLFLOW_PARENT_RUN_ID
 
                 complete = ended or (self._jobs and not self._open)
-                store.client.set_terminated(self._parent, "FINISHED" if complete else "FAILED")
+                store.end(self._parent, "FINISHED" if complete else "FAILED")
                 if not store.find(**{MLFLOW_PARENT_RUN_ID: self._parent}):
                     store.client.delete_run(self._parent)
 

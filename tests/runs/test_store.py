@@ -94,7 +94,7 @@ def test_a_second_signal_does_not_interrupt_the_end_of_a_run(store, monkeypatch)
         signal.raise_signal(signal.SIGTERM)
         ended.append(status)
 
-    monkeypatch.setattr(Store, "_end", end)
+    monkeypatch.setattr(Store, "end", end)
     # Else a signal that is not expected would end the tests.
     signal.signal(signal.SIGTERM, lambda *_: pytest.fail("a signal was not expected"))
     try:

@@ -12,8 +12,8 @@ from omegaconf import OmegaConf
 
 from skin.core.files import CONF
 from skin.errors import InputError
-from skin.runs.configuration import Tracking
-from skin.runs.store import Store, shorten
+from skin.runs.configuration import Tracking, shorten
+from skin.runs.store import Store
 from skin.runs.sweep import SweepCallback, sweep_jobs, sweep_title
 
 # MLflow's own business with SQLAlchemy.

@@ -9,7 +9,7 @@ from hydra import compose, initialize_config_dir
 from skin.core.files import CONF, ROOT
 from skin.device.files import DataSet, Manifest
 from skin.runs.build import build_device
-from skin.runs.configuration import validate_config
+from skin.runs.configuration import settings_of, validate_config
 from skin.runs.generation import generate_data_set
 from skin.touch.labels import CONTACT
 
@@ -27,7 +27,7 @@ def place(tmp_path_factory):
         patch.setattr("skin.device.simulated._BATCH", 16)
         patch.setattr("skin.device.base._PART", 1)
         config = validate_config(compose("generate", ["simulator=naive", "n=48", "device.dead=1"]))
-        generate_data_set(build_device(config), config, place / "touches")
+        generate_data_set(build_device(config), settings_of(config), place / "touches")
     return place
 
 

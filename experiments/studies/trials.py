@@ -62,12 +62,11 @@ from skin.evaluation.operating_point import OperatingPoint
 from skin.evaluation.settings import check_evaluation
 from skin.learning.learner import AbstractLearner
 from skin.runs.build import build_device
-from skin.runs.configuration import Config, fingerprint, source_tags, validate_config
+from skin.runs.configuration import Config, fingerprint, simulator, source_tags, validate_config
 from skin.runs.run import TAG, FinishedRun, find_run
 from skin.runs.store import Store, note_reuse, note_source
 from skin.runs.sweep import LEFT_OUT, Shard
 from skin.runs.torch_model import TorchModel, alarm_source, load_model, load_run
-from skin.runs.train import simulator
 from skin.touch.labels import TOUCH
 
 _log = logging.getLogger(__name__)
@@ -189,7 +188,9 @@ def run_study(study: Study, config: Config, folder: Path, smoke: bool) -> bool:
     else:
         paths = publish_tables(study, tables, path)
     if study.report_figures:
-        skins = {simulator(config): config for run in planned for config in run.variant.configs.values()}
+        skins = {
+            simulator(config.device): config for run in planned for config in run.variant.configs.values()
+        }
         print(f"{len(draw_report(frame, skins, folder))} figures of the report in {folder}")
     if store and (study.measure or frame.condition.any()):
         log_summary(store, study, frame, paths)
@@ -266,7 +267,7 @@ def find_runs(study: Study, config: Config, store: Store) -> list[Planned]:
         assert study.run is not None
         return [_found(find_run(config.tracking, study.run).run)]
     newest: dict[tuple[str, str], Planned] = {}
-    data = simulator(config)
+    data = simulator(config.device)
     for run in store.find("FINISHED", simulator=data):
         tags = run.data.tags
         chosen = study.rows == "all" or tags["row"] in study.rows
@@ -399,7 +400,7 @@ def _page(measure: StudyMeasure, frame: pd.DataFrame, title: str) -> Page:
 
 def _row_and_simulator(variant: Variant) -> dict[str, str]:
     for config in variant.configs.values():
-        return {"row": str(config.row), "simulator": simulator(config)}
+        return {"row": str(config.row), "simulator": simulator(config.device)}
     chosen = variant.chosen
     row = chosen.get("row", chosen.get("experiment", ""))
     return {"row": row, "simulator": chosen.get("simulator", "")}

@@ -6,6 +6,7 @@
 Writes tables, pictures and JSON into out=.
 """
 
+from functools import partial
 from typing import Any
 
 from skin.commands._command import command
@@ -19,4 +20,8 @@ def main(config: Config, out: str | None, design: dict[str, Any]) -> None:
     """Build the chosen analysis from its settings, run it and write its files."""
     settings = dict(design)
     target = import_target(settings.pop("_target_"), "design")
-    configured(target, settings, "design").run(config, results(out))
+    analysis = configured(target, settings, "design")
+
+    from skin.runs.build import build_device, build_skin
+
+    analysis.run(build_skin(config), partial(build_device, config), results(out))

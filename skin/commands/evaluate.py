@@ -7,6 +7,7 @@ Writes evaluation_<device>_<id>.md and .png into out=, and an MLflow run of its 
 """
 
 from skin.commands._command import command
+from skin.core.files import results
 from skin.runs.configuration import Config, overrides
 
 
@@ -15,4 +16,4 @@ def main(config: Config, run: str, out: str | None) -> None:
     """Restore a finished run, evaluate it, and print and log the metrics."""
     from skin.runs.train import evaluate_run
 
-    evaluate_run(config, run, out, overrides())
+    evaluate_run(run, config.tracking, config.trust, results(out), overrides())

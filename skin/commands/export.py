@@ -24,7 +24,7 @@ from skin.core.messages import quiet
 from skin.core.progress import Steps
 from skin.core.settings import check_settings
 from skin.errors import InputError
-from skin.runs.configuration import Config, overrides
+from skin.runs.configuration import Config, overrides, settings_of
 
 if TYPE_CHECKING:
     from skin.runs.torch_model import TorchModel
@@ -56,10 +56,10 @@ def main(
             raise InputError(f"a folder is written to models/NAME, not to out={out}: add name=my_skin")
 
         from skin.runs.card import check_folder, write_folder
-        from skin.runs.run import FinishedRun
+        from skin.runs.run import find_run
 
         folder = check_folder(name, licence)
-        write_folder(FinishedRun.named(run, config), folder, str(licence))
+        write_folder(find_run(config.tracking, run, config.trust), folder, str(licence))
         print(folder)
     elif name is not None or licence is not None:
         raise InputError("only a folder takes name and licence: add format=folder, or leave them out")
@@ -94,7 +94,7 @@ def _export_file(
         raise InputError(f"out={out} must end in .onnx: as in out=skin.onnx")
 
     from skin.runs.model import describe_skin
-    from skin.runs.run import FinishedRun
+    from skin.runs.run import find_run
     from skin.runs.torch_model import equation10_warning, load_model
 
     try:
@@ -104,14 +104,14 @@ def _export_file(
             "skin export needs onnx, onnxscript and onnxruntime: pip install 'tactile-skin[export]'"
         ) from error
     quiet()
-    run = FinishedRun.named(name, config)
+    run = find_run(config.tracking, name, config.trust)
     whole = run.configured(overrides())
     model = load_model(run, whole, touch=touch, one_skin=True)
     module = model.learner.pipeline(model.places)  # refused before anything else is simulated
     if advice := equation10_warning(run.stored):
         print(advice, file=sys.stderr)
     steps.begin("tuning the contact threshold")
-    described = replace(model.describe(), skin=describe_skin(whole, model.positions))
+    described = replace(model.describe(), skin=describe_skin(settings_of(whole), model.positions))
     if "simulator" in run.stored.device and model.threshold is not None:
         steps.begin(_THRESHOLDS)
         described = replace(described, thresholds=_choose_thresholds(model, rates))

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from skin.commands._command import command
 from skin.errors import InputError
-from skin.runs.configuration import Config
+from skin.runs.configuration import Config, settings_of
 
 
 @command("generate")
@@ -34,4 +34,4 @@ def main(config: Config, n: int, out: str | None) -> None:
 
     device = build_device(config)
     generate = generate_file if path.suffix else generate_data_set
-    print(f"{path}: {generate(device, config, path)}")
+    print(f"{path}: {generate(device, settings_of(config), path)}")

@@ -2,7 +2,7 @@
 
 import math
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -23,6 +23,7 @@ from skin.core.files import json_text, write
 from skin.core.rng import Stream, generator
 from skin.core.settings import RISING, checked
 from skin.design.precision import Sensitivity, local_covariance, sensitivity
+from skin.device.base import AbstractDevice
 from skin.errors import InputError
 from skin.inference.candidates import CandidateReadings, FingertipPrior, disc_readings
 from skin.inference.contact import Cloud, blur_first, one_contact
@@ -30,8 +31,7 @@ from skin.inference.likelihood import Observation
 from skin.inference.noise import Noise
 from skin.mechanics.geometry import Fingertip
 from skin.mechanics.simulator.base import AbstractSimulator
-from skin.runs.build import SkinModel, build_skin
-from skin.runs.configuration import Config
+from skin.runs.build import SkinModel
 
 _UNITS = {
     **dict.fromkeys(("radii", "rim", "margin"), "_m"),
@@ -160,24 +160,27 @@ class ExpectedPosterior:
     touches: Annotated[int, Ge(16)] = 512
     seed: Annotated[int, Ge(0)] = 0
 
-    def run(self, config: Config, folder: Path) -> None:
-        """Write design.json and design.png for the configured skin, and print a table.
+    def run(self, skin: SkinModel, make_device: Callable[[], AbstractDevice], folder: Path) -> None:
+        """Write design.json and design.png for a skin, and print a table; no device is needed.
 
         Raises:
             InputError: a skin that cannot be built, or a margin that leaves no place.
         """
         from skin.design.drawing import draw_expected, print_expected
 
-        skin = build_skin(config)
         simulator = skin.simulator(skin.body, skin.sensors)
         trials = self.trials(simulator, skin.body)
         findings = self.find(simulator, skin.body, trials)
         print_expected(findings)
         settings = {name + _UNITS.get(name, ""): value for name, value in asdict(self).items()}
-        about = {"sensors": len(skin.sensors), "settings": settings, "expected": list(map(asdict, findings))}
+        content = {
+            "sensors": len(skin.sensors),
+            "settings": settings,
+            "expected": list(map(asdict, findings)),
+        }
         maps = {force: self.expected_map(trial, skin.body) for force, trial in trials.items()}
         print(
-            write(json_text(about), folder / "design.json"),
+            write(json_text(content), folder / "design.json"),
             draw_expected(skin.body, skin.sensors, maps, folder / "design.png"),
             sep="\n",
         )
@@ -191,13 +194,15 @@ class ExpectedPosterior:
         places = self.sample(body)
         priors = {force: FingertipPrior(force, radii=self.radii, rim=self.rim) for force in self.forces}
         candidates = CandidateReadings(simulator, body, next(iter(priors.values())))
-        felt = disc_readings(simulator, body, places, self.rim)
+        responses = disc_readings(simulator, body, places, self.rim)
         trials = dict[float, Trials]()
         for number, (force, prior) in enumerate(priors.items()):
             rng = generator(Stream.DESIGN, self.seed, number)
             drawn = force * np.exp(prior.spread * rng.standard_normal(len(places)))
             touches = np.column_stack([places, drawn])
-            trials[force] = try_touches(candidates, prior, self._noise, touches, felt * drawn[:, None], rng)
+            trials[force] = try_touches(
+                candidates, prior, self._noise, touches, responses * drawn[:, None], rng
+            )
         return trials
 
     def find(
@@ -214,17 +219,19 @@ class ExpectedPosterior:
         """
         trials = trials or self.trials(simulator, body)
         unit = torch.from_numpy(np.column_stack([self.sample(body), np.ones(self.touches)]))
-        felt = sensitivity(simulator, Fingertip(body, self.rim, simulator.smooth), unit)
+        responses = sensitivity(simulator, Fingertip(body, self.rim, simulator.smooth), unit)
         simulator.float()
         area = math.prod(self._extent(body))
         return [
-            _findings(force, trial, area, self._local_precision(felt.of_force(force), force, body))
+            _findings(force, trial, area, self._local_precision(responses.of_force(force), force, body))
             for force, trial in trials.items()
         ]
 
-    def _local_precision(self, felt: Sensitivity, force: float, body: AbstractBody) -> float:
+    def _local_precision(self, responses: Sensitivity, force: float, body: AbstractBody) -> float:
         """Return the median local precision of the place, m."""
-        variances = local_covariance(felt, self._noise, self.priors(force, body)).diagonal(dim1=1, dim2=2)
+        variances = local_covariance(responses, self._noise, self.priors(force, body)).diagonal(
+            dim1=1, dim2=2
+        )
         return float(variances[:, :2].mean(1).sqrt().median())
 
     @property
@@ -321,8 +328,8 @@ class Step:
         """Yield one line of a table per force."""
         rows, columns = self.grid
         for finding in self.findings:
-            about = {"thickness_m": self.thickness, "rows": rows, "columns": columns, "pitch_m": self.pitch}
-            yield about | asdict(finding)
+            case = {"thickness_m": self.thickness, "rows": rows, "columns": columns, "pitch_m": self.pitch}
+            yield case | asdict(finding)
 
 
 @checked("design")
@@ -344,8 +351,8 @@ class Sweep(ExpectedPosterior):
     footprint: Footprint = (0.01, 0.01)
     height: PositiveFloat = 0.0005
 
-    def run(self, config: Config, folder: Path) -> None:
-        """Write design_sweep.csv and design_sweep.png.
+    def run(self, skin: SkinModel, make_device: Callable[[], AbstractDevice], folder: Path) -> None:
+        """Write design_sweep.csv and design_sweep.png; no device is needed.
 
         Raises:
             InputError: a skin that cannot be built, a simulator without mechanics, or sensors outside the
@@ -353,7 +360,6 @@ class Sweep(ExpectedPosterior):
         """
         from skin.design.drawing import draw_sweep, print_sweep
 
-        skin = build_skin(config)
         cases = [
             (thickness, (rows, columns)) for thickness in self.thicknesses for rows, columns in self.grids
         ]

@@ -22,12 +22,11 @@ from skin.core.rng import Stream, generator
 from skin.core.settings import checked
 from skin.design.drawing import placement
 from skin.design.placement import PlacementProblem, Zones, keep_out
-from skin.device.base import AbstractSimulated
+from skin.device.base import AbstractDevice, AbstractSimulated
 from skin.device.simulated import build_model
 from skin.errors import InputError
 from skin.plot.figures import save_figure
-from skin.runs.build import build_device
-from skin.runs.configuration import Config
+from skin.runs.build import SkinModel
 from skin.touch.movie import Movie
 
 # The readings that sampled touches give at any sites of a skin, and their covariance.
@@ -116,22 +115,21 @@ class Place:
     keep_out: str | Zones | None = None
     keep: Literal["all"] | Sequence[PositiveInt] = ()
 
-    def run(self, config: Config, folder: Path) -> None:
-        """Place the sensors of the configured skin, print a table and write the files.
+    def run(self, skin: SkinModel, make_device: Callable[[], AbstractDevice], folder: Path) -> None:
+        """Place the sensors of a skin, print a table and write the files.
 
         Args:
-            config: the whole configuration.
+            skin: not needed.
+            make_device: returns the simulated device of the skin.
             folder: of the files.
 
         Raises:
             InputError: no site, too few sites, a device without simulation or without noise.
         """
         started = time.perf_counter()
+        device = make_device().simulated("sensors are placed by simulated touches")
         # Gestures must not depend on the layout that is to be replaced.
-        drawn = {"touch": config.touch | {"over_sensors": False}} if "touch" in config.device else {}
-        device = build_device(replace(config, device=config.device | drawn)).simulated(
-            "sensors are placed by simulated touches"
-        )
+        device = device.replace(touch=replace(device.sampler.settings, over_sensors=False))
         forbidden = keep_out(self.keep_out, device.size)
         problem = PlacementProblem.of(device, forbidden, self.count, self.keep, self.distance, self.raster)
         noise = self._noise(device)

@@ -34,7 +34,7 @@ from skin.evaluation.operating_point import (
     dangerous_column,
     parse_operating_point,
 )
-from skin.evaluation.settings import Evaluation, check_evaluation
+from skin.evaluation.settings import ENOUGH, Evaluation, check_evaluation
 from skin.touch.labels import TOUCH
 
 if TYPE_CHECKING:
@@ -43,17 +43,13 @@ if TYPE_CHECKING:
     from skin.device.base import AbstractDevice, AbstractSimulated
     from skin.device.touches import Touches
 
-SAFE_TOUCHES = 2000
-"""Safe touches on which a threshold is chosen: where 2 % are wanted, the rate is then 1.4 to 2.7 % (95 %)."""
+SAFE_TOUCHES = ENOUGH
+"""Safe touches on which a threshold is chosen."""
 DANGEROUS_TOUCHES = 400
 """Dangerous touches on which a threshold of the live view is checked: 75 % are then 71 to 79 % (95 %)."""
-_APART = 1e-6  # scores closer than this may have another order on another processor
-_MOST_DRAWS = 6
-_RATIOS = (1, 2, 3, 5, 7, 10, 15, 20, 30, 50, 70, 100)  # of the rate of a device to that of the model
 _USUAL = "mild"
 _EVERY = {"without_lag": 0.0, "framed": 0.0}  # every device is as described, whatever the training mixed in
 _DEVICE = "device"  # in place of a profile: the imperfections of the device that is evaluated
-_EXPECTED = 20.0  # s
 _log = logging.getLogger(__name__)
 
 
@@ -149,15 +145,17 @@ def _exported_point(
     threshold = source.threshold
     if threshold is None:
         return None
-    if live is not None and source.thresholds:
-        nearest = min(source.thresholds, key=lambda text: abs(log(float(text) / live.rate)))
-        say(f"the device sends {live.rate:.3g} frames a second: threshold for {nearest} Hz, per touch")
-        threshold = source.thresholds[nearest]
-    elif live is not None:
-        say("the threshold was chosen for single windows: a touch has many, and raises more false alarms")
-    if live is not None and threshold >= 1:
-        raise InputError(f"{source.name} has no threshold that raises an alarm: give live.patience.above=0.5")
     if live is not None:
+        if source.thresholds:
+            nearest = min(source.thresholds, key=lambda text: abs(log(float(text) / live.rate)))
+            say(f"the device sends {live.rate:.3g} frames a second: threshold for {nearest} Hz, per touch")
+            threshold = source.thresholds[nearest]
+        else:
+            say("the threshold was chosen for single windows: a touch has many, and raises more false alarms")
+        if threshold >= 1:
+            raise InputError(
+                f"{source.name} has no threshold that raises an alarm: give live.patience.above=0.5"
+            )
         say(f"alarm above {threshold:.4f}")
     return OperatingPoint(threshold, math.nan, 0, 0, None)
 
@@ -168,9 +166,8 @@ def _stored_point(source: AlarmSource, settings: Evaluation) -> OperatingPoint |
     If it has none for the target rate, it is chosen now if the device of its training draws fresh gestures;
     else the threshold is 0.5. Both cases are reported on standard error.
     """
-    point, target = None, settings.false_alarm_rate
-    if source.stored is not None:
-        point = parse_operating_point(source.stored)
+    target = settings.false_alarm_rate
+    point = None if source.stored is None else parse_operating_point(source.stored)
     if source.stored is not None and (point is None or point.target == target):
         return point
     lacks = f"{source.name} stores no alarm threshold for {100 * target:g} % false alarms"
@@ -211,7 +208,7 @@ def threshold_device(source: AlarmSource) -> "AbstractSimulated":
     if profile is not None:
         sampled = {name: source.used[name] for name in ("rate", "aligned") if name in source.used}
         own = _imperfections(source.used) if profile == _DEVICE else sampled | profile_settings(profile)
-        # Drawn skins draw a device for every gesture without being told.
+        # Drawn skins draw a device for each gesture already.
         every = {} if "skins" in device else {"randomise": True, "calibration": None}
         device |= _EVERY | own
         device = {name: value for name, value in device.items() if name != "randomise"} | every
@@ -277,13 +274,13 @@ def _on_gestures(learner: Predictor, device: "AbstractDevice", settings: Evaluat
     if LABEL not in device.task.names:
         return None
     touches, target = threshold_gestures(device, settings), settings.false_alarm_rate
-    labels, chances = touches.known_labels, learner.probabilities(touches)
-    chance, dangerous = dangerous_column(chances, labels, device.task)
+    labels, probabilities = touches.known_labels, learner.probabilities(touches)
+    probability, dangerous = dangerous_column(probabilities, labels, device.task)
     if dangerous.all():
         return OperatingPoint.default(target)
     seed = None if device.simulation is None else device.simulation.data_seed
-    point = OperatingPoint(_lowest_threshold(chance[~dangerous], target), target, 0, 0, seed)
-    return replace(point, **asdict(point.reached(chances, labels, device.task)))
+    point = OperatingPoint(_lowest_threshold(probability[~dangerous], target), target, 0, 0, seed)
+    return replace(point, **asdict(point.reached(probabilities, labels, device.task)))
 
 
 def threshold_gestures(device: "AbstractDevice", settings: Evaluation) -> "Touches":
@@ -298,7 +295,7 @@ def threshold_gestures(device: "AbstractDevice", settings: Evaluation) -> "Touch
         return device.touches("validation")
     # Half of the sampled gestures are safe; some windows of streams show no touch.
     count = 2 * settings.safe_gestures
-    for _ in range(_MOST_DRAWS):
+    for _ in range(6):  # up to 32 times as many, where few are safe
         touches = simulation.fresh_touches(count)
         _, dangerous = dangerous_column(touches.known_labels, touches.known_labels, device.task)
         if int((~dangerous).sum()) >= settings.safe_gestures:
@@ -322,10 +319,11 @@ def _lowest_threshold(safe: "Tensor", target: float) -> float:
     scores = np.sort(safe.detach().cpu().double().numpy())[::-1]
     # 1e-9 keeps a product such as 0.29 * 100 from rounding below its whole number.
     allowed = max(math.floor(target * (len(scores) + 1) + 1e-9) - 1, 0)
-    gaps = scores[:-1] - scores[1:] > 2 * _APART  # [i]: between the first i + 1 scores and the others
+    apart = 1e-6  # scores closer than this may have another order on another processor
+    gaps = scores[:-1] - scores[1:] > 2 * apart  # [i]: between the first i + 1 scores and the others
     cuts = np.flatnonzero(gaps[:allowed])
     above = int(cuts[-1]) + 1 if len(cuts) else 0
-    return float(np.float32(scores[above] + _APART))
+    return float(np.float32(scores[above] + apart))
 
 
 # The choice on touches, as the live view judges them.
@@ -380,7 +378,8 @@ def _snapped(live: LiveConditions, device: "AbstractSimulated") -> LiveCondition
 
     A measured rate is never the same twice, and the threshold would be chosen anew at each start.
     """
-    ratio = min(_RATIOS, key=lambda ratio: abs(log(ratio * device.model_rate / live.rate)))
+    ratios = (1, 2, 3, 5, 7, 10, 15, 20, 30, 50, 70, 100)
+    ratio = min(ratios, key=lambda ratio: abs(log(ratio * device.model_rate / live.rate)))
     return replace(live, rate=ratio * device.model_rate)
 
 
@@ -408,7 +407,7 @@ def _on_touches_of(
     danger = labels[:, TOUCH.names.index(LABEL)]
     safe, others = labels[~danger][:count], labels[danger][:DANGEROUS_TOUCHES]
     chosen = np.concatenate([safe, others])
-    with Steps({"choosing the threshold of the alarm": _EXPECTED}) as steps:
+    with Steps({"choosing the threshold of the alarm": 20.0}) as steps:
         # More threads than free cores take many times as long.
         report = lambda done: setattr(steps, "share", done / len(chosen))  # noqa: E731
         scores = touch_scores(learner, device, live, chosen, seed, report)

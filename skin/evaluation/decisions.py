@@ -80,21 +80,42 @@ def as_press(idle: np.ndarray, present: np.ndarray, held: int) -> np.ndarray:
 
 
 DRIFT = 0.2 / 600  # N/s: 0.2 N in ten minutes
-_DOUBT = 1.0  # s of rest that end a contact whose sensor was invalid meanwhile
-_LONGEST = 1.0  # s for which the baseline drifts at most between two updates
-_SINK = 1.0  # thresholds per second by which the baseline follows downwards
-_MARGIN = 0.5  # of the threshold, below the baseline, from which on it does so
-_NOISE = 5.0  # standard deviations that noise does not exceed
-_HIGH, _BEGUN = 2.0, 0.5  # thresholds: a reading in the middle of a touch, and at its beginning
-_FAINT = 0.1  # thresholds: least reading that shows a touch beside a sensor, if there is no noise
-_LIFT = 0.1
-"""Share of the largest reading below which no sensor beside a touch falls: 0.044 is the most that the solid
-shows, with friction of 0.5."""
+
+
+@dataclass(frozen=True)
+class ContactLimits:
+    """Limits of :class:`ContactDetector`; thresholds are those of contact.
+
+    Attributes:
+        rest: s without a rise that end a contact whose sensor was invalid meanwhile.
+        step: s for which the baseline drifts at most between two updates.
+        sink: thresholds per second by which the baseline follows downwards.
+        margin: of the threshold, below the baseline, from which on it does so.
+        noise: standard deviations that noise does not exceed.
+        high: thresholds that a reading in the middle of a touch reaches.
+        begun: thresholds that a reading at the beginning of a touch reaches.
+        faint: thresholds: smallest reading that shows a touch beside a sensor, if there is no noise.
+        lift: fraction of the largest reading below which no sensor beside a touch falls. The largest that the
+            solid shows, with friction of 0.5, is 0.044.
+    """
+
+    rest: float = 1.0
+    step: float = 1.0
+    sink: float = 1.0
+    margin: float = 0.5
+    noise: float = 5.0
+    high: float = 2.0
+    begun: float = 0.5
+    faint: float = 0.1
+    lift: float = 0.1
+
+
+_LIMITS = ContactLimits()
 
 
 def least_visible(noise: np.ndarray, threshold: float) -> np.ndarray:
     """Return the readings (S,), N, half of which is no noise, given its standard deviation (S,), N."""
-    return 2 * np.maximum(_NOISE * noise, _FAINT * threshold)
+    return 2 * np.maximum(_LIMITS.noise * noise, _LIMITS.faint * threshold)
 
 
 class ContactDetector:
@@ -140,7 +161,7 @@ class ContactDetector:
         shares: np.ndarray | None = None,
     ) -> None:
         self._rate, self._threshold, self._drift = rate, threshold, drift
-        self._recent, self._long = (max(1, ceil(span * rate - 1e-9)) for span in (RELEASE, _DOUBT))
+        self._recent, self._long = (max(1, ceil(span * rate - 1e-9)) for span in (RELEASE, _LIMITS.rest))
         self._shares = np.zeros((sensors, sensors)) if shares is None else shares
         self._witnesses = np.zeros((sensors, sensors), dtype=bool)
         self._touched, self._doubtful, self._held = (np.zeros(sensors, dtype=bool) for _ in range(3))
@@ -173,12 +194,12 @@ class ContactDetector:
         The wire is broken, the values fall with force, or the tare was taken under a load.
         """
         rise = np.where(valid, readings - self.rest, 0.0)
-        return np.asarray(rise < -(self._least + _LIFT * rise.max(axis=-1, keepdims=True)))
+        return np.asarray(rise < -(self._least + _LIMITS.lift * rise.max(axis=-1, keepdims=True)))
 
     @property
     def _least(self) -> np.ndarray:
         """(S,), N, that a reading falls below its rest where neither noise nor drift explains it."""
-        return np.maximum(self._threshold, _NOISE * self.noise)
+        return np.maximum(self._threshold, _LIMITS.noise * self.noise)
 
     def update(self, readings: np.ndarray, valid: np.ndarray, t: float) -> bool:
         """Update with the window that ends now; return whether something touches the skin.
@@ -204,7 +225,7 @@ class ContactDetector:
                 self.since = t - (len(risen) - 2 - before) / self._rate
         else:
             self.since = None
-        passed = 0.0 if self._updated_at is None else min(t - self._updated_at, _LONGEST)
+        passed = 0.0 if self._updated_at is None else min(t - self._updated_at, _LIMITS.step)
         self._follow(readings[recent], valid[recent], sound[recent].all(axis=0), passed)
         self._updated_at = t
         return self.since is not None
@@ -217,7 +238,7 @@ class ContactDetector:
         fallen = self._held & (rises <= self._top - self._threshold)
         self._held &= ~fallen
         # The skin may sink below its rest for a while after a touch.
-        self.void |= rises < -(self._least + _LIFT * self._peak)
+        self.void |= rises < -(self._least + _LIMITS.lift * self._peak)
         self._peak = max(self._peak, float(np.where(valid[-1], readings[-1] - self.rest, 0.0).max()))
         return fallen
 
@@ -234,12 +255,12 @@ class ContactDetector:
         self.lost &= ~risen
         # Sensors that lag may fall a little later than others.
         before, latest, now = np.where(valid, readings - self.rest, np.nan)[-3:]
-        self.beyond = ~valid[-1] & (self.beyond | self._touched | (latest >= _BEGUN * self._threshold))
+        self.beyond = ~valid[-1] & (self.beyond | self._touched | (latest >= _LIMITS.begun * self._threshold))
         expected, visible = before[:, None] * self._shares, least_visible(self.noise, self._threshold)
         shown = expected >= visible
         steady = np.abs(now - before) < expected / 2
         witnesses = shown & steady & (np.minimum(before, now) >= expected / 2)
-        fell = (before >= _HIGH * self._threshold) & (np.abs(now) < self._threshold)
+        fell = (before >= _LIMITS.high * self._threshold) & (np.abs(now) < self._threshold)
         fell &= witnesses.any(axis=1) & (steady | ~shown).all(axis=1) & ~self.lost
         if fell.any():
             self.lost |= fell
@@ -265,8 +286,8 @@ class ContactDetector:
 
     def _step(self, away: np.ndarray, rise: float, passed: float) -> np.ndarray:
         """Return how far baselines (S,) move in ``passed`` s towards readings that are ``away``, N."""
-        fast = _SINK * self._threshold * passed
+        fast = _LIMITS.sink * self._threshold * passed
         slow = np.clip(away, -rise, rise)
         # Noise alone must not lower the baseline, because it rises slowly.
-        far = np.clip(away + _MARGIN * self._threshold, -fast, 0.0)
+        far = np.clip(away + _LIMITS.margin * self._threshold, -fast, 0.0)
         return np.where(self._touched, 0.0, np.where(far < 0, far, slow))

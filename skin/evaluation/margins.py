@@ -109,18 +109,27 @@ def measure_margins(
         "test", complete=False
     )
     touches, labels = recording.touches, recording.touches.known_labels
-    places = [device.task.names.index(name) for name in TOUCH.names]
-    chances = learner.probabilities(touches)[:, places]
-    predicted, parameters = chances > 0.5, recording.parameters
+    columns = [device.task.names.index(name) for name in TOUCH.names]
+    probabilities = learner.probabilities(touches)[:, columns]
+    predicted, parameters = probabilities > 0.5, recording.parameters
     measures = Measures(*(parameters[name] for name in Measures._fields))
     settings = simulation.sampler.settings
     shares = _shares(measures, settings.thresholds, settings.frames.duration)
     spans = {name: find_spans(predicted[:, n], shares[:, n]) for n, name in enumerate(TOUCH.names)}
     danger = TOUCH.names.index(LABEL)
-    spans[ALARM_NAME] = find_spans(point.alarm(chances[:, danger]), shares[:, danger])
-    faint = _count_faint(predicted != (labels > 0.5), above_idle(touches).amax(dim=(1, 2)))
-    overall = compute_metrics(chances, labels, TOUCH, point)
-    return MarginReport(spans, faint, point, point.reached(chances, labels, TOUCH), overall)
+    spans[ALARM_NAME] = find_spans(point.alarm(probabilities[:, danger]), shares[:, danger])
+    wrong = predicted != (labels > 0.5)
+    faint = [
+        Faint(
+            low,
+            high,
+            int(inside.sum()),
+            dict(zip(TOUCH.names, wrong[inside].sum(dim=0).tolist(), strict=True)),
+        )
+        for low, high, inside in _split_ranges(_STRENGTHS, above_idle(touches).amax(dim=(1, 2)))
+    ]
+    overall = compute_metrics(probabilities, labels, TOUCH, point)
+    return MarginReport(spans, faint, point, point.reached(probabilities, labels, TOUCH), overall)
 
 
 def find_spans(predicted: Tensor, shares: Tensor) -> list[Span]:
@@ -145,19 +154,6 @@ def _shares(measures: Measures, thresholds: Thresholds, longest_tap: int) -> Ten
         (measures.pressure, thresholds.pressure),
     )
     return torch.stack([measure / threshold for measure, threshold in pairs], dim=1)
-
-
-def _count_faint(wrong: Tensor, strength: Tensor) -> list[Faint]:
-    """Return the errors (B, 4) by the strength (B,), N, of the touch."""
-    return [
-        Faint(
-            low,
-            high,
-            int(inside.sum()),
-            dict(zip(TOUCH.names, wrong[inside].sum(dim=0).tolist(), strict=True)),
-        )
-        for low, high, inside in _split_ranges(_STRENGTHS, strength)
-    ]
 
 
 def _split_ranges(edges: Sequence[float], values: Tensor) -> Iterator[tuple[float, float, Tensor]]:

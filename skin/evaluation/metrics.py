@@ -55,14 +55,14 @@ def compute_metrics(
         return {"overall/accuracy": float(right.float().mean())} | alarm
     values: dict[str, float] = {}
     pairs = _pairs(probabilities, labels, task)
-    for name, (chance, label) in zip(task.binary, pairs, strict=True):
-        right = ((chance > 0.5) == (label > 0)).float()
+    for name, (probability, label) in zip(task.binary, pairs, strict=True):
+        right = ((probability > 0.5) == (label > 0)).float()
         values[f"{name}/accuracy"] = float(right.mean())
         values[f"{name}/balanced_accuracy"] = math.nan
-        if _has_both(label):
+        if 0 < int(label.sum()) < len(label):
             recall, specificity = right[label > 0].mean(), right[label == 0].mean()
             values[f"{name}/balanced_accuracy"] = float((recall + specificity) / 2)
-        values[f"{name}/ece"] = calibration_error(chance, label)
+        values[f"{name}/ece"] = calibration_error(probability, label)
     # A label that is unknown in all test touches does not count in the overall values.
     unknown = {name for name, column in zip(task.names, labels.T, strict=True) if column.isnan().all()}
     for metric in ("accuracy", "balanced_accuracy", "ece"):
@@ -90,24 +90,24 @@ def _errors(predicted: Tensor, labels: Tensor, task: Task) -> dict[str, float]:
     return values
 
 
-def calibration_error(chance: Tensor, label: Tensor, bins: int = 15) -> float:
+def calibration_error(probability: Tensor, label: Tensor, bins: int = 15) -> float:
     """Return the expected calibration error in bins of equal numbers of touches; NaN without touches.
 
     It is the mean distance between the mean probability of a bin and the share of true labels in it (Nguyen
     and O'Connor, 2015).
 
     Args:
-        chance: (B,), probabilities.
+        probability: (B,), probabilities.
         label: (B,), 0 or 1.
         bins: their number.
     """
-    if not len(chance):
+    if not len(probability):
         return math.nan
-    edges = chance.double().quantile(torch.linspace(0, 1, bins + 1, dtype=torch.float64))[1:-1]
+    edges = probability.double().quantile(torch.linspace(0, 1, bins + 1, dtype=torch.float64))[1:-1]
     # Equal probabilities share a bin.
-    group = torch.bucketize(chance.double(), edges.unique())
-    gaps = torch.zeros(bins, dtype=torch.float64).index_add_(0, group, chance.double() - label)
-    return float(gaps.abs().sum()) / len(chance)
+    group = torch.bucketize(probability.double(), edges.unique())
+    gaps = torch.zeros(bins, dtype=torch.float64).index_add_(0, group, probability.double() - label)
+    return float(gaps.abs().sum()) / len(probability)
 
 
 def measure_angles(probabilities: Tensor, labels: Tensor, task: Task) -> Tensor:
@@ -121,26 +121,20 @@ def measure_angles(probabilities: Tensor, labels: Tensor, task: Task) -> Tensor:
     return angle.where((x != 0) | (y != 0), 90)
 
 
-def _has_both(label: Tensor) -> bool:
-    """Return whether a label (B,) has both classes."""
-    return bool(label.any()) and not bool(label.all())
-
-
 def count_confusions(probabilities: Tensor, labels: Tensor, task: Task | None = None) -> Tensor:
     """Return confusion matrices (L, 2, 2) of probabilities and labels (B, L), true class in rows.
 
     If the task has a gate, each label is counted where it is defined. A direction has no matrix.
     """
     pairs = _pairs(probabilities, labels, task)
-    cells = (2 * label + (chance > 0.5) for chance, label in pairs)
+    cells = (2 * label + (probability > 0.5) for probability, label in pairs)
     return torch.stack([cell.bincount(minlength=4).view(2, 2) for cell in cells])
 
 
 def _pairs(probabilities: Tensor, labels: Tensor, task: Task | None) -> Iterator[tuple[Tensor, Tensor]]:
     """Yield the probabilities and labels (B',) of each label, for the touches for which it is defined."""
     counts = torch.ones_like(labels, dtype=torch.bool) if task is None else task.counts(labels)
-    last = probabilities.shape[1] if task is None else len(task.binary)
-    for i in range(last):
+    for i in range(probabilities.shape[1] if task is None else len(task.binary)):
         yield probabilities[counts[:, i], i], labels[counts[:, i], i].long()
 
 
@@ -167,10 +161,10 @@ def encode(
     wrong = ((probabilities > 0.5) != (labels > 0.5)).numpy()
     code = (wrong << np.arange(len(task))).sum(axis=1)
     if LABEL in task.names:
-        place = task.names.index(LABEL)
-        code += _DANGEROUS * (labels[:, place] > 0.5).numpy()
+        column = task.names.index(LABEL)
+        code += _DANGEROUS * (labels[:, column] > 0.5).numpy()
         if point is not None:
-            code += _ALARM * point.alarm(probabilities[:, place]).numpy()
+            code += _ALARM * point.alarm(probabilities[:, column]).numpy()
     return code.astype(np.uint8)
 
 

@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from skin.device.touches import Touches
 
 LABEL = "dangerous"
-_HIDDEN = 0.25  # share of dangerous touches that a threshold may hide
 
 
 class Predictor(Protocol):
@@ -116,18 +115,17 @@ class OperatingPoint:
     @property
     def useless(self) -> bool:
         """Whether it is silent, or more than a quarter of the dangerous touches raise no alarm when live."""
-        return self.silent or (
-            self.rate is not None and self.dangerous - self.found > _HIDDEN * self.dangerous
-        )
+        hidden = self.dangerous - self.found
+        return self.silent or (self.rate is not None and hidden > 0.25 * self.dangerous)
 
-    def alarm(self, chance: "Tensor") -> "Tensor":
-        """Return which probabilities raise the alarm, bool, in the shape of ``chance``."""
-        return chance > self.threshold
+    def alarm(self, probability: "Tensor") -> "Tensor":
+        """Return which probabilities raise the alarm, bool, in the shape of ``probability``."""
+        return probability > self.threshold
 
-    def reached(self, chances: "Tensor", labels: "Tensor", task: Task) -> Reached:
+    def reached(self, probabilities: "Tensor", labels: "Tensor", task: Task) -> Reached:
         """Return the alarms on gestures with probabilities (B, L) and labels (B, L)."""
-        chance, dangerous = dangerous_column(chances, labels, task)
-        alarm = self.alarm(chance)
+        probability, dangerous = dangerous_column(probabilities, labels, task)
+        alarm = self.alarm(probability)
         counts = dangerous.sum(), (alarm & dangerous).sum(), (~dangerous).sum(), (alarm & ~dangerous).sum()
         return Reached(*(int(count) for count in counts))
 
@@ -196,8 +194,8 @@ def parse_operating_point(text: str) -> OperatingPoint | None:
             int(stored["found"]),
         )
         usable = stored["label"] == LABEL and point.threshold > 0 and 0 < point.target < 1
-        counted = 0 <= point.raised <= point.safe and 0 <= point.found <= point.dangerous
-        if not usable or not counted or not math.isfinite(point.threshold):
+        usable &= 0 <= point.raised <= point.safe and 0 <= point.found <= point.dangerous
+        if not usable or not math.isfinite(point.threshold):
             raise ValueError(text)
     except (ValueError, TypeError, KeyError, OverflowError, RecursionError) as error:
         raise InputError(
@@ -207,8 +205,8 @@ def parse_operating_point(text: str) -> OperatingPoint | None:
     return point
 
 
-def dangerous_column(chances: "Tensor", labels: "Tensor", task: Task) -> "tuple[Tensor, Tensor]":
+def dangerous_column(probabilities: "Tensor", labels: "Tensor", task: Task) -> "tuple[Tensor, Tensor]":
     """Return probabilities (B',) and truth (B',), bool, of the gestures for which the label is defined."""
-    place = task.names.index(LABEL)
-    rows = task.counts(labels)[:, place]
-    return chances[rows, place], labels[rows, place] > 0.5
+    column = task.names.index(LABEL)
+    rows = task.counts(labels)[:, column]
+    return probabilities[rows, column], labels[rows, column] > 0.5

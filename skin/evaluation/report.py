@@ -26,8 +26,6 @@ from skin.evaluation.settings import Evaluation
 from skin.plot.figures import confusions, save_figure
 from skin.touch.labels import Task
 
-# Neither the default device (0) nor any layout of data/layouts is among them.
-_FIRST_DEVICE, _FIRST_LAYOUT = 1, 101
 PERCENTAGES = ("/accuracy", "/alarm_recall", "/false_alarm_rate")
 """Suffixes of the metrics that are shown in per cent."""
 _SHOWN = (*PERCENTAGES, "/degrees", "/r2", "/rms", "/rms_mm", "/rms_N")
@@ -62,13 +60,20 @@ class Report:
     outcomes: np.ndarray | None = None
     split: str = ""
 
+    @property
+    def notes(self) -> list[str]:
+        """How the alarm was raised, and why values are missing."""
+        point, reached = self.point, self.reached
+        alarm = [f"{point.sentence()}; {reached.sentence()}"] if point and reached else []
+        return [*alarm, *(f"{column}: {reason}" for column, reason in self.cannot.items())]
+
 
 def touch_sets(device: AbstractDevice, settings: Evaluation) -> dict[str, Iterator[Touches]]:
     """Return the sets of touches of each further column of a report, drawn lazily.
 
     Those of ``unseen_layout`` raise InputError where the sensors cannot form a grid.
     """
-    sets = {"holdout": _holdout(device)}
+    sets: dict[str, Iterator[Touches]] = {"holdout": (device.touches("holdout") for _ in range(1))}
     if (simulation := device.simulation) is not None:
         sets["device_shift"] = _devices(simulation, settings)
         sets["unseen_layout"] = _layouts(simulation, settings)
@@ -88,8 +93,9 @@ def evaluate(
     """
     task, metrics, cannot = device.task, dict[str, float](), dict[str, str]()
     same, drawn = _test(device)
-    chances = learner.probabilities(same)
-    metrics |= _add_prefix("same", compute_metrics(chances, same.known_labels, task, point))
+    probabilities = learner.probabilities(same)
+    computed = compute_metrics(probabilities, same.known_labels, task, point)
+    metrics |= {f"same/{name}": value for name, value in computed.items()}
     for column, sets in touch_sets(device, settings).items():
         try:
             pairs = [(learner.probabilities(touches), touches.known_labels) for touches in sets]
@@ -98,17 +104,20 @@ def evaluate(
             continue
         if pairs:
             predicted, true = (torch.cat(parts) for parts in zip(*pairs, strict=True))
-            metrics |= _add_prefix(column, compute_metrics(predicted, true, task, point))
+            computed = compute_metrics(predicted, true, task, point)
+            metrics |= {f"{column}/{name}": value for name, value in computed.items()}
     never = same.known_labels.isnan().all(dim=0)
     if unknown := [name for name, missing in zip(task.names, never, strict=True) if missing]:
         cannot["labels"] = f"the touches of the test tell nothing of {', '.join(unknown)}"
         hidden = [*unknown, *(["direction"] if task.direction and never[-1] else [])]
         metrics = {name: value for name, value in metrics.items() if name.split("/")[1] not in hidden}
     cannot |= {name: _UNDEFINED for name, value in metrics.items() if isnan(value) and name.endswith(_SHOWN)}
-    table = count_confusions(chances, same.known_labels, task) if task.kind == "binary" else None
-    reached = None if point is None or LABEL in unknown else point.reached(chances, same.known_labels, task)
-    outcomes = encode(chances, same.known_labels, task, point)
-    predictions = _predictions(chances, same, task, drawn)
+    table = count_confusions(probabilities, same.known_labels, task) if task.kind == "binary" else None
+    reached = (
+        None if point is None or LABEL in unknown else point.reached(probabilities, same.known_labels, task)
+    )
+    outcomes = encode(probabilities, same.known_labels, task, point)
+    predictions = _predictions(probabilities, same, task, drawn)
     return Report(metrics, cannot, table, predictions, point, reached, outcomes, device.split)
 
 
@@ -120,15 +129,11 @@ def _test(device: AbstractDevice) -> tuple[Touches, dict[str, Tensor]]:
     return recording.touches, recording.parameters
 
 
-def _holdout(device: AbstractDevice) -> Iterator[Touches]:
-    yield device.touches("holdout")
-
-
 def _devices(device: AbstractSimulated, settings: Evaluation) -> Iterator[Touches]:
     """Yield the share of the test touches that each of some other devices of the same kind measures."""
     for number in range(settings.devices):
-        sibling = device.replace(seed=_FIRST_DEVICE + number)
-        yield _share(sibling.touches("test"), number, settings.devices)
+        sibling = device.replace(seed=1 + number)  # the default device has 0
+        yield sibling.touches("test")[number :: settings.devices]
 
 
 def _layouts(device: AbstractSimulated, settings: Evaluation) -> Iterator[Touches]:
@@ -137,7 +142,7 @@ def _layouts(device: AbstractSimulated, settings: Evaluation) -> Iterator[Touche
     A gesture whose dangerous pressure no sensor of a layout would feel takes another path there.
     """
     for number, other in enumerate(scattered_devices(device, settings.layouts)):
-        yield _share(other.touches("test"), number, settings.layouts)
+        yield other.touches("test")[number :: settings.layouts]
 
 
 def scattered_devices(device: AbstractSimulated, count: int) -> Iterator[AbstractSimulated]:
@@ -154,7 +159,7 @@ def scattered_devices(device: AbstractSimulated, count: int) -> Iterator[Abstrac
         layout = Scattered(
             rows,
             sensors // rows,
-            seed=_FIRST_LAYOUT + number,
+            seed=101 + number,  # none of data/layouts
             footprint=device.sensors.footprint,
             depth=device.sensors.positions[:, 2],
             normals=device.sensors.normals,
@@ -162,21 +167,12 @@ def scattered_devices(device: AbstractSimulated, count: int) -> Iterator[Abstrac
         yield device.replace(layout=layout)
 
 
-def _share(touches: Touches, number: int, count: int) -> Touches:
-    """Return one of ``count`` shares of touches, which together are all of them."""
-    return touches[torch.arange(number, len(touches), count)]
-
-
-def _add_prefix(column: str, values: dict[str, float]) -> dict[str, float]:
-    return {f"{column}/{name}": value for name, value in values.items()}
-
-
-def _predictions(chances: Tensor, touches: Touches, task: Task, drawn: dict[str, Tensor]) -> pa.Table:
+def _predictions(probabilities: Tensor, touches: Touches, task: Task, drawn: dict[str, Tensor]) -> pa.Table:
     columns: dict[str, Any] = {}
-    for name, label, chance in zip(task.names, touches.known_labels.T, chances.T, strict=True):
+    for name, label, probability in zip(task.names, touches.known_labels.T, probabilities.T, strict=True):
         kind = pa.int8() if name in task.binary else pa.float32()
         truth = pa.array(label.numpy(), kind, mask=label.isnan().numpy(), safe=False)  # null where unknown
-        columns |= {name: truth, f"p_{name}": chance.numpy()}
+        columns |= {name: truth, f"p_{name}": probability.numpy()}
     columns |= {name: np.asarray(values) for name, values in drawn.items() if np.ndim(values) == 1}
     return pa.table(columns)
 
@@ -191,13 +187,8 @@ def print_report(report: Report, title: str, console: Console | None = None) -> 
     """
     console = console or Console()
     console.print(metrics_table(report.metrics, title))
-    if report.split:
-        console.print(f"split: {report.split}", markup=False, highlight=False, soft_wrap=True)
-    if report.point is not None and report.reached is not None:
-        sentence = f"{report.point.sentence()}; {report.reached.sentence()}"
-        console.print(sentence, markup=False, highlight=False, soft_wrap=True)
-    for column, reason in report.cannot.items():
-        console.print(f"{column}: {reason}", markup=False)
+    for note in [f"split: {report.split}"] * bool(report.split) + report.notes:
+        console.print(note, markup=False, highlight=False, soft_wrap=True)
 
 
 def metrics_table(metrics: Mapping[str, float], title: str) -> Table:
@@ -229,23 +220,21 @@ def format_number(value: float | None, unit: float = 100, digits: int = 1) -> st
     return "" if value is None else "-" if isnan(value) else f"{unit * value:.{digits}f}"
 
 
-def evaluation_markdown(report: Report, task: Task, title: str, about: str) -> str:
+def evaluation_markdown(report: Report, task: Task, title: str, description: str) -> str:
     """Return a page in Markdown: accuracies in per cent, and how often each label was taken for what.
 
     Args:
         report: what an evaluation found.
         task: the labels.
         title: of the page.
-        about: a sentence on where the touches came from.
+        description: a sentence on where the touches came from.
     """
     (_, *columns), *rows = metric_rows(report.metrics, "°")
-    lines = [f"# {title}", "", about, "", *([f"Split {report.split}.", ""] if report.split else [])]
+    lines = [f"# {title}", "", description, "", *([f"Split {report.split}.", ""] if report.split else [])]
     lines += ["" if task.kind == "regression" else "Per cent:", "", f"| | {' | '.join(columns)} |"]
     lines.append("|---" * (len(columns) + 1) + "|")
     lines += [f"| {' | '.join(row)} |" for row in rows]
-    if report.point is not None and report.reached is not None:
-        lines += ["", f"{report.point.sentence()}; {report.reached.sentence()}."]
-    lines += [f"\n{column}: {reason}" for column, reason in report.cannot.items()]
+    lines += [f"\n{note}" for note in report.notes]
     if report.confusion is not None:
         lines += [
             "",
@@ -257,20 +246,20 @@ def evaluation_markdown(report: Report, task: Task, title: str, about: str) -> s
     return "\n".join(lines) + "\n"
 
 
-def publish_evaluation(path: Path, report: Report, task: Task, title: str, about: str) -> list[Path]:
+def publish_evaluation(path: Path, report: Report, task: Task, title: str, description: str) -> list[Path]:
     """Write ``path`` (.md), and the confusion matrices beside it (.png), each whole."""
-    written = [write(evaluation_markdown(report, task, title, about), path)]
+    written = [write(evaluation_markdown(report, task, title, description), path)]
     if report.confusion is not None:
         named = dict(zip(task.binary, report.confusion.numpy(), strict=True))
         written.append(save_figure(confusions(named, ("no", "yes")), path.with_suffix(".png")))
     return written
 
 
-def write_chances(chances: Tensor, task: Task, point: OperatingPoint | None, path: Path) -> str:
+def write_chances(probabilities: Tensor, task: Task, point: OperatingPoint | None, path: Path) -> str:
     """Write the probability of each label, gesture by gesture, where nobody knows the truth.
 
     Args:
-        chances: (B, L); of a direction the mean cosines.
+        probabilities: (B, L); of a direction the mean cosines.
         task: the labels.
         point: where the alarm is raised; a gesture is said to be dangerous there, as ``live`` says it.
         path: x.csv.
@@ -278,18 +267,18 @@ def write_chances(chances: Tensor, task: Task, point: OperatingPoint | None, pat
     Returns:
         lines for a person.
     """
-    columns = {f"p_{name}": values.numpy() for name, values in zip(task.names, chances.T, strict=True)}
+    columns = {f"p_{name}": values.numpy() for name, values in zip(task.names, probabilities.T, strict=True)}
     with whole(path) as partial:
-        pa.csv.write_csv(pa.table({"gesture": np.arange(len(chances)), **columns}), partial)
+        pa.csv.write_csv(pa.table({"gesture": np.arange(len(probabilities)), **columns}), partial)
     levels = dict.fromkeys(task.binary, 0.5) | ({} if point is None else {LABEL: point.threshold})
     lines = [
         f"gesture {number}: "
         + ", ".join(
-            f"{'' if chance > levels[name] else 'not '}{name} ({chance:.2f})"
-            for name, chance in zip(task.binary, row, strict=False)
+            f"{'' if probability > levels[name] else 'not '}{name} ({probability:.2f})"
+            for name, probability in zip(task.binary, row, strict=False)
         )
         + (_slide(row, task) if task.direction else "")
-        for number, row in enumerate(chances.tolist())
+        for number, row in enumerate(probabilities.tolist())
     ]
     return "\n".join(lines)
 

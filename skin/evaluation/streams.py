@@ -1,6 +1,6 @@
 """Evaluation on sliding windows over a stream, which show a part of a touch, a whole touch, or none."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from statistics import fmean
@@ -16,10 +16,6 @@ from skin.evaluation.metrics import compute_metrics, count_confusions
 from skin.evaluation.operating_point import LABEL, OperatingPoint, Predictor
 from skin.evaluation.settings import StreamSettings
 from skin.touch.labels import TOUCH_OR_NOT, Task
-
-_CHUNK = 1024
-_EDGES = (0.2, 0.4, 0.6, 0.8)
-
 
 # Contact detection by a threshold (report, section 4.2).
 
@@ -84,12 +80,12 @@ class ContactThreshold:
 def gates(threshold: ContactThreshold, task: Task) -> dict[str, Gate]:
     """Return the gates by name: ``none`` lets all through; ``learned`` only where the task has a gate."""
     gates: dict[str, Gate] = {
-        "none": lambda touches, chances: torch.ones(len(touches), dtype=torch.bool),
-        "threshold": lambda touches, chances: threshold.touched(touches),
+        "none": lambda touches, probabilities: torch.ones(len(touches), dtype=torch.bool),
+        "threshold": lambda touches, probabilities: threshold.touched(touches),
     }
     if task.gate is not None:
         gate = task.names.index(task.gate)
-        gates["learned"] = lambda touches, chances: chances[:, gate] > 0.5
+        gates["learned"] = lambda touches, probabilities: probabilities[:, gate] > 0.5
     return gates
 
 
@@ -246,14 +242,16 @@ def evaluate_windows(
     device = device.simulated(f"streams are simulated, {type(device).__name__} has none")
     # One device records the whole stream, and its baseline is known as after a tare.
     streamed = device.replace(stream=True, randomise=False)
-    threshold = _tune_threshold(streamed)
+    known = streamed.touches("validation")
+    touched = known.known_labels[:, -1] > 0.5
+    threshold = ContactThreshold.tuned(rise(known, streamed.idle), touched, streamed.idle)
     all_gates = gates(threshold, device.task)
     recording = streamed.recording("test")
     touches, labels = recording.touches, recording.touches.known_labels
-    chances = learner.probabilities(touches)
-    answers = {name: gate(touches, chances) for name, gate in all_gates.items() if name != "none"}
+    probabilities = learner.probabilities(touches)
+    answers = {name: gate(touches, probabilities) for name, gate in all_gates.items() if name != "none"}
     return WindowReport(
-        bin_by_share(chances, labels, recording.parameters["share"], device.task),
+        bin_by_share(probabilities, labels, recording.parameters["share"], device.task),
         {name: count_confusions(gate[:, None].float(), labels[:, -1:])[0] for name, gate in answers.items()},
         threshold.least,
         _listen(learner, streamed, device.task, all_gates, settings, point, track),
@@ -264,26 +262,27 @@ def evaluate_windows(
     )
 
 
-def _tune_threshold(device: AbstractSimulated) -> ContactThreshold:
-    """Return the threshold that separates touched from idle windows, tuned on the validation split."""
-    touches, idle = device.touches("validation"), device.idle
-    return ContactThreshold.tuned(rise(touches, idle), touches.known_labels[:, -1] > 0.5, idle)
-
-
-def bin_by_share(chances: Tensor, labels: Tensor, share: Tensor, task: Task) -> list[Bin]:
+def bin_by_share(
+    probabilities: Tensor,
+    labels: Tensor,
+    share: Tensor,
+    task: Task,
+    edges: Sequence[float] = (0.2, 0.4, 0.6, 0.8),
+) -> list[Bin]:
     """Return accuracies by the share of the touch in the window, for windows that show a touch.
 
     Args:
-        chances: (W, L), probabilities of the labels of ``task``.
+        probabilities: (W, L), probabilities of the labels of ``task``.
         labels: (W, 5), of ``TOUCH_OR_NOT``.
         share: (W,), fraction of the touch in the window; 0 without touch.
         task: task of the learner.
+        edges: of the bins, fractions of the touch.
     """
     names = TOUCH_OR_NOT.gated
     truth = labels[:, : len(names)] > 0.5
-    right = (chances[:, [task.names.index(name) for name in names]] > 0.5) == truth
-    group = torch.bucketize(share, torch.tensor(_EDGES)).where(share < 1, len(_EDGES) + 1)
-    ends = [0.0, *_EDGES, 1.0]
+    right = (probabilities[:, [task.names.index(name) for name in names]] > 0.5) == truth
+    group = torch.bucketize(share, torch.tensor(edges)).where(share < 1, len(edges) + 1)
+    ends = [0.0, *edges, 1.0]
     titles = [*(f"{low:g}-{high:g}" for low, high in pairwise(ends)), "whole"]
     bins = []
     for number, title in enumerate(titles):
@@ -313,16 +312,16 @@ def _listen(
     stream = device.simulate_stream(frames, gap)
     starts = torch.arange(0, frames - device.window + 1, stride)
     dangerous = task.names.index(LABEL)
-    heard: dict[str, list[Tensor]] = {name: [] for name in all_gates}
-    for part in track(starts.split(_CHUNK)):
+    raised: dict[str, list[Tensor]] = {name: [] for name in all_gates}
+    for part in track(starts.split(1024)):
         touches = stream.cut(part, device.window).touches
-        chances = learner.probabilities(touches)
+        probabilities = learner.probabilities(touches)
         for name, gate in all_gates.items():
-            heard[name].append(point.alarm(chances[:, dangerous]) & gate(touches, chances))
+            raised[name].append(point.alarm(probabilities[:, dangerous]) & gate(touches, probabilities))
     gesture = stream.timeline.window_content(starts, device.window)[0]
     truth = stream.timeline.movie.labels[:, TOUCH_OR_NOT.names.index("dangerous")] > 0.5
     hours = stride / rate / 3600
-    return {name: count_alarms(torch.cat(parts), gesture, truth, hours) for name, parts in heard.items()}
+    return {name: count_alarms(torch.cat(parts), gesture, truth, hours) for name, parts in raised.items()}
 
 
 def _frames(seconds: float, rate: float, name: str) -> int:

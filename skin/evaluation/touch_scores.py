@@ -18,10 +18,6 @@ from skin.evaluation.operating_point import Predictor
 from skin.touch.labels import RELEASE
 from skin.touch.movie import Movie
 
-_TOUCHES = 50  # touches
-_WINDOWS = 500  # windows that are classified at once
-_AFTER = 1.0  # s that are simulated behind the window of a touch
-
 
 @torch.inference_mode()
 def touch_scores(
@@ -37,7 +33,7 @@ def touch_scores(
     Args:
         learner: trained.
         device: simulates and measures the touches; with ``randomise``, each with another device.
-        live: how they are watched.
+        live: conditions of the live view.
         labels: (B, 4), bool, of the touches.
         seed: of the touches and their devices.
         report: called with the number of touches that are done.
@@ -48,16 +44,16 @@ def touch_scores(
     """
     device = device.replace(padded=False, stream=False)
     scores = list[Tensor]()
-    for first in range(0, len(labels), _TOUCHES):
-        batch, draw = labels[first : first + _TOUCHES], generator(Stream.ALARM, seed, 2, first)
+    for first in range(0, len(labels), 50):
+        batch, draw = labels[first : first + 50], generator(Stream.ALARM, seed, 2, first)
         movie = device.sampler.sample(len(batch), draw, batch)
         readings, valid, contact = _decision_windows(device, movie, live, draw)
-        chances = torch.zeros(contact.shape)
-        chances[contact] = _classify_windows(
+        probabilities = torch.zeros(contact.shape)
+        probabilities[contact] = _classify_windows(
             learner, device, live, readings[contact], valid[contact.nonzero()[:, 0]]
         )
         row = live.decisions(_round_rate(device, live))
-        least = -max_pool1d(-pad(chances, (row - 1, 0)), row, 1) if row > 1 else chances
+        least = -max_pool1d(-pad(probabilities, (row - 1, 0)), row, 1) if row > 1 else probabilities
         scores.append(least.amax(dim=1))
         if report is not None:
             report(first + len(batch))
@@ -80,11 +76,11 @@ def _decision_windows(
     readings, valid = _measure_touches(device, movie, live, draw)
     rate, window = _round_rate(device, live), device.window
     ratio = round(rate / device.model_rate)
-    # Each place holds the maximum over the interval of the model that begins there.
+    # Each frame holds the maximum over the interval of the model that begins there.
     highest = max_pool1d(readings.transpose(1, 2), ratio, 1).transpose(1, 2)
     end = _draw_decisions(readings.shape, ratio * window, max(1.0, rate / DECISIONS), draw)
-    place = end[:, :, None] - ratio * torch.arange(window, 0, -1) + 1
-    windows = highest[torch.arange(len(end))[:, None, None], place]
+    frames = end[:, :, None] - ratio * torch.arange(window, 0, -1) + 1
+    windows = highest[torch.arange(len(end))[:, None, None], frames]
     risen = (windows >= live.contact) & valid[:, None, None]
     recent = max(1, ceil(RELEASE * device.model_rate - 1e-9))
     contact = risen[:, :, -recent:].flatten(2).any(dim=2)
@@ -102,7 +98,7 @@ def _measure_touches(
 ) -> tuple[Tensor, Tensor]:
     """Return what devices read of touches after a window of rest, (B, F, S), N, and their valid sensors."""
     force = device.model.respond(movie, displacement=False).readings
-    before, after = device.window, ceil(_AFTER * device.model_rate)
+    before, after = device.window, ceil(1.0 * device.model_rate)  # a second behind the window of a touch
     padded, rate = pad(force, (0, 0, before, after)), _round_rate(device, live)
     if rate > device.model_rate or not live.aligned:
         padded = between_frames(padded, device.model_rate, rate, draw.random(len(padded)))
@@ -128,9 +124,8 @@ def _classify_windows(
 ) -> Tensor:
     """Return the probability of ``dangerous`` of windows (W, T, S) with valid sensors (W, S), (W,)."""
     positions = torch.from_numpy(device.sensors.positions).float()
-    mask = valid[:, None].expand_as(readings)
     parts = [
         learner.probabilities(Touches(*part, positions, None, device.model_rate))[:, live.column]
-        for part in zip(readings.split(_WINDOWS), mask.split(_WINDOWS), strict=True)
+        for part in zip(readings.split(500), valid[:, None].expand_as(readings).split(500), strict=True)
     ]
     return torch.cat(parts).nan_to_num(1.0) if parts else torch.zeros(0)

@@ -409,11 +409,11 @@ def watch_run(
 
     from skin.record.serial import open_source
     from skin.runs.build import build_device
-    from skin.runs.run import FinishedRun
+    from skin.runs.run import find_run
     from skin.runs.torch_model import equation10_warning, load_model
 
     torch.set_num_threads(config.tracking.threads or 1)
-    run = FinishedRun.named(name, config)
+    run = find_run(config.tracking, name, config.trust)
     watched = run.configured(overrides)
     device = build_device(watched)
     # A port is opened first: that it is missing must not take as long to say as a run takes to load.

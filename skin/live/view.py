@@ -40,11 +40,11 @@ def emulated_skin(run: str, config: Config, overrides: Sequence[str]) -> Iterato
         InputError: there is no such run, or its skin cannot be emulated.
     """
     from skin.runs.build import build_device
-    from skin.runs.run import FinishedRun
+    from skin.runs.run import find_run
     from skin.wire.emulator import Emulator, EmulatorSettings, Faults, open_port
 
     quiet()
-    emulated = FinishedRun.named(run, config).configured(["device=simulated", *overrides])
+    emulated = find_run(config.tracking, run, config.trust).configured(["device=simulated", *overrides])
     device = build_device(emulated).simulated("a skin is emulated")
     port = open_port("tcp:0", None)
     emulator = Emulator(device, port, EmulatorSettings(), Faults())

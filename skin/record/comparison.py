@@ -186,10 +186,10 @@ def compare_predictions(
     Raises:
         InputError: there is no such run, or it cannot predict these touches.
     """
-    from skin.runs.run import FinishedRun
+    from skin.runs.run import find_run
     from skin.runs.torch_model import load_model
 
-    run = FinishedRun.named(name, config)
+    run = find_run(config.tracking, name, config.trust)
     if (learned := run.stored.simulator["_target_"]) != config.simulator["_target_"]:
         text = f"run {run.identity} was trained with {learned}"
         print(f"{text}: add simulator= to simulate the session with it\n")

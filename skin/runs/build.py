@@ -46,20 +46,19 @@ class SkinModel:
 
 def build_skin(config: Config) -> SkinModel:
     """Return the body, the sensors and the simulator."""
-    body, layout = _body_and_layout(config, "simulator")
+    body, layout = _build_body(vars(config), "simulator")
     return SkinModel(body, layout, layout.sensors(body), instantiate(config.simulator))
 
 
-def _body_and_layout(config: Config, source: str) -> tuple[AbstractBody, AbstractLayout]:
+def _build_body(groups: Mapping[str, Any], source: str) -> tuple[AbstractBody, AbstractLayout]:
     """Check body, layout and the group of what responds to touches; return the first two."""
-    _check_options(config, "body", "layout", source)
-    check_plausibility(vars(config))
-    return instantiate(config.body), instantiate(config.layout)
+    _check_options({name: groups[name] for name in ("body", "layout", source)})
+    check_plausibility(groups)
+    return instantiate(groups["body"]), instantiate(groups["layout"])
 
 
-def _check_options(config: Config, *names: str) -> None:
+def _check_options(groups: Mapping[str, Any]) -> None:
     """Raise InputError where a group names no option, or has settings that its option does not take."""
-    groups = {name: getattr(config, name) for name in names}
     for name, group in groups.items():
         if "_target_" not in group:
             raise InputError(f"{name} chooses no option: leave it out, or give one that --help lists")
@@ -68,7 +67,7 @@ def _check_options(config: Config, *names: str) -> None:
 
 def build_device(config: Config) -> AbstractDevice:
     """Return the device, with its body, layout and, if it has one, its simulator."""
-    body, layout = _body_and_layout(config, "device")
+    body, layout = _build_body(vars(config), "device")
     if config.task is not None and "task" not in config.device:
         raise InputError(f"task={config.task} needs device=recording device.path=FILE.parquet")
     # Not arguments of instantiate, which would treat the dataclass of the body as a configuration.
@@ -78,19 +77,35 @@ def build_device(config: Config) -> AbstractDevice:
     return device
 
 
-def build_frames(config: Config, device: AbstractDevice) -> TouchData:
-    """Return what makes the frames of touches in the configured representation: enough to predict."""
-    _check_options(config, "representation")
-    geometry = partial(_geometry, config) if device.configured else None
-    return TouchData(device, instantiate(config.representation), geometry=geometry)
+def build_frames(
+    representation: Mapping[str, Any], device: AbstractDevice, make_skin: Callable[[], SkinModel]
+) -> TouchData:
+    """Return what makes the frames of touches in a representation: enough to predict.
+
+    Args:
+        representation: its settings.
+        device: of the touches.
+        make_skin: returns the skin of the device, where a representation needs its geometry.
+    """
+    _check_options({"representation": representation})
+
+    def measure_geometry() -> "Tensor":
+        from skin.mechanics.geometry import sensor_geometry
+
+        skin = make_skin()
+        return sensor_geometry(skin.body, skin.sensors, skin.simulator(skin.body, skin.sensors))
+
+    geometry = measure_geometry if device.configured else None
+    return TouchData(device, instantiate(representation), geometry=geometry)
 
 
 def build_data(config: Config, device: AbstractDevice) -> TouchData:
     """Return the data of a device's touches in the configured representation."""
     assert config.data is not None
     augmentation = configured(Augmentation, config.data.augment, "data.augment")
-    made, batch_size = build_frames(config, device), config.data.batch_size
-    return TouchData(device, made.make, batch_size, config.seed, augmentation, made.make_geometry)
+    made = build_frames(config.representation, device, partial(build_skin, config))
+    size = config.data.batch_size
+    return TouchData(device, made.make, size, config.seed, augmentation, made.make_geometry)
 
 
 def training_data(settings: Mapping[str, Any] | None = None, /, **groups: Any) -> TouchData:
@@ -119,17 +134,9 @@ def training_data(settings: Mapping[str, Any] | None = None, /, **groups: Any) -
         raise to_input_error(error) or InputError(one_line(error)) from error
 
 
-def _geometry(config: Config) -> "Tensor":
-    """Return what the sensors of the configured skin respond to, (S, G)."""
-    from skin.mechanics.geometry import sensor_geometry
-
-    skin = build_skin(config)
-    return sensor_geometry(skin.body, skin.sensors, skin.simulator(skin.body, skin.sensors))
-
-
 def build_learner(config: Config) -> AbstractLearner:
     """Return an untrained learner."""
-    _check_options(config, "learner")
+    _check_options({"learner": config.learner})
     return instantiate(config.learner, seed=config.seed)
 
 
@@ -151,12 +158,11 @@ def with_skin(config: Config, body: AbstractBody | str | None, layout: AbstractL
         settings = default_option("body", body) if isinstance(body, str) else _body_settings(body)
         config = replace(config, body=settings)
     if isinstance(layout, str):
-        file = layout.lower().endswith(".csv")
-        settings = default_option("layout", "file" if file else layout)
-        config = replace(config, layout=settings | ({"path": layout} if file else {}))
-    elif layout is not None:
+        file = {"path": layout} if layout.lower().endswith(".csv") else {}
+        return replace(config, layout=default_option("layout", "file" if file else layout) | file)
+    if layout is not None:
         check_groups({"body": config.body})
-        config = replace(config, layout=_listed_settings(layout, instantiate(config.body)))
+        return replace(config, layout=_listed_settings(layout, instantiate(config.body)))
     return config
 
 

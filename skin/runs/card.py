@@ -22,13 +22,7 @@ from skin.runs.store import PROCESS
 
 _TEMPLATE = Path(__file__).with_name("card.md")
 _LARGEST = 4_000_000  # bytes of weights
-_CHECKED = 400  # test gestures whose predictions are kept
-_TOLERANCE = 2  # of them may be closer to a threshold than processors round
-# Machine and folders of the training.
-_PRIVATE = ("tracking", "trust")
-
 _FRACTIONS = (*PERCENTAGES, "/balanced_accuracy", "/ece")  # in per cent
-_DIRTY = {"true": ", with uncommitted changes", "false": ""}
 
 
 def check_folder(name: str | None, licence: str | None) -> Path:
@@ -77,7 +71,9 @@ def write_folder(run: FinishedRun, folder: Path, licence: str) -> None:
 
 def _write(run: FinishedRun, licence: str, folder: Path) -> None:
     """Write the files of a model to a folder that has its name."""
-    settings = {key: value for key, value in settings_of(run.stored).items() if key not in _PRIVATE}
+    # Without the machine and the folders of the training.
+    omitted = ("tracking", "trust")
+    settings = {key: value for key, value in settings_of(run.stored).items() if key not in omitted}
     tags, metrics = run.run.data.tags, run.run.data.metrics
     weights = run.fetch(tags["learned"], str(folder))
     size = weights.stat().st_size
@@ -104,19 +100,22 @@ def _write(run: FinishedRun, licence: str, folder: Path) -> None:
 
 
 def _reference(run: FinishedRun) -> dict[str, Any]:
-    """Return predictions on the first test gestures, of the evaluation after the training."""
+    """Return predictions on the first 400 test gestures, of the evaluation after the training."""
     with TemporaryDirectory() as folder:
-        table = pq.read_table(run.fetch("predictions.parquet", folder)).slice(0, _CHECKED)
-    labels = [name for name in table.column_names if f"same/{name}/accuracy" in run.run.data.metrics]
-    columns = [(name, name, 0.5) for name in labels]
+        table = pq.read_table(run.fetch("predictions.parquet", folder)).slice(0, 400)
+    columns = {
+        name: (name, 0.5) for name in table.column_names if f"same/{name}/accuracy" in run.run.data.metrics
+    }
     if (point := run.point) is not None:
-        columns.append(("alarm", LABEL, point.threshold))
-    predictions, correct = {}, {}
-    for name, label, threshold in columns:
-        predicted = table[f"p_{label}"].to_numpy() > threshold
-        predictions[name] = "".join("01"[int(yes)] for yes in predicted)
-        correct[name] = int((predicted == (table[label].to_numpy() > 0.5)).sum())
-    return {"touches": len(table), "tolerance": _TOLERANCE, "correct": correct, "predictions": predictions}
+        columns["alarm"] = LABEL, point.threshold
+    predicted = {name: table[f"p_{label}"].to_numpy() > level for name, (label, level) in columns.items()}
+    predictions = {name: "".join("01"[int(yes)] for yes in values) for name, values in predicted.items()}
+    correct = {
+        name: int((values == (table[columns[name][0]].to_numpy() > 0.5)).sum())
+        for name, values in predicted.items()
+    }
+    # Two may be closer to a threshold than processors round.
+    return {"touches": len(table), "tolerance": 2, "correct": correct, "predictions": predictions}
 
 
 def model_card(name: str, record: Mapping[str, Any], config: Mapping[str, Any]) -> str:
@@ -130,10 +129,6 @@ def model_card(name: str, record: Mapping[str, Any], config: Mapping[str, Any]) 
     tags, metrics, network = record["tags"], record["metrics"], "model" in config["learner"]
     measured = [metric for metric in metrics if metric.count("/") == 2]
     columns = list(dict.fromkeys(metric.split("/")[0] for metric in measured))
-    rows = [
-        [row, *(_cell(metrics.get(f"{column}/{row}"), row) for column in columns)]
-        for row in dict.fromkeys(metric.split("/", 1)[1] for metric in measured)
-    ]
     template = Environment(trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True).from_string(
         _TEMPLATE.read_text(encoding="utf-8")
     )
@@ -145,16 +140,11 @@ def model_card(name: str, record: Mapping[str, Any], config: Mapping[str, Any]) 
         network=["representation", "model", "fusion"] if network else [],
         trained=["optimizer", "trainer"] if network else [],
         point=parse_operating_point(tags["operating_point"]),
-        dirty=_DIRTY.get(tags["source_dirty"], ", changes unknown"),
-        day=f"{datetime.fromtimestamp(record['start_time'] / 1000, UTC):%Y-%m-%d}",
+        day=datetime.fromtimestamp(record["start_time"] / 1000, UTC),
         columns=columns,
-        rows=rows,
+        rows=dict.fromkeys(metric.split("/", 1)[1] for metric in measured),
+        cell=lambda value, row: format_number(value, 100 if row.endswith(_FRACTIONS) else 1),
     )
-
-
-def _cell(value: float | None, row: str) -> str:
-    """Return a metric, in per cent where it is a fraction."""
-    return format_number(value, 100 if row.endswith(_FRACTIONS) else 1)
 
 
 def _settings(group: Mapping[str, Any], *without: str) -> str:

@@ -11,6 +11,7 @@ import re
 import socket
 import subprocess
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from functools import cache
 from inspect import signature
@@ -30,7 +31,7 @@ from omegaconf.errors import OmegaConfBaseException
 from skin import __version__
 from skin.core.files import BUNDLED, CONF, MANIFEST, ROOT, candidates
 from skin.core.messages import one_line
-from skin.core.settings import check_settings, walk_settings
+from skin.core.settings import check_settings, import_target, option_name, walk_settings
 from skin.errors import InputError
 from skin.evaluation.settings import Evaluation
 
@@ -61,8 +62,8 @@ _FOLDERS = ("skin", "experiments", "conf", "data")  # results depend on nothing 
 
 def config_hash(content: dict[str, Any]) -> str:
     """Return the hash of a configuration in plain containers, 16 hexadecimal digits."""
-    texts = (value for _, value in walk_settings(content) if isinstance(value, str))
-    files = {text: _hash_of(text) for text in texts if _file(text)}
+    texts = {value for _, value in walk_settings(content) if isinstance(value, str)}
+    files = {text: hashlib.sha256(path.read_bytes()).hexdigest() for text in texts if (path := _file(text))}
     text = json.dumps([_counted(content), files, __version__], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
@@ -88,14 +89,6 @@ def _file(name: str) -> Path | None:
         return next((candidate for candidate in paths if candidate.is_file()), None)
     except OSError:
         return None
-
-
-def _hash_of(name: str) -> str:
-    path = _file(name)
-    if path is None:
-        return ""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 @cache
@@ -128,32 +121,23 @@ def _git(*arguments: str) -> str | None:
 
 
 def _processor() -> str:
-    """Return the name of the processor, with its family and model where the system tells them."""
-    try:
+    """Return the name of the processor, with its family and model where the system gives them."""
+    with suppress(OSError):
         text = Path("/proc/cpuinfo").read_text()
-    except OSError:
-        text = ""
-    facts = dict(re.findall(r"^(model name|cpu family|model)\s*:\s*(.+)$", text, re.MULTILINE))
-    if not facts:
-        return platform.processor() or platform.machine() or "unknown"
-    return ", ".join(
-        part for part in (
-            facts.get("model name"),
-            f"family {facts['cpu family']}" if "cpu family" in facts else None,
-            f"model {facts['model']}" if "model" in facts else None,
-        ) if part
-    )  # fmt: skip
+        lines = dict(re.findall(r"^(model name|cpu family|model)\s*:\s*(.+)$", text, re.MULTILINE))
+        prefixes = {"model name": "", "cpu family": "family ", "model": "model "}
+        if name := ", ".join(f"{prefix}{lines[key]}" for key, prefix in prefixes.items() if key in lines):
+            return name
+    return platform.processor() or platform.machine() or "unknown"
 
-
-_TOO_LARGE = 2**63
-_COUNTED = (("seconds",), ("gestures",), ("n",))  # settings of commands
-_PATIENCE = 5.0  # s until a server that accepts no connection counts as away
 
 # Of an address: what is before its password, which is not the port of a server, and what is after it.
 _PASSWORD = re.compile(r"""([a-z][\w+.-]*://[^/@:\s]*:)(?!\d+/|\*\*\*@)(\S*)(@[^\s'"]*)""")
 _PORTS = {"http": 80, "https": 443, "postgresql": 5432, "mysql": 3306, "mssql": 1433}
 # Settings without effect on results.
 _STEERING = ("shard", "tracking", "trust")
+NETWORK = ("representation", "model", "fusion", "optimizer", "trainer")
+"""Groups that a network consists of."""
 
 
 @dataclass
@@ -183,6 +167,8 @@ class Tracking:
 
     def __post_init__(self) -> None:
         self.uri = self.uri and hide_password(self.uri)
+        if self.threads is not None and self.threads < 1:
+            raise InputError(f"tracking.threads={self.threads} must be at least 1, or null")
 
 
 @dataclass(frozen=True)
@@ -246,34 +232,18 @@ def _variable(hidden: str) -> str:
 
 
 def answers(uri: str | None) -> bool:
-    """Return whether the server of a tracking URI accepts connections; True for a file."""
-    place = urlsplit(uri or "")
-    port = place.port or _PORTS.get(place.scheme.partition("+")[0])
-    if not place.hostname or port is None:
+    """Return whether the server of a tracking URI accepts connections within 5 s; True for a file."""
+    address = urlsplit(uri or "")
+    port = address.port or _PORTS.get(address.scheme.partition("+")[0])
+    with suppress(OSError):
+        if address.hostname and port is not None:
+            socket.create_connection((address.hostname, port), timeout=5.0).close()
         return True
-    try:
-        socket.create_connection((place.hostname, port), timeout=_PATIENCE).close()
-    except OSError:
-        return False
-    return True
+    return False
 
 
 def check_server(uri: str | None) -> None:
-    """Check that the server of a tracking URI answers, before anything heavy is imported.
-
-    Raises:
-        InputError: it does not, or it is a database whose driver is not installed.
-    """
-    if uri is not None and uri.startswith(("mssql", "mysql", "postgresql")):
-        from sqlalchemy import exc, make_url  # only where a database is named
-
-        try:
-            make_url(uri).get_dialect().import_dbapi()
-        except (ImportError, exc.SQLAlchemyError) as error:
-            raise InputError(
-                f"tracking.uri={uri} needs a driver that is not installed ({one_line(error)}): install it, "
-                'or give postgresql+pg8000://... after pip install "tactile-skin[server]"'
-            ) from error
+    """Raise InputError if the server of a tracking URI does not answer, before anything heavy is imported."""
     if not answers(uri):
         raise InputError(
             f"the tracking server {uri} does not answer: start it, open the tunnel to it, or correct "
@@ -323,10 +293,11 @@ def _check_numbers(settings: Any) -> None:
     """Raise InputError for numbers that no setting takes."""
     # NaN would pass most comparisons, and numbers of more than 64 bits overflow in arrays.
     for path, value in walk_settings(settings):
-        unfit = isinstance(value, int) and abs(value) >= _TOO_LARGE
+        unfit = "too large" if isinstance(value, int) and abs(value) >= 2**63 else ""
         if unfit or (isinstance(value, float) and isnan(value)):
-            raise InputError(f"{'.'.join(path)} is {'too large' if unfit else 'nan'}: give a number")
-        if path in _COUNTED and isinstance(value, int | float) and value < 0:
+            raise InputError(f"{'.'.join(path)} is {unfit or 'nan'}: give a number")
+        counted = path in (("seconds",), ("gestures",), ("n",))  # settings of commands
+        if counted and isinstance(value, int | float) and value < 0:
             raise InputError(f"{path[0]}={value:g} is below 0: give a number above 0")
 
 
@@ -364,10 +335,84 @@ def settings_of(config: Config) -> dict[str, Any]:
     return {key: value for key, value in asdict(config).items() if value not in (None, {})}
 
 
+def settings_hash(settings: Mapping[str, Any]) -> str:
+    """Return a hash of everything that results depend on: settings, files they name, version."""
+    return config_hash({key: value for key, value in settings.items() if key not in _STEERING})
+
+
 def fingerprint(config: Config) -> str:
-    """Return a hash of everything that results depend on: configuration, files it names, version."""
+    """Return a hash of everything that the results of a configuration depend on."""
     # Unset keys belong to other commands; a new command must not change the fingerprint of finished runs.
-    return config_hash({key: value for key, value in settings_of(config).items() if key not in _STEERING})
+    return settings_hash(settings_of(config))
+
+
+def tags(config: Config) -> dict[str, str]:
+    """Return the tags that identify a run."""
+    return {
+        "fingerprint": fingerprint(config),
+        "row": str(config.row),
+        "simulator": simulator(config.device),
+        "seed": str(config.seed),
+    }
+
+
+def simulator(device: Mapping[str, Any]) -> str:
+    """Return the name of the simulator of a device, in its settings; without one, of the device."""
+    name = "simulator" if "simulator" in device else "device"
+    return name_option(device["simulator"] if name == "simulator" else device, name)
+
+
+def name_option(part: Mapping[str, Any], name: str) -> str:
+    """Return the name of the option that a part of a configuration, called ``name``, builds."""
+    if "_target_" not in part:
+        raise InputError(f"{name} chooses no option: leave it out, or give one that --help lists")
+    return option_name(import_target(part["_target_"], name))
+
+
+def name_run(identity: Mapping[str, str], changes: Mapping[str, str]) -> str:
+    """Return the name of a run: its row, simulator, other changes and seed.
+
+    Args:
+        identity: as of :func:`tags`.
+        changes: as of :func:`relevant_overrides`.
+    """
+    # The first ones are in the name in any case; the others choose the machine.
+    omitted = ("experiment", "row", "seed", "simulator", *(f"trainer.{name}" for name in MACHINE))
+    words = [f"{key.split('.')[-1]}={value}" for key, value in changes.items() if key not in omitted]
+    name = " ".join(filter(None, (identity["row"], identity["simulator"], *words)))
+    return shorten(name, f" seed {identity['seed']}")
+
+
+def shorten(name: str, end: str = "") -> str:
+    """Return the name of a run with its end, in at most 80 characters; other names stay other ones.
+
+    The table of runs and the legends of charts show 80 characters.
+    """
+    other = f" {hashlib.sha256(name.encode()).hexdigest()[:8]}{end}"
+    return name + end if len(name + end) <= 80 else name[: 80 - len(other)] + other
+
+
+def relevant_overrides(learner: Mapping[str, Any]) -> dict[str, str]:
+    """Return the overrides of the running command that affect its result; empty without a command.
+
+    Args:
+        learner: settings of its learner.
+    """
+    if not HydraConfig.initialized():
+        return {}
+    unused = unused_groups(learner)
+    return {
+        override.key_or_group: override.get_value_element_as_str()
+        for override in OverridesParser.create().parse_overrides(overrides())
+        if not override.is_delete()
+        and not override.key_or_group.startswith(("hydra", "sweep", *_STEERING))
+        and override.key_or_group.split(".")[0] not in unused
+    }
+
+
+def unused_groups(learner: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return the groups that have no part in a run, because its learner holds no network."""
+    return () if any("model" in path for path, _ in walk_settings(learner)) else NETWORK
 
 
 def overrides() -> list[str]:
@@ -413,9 +458,9 @@ def recompose(stored: Config, overrides: Sequence[str]) -> Config:
     parsed = OverridesParser.create().parse_overrides(list(overrides))
     lines = {override.key_or_group: str(override.input_line) for override in parsed}
     groups = {key: key.split(".")[0].split("/")[0] for key in lines}
-    keys = [key for key, group in groups.items() if group in (*_FIXED, *_SKIN, "task", "evaluation")]
-    if fixed := next((key for key in keys if groups[key] in _FIXED), None):
-        raise InputError(f"{fixed} was fixed when the run was trained: leave it out, or train another run")
+    if fixed := [key for key, group in groups.items() if group in _FIXED]:
+        raise InputError(f"{fixed[0]} was fixed when the run was trained: leave it out, or train another run")
+    keys = [key for key, group in groups.items() if group in (*_SKIN, "task", "evaluation")]
     general = [lines[key] for key, group in groups.items() if group in ("hydra", "tracking")]
     fresh = compose("train", [*general, *(lines[key] for key in keys)])
     run = _restored(stored, _raw(fresh.device))
@@ -423,11 +468,15 @@ def recompose(stored: Config, overrides: Sequence[str]) -> Config:
     whole = _compose_options(run, options)
     for group in _SKIN:
         changed = (whole.get(group) or {}) != (run.get(group) or {})
-        if group in fresh and (group in keys or (changed and _class(fresh[group]) != _class(run[group]))):
+        other = changed and (fresh.get(group) or {}).get("_target_") != (run[group] or {}).get("_target_")
+        if group in fresh and (group in keys or other):
             whole[group] = _raw(fresh)[group]
     for key in keys:
         if key not in _SKIN:
-            _take(whole, fresh, key)
+            # Unresolved, so that a device refers to the simulator of this run.
+            parent, _, name = key.rpartition(".")
+            source = OmegaConf.select(fresh, parent) if parent else fresh
+            OmegaConf.update(whole, key, _raw(source)[name], merge=False)
     whole.tracking = fresh.tracking
     for path, value in iterate_leaves({group: _raw(whole)[group] for group in _FIXED if group in whole}):
         if OmegaConf.select(run, ".".join(path)) != value:
@@ -466,18 +515,6 @@ def _compose_options(run: DictConfig, options: Sequence[str]) -> DictConfig:
         {"defaults": defaults} | {key: value for key, value in settings.items() if key not in skin},
     )
     return OmegaConf.create(_raw(run) | _raw(compose("stored_run", list(options))))
-
-
-def _take(whole: DictConfig, fresh: DictConfig, key: str) -> None:
-    """Take a setting, unresolved, so that a device refers to the simulator of this run."""
-    parent, _, name = key.rpartition(".")
-    source = OmegaConf.select(fresh, parent) if parent else fresh
-    OmegaConf.update(whole, key, _raw(source)[name], merge=False)
-
-
-def _class(group: Any) -> Any:
-    """Return the name of the class that a group builds."""
-    return group.get("_target_") if group else None
 
 
 def iterate_leaves(

@@ -2,8 +2,7 @@
 
 import json
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,12 +18,10 @@ from skin.device.base import AbstractDevice, in_threads
 from skin.device.files import DataSet, Manifest, describe_recording, write_recording
 from skin.device.touches import Part
 from skin.errors import InputError
-from skin.runs.configuration import Config, fingerprint, iterate_leaves, settings_of, source_tags
-
-_BYTES = 40.0  # of memory for each reading of a file: with displacements, and a table of everything
+from skin.runs.configuration import iterate_leaves, settings_hash, source_tags
 
 
-def generate_data_set(device: AbstractDevice, config: Config, folder: Path) -> str:
+def generate_data_set(device: AbstractDevice, settings: Mapping[str, Any], folder: Path) -> str:
     """Write the touches of a device as a data set, and return a summary of it.
 
     Shards are drawn on as many threads as torch has. Each appears whole, and those that are in the folder
@@ -32,7 +29,7 @@ def generate_data_set(device: AbstractDevice, config: Config, folder: Path) -> s
 
     Args:
         device: draws or reads the touches; simulated ones have no displacements.
-        config: its configuration.
+        settings: its configuration, in plain containers.
         folder: new, empty, or with a part of the same data set.
 
     Raises:
@@ -42,15 +39,20 @@ def generate_data_set(device: AbstractDevice, config: Config, folder: Path) -> s
     if not parts:
         whole = device.recording()
         parts = [Part(len(whole), lambda: whole)]
-    source = {"config_hash": fingerprint(config), "config": json.loads(json.dumps(settings_of(config)))}
+    source = {"config_hash": settings_hash(settings), "config": json.loads(json.dumps(settings))}
     if not (folder / MANIFEST).is_file():
         _begin(device, parts, source, folder)
     manifest = Manifest.read(folder)
     _compare(manifest, source, folder)
-    with _lock_folder(folder):
-        for left in folder.glob("shards/.*"):  # of a process that was killed
-            left.unlink()
-        _write_missing(parts, manifest, folder)
+    try:
+        with FileLock(folder / ".lock", timeout=0):
+            for left in folder.glob("shards/.*"):  # of a process that was killed
+                left.unlink()
+            _write_missing(parts, manifest, folder)
+    except Timeout as error:
+        raise InputError(
+            f"another process generates {folder}: wait for it, or add out= with a new folder"
+        ) from error
     data_set = DataSet(folder)
     size = sum(data_set.path(number).stat().st_size for number in range(len(data_set.counts)))
     return f"{manifest.gestures} gestures in {len(data_set.counts)} shards, {size / 1e6:.0f} MB"
@@ -62,16 +64,10 @@ def _begin(device: AbstractDevice, parts: list[Part], source: dict[str, Any], fo
         raise InputError(f"{folder} exists and has no {MANIFEST}: add out= with a new or an empty folder")
     drawn = [parts[0].make()]
     report_balance(device, drawn[0])
-    tags = source_tags()
-    manifest = Manifest.of(
-        describe_recording(drawn[0]),
-        [part.count for part in parts],
-        seed=source["config"].get("seed"),
-        source_commit=tags["source_commit"],
-        source_dirty=tags["source_dirty"],
-        **source,
-    )
-    manifest.write(folder)
+    code = {name: tag for name, tag in source_tags().items() if name.startswith("source_")}
+    counts = [part.count for part in parts]
+    seed = source["config"].get("seed")
+    Manifest.of(describe_recording(drawn[0]), counts, seed=seed, **code, **source).write(folder)
     parts[0] = Part(parts[0].count, drawn.pop)  # its memory is free once it is written
 
 
@@ -79,16 +75,12 @@ def _compare(manifest: Manifest, source: dict[str, Any], folder: Path) -> None:
     """Check that a data set was begun with the same settings by the same code."""
     commit = source_tags()["source_commit"]
     if manifest.config_hash != source["config_hash"]:
-        before, now = (
-            {".".join(path): value for path, value in iterate_leaves(settings)}
-            for settings in (manifest.config, source["config"])
-        )
-        changed = [name for name in before | now if before.get(name, ...) != now.get(name, ...)]
-        changed.sort(key=lambda name: name.count("."))  # settings before what is derived from them
-        differences = [f"{name}={before.get(name)}, not {now.get(name)}" for name in changed[:3]]
-        what = (
-            "; ".join(differences) or "other contents of the files that its settings name, or another version"
-        )
+        before, now = (dict(iterate_leaves(part)) for part in (manifest.config, source["config"]))
+        changed = [path for path in before | now if before.get(path, ...) != now.get(path, ...)]
+        changed.sort(key=len)  # settings before what is derived from them
+        differences = [f"{'.'.join(path)}={before.get(path)}, not {now.get(path)}" for path in changed[:3]]
+        other = "other contents of the files that its settings name, or another version"
+        what = "; ".join(differences) or other
         raise InputError(f"{folder} was begun with {what}: repeat those settings, or add out= with a new one")
     if manifest.source_commit != commit:
         raise InputError(
@@ -97,27 +89,14 @@ def _compare(manifest: Manifest, source: dict[str, Any], folder: Path) -> None:
         )
 
 
-@contextmanager
-def _lock_folder(folder: Path) -> Iterator[None]:
-    """Keep other processes from generating the same folder."""
-    try:
-        with FileLock(folder / ".lock", timeout=0):
-            yield
-    except Timeout as error:
-        raise InputError(
-            f"another process generates {folder}: wait for it, or add out= with a new folder"
-        ) from error
-
-
-def _write_missing(parts: list[Part], manifest: Manifest, folder: Path) -> None:
+def _write_missing(parts: Sequence[Part], manifest: Manifest, folder: Path) -> None:
     """Draw and write the shards that a folder lacks."""
     missing, firsts = manifest.missing(folder), manifest.firsts
-    there = manifest.gestures - sum(parts[n].count for n in missing)
-    if there:
-        print(f"{there} of {manifest.gestures} gestures are there already", file=sys.stderr)
+    if present := manifest.gestures - sum(parts[n].count for n in missing):
+        print(f"{present} of {manifest.gestures} gestures are there already", file=sys.stderr)
     console = Console(stderr=True)
     with Progress(console=console, disable=not console.is_terminal) as progress:
-        task = progress.add_task("gestures", total=manifest.gestures, completed=there)
+        task = progress.add_task("gestures", total=manifest.gestures, completed=present)
 
         def write(turn: int) -> None:
             number = missing[turn]
@@ -129,25 +108,24 @@ def _write_missing(parts: list[Part], manifest: Manifest, folder: Path) -> None:
         in_threads(write, len(missing))
 
 
-def generate_file(device: AbstractDevice, config: Config, path: Path) -> str:
+def generate_file(device: AbstractDevice, settings: Mapping[str, Any], path: Path) -> str:
     """Write the touches of a device as one recording, and return a summary of them.
 
     Args:
-        device, config: as of :func:`generate_data_set`.
+        device, settings: as of :func:`generate_data_set`.
         path: ``x.parquet`` or ``x.csv``.
 
     Raises:
         InputError: the touches do not fit into memory, or the file cannot be written.
     """
     if (simulation := device.simulation) is not None:
-        count = config.data.gestures if config.data else 0
-        readings = float(count * simulation.window * len(simulation.sensors))
-        require_memory(
-            _BYTES * readings, f"n={count} in one file", "add out=FOLDER for a data set, which needs less"
-        )
+        count = settings["data"]["gestures"] if "data" in settings else 0
+        # 40 bytes for each reading: with displacements, and a table of everything.
+        needed = 40.0 * count * simulation.window * len(simulation.sensors)
+        require_memory(needed, f"n={count} in one file", "add out=FOLDER for a data set, which needs less")
     recording = device.recording()
     report_balance(device, recording)
-    about = recording.metadata | {"config_hash": fingerprint(config), "config": settings_of(config)}
-    write_recording(replace(recording, metadata=about), path)
+    metadata = recording.metadata | {"config_hash": settings_hash(settings), "config": settings}
+    write_recording(replace(recording, metadata=metadata), path)
     # The metadata of a file may have any content.
     return f"{len(recording)} gestures" if simulation is None else summary_line(recording.metadata["summary"])

@@ -5,7 +5,7 @@ torch is not imported: :class:`skin.runs.torch_model.TorchModel` is the form tha
 
 import json
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from threading import Thread
@@ -18,7 +18,6 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.utils import instantiate
 from numpy.typing import ArrayLike
 
-from skin.body.base import Sensors
 from skin.core.files import json_line
 from skin.core.safe_loading import KEY as CHECKSUM
 from skin.core.safe_loading import ChecksumError, check_content, limited_memory, read_file
@@ -27,12 +26,11 @@ from skin.errors import InputError
 from skin.evaluation.alarm import AlarmSource
 from skin.evaluation.decisions import LiveConditions
 from skin.evaluation.operating_point import LABEL
-from skin.runs.configuration import Config, recompose, settings_of, validate_config
+from skin.runs.configuration import recompose, settings_of, validate_config
 from skin.touch.labels import Task
 
 if TYPE_CHECKING:
     from onnx import ModelProto
-    from onnxruntime import InferenceSession
 
 
 class Model(ABC):
@@ -220,25 +218,19 @@ class ModelMetadata:
         return metadata
 
 
-_NAMES = """
-Abs Acos Acosh Add And ArgMax ArgMin Asin Asinh Atan Atanh AveragePool BatchNormalization Cast
-CastLike Ceil Celu Clip Concat Constant ConstantOfShape Conv ConvTranspose Cos Cosh CumSum
-DepthToSpace Div Dropout Einsum Elu Equal Erf Exp Expand EyeLike Flatten Floor GRU Gather
-GatherElements GatherND Gelu Gemm GlobalAveragePool GlobalMaxPool Greater GreaterOrEqual GridSample
-GroupNormalization HardSigmoid HardSwish Identity InstanceNormalization IsInf IsNaN LSTM
-LayerNormalization LeakyRelu Less LessOrEqual Log LogSoftmax MatMul Max MaxPool Mean Min Mish Mod
-Mul Neg Not Or PRelu Pad Pow RNN Range Reciprocal ReduceL1 ReduceL2 ReduceLogSum ReduceLogSumExp
-ReduceMax ReduceMean ReduceMin ReduceProd ReduceSum ReduceSumSquare Relu Reshape Resize Round
-ScatterElements ScatterND Selu Shape Sigmoid Sign Sin Sinh Size Slice Softmax Softplus Softsign
-SpaceToDepth Split Sqrt Squeeze Sub Sum Tan Tanh ThresholdedRelu Tile TopK Transpose Trilu Unsqueeze
-Where Xor
+# What the networks and layers of torch are written with. Each operator computes tensors from tensors, without
+# loops, branches or random numbers. The others are listed with their inputs that determine the size of their
+# output. A size may not depend on readings, so that a window of zeros is as costly as any other.
+_PLAIN = """
+Abs Add And ArgMax Asinh Atan AveragePool BatchNormalization Cast CastLike Ceil Clip Concat Conv Cos
+CumSum Div Dropout Einsum Elu Equal Erf Exp EyeLike Flatten Floor GRU Gather GatherElements GatherND
+Gelu Gemm GlobalAveragePool GlobalMaxPool Greater GreaterOrEqual GridSample GroupNormalization
+HardSigmoid HardSwish Identity InstanceNormalization IsInf IsNaN LSTM LayerNormalization LeakyRelu
+Less LessOrEqual Log LogSoftmax MatMul Max MaxPool Min Mod Mul Neg Not Or PRelu Pow Reciprocal
+ReduceL2 ReduceMax ReduceMean ReduceMin ReduceProd ReduceSum Relu ScatterElements ScatterND Selu
+Shape Sigmoid Sign Sin Size Softmax Softplus Sqrt Sub Sum Tanh Transpose Trilu Where
 """
-OPERATORS = frozenset(_NAMES.split())
-"""Operators that a file may use: each computes tensors from tensors, without loops, branches or chance."""
-
-# Operator -> its inputs that determine the size of its output. They may not depend on readings, so that a
-# window of zeros needs as much time and memory as any other.
-_SIZES = {
+OPERATORS: dict[str, tuple[int, ...]] = dict.fromkeys(_PLAIN.split(), ()) | {
     "ConstantOfShape": (0,),
     "Expand": (1,),
     "Pad": (1, 3),
@@ -254,104 +246,86 @@ _SIZES = {
 }
 _BYTES = 1 << 28  # of a file: ten times the largest network of this package
 _NODES = 20_000  # ten times an ensemble of the largest ones
-_FLOAT, _BOOL, _EXTERNAL = 1, 9, 1  # TensorProto.DataType, TensorProto.DataLocation
+
+
+def _libraries() -> tuple[ModuleType, ModuleType]:
+    """Return onnx and onnxruntime."""
+    try:
+        import onnx
+        import onnxruntime
+    except ModuleNotFoundError as error:
+        raise InputError(
+            "an ONNX model needs onnx and onnxruntime: pip install onnx onnxruntime, or "
+            "'tactile-skin[export]'"
+        ) from error
+    return onnx, onnxruntime
 
 
 def inspect(path: Path) -> tuple[bytes, ModelMetadata]:
     """Return the content of an ONNX file and the description of its network.
 
     Raises:
-        InputError: the file is none of ``skin export``, is damaged, or could do something else than to
-            compute probabilities of readings.
+        InputError: the file was not written by ``skin export``, is damaged, or could do
+            something else than to compute probabilities of readings.
     """
-    try:
-        from google.protobuf.message import DecodeError
-        from onnx import ModelProto
-    except ModuleNotFoundError as error:
-        raise InputError(
-            "an ONNX model needs onnx and onnxruntime: pip install onnx onnxruntime, or "
-            "'tactile-skin[export]'"
-        ) from error
-    if not path.exists():
-        raise InputError(f"there is no file {path}: skin export run=latest out={path} writes one")
+    onnx, _ = _libraries()
+    from google.protobuf.message import DecodeError  # onnx needs it
+
     try:
         content = read_file(path, _BYTES)
+        model = onnx.ModelProto.FromString(content)
+    except FileNotFoundError as error:
+        raise InputError(f"there is no file {path}: skin export run=latest out={path} writes one") from error
+    except DecodeError as error:
+        raise InputError(f"ONNX Runtime cannot load {path}: export it again") from error
     except (OSError, ValueError) as error:
         raise InputError(f"cannot read the model {path}: {error}") from error
-    try:
-        model = ModelProto.FromString(content)
-    except DecodeError as error:
-        raise InputError(f"{path} is no model that ONNX Runtime can load: export it again") from error
     entries = {entry.key: entry.value for entry in model.metadata_props}
     metadata = ModelMetadata.parse(entries, str(path))
-    _check_interface(model, metadata, path)
+    shape, types = [metadata.window, len(metadata.positions)], onnx.TensorProto
+    tensors = {value.name: value.type.tensor_type for value in model.graph.input}
+    inputs = {
+        name: (tensor.elem_type, [axis.dim_value for axis in tensor.shape.dim][1:])
+        for name, tensor in tensors.items()
+    }
+    wanted = {"readings": (types.FLOAT, shape), "valid": (types.BOOL, shape)}
+    if inputs != wanted or [value.name for value in model.graph.output] != ["probabilities"]:
+        raise InputError(
+            f"{path} has inputs {inputs}, not readings (float) and valid (bool) of {shape}, or other outputs "
+            "than probabilities: export it again"
+        )
     try:
         check_content(content)
         _check(model, entries)
     except ValueError as error:
-        wrong = "" if isinstance(error, ChecksumError) else "is no file of skin export: "
+        wrong = "" if isinstance(error, ChecksumError) else "not a file of skin export, because "
         raise InputError(f"{path}: {wrong}{error}: export it again") from error
     return content, metadata
 
 
-def _check_interface(model: "ModelProto", metadata: ModelMetadata, path: Path) -> None:
-    """Raise InputError unless inputs and outputs are those of ``docs/export.md``."""
-    shape, types = [metadata.window, len(metadata.positions)], {"readings": _FLOAT, "valid": _BOOL}
-    tensors = {value.name: value.type.tensor_type for value in model.graph.input}
-    inputs = {name: [axis.dim_value for axis in tensor.shape.dim][1:] for name, tensor in tensors.items()}
-    outputs = [value.name for value in model.graph.output]
-    if inputs != dict.fromkeys(types, shape) or outputs != ["probabilities"]:
-        raise InputError(
-            f"{path} has inputs {inputs}, not readings and valid of {shape}, or other outputs than "
-            "probabilities: export it again"
-        )
-    if types != {name: tensor.elem_type for name, tensor in tensors.items()}:
-        raise InputError(f"{path} has inputs of other types than float and bool: export it again")
-
-
 def _check(model: "ModelProto", entries: dict[str, str]) -> None:
     """Raise a ValueError where a file has what no network needs."""
-    graph = model.graph
+    graph, nodes = model.graph, model.graph.node
     if unknown := sorted(set(entries) - {KEY, CHECKSUM}):
         raise ValueError(f"it has the unknown entry {unknown[0]!r}")
-    if len(graph.node) > _NODES:
-        raise ValueError(f"it has {len(graph.node)} operators")
-    if model.functions or graph.sparse_initializer or model.training_info:
-        raise ValueError("it has functions, sparse tensors or a training")
+    if len(nodes) > _NODES or model.functions or graph.sparse_initializer or model.training_info:
+        raise ValueError(f"it has more than {_NODES} operators, functions, sparse tensors or a training")
+    attributes = [attribute for node in nodes for attribute in node.attribute]
+    tensors = [tensor for attribute in attributes for tensor in (attribute.t, *attribute.tensors)]
     # Whose content would be another file, perhaps a device.
-    if any(tensor.data_location == _EXTERNAL or tensor.external_data for tensor in _tensors(model)):
+    if any(tensor.data_location or tensor.external_data for tensor in (*graph.initializer, *tensors)):
         raise ValueError("it refers to other files")
     dependent = {value.name for value in graph.input}
-    for node in graph.node:
+    for node in nodes:
         if node.domain not in ("", "ai.onnx") or node.op_type not in OPERATORS:
             raise ValueError(f"it uses the operator {node.domain} {node.op_type}".replace("  ", " "))
         if any(attribute.HasField("g") or attribute.graphs for attribute in node.attribute):
             raise ValueError(f"{node.op_type} has a graph inside")
-        _follow(node, dependent)
-
-
-def _tensors(model: "ModelProto") -> Iterator:
-    yield from model.graph.initializer
-    for node in model.graph.node:
-        for attribute in node.attribute:
-            yield from (attribute.t, *attribute.tensors)
-
-
-def _follow(node, dependent: set[str]) -> None:  # type: ignore[no-untyped-def]
-    """Add the outputs of an operator to the names of tensors that depend on readings, if they do.
-
-    Raises:
-        ValueError: the size of its output depends on readings.
-    """
-    sizes = {node.input[place] for place in _SIZES.get(node.op_type, ()) if place < len(node.input)}
-    if sizes & dependent:
-        raise ValueError(f"the size of what {node.op_type} returns depends on readings")
-    if node.op_type not in ("Shape", "Size") and dependent & set(node.input):
-        dependent.update(node.output)
-
-
-_SECONDS = 20.0  # s to load a file and to classify a window, which takes some ms
-_MEMORY = 1 << 30  # bytes that it may take
+        if dependent.intersection(node.input[at] for at in OPERATORS[node.op_type] if at < len(node.input)):
+            raise ValueError(f"the size of what {node.op_type} returns depends on readings")
+        # The shape of a tensor is known without its values.
+        if node.op_type not in ("Shape", "Size") and dependent.intersection(node.input):
+            dependent.update(node.output)
 
 
 class OnnxModel(Model):
@@ -379,7 +353,7 @@ class OnnxModel(Model):
         self.presses = None if metadata.presses is None else np.array(metadata.presses)
         thresholds = metadata.thresholds or {}
         self.alarm = AlarmSource(str(self.path), threshold=self.threshold, thresholds=thresholds)
-        self._try(content, self.path)
+        self._try(content)
 
     def probabilities(self, readings: np.ndarray, valid: np.ndarray) -> np.ndarray:
         """Return the probability of each label, (B, L), float32.
@@ -390,52 +364,37 @@ class OnnxModel(Model):
         """
         return self._session.run(["probabilities"], {"readings": readings, "valid": valid})[0]  # type: ignore[return-value]
 
-    def _try(self, content: bytes, path: Path) -> None:
+    def _try(self, content: bytes) -> None:
         """Load a file and classify a window of zeros, as costly as any other, in bounded time and memory."""
-        _runtime()  # imported before memory is limited
-        shape = 1, self.metadata.window, len(self.metadata.positions)
+        _, runtime = _libraries()  # imported before memory is limited
+        options = runtime.SessionOptions()
+        # One thread: a window alone is too small to be shared among threads.
+        options.intra_op_num_threads = options.inter_op_num_threads = 1
+        options.log_severity_level = 4  # its errors are reported by the caller
+        shape = 1, self.window, len(self.positions)
         results: list[np.ndarray | BaseException] = []
 
         def classify() -> None:
             try:
-                self._session = _open(content)
+                self._session = runtime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
                 results.append(self.probabilities(np.zeros(shape, np.float32), np.ones(shape, bool)))
             except BaseException as error:  # those of ONNX Runtime share no other base
                 results.append(error)
 
         thread = Thread(target=classify, name="skin-trial", daemon=True)
-        with limited_memory(_MEMORY):
+        with limited_memory(1 << 30):  # bytes; a window takes some MB, and some ms
             thread.start()
-            thread.join(_SECONDS)
+            thread.join(20.0)
         if not results:
-            raise InputError(f"{path} needs more than {_SECONDS:g} s for a window: export it again")
+            raise InputError(f"{self.path} needs more than 20 s for a window: export it again")
         (result,) = results
-        if isinstance(result, InputError):
-            raise result
         if isinstance(result, BaseException):
-            raise InputError(f"{path} is no model that ONNX Runtime can load: export it again") from result
-        labels = len(self.metadata.labels)
-        if result.shape != (1, labels) or result.dtype != np.float32 or not np.isfinite(result).all():
-            raise InputError(f"{path} does not give probabilities of its {labels} labels: export it again")
-
-
-def _runtime() -> ModuleType:
-    try:
-        import onnxruntime
-    except ModuleNotFoundError as error:
-        raise InputError(
-            "an ONNX model needs ONNX Runtime: pip install onnxruntime, or 'tactile-skin[export]'"
-        ) from error
-    return onnxruntime
-
-
-def _open(content: bytes) -> "InferenceSession":
-    """Return a session on one thread: a window alone is too small to be shared among threads."""
-    runtime = _runtime()
-    options = runtime.SessionOptions()
-    options.intra_op_num_threads = options.inter_op_num_threads = 1
-    options.log_severity_level = 4  # its errors are reported by the caller
-    return runtime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
+            raise InputError(f"ONNX Runtime cannot load {self.path}: export it again") from result
+        wanted = result.shape == (1, len(self.labels)) and result.dtype == np.float32
+        if not wanted or not np.isfinite(result).all():
+            raise InputError(
+                f"{self.path} does not give probabilities of its {len(self.labels)} labels: export it again"
+            )
 
 
 GROUPS = ("body", "layout", "simulator", "touch", "evaluation")
@@ -443,22 +402,25 @@ GROUPS = ("body", "layout", "simulator", "touch", "evaluation")
 
 # What an exported network leaves to the command line.
 _FREE = ("device", "live", "web", "seconds", "run", "trust", "tracking", "hydra")
-_CLOSE = 1e-6  # m; positions in the file are single precision
 
 
-def describe_skin(config: Config, positions: np.ndarray) -> dict[str, Any] | None:
+def describe_skin(settings: Mapping[str, Any], positions: np.ndarray) -> dict[str, Any] | None:
     """Return the settings of the skin of a network, for its file.
 
     Args:
-        config: of the run, with the skin that it is exported for.
+        settings: configuration of the run with the skin that it is exported for, in plain containers.
         positions: of its sensors, (S, 3), m.
 
     Returns:
-        The groups :data:`GROUPS`, plain; None if the sensors are not those of the configuration, such as
-        those of a recording.
+        The groups :data:`GROUPS`; None if the sensors are not those of the configuration, such as those of a
+        recording.
     """
-    described = {name: value for name, value in settings_of(config).items() if name in GROUPS}
-    return described if _at(_sensors(config), positions) else None
+    check_groups({name: settings.get(name, {}) for name in ("body", "layout")})
+    described = instantiate(settings["layout"]).sensors(instantiate(settings["body"])).positions
+    # 1e-6 m: positions in the file are single precision.
+    if described.shape != positions.shape or not np.allclose(described, positions, rtol=0, atol=1e-6):
+        return None
+    return {name: value for name, value in settings.items() if name in GROUPS}
 
 
 def check_overrides(path: str, overrides: Sequence[str]) -> None:
@@ -469,29 +431,17 @@ def check_overrides(path: str, overrides: Sequence[str]) -> None:
         overrides: of the command line.
 
     Raises:
-        InputError: an override contradicts the file or has no effect on an exported network, or the file
-            cannot be used.
+        InputError: an override contradicts the file or has no effect on an exported network, or the file does
+            not describe its skin or cannot be used.
     """
     parsed = OverridesParser.create().parse_overrides(list(overrides))
-    groups = [override.key_or_group.split(".")[0].split("/")[0] for override in parsed]
-    restricted = [word for word, group in zip(overrides, groups, strict=True) if group not in _FREE]
-    for word, group in zip(overrides, groups, strict=True):
-        if word in restricted and group not in GROUPS:
-            raise InputError(f"{word} has no effect on {path}, a network for one skin: leave it out")
-    words = " ".join(restricted)
-    if words and not _agrees(OnnxModel(path).metadata, overrides, words, path):
-        raise InputError(
-            f"{words} contradicts {path}, which was exported for another skin: leave it out, or export the "
-            "run again with it"
-        )
-
-
-def _agrees(metadata: ModelMetadata, overrides: Sequence[str], words: str, path: str) -> bool:
-    """Return whether overrides leave the skin of a network as it is.
-
-    Raises:
-        InputError: the file does not describe its skin, or it describes none that can be built.
-    """
+    groups = {str(word.input_line): word.key_or_group.split(".")[0].split("/")[0] for word in parsed}
+    restricted = [word for word, group in groups.items() if group not in _FREE]
+    if ineffective := [word for word in restricted if groups[word] not in GROUPS]:
+        raise InputError(f"{ineffective[0]} has no effect on {path}, a network for one skin: leave it out")
+    if not restricted:
+        return
+    words, metadata = " ".join(restricted), OnnxModel(path).metadata
     if metadata.skin is None:
         raise InputError(
             f"{words} cannot be compared with {path}, which does not describe its skin: leave it "
@@ -499,24 +449,18 @@ def _agrees(metadata: ModelMetadata, overrides: Sequence[str], words: str, path:
         )
     check_targets({name: metadata.skin.get(name) for name in ("body", "layout")}, path)
     stored = validate_config({name: group for name in GROUPS if (group := metadata.skin.get(name))})
-    device = ("device=", "device.")  # another one is at a port, and has no part in the skin
-    changed = [word for word in overrides if not word.startswith(device)]
-    before, after = (recompose(stored, words) for words in ([], changed))
-    if any(getattr(after, group) != getattr(before, group) for group in GROUPS if group != "layout"):
-        return False
-    same = after.layout.get("footprint") == before.layout.get("footprint")
-    # A file of the same name may list other positions.
-    return same and _at(_sensors(after), np.array(metadata.positions))
-
-
-def _sensors(config: Config) -> Sensors:
-    """Return the sensors that a configuration describes."""
-    check_groups({"body": config.body, "layout": config.layout})
-    sensors: Sensors = instantiate(config.layout).sensors(instantiate(config.body))
-    return sensors
-
-
-def _at(sensors: Sensors, positions: np.ndarray) -> bool:
-    """Return whether sensors are at positions (S, 3), m."""
-    same = sensors.positions.shape == positions.shape
-    return same and bool(np.allclose(sensors.positions, positions, rtol=0, atol=_CLOSE))
+    # Another device is at a port, and has no part in the skin.
+    changed = [word for word, group in groups.items() if group != "device"]
+    before, after = (
+        describe_skin(settings_of(recompose(stored, given)), np.array(metadata.positions))
+        for given in ([], changed)
+    )
+    # Layouts are compared by their positions: a file of the same name may list others.
+    for described in (before, after):
+        if described is not None:
+            described["layout"] = described["layout"].get("footprint")
+    if after is None or after != before:
+        raise InputError(
+            f"{words} contradicts {path}, which was exported for another skin: leave it out, or export the "
+            "run again with it"
+        )

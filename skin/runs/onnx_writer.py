@@ -10,7 +10,6 @@ from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import onnx
 import onnx_ir
 import torch
@@ -29,8 +28,6 @@ from skin.runs.model import KEY, ModelMetadata, OnnxModel
 TOLERANCE = 1e-5
 """Largest difference of a probability from that of torch, unless rounding makes a larger one in torch."""
 
-_OPSET = 20
-
 
 def write_model(module: nn.Module, metadata: ModelMetadata, touches: Touches, path: Path) -> float:
     """Write a module with its description to an ONNX file.
@@ -47,18 +44,22 @@ def write_model(module: nn.Module, metadata: ModelMetadata, touches: Touches, pa
     Raises:
         InputError: ONNX cannot express the module, the file differs from it, or it cannot be written.
     """
-    whole = _convert(module, touches)
-    whole.metadata_props[CHECKSUM] = BLANK
-    whole.metadata_props[KEY] = metadata.text()
-    with files.whole(path, "out=FILE.onnx") as partial:
+    whole, readings, valid = _convert(module, touches), touches.readings, touches.valid
+    whole.metadata_props.update({CHECKSUM: BLANK, KEY: metadata.text()})
+    with files.whole(path, "out=FILE.onnx") as partial, torch.inference_mode():
         onnx_ir.save(whole, partial)
         seal(partial)
-        difference = _difference(module, OnnxModel(partial), touches)
-        if not difference <= TOLERANCE and not difference <= 2 * _rounding(module, touches):
-            raise InputError(
-                f"the ONNX file would differ from the network by {difference:.2g}, more than {TOLERANCE:g}: "
-                "it was not written; export another run"
-            )
+        expected = module(readings, valid)
+        written = torch.from_numpy(OnnxModel(partial).probabilities(readings.numpy(), valid.numpy()))
+        difference = float((written - expected).abs().max())
+        # What is rounded in torch may differ as much from the numbers in double precision.
+        if not difference <= TOLERANCE:
+            exact = deepcopy(module).double()(readings.double(), valid)
+            if not difference <= 2 * float((exact - expected).abs().max()):
+                raise InputError(
+                    f"the ONNX file would differ from the network by {difference:.2g}, more than "
+                    f"{TOLERANCE:g}: it was not written; export another run"
+                )
     return difference
 
 
@@ -77,7 +78,7 @@ def _convert(module: nn.Module, touches: Touches) -> Any:
                 input_names=["readings", "valid"],
                 output_names=["probabilities"],
                 dynamic_shapes=(batch, batch),
-                opset_version=_OPSET,
+                opset_version=20,  # that of the translations below
                 custom_translation_table=TRANSLATIONS,
                 verbose=False,
             )
@@ -95,32 +96,11 @@ def _convert(module: nn.Module, touches: Touches) -> Any:
 @contextmanager
 def _quiet() -> Iterator[None]:
     """Silence what the exporter says about libraries that are not needed, and start no thread of tqdm."""
-    logger = logging.getLogger("torch.onnx")
-    before, interval = logger.level, tqdm.monitor_interval
-    logger.setLevel(logging.ERROR)
+    logging.getLogger("torch.onnx").setLevel(logging.ERROR)
     tqdm.monitor_interval = 0
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            yield
-    finally:
-        logger.setLevel(before)
-        tqdm.monitor_interval = interval
-
-
-def _difference(module: nn.Module, model: OnnxModel, touches: Touches) -> float:
-    with torch.inference_mode():
-        expected = module(touches.readings, touches.valid).numpy()
-    computed = model.probabilities(touches.readings.numpy(), touches.valid.numpy())
-    return float(np.abs(computed - expected).max())
-
-
-def _rounding(module: nn.Module, touches: Touches) -> float:
-    """Return the largest difference of a probability of the module from that in double precision."""
-    with torch.inference_mode():
-        single = module(touches.readings, touches.valid)
-        double = deepcopy(module).double()(touches.readings.double(), touches.valid)
-    return float((single - double).abs().max())
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        yield
 
 
 # Translations of the torch operators of the representations that ONNX lacks.

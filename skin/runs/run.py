@@ -24,8 +24,9 @@ from hydra.errors import InstantiationException
 from omegaconf.errors import OmegaConfBaseException
 
 from skin.core.files import candidates
+from skin.core.messages import one_line
 from skin.core.safe_loading import TEXT, file_sha256, load_yaml, parse_json, read_file, regular
-from skin.core.settings import check_settings, check_targets
+from skin.core.settings import check_targets, configured
 from skin.errors import InputError
 from skin.evaluation.operating_point import OperatingPoint, parse_operating_point
 from skin.learning.learner import AbstractLearner
@@ -73,16 +74,6 @@ class FinishedRun:
     run: "Run"
     trust: bool = False
 
-    @classmethod
-    def named(cls, run: str, config: Config) -> "FinishedRun":
-        """Return the run that a command names with ``run=``, as :func:`find_run` does.
-
-        Args:
-            run: its name.
-            config: of the command; its ``tracking`` and ``trust`` count.
-        """
-        return find_run(config.tracking, run, config.trust)
-
     @property
     def identity(self) -> str:
         """The id of the run."""
@@ -101,14 +92,13 @@ class FinishedRun:
             InputError: it cannot be read, is that of another version, or names a class that is not allowed
                 (:mod:`skin.core.settings`).
         """
-        with tempfile.TemporaryDirectory() as folder:
-            path = self.fetch(CONFIG, folder)
-            try:
-                stored = load_yaml(path)
-            except (ValueError, OSError) as error:
-                raise InputError(f"run {self.identity} has no readable config.yaml: {error}") from error
-        if not isinstance(stored, dict) or not all(isinstance(key, str) for key in stored):
-            raise InputError(f"run {self.identity} has no readable config.yaml: it holds no settings")
+        try:
+            with tempfile.TemporaryDirectory() as folder:
+                stored = load_yaml(self.fetch(CONFIG, folder))
+            if not isinstance(stored, dict) or not all(isinstance(key, str) for key in stored):
+                raise ValueError("it holds no settings")
+        except (ValueError, OSError) as error:
+            raise InputError(f"run {self.identity} has no readable config.yaml: {error}") from error
         if not self.trust:
             check_targets(stored, f"config.yaml of run {self.identity}")
         try:
@@ -132,18 +122,21 @@ class FinishedRun:
         return parse_operating_point(self.run.data.tags.get(TAG, "null"))
 
     @contextmanager
-    def described(self) -> Iterator[None]:
-        """Turn what goes wrong with the stored settings into an InputError: they may be damaged."""
+    def reading(self, name: str, refused: str) -> Iterator[None]:
+        """Turn what goes wrong with a stored file into an InputError: it may be damaged.
+
+        Args:
+            name: of the file.
+            refused: what it is then, such as ``is damaged``.
+        """
         try:
             yield
         except (InputError, OmegaConfBaseException):
             raise
         except (*_UNFIT, AssertionError, InstantiationException) as error:
             cause = error.__cause__ if isinstance(error, InstantiationException) else None
-            raise InputError(
-                f"config.yaml of run {self.identity} describes nothing that can be built: "
-                f"{_reason(cause or error)}"
-            ) from error
+            reason = _reason(cause or error)
+            raise InputError(f"{name} of run {self.identity} {refused}: {reason}") from error
 
     def load_weights(self, learner: AbstractLearner, data: "TouchData") -> None:
         """Load the weights into a learner.
@@ -154,19 +147,11 @@ class FinishedRun:
         name = self.run.data.tags["learned"]
         if Path(name).name != name:
             raise InputError(
-                f"run {self.identity} names {name!r} as what it learned, which is no file of its own"
+                f"run {self.identity} names {name!r} as what it learned, a file of something else"
             )
-        with tempfile.TemporaryDirectory() as folder:
-            path = self.fetch(name, folder)
-            try:
-                learner.load(data, path)
-            except InputError:
-                raise
-            except _UNFIT as error:
-                raise InputError(
-                    f"{name} of run {self.identity} is damaged or does not fit these touches: "
-                    f"{_reason(error)}"
-                ) from error
+        refused = "is damaged or does not fit these touches"
+        with tempfile.TemporaryDirectory() as folder, self.reading(name, refused):
+            learner.load(data, self.fetch(name, folder))
 
     def fetch(self, name: str, folder: str) -> Path:
         """Copy a file or folder of the run into ``folder`` and return its path.
@@ -175,8 +160,10 @@ class FinishedRun:
             InputError: the run does not have it, or it cannot be read.
         """
         place = self.run.info.artifact_uri
+        parts = urlsplit(place)
         try:
-            if (local := _local(place)) is not None:
+            if not parts.netloc and parts.scheme in ("", "file"):  # a folder of this machine
+                local = Path(url2pathname(parts.path) if parts.scheme else place)
                 return _copied(local / name, Path(folder) / name)
             from mlflow.artifacts import download_artifacts
 
@@ -184,8 +171,7 @@ class FinishedRun:
             uri = reveal_password(self.store.uri)
             return Path(download_artifacts(f"{place}/{name}", None, None, folder, uri))
         except Exception as error:  # of the file system, of MLflow, or of the library of another storage
-            reason = " ".join(str(error).split())
-            raise InputError(f"run {self.identity} has no {name} in {place}: {reason}") from error
+            raise InputError(f"run {self.identity} has no {name} in {place}: {one_line(error)}") from error
 
 
 def find_run(tracking: Tracking, name: str, trust: bool = False) -> FinishedRun:
@@ -214,14 +200,6 @@ def find_run(tracking: Tracking, name: str, trust: bool = False) -> FinishedRun:
     if len(matches) > 1:
         raise InputError(f"{len(matches)} runs have an id that begins with {name}: give more of it")
     return FinishedRun(store, matches[0], trust)
-
-
-def _local(place: str) -> Path | None:
-    """Return the folder of the artifacts of a run if it is one of this machine."""
-    parts = urlsplit(place)
-    if parts.netloc or parts.scheme not in ("", "file"):
-        return None
-    return Path(url2pathname(parts.path) if parts.scheme else place)
 
 
 def _copied(path: Path, copy: Path) -> Path:
@@ -266,13 +244,22 @@ def find_pretrained(name: str) -> "Run | None":
     Raises:
         InputError: the folder has another format, or a file of it was altered.
     """
-    path = Path(name).expanduser()
-    if "/" in name and (path / RECORD).is_file():
-        return _recorded_run(path.resolve().name, path, _record(path))
-    if not is_name(name):
+    folder: Path | None = Path(name).expanduser().resolve()
+    if "/" not in name or not (folder / RECORD).is_file():  # type: ignore[operator]
+        named = candidates(Path(MODELS) / name) if is_name(name) else []
+        folder = next((path.resolve() for path in named if path.is_dir()), None)
+    if folder is None:
         return None
-    folder = next((path for path in candidates(Path(MODELS) / name) if path.is_dir()), None)
-    return None if folder is None else _recorded_run(name, folder, _record(folder))
+    record = _record(folder)
+    info = SimpleNamespace(
+        run_id=record["run"],
+        start_time=record["start_time"],
+        end_time=record["start_time"],  # a record does not say when the training ended
+        artifact_uri=folder.as_uri(),
+        run_name=folder.name,
+    )
+    data = SimpleNamespace(metrics=record["metrics"], tags=record["tags"])
+    return cast("Run", SimpleNamespace(info=info, data=data))
 
 
 def is_name(name: str) -> bool:
@@ -320,18 +307,5 @@ def _record(folder: Path) -> dict[str, Any]:
             f"{', '.join(altered)} in {folder} differs from {SUMS}: restore the folder, or {again}"
         )
     needed = {name: record[name] for name in _Record.__annotations__ if name in record}
-    check_settings(_Record, needed, f"{RECORD} of {folder}", whole=True)
+    configured(_Record, needed, f"{RECORD} of {folder}")
     return record
-
-
-def _recorded_run(name: str, folder: Path, record: dict[str, Any]) -> "Run":
-    """Return what this package reads of a finished run, with the artifacts, tags and metrics of a model."""
-    info = SimpleNamespace(
-        run_id=record["run"],
-        start_time=record["start_time"],
-        end_time=record["start_time"],  # a record does not say when the training ended
-        artifact_uri=folder.resolve().as_uri(),
-        run_name=name,
-    )
-    data = SimpleNamespace(metrics=record["metrics"], tags=record["tags"])
-    return cast("Run", SimpleNamespace(info=info, data=data))

@@ -14,10 +14,8 @@ os.environ.setdefault("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "3")
 os.environ.setdefault("MLFLOW_HTTP_REQUEST_BACKOFF_FACTOR", "1")
 
 import atexit
-import hashlib
 import json
 import logging
-import platform
 import sqlite3
 import time
 from collections.abc import Iterator, Mapping
@@ -29,16 +27,15 @@ from urllib.parse import unquote
 
 import psutil
 from alembic.util import CommandError
-from filelock import FileLock
+from filelock import FileLock, Timeout
 from mlflow import MlflowClient
-from mlflow.entities import Experiment, Metric, Run, ViewType
+from mlflow.entities import Metric, Run, ViewType
 from mlflow.exceptions import MlflowException, RestException
-from mlflow.protos.databricks_pb2 import RESOURCE_ALREADY_EXISTS, ErrorCode
 from mlflow.store.tracking import SEARCH_MAX_RESULTS_THRESHOLD
 from mlflow.utils.mlflow_tags import MLFLOW_PARENT_RUN_ID
 from sqlalchemy.exc import SQLAlchemyError
 
-from skin.core.files import whole
+from skin.core.files import unwritable, whole
 from skin.core.interrupt import ends_on_signal
 from skin.errors import InputError
 from skin.runs.configuration import (
@@ -47,38 +44,33 @@ from skin.runs.configuration import (
     check_server,
     is_server,
     reveal_password,
+    shorten,
     source_tags,
 )
 
 _log = logging.getLogger(__name__)
 
 PROCESS = "process"
-"""Tag of the process that makes a run."""
+"""Tag of a run: the number of the process that makes it."""
 
 _QUICK = {"MLFLOW_HTTP_REQUEST_MAX_RETRIES": "3", "MLFLOW_HTTP_REQUEST_BACKOFF_FACTOR": "1"}
 # During a run: waits of 0, 20, 40, 80 and five times 120 s, together 12 minutes. MLflow takes no more than 9.
 _PATIENT = {"MLFLOW_HTTP_REQUEST_MAX_RETRIES": "9", "MLFLOW_HTTP_REQUEST_BACKOFF_FACTOR": "10"}
-_NAME_LENGTH = 80  # characters that the table of runs and legends of charts show
-_SET_CLOCK = 60  # s by which the clock of a machine may be set without a process looking like another one
 
 # The table of runs in the UI of MLflow: the shared view of a link, with widths of its columns in pixels.
 _VIEW = "skin"
-_NAME = "attributes.`Run Name`"
 _COLUMNS = {
-    _NAME: 420,
     "metrics.`same/overall/accuracy`": 180,
     "metrics.`same/dangerous/alarm_recall`": 230,
     "metrics.`same/dangerous/false_alarm_rate`": 250,
 }
-_SHOWN = {
-    "selectedColumns": [name for name in _COLUMNS if name != _NAME],
-    "columnOrder": list(_COLUMNS),
-    "columnWidths": _COLUMNS,
-}
+_WIDTHS = {"attributes.`Run Name`": 420} | _COLUMNS
 TAGS = {
     # Which of its two interfaces MLflow shows. 3.17 takes it from the link instead.
     "mlflow.experimentKind": "custom_model_development",
-    f"mlflow.sharedViewState.{_VIEW}": json.dumps(_SHOWN),
+    f"mlflow.sharedViewState.{_VIEW}": json.dumps(
+        {"selectedColumns": list(_COLUMNS), "columnOrder": list(_WIDTHS), "columnWidths": _WIDTHS}
+    ),
 }
 """Tags of an experiment that holds runs of this package."""
 
@@ -91,11 +83,13 @@ class Store:
         client: of the tracking store.
         uri: of the tracking store, without its password.
         experiment: id of the experiment.
+        folder: of checkpoints and locks, which all processes that train the same runs share.
     """
 
     client: MlflowClient
     uri: str
     experiment: str
+    folder: Path
 
     @classmethod
     def open(cls, settings: Tracking) -> "Store":
@@ -115,14 +109,19 @@ class Store:
                 served = is_server(uri) and settings.artifacts is None
                 location = None if served else (artifacts / settings.experiment).resolve().as_uri()
                 identity = _experiment(client, settings.experiment, location)
-        except (MlflowException, SQLAlchemyError, CommandError, sqlite3.Error, OSError) as error:
+        except (ImportError, MlflowException, SQLAlchemyError, CommandError, sqlite3.Error, OSError) as error:
             reason = next(iter(str(error.__cause__ or error).splitlines()), type(error).__name__)
             raise InputError(
                 f"cannot use the runs in {uri}: {reason.replace(reveal_password(uri), uri)}: give another "
-                "place, as in tracking.uri=sqlite:////FOLDER/runs.db"
+                "place, as in tracking.uri=sqlite:////FOLDER/runs.db, or for postgresql+pg8000://... "
+                'pip install "tactile-skin[server]"'
             ) from error
-        store = cls(client, uri, identity)
-        store._close_abandoned()
+        store = cls(client, uri, identity, artifacts.resolve() / "unfinished")
+        for run in store.find("RUNNING"):
+            # Without a file of its lock here, the run is one of another machine, or of another folder.
+            if (store.folder / f"{run.info.run_id}.lock").exists():
+                with suppress(InputError), store.hold(run.info.run_id):
+                    store.end(run.info.run_id, "KILLED")
         return store
 
     @classmethod
@@ -136,7 +135,7 @@ class Store:
         """
         uri = settings.uri or database_uri(Path.cwd() / "mlflow.db")
         if uri.startswith("sqlite:///") and not _database(uri).exists():
-            return cls(cast(MlflowClient, None), uri, "")
+            return cls(cast(MlflowClient, None), uri, "", Path())
         return cls.open(settings)
 
     def find(self, status: str | None = None, **tags: str) -> list[Run]:
@@ -154,19 +153,35 @@ class Store:
         )
 
     def create(self, name: str, tags: dict[str, str]) -> Run:
-        """Return a new run, tagged with this process; the caller must end it."""
-        return self.client.create_run(
-            self.experiment, tags=tags | {PROCESS: _identify_process()}, run_name=shorten(name)
-        )
+        """Return a new run, tagged with this process; the caller must hold its lock and end it."""
+        tags = tags | {PROCESS: str(os.getpid())}
+        return self.client.create_run(self.experiment, tags=tags, run_name=shorten(name))
 
-    def _close_abandoned(self) -> None:
-        """Set the status of runs whose process no longer exists to KILLED.
+    @contextmanager
+    def hold(self, name: str) -> Iterator[None]:
+        """Hold the lock of a run or of a training; the system frees that of a process that was killed.
 
-        Only processes of this machine can be checked. Runs without the tag are left unchanged.
+        Args:
+            name: id of the run, or fingerprint of the training.
+
+        Raises:
+            InputError: another process holds it, or the folder cannot be written.
         """
-        for run in self.find("RUNNING"):
-            if _is_gone(run.data.tags.get(PROCESS, "")):
-                self.client.set_terminated(run.info.run_id, "KILLED")
+        lock = FileLock(self.folder / f"{name}.lock")
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            lock.acquire(timeout=0)
+        except Timeout:
+            raise InputError(
+                f"a training with the same configuration ({name}) is in progress in another process: "
+                "wait for it"
+            ) from None
+        except OSError as error:
+            raise unwritable(self.folder, error, "tracking.artifacts=FOLDER") from error
+        try:
+            yield
+        finally:
+            lock.release()
 
     @contextmanager
     def run(
@@ -189,14 +204,14 @@ class Store:
         run = again or self.create(name, tags)
         if again:
             self.client.update_run(run.info.run_id, status="RUNNING")
-            for key, value in (tags | {PROCESS: _identify_process()}).items():
+            for key, value in (tags | {PROCESS: str(os.getpid())}).items():
                 self.client.set_tag(run.info.run_id, key, value)
         status = "KILLED"
-        with ends_on_signal(lambda: self._end(run, status)):
+        with self.hold(run.info.run_id), ends_on_signal(lambda: self.end(run.info.run_id, status)):
             try:
                 with _patience():
                     yield run
-                    self.client.set_terminated(run.info.run_id, "FINISHED")
+                    self.client.set_terminated(run.info.run_id, "FINISHED")  # waits for the server
                 status = "FINISHED"
             except Exception as error:
                 if self._lost(error):
@@ -210,8 +225,7 @@ class Store:
                     self.client.set_tag(run.info.run_id, "error", text[:500])
                 raise
             finally:
-                if status != "FINISHED":
-                    self._end(run, status)
+                self.end(run.info.run_id, status)
 
     def _lost(self, error: Exception) -> bool:
         """Return whether an error means that the server gives no answer; what it answers is another one."""
@@ -222,10 +236,14 @@ class Store:
             and str(error).startswith("API request to")
         )
 
-    def _end(self, run: Run, status: str) -> None:
-        """End a run; without the server it stays RUNNING until the next start closes it."""
+    def end(self, run: str, status: str) -> None:
+        """End a run, and remove its lock; the caller holds it.
+
+        Without the server the run stays RUNNING until the next start closes it.
+        """
         if answers(self.uri):
-            self.client.set_terminated(run.info.run_id, status)
+            self.client.set_terminated(run, status)
+            (self.folder / f"{run}.lock").unlink(missing_ok=True)
 
     def log_metrics(self, run: Run, values: dict[str, float]) -> None:
         """Log final metrics, 1000 in one transaction; what is not defined (NaN) is left out."""
@@ -233,12 +251,6 @@ class Store:
         metrics = [Metric(name, value, now, 0) for name, value in values.items() if value == value]
         for start in range(0, len(metrics), 1000):
             self.client.log_batch(run.info.run_id, metrics[start : start + 1000], synchronous=True)
-
-
-def shorten(name: str, end: str = "") -> str:
-    """Return the name of a run with its end, in at most 80 characters; other names stay other ones."""
-    other = f" {hashlib.sha256(name.encode()).hexdigest()[:8]}{end}"
-    return name + end if len(name + end) <= _NAME_LENGTH else name[: _NAME_LENGTH - len(other)] + other
 
 
 @contextmanager
@@ -253,24 +265,15 @@ def _patience() -> Iterator[None]:
 
 
 def _experiment(client: MlflowClient, name: str, location: str | None) -> str:
-    """Return the id of an experiment, made if it is missing, perhaps by another process at the same time."""
+    """Return the id of an experiment, made if it is missing."""
     if (experiment := client.get_experiment_by_name(name)) is None:
         try:
             return client.create_experiment(name, artifact_location=location, tags=TAGS)
-        except MlflowException as error:
-            if error.error_code != ErrorCode.Name(RESOURCE_ALREADY_EXISTS):
+        except MlflowException:
+            # Perhaps another process made it at the same time.
+            if (experiment := client.get_experiment_by_name(name)) is None:
                 raise
-            return _experiment(client, name, location)
-    _tag(client, experiment)
     return str(experiment.experiment_id)
-
-
-def _tag(client: MlflowClient, experiment: Experiment) -> None:
-    """Add the tags that an experiment lacks; they matter only to the UI, so that failures are ignored."""
-    for key, value in TAGS.items():
-        if experiment.tags.get(key) != value:
-            with suppress(MlflowException):
-                client.set_experiment_tag(experiment.experiment_id, key, value)
 
 
 def print_table_link(address: str = "http://127.0.0.1:5000") -> None:
@@ -278,33 +281,6 @@ def print_table_link(address: str = "http://127.0.0.1:5000") -> None:
     experiment = Store.open(Tracking()).experiment
     table = f"{address}/#/experiments/{experiment}/runs"
     print(f"runs: {table}?workflowType=machine_learning&viewStateShareKey={_VIEW}")
-
-
-def _identify_machine() -> str:
-    """Return an identifier of the machine, or of the container with its own process numbers."""
-    try:
-        space = os.readlink("/proc/self/ns/pid")
-    except OSError:
-        space = ""
-    return f"{platform.node()} {space}"
-
-
-def _identify_process() -> str:
-    """Return the tag of this process; its start time makes it unique."""
-    return json.dumps([_identify_machine(), os.getpid(), psutil.Process().create_time()])
-
-
-def _is_gone(process: str) -> bool | None:
-    """Return whether a tagged process no longer exists; None for those of other machines."""
-    try:
-        where, number, started = json.loads(process)
-        if where != _identify_machine():
-            return None
-        return abs(psutil.Process(number).create_time() - started) > _SET_CLOCK
-    except psutil.NoSuchProcess:
-        return True
-    except (ValueError, TypeError, psutil.Error):
-        return None
 
 
 def database_uri(path: Path) -> str:

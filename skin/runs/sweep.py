@@ -4,9 +4,8 @@ import atexit
 import os
 import re
 import sys
-import time
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
@@ -18,14 +17,20 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.utils import JobReturn, JobStatus
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
 
-from skin.core.messages import PARENT, format_duration, to_input_error
+from skin.core.messages import PARENT, to_input_error
 from skin.errors import InputError
-from skin.runs.configuration import Config, check_server, refuse_unknown, validate_config
+from skin.runs.configuration import (
+    check_server,
+    fingerprint,
+    refuse_unknown,
+    shorten,
+    validate_config,
+)
 
 if TYPE_CHECKING:
-    from mlflow.entities import Run
-
     from skin.runs.store import Store
 
 
@@ -71,10 +76,6 @@ class Shard:
         ones, and runs that several jobs have in common are in one part.
         """
         return set(sorted(set(names))[self.number - 1 :: self.count])
-
-
-class Reused(float):
-    """The objective of a job whose results a finished run has."""
 
 
 def left_out() -> bool:
@@ -124,7 +125,7 @@ def _words(config: DictConfig) -> list[str]:
 
 
 class SweepCallback(Callback):
-    """Hydra's callback of every command: opens and closes the parent run, prints progress.
+    """Hydra's callback of every command: opens and closes the parent run, shows the progress.
 
     The parent exists before the first job, and with it database and experiment: jobs that start at once must
     not race to make them. Hydra does not call ``on_multirun_end`` when a job has failed, so the parent is
@@ -141,14 +142,15 @@ class SweepCallback(Callback):
     def __init__(self, parent: bool = True, runs: Collection[str] | None = None) -> None:
         self._wanted, self._runs = parent, runs
         self._store: Store | None = None
-        self._parent: Run | None = None
-        self._resume = True
-        self._jobs: list[dict[str, str]] = []
-        self._fingerprints: list[str] = []
-        self._own: list[int] = []
+        self._held = ExitStack()  # the lock of the parent
+        self._jobs: list[int] = []  # numbers of the jobs of this shard; empty: unknown
+        self._open: set[int] = set()  # those that have not ended
         self._swept: list[str] = []
-        self._began = self._spent = 0.0  # s
-        self._trained = self._ended = 0  # jobs
+        self._bar: Progress | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what jobs in other processes need: they print how they ended."""
+        return vars(self) | {"_held": None, "_bar": None}
 
     def on_run_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Refuse to divide a single job."""
@@ -157,143 +159,110 @@ class SweepCallback(Callback):
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Open the parent run, and pass it to the jobs."""
-        if not self._wanted:
-            return
         try:
-            self._open(config)
+            if self._wanted:
+                self._begin(config)
         except Exception as error:
             refused = to_input_error(error)
             if refused is None:
                 raise
             _refuse(refused)
 
-    def _open(self, config: DictConfig) -> None:
+    def _begin(self, config: DictConfig) -> None:
         """Choose the jobs, and make the folder that Hydra writes to, and the parent run."""
+        words = _words(config)
         # Swept or not, Hydra lists only what belongs to jobs here.
         if config.hydra.sweeper._target_.endswith(f".{BasicSweeper.__name__}"):
-            self._jobs = sweep_jobs(_words(config), config.hydra.sweeper.params or {})
-            self._swept = [key for key in self._jobs[0] if len({job[key] for job in self._jobs}) > 1]
+            jobs = sweep_jobs(words, config.hydra.sweeper.params or {})
+            self._swept = [key for key in jobs[0] if len({job[key] for job in jobs}) > 1]
         elif config.get("shard") is not None:
             raise InputError(f"shard={config.shard} divides a list of jobs, which this sweeper does not have")
         else:
-            self._swept = [
-                override.get_key_element()
-                for override in OverridesParser.create().parse_overrides(_words(config))
-                if override.is_sweep_override()
-            ]
+            jobs, parsed = [], OverridesParser.create().parse_overrides(words)
+            self._swept = [override.get_key_element() for override in parsed if override.is_sweep_override()]
         if "tracking" not in config:
-            self._choose(config, [""] * len(self._jobs))
+            self._choose(config, jobs)
             return
-        trains = config.hydra.job.config_name == "train"
-        if trains:
+        if config.hydra.job.config_name == "train":
             refuse_unknown(config)
         settings = validate_config(config).tracking
         check_server(settings.uri)
         config.tracking.uri = settings.uri  # without its password, for the file that Hydra writes
-        composed = [_compose_job(config, job) for job in self._jobs]
+        self._choose(config, jobs)
         Path(config.hydra.sweep.dir).mkdir(parents=True, exist_ok=True)
 
-        from skin.runs.store import Store, shorten
-        from skin.runs.train import tags
+        from skin.runs.store import Store
 
-        identities = [tags(job) if job and trains else {} for job in composed]
-        self._fingerprints = [identity.get("fingerprint", "") for identity in identities]
-        self._choose(config, self._fingerprints)
-        self._store = store = Store.open(settings)
-        swept = sweep_title(self._jobs or [_parse_choices(_words(config))], self._swept)
-        name = shorten(config.hydra.runtime.choices.get("sweep") or swept or "sweep")
-        self._parent, self._resume = store.create(name, {"sweep": name}), settings.resume
+        title = sweep_title(jobs or [_parse_choices(words)], self._swept)
+        name = shorten(config.hydra.runtime.choices.get("sweep") or title or "sweep")
+        self._store = Store.open(settings)
+        self._parent = self._store.create(name, {"sweep": name}).info.run_id
+        self._held.enter_context(self._store.hold(self._parent))
         atexit.register(self._close)
-        os.environ[PARENT] = self._parent.info.run_id
+        os.environ[PARENT] = self._parent
         _share_cores(config.hydra.launcher)
+        if (console := Console(stderr=True)).is_terminal:
+            columns = "{task.description}", BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
+            redirect = sys.stdout.isatty()
+            self._bar = Progress(*columns, console=console, transient=True, redirect_stdout=redirect)
+            self._task = self._bar.add_task(name, total=len(self._jobs) or None)
 
-    def _choose(self, config: DictConfig, fingerprints: Sequence[str]) -> None:
+    def _choose(self, config: DictConfig, jobs: Sequence[Mapping[str, str]]) -> None:
         """Choose the jobs of this shard, and tell the others that they have nothing to do."""
-        shard = Shard.parse(config.shard) if config.get("shard") is not None else Shard(1, 1)
-        # A job without a fingerprint is refused, or is no training; its overrides identify it.
-        names = [fingerprint or str(job) for fingerprint, job in zip(fingerprints, self._jobs, strict=True)]
-        chosen = shard.part(names) if self._runs is None else self._runs
-        self._own = [number for number, name in enumerate(names) if name in chosen]
-        os.environ[LEFT_OUT] = " ".join(str(number) for number in set(range(len(names))) - {*self._own})
-        if self._jobs and not self._own:
+        shard = Shard.parse(config.shard) if config.get("shard") is not None else None
+        names = [str(job) for job in jobs]
+        if (shard or self._runs is not None) and config.hydra.job.config_name == "train":
+            names = [_identify_job(config, job) for job in jobs]
+        chosen = self._runs if self._runs is not None else (shard or Shard(1, 1)).part(names)
+        self._jobs = [number for number, name in enumerate(names) if name in chosen]
+        self._open = {*self._jobs}
+        os.environ[LEFT_OUT] = " ".join(str(n) for n in range(len(names)) if n not in self._open)
+        if jobs and not self._jobs:
             if self._runs is None:
                 print(f"shard {config.shard} has no job: the sweep has only {len(set(names))}")
             sys.exit(0)
 
     def on_job_start(self, config: DictConfig, **kwargs: Any) -> None:
-        """Print which job begins."""
-        self._began = time.monotonic()
-        if self._has(config):
-            left = (len(self._own) - self._ended) * self._spent / self._trained if self._trained else 0.0
-            remainder = f" about {format_duration(left)} left" if left > 0 else ""
-            print(f"{self._label(config)} …{remainder}", flush=True)
+        """Show the bar, where standard error is a terminal."""
+        if self._bar:
+            self._bar.start()
 
     def on_job_end(self, config: DictConfig, job_return: JobReturn, **kwargs: Any) -> None:
         """Print how a job ended."""
-        if not self._has(config):
+        if self._store is None or (self._jobs and config.hydra.job.num not in self._jobs):
             return
-        took, value, label = time.monotonic() - self._began, job_return._return_value, self._label(config)
-        if job_return.status == JobStatus.FAILED:
-            print(f"{label} failed: {value}", file=sys.stderr, flush=True)
-            if isinstance(value, InputError) and self._store and self._parent:
-                self._store.client.set_tag(
-                    self._parent.info.run_id, f"refused_{config.hydra.job.num}", f"{label}: {value}"[:500]
-                )
-        elif isinstance(value, Reused):
-            print(f"{label} was finished before", flush=True)
-        else:
-            print(f"{label} took {format_duration(took)}", flush=True)
-        self._ended += 1
-        if not isinstance(value, Reused):
-            self._trained, self._spent = self._trained + 1, self._spent + took
+        number, value = config.hydra.job.num, job_return._return_value
+        if self._bar:
+            self._bar.advance(self._task)
+            self._bar.stop()
+        count = f"{self._jobs.index(number) + 1}/{len(self._jobs)}" if self._jobs else f"{number + 1}"
+        job = _parse_choices(_words(config))
+        label = f"[{count}] {' '.join(f'{key}={job[key]}' for key in self._swept or job)}"
+        if job_return.status != JobStatus.FAILED:
+            print(f"{label}: done", flush=True)
+            self._open.discard(number)
+            return
+        print(f"{label}: {value}", file=sys.stderr, flush=True)
+        if isinstance(value, InputError):
+            self._open.discard(number)
+            self._store.client.set_tag(self._parent, f"refused_{number}", f"{label}: {value}"[:500])
 
     def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
-        """Close the parent run."""
+        """Close the parent run: no job has failed."""
         self._close(ended=True)
 
-    def _has(self, config: DictConfig) -> bool:
-        """Return whether a job belongs to the parent run and the shard."""
-        return self._parent is not None and (not self._jobs or config.hydra.job.num in self._own)
-
     def _close(self, ended: bool = False) -> None:
-        """End the parent run, once: FINISHED only if every job of the shard ended or was refused."""
+        """End the parent run, once: FINISHED if each job ended or was refused; delete it without children."""
         store, self._store = self._store, None
-        if store is None or self._parent is None:
-            return
         # Errors of the database were reported before; the next start closes the run.
-        with suppress(Exception):
-            self._conclude(store, self._parent, ended)
+        with suppress(Exception), self._held:
+            if store is not None:
+                from mlflow.utils.mlflow_tags import MLFLOW_PARENT_RUN_ID
 
-    def _conclude(self, store: "Store", parent: "Run", ended: bool) -> None:
-        """End the parent: FAILED if a job that was not refused, or every job, has no finished run.
-
-        One without children is deleted. Without a list of jobs, the sweeper must have ended by itself.
-        """
-        from mlflow.utils.mlflow_tags import MLFLOW_PARENT_RUN_ID
-
-        from skin.runs.store import note_reuse
-
-        children = {MLFLOW_PARENT_RUN_ID: parent.info.run_id}
-        notes = store.client.get_run(parent.info.run_id).data.tags
-        valid = {self._fingerprints[number] for number in self._own if f"refused_{number}" not in notes}
-        results = [
-            # One that was finished before counts, unless it was to be repeated.
-            store.find("FINISHED", fingerprint=identity, **{} if self._resume else children)
-            for identity in valid
-        ]
-        for run, *_ in filter(None, results):
-            note_reuse(run)  # jobs in other processes warn of nothing
-        if not self._jobs:
-            results = [store.find("FINISHED", **children)] if ended else []
-        store.client.set_terminated(parent.info.run_id, "FINISHED" if results and all(results) else "FAILED")
-        if not store.find(**children):
-            store.client.delete_run(parent.info.run_id)
-
-    def _label(self, config: DictConfig) -> str:
-        job = _parse_choices(_words(config))
-        chosen = " ".join(f"{key}={job[key]}" for key in self._swept or job)
-        number, count = config.hydra.job.num, f"/{len(self._own)}" if self._jobs else ""
-        return f"[{(self._own.index(number) if self._jobs else number) + 1}{count}] {chosen}"
+                complete = ended or (self._jobs and not self._open)
+                store.end(self._parent, "FINISHED" if complete else "FAILED")
+                if not store.find(**{MLFLOW_PARENT_RUN_ID: self._parent}):
+                    store.client.delete_run(self._parent)
 
 
 def _refuse(error: InputError) -> NoReturn:
@@ -302,14 +271,14 @@ def _refuse(error: InputError) -> NoReturn:
     sys.exit(2)
 
 
-def _compose_job(config: DictConfig, job: Mapping[str, str]) -> Config | None:
-    """Return the configuration of a job; None where it will be refused."""
+def _identify_job(config: DictConfig, job: Mapping[str, str]) -> str:
+    """Return the fingerprint of a training; of one that will be refused, its overrides."""
     words = [f"{key}={value}" for key, value in job.items()]
-    whole = GlobalHydra.instance().config_loader().load_sweep_config(config, words)
     try:
-        return validate_config(whole)
+        whole = GlobalHydra.instance().config_loader().load_sweep_config(config, words)
+        return fingerprint(validate_config(whole))
     except InputError:
-        return None
+        return str(job)
 
 
 def _share_cores(launcher: DictConfig) -> None:

@@ -24,7 +24,7 @@ from skin.evaluation.alarm import AlarmSource, choose_alarm_threshold
 from skin.evaluation.operating_point import OperatingPoint, Predictor
 from skin.evaluation.streams import ContactThreshold, rise
 from skin.learning.learner import AbstractLearner
-from skin.runs.build import build_device, build_frames, build_learner, build_skin, with_skin
+from skin.runs.build import SkinModel, build_device, build_frames, build_learner, build_skin, with_skin
 from skin.runs.configuration import Config, Tracking
 from skin.runs.model import Model, ModelMetadata, OnnxModel
 from skin.runs.run import TAG, FinishedRun, find_run
@@ -33,33 +33,39 @@ _FAINT = 0.3  # N, default contact threshold
 _MANY = 4000  # windows of streams, a tenth of which tunes the contact threshold
 
 
-def alarm_source(run: FinishedRun, learner: Predictor, config: Config) -> AlarmSource:
+def alarm_source(run: FinishedRun, learner: Predictor, used: Config) -> AlarmSource:
     """Return what decides where a run raises the alarm.
 
     Args:
         run: the run.
         learner: of the run, trained.
-        config: its configuration with the skin and the device to use.
+        used: its configuration with the skin and the device to use.
     """
     stored = run.stored
+    skin = {group: getattr(used, group) for group in ("body", "layout", "simulator", "touch")}
     return AlarmSource(
         f"run {run.identity}",
-        config.evaluation,
+        used.evaluation,
         learner,
         stored.device,
-        config.device,
-        {group: getattr(config, group) for group in ("body", "layout", "simulator", "touch")},
-        device_on_skin(stored, config),
+        used.device,
+        skin,
+        device_on_skin(stored, skin),
         partial(build_device, stored),
         stored=run.run.data.tags.get(TAG),
         profile=None if stored.evaluation is None else stored.evaluation.profile,
     )
 
 
-def device_on_skin(stored: Config, config: Config) -> Callable[[Mapping[str, Any]], AbstractDevice]:
-    """Return a function of the settings of a device that builds it on the skin of ``config``."""
-    skin = {group: getattr(config, group) for group in ("body", "layout", "simulator")}
-    return lambda device: build_device(replace(stored, **skin, device={**device, **skin}))
+def device_on_skin(trained: Config, skin: Mapping[str, Any]) -> Callable[[Mapping[str, Any]], AbstractDevice]:
+    """Return a function of the settings of a device that builds it on a skin.
+
+    Args:
+        trained: configuration of the training.
+        skin: settings of ``body``, ``layout`` and ``simulator``.
+    """
+    skin = {group: skin[group] for group in ("body", "layout", "simulator")}
+    return lambda device: build_device(replace(trained, **skin, device={**device, **skin}))
 
 
 # The model.
@@ -76,10 +82,10 @@ class TorchModel(Model):
         touch: contact threshold, N; None: tuned on simulated streams of the device, and the learned label
             ``touch`` counts, too.
         run: the run; None: it was trained in this process.
-        watched: configuration of the run with the skin, the device and the profile that it is used on.
+        used: configuration of the run with the skin, the device and the profile that it is used on.
 
     Attributes:
-        device, learner, point, run, config: as above; ``config`` is ``watched``.
+        device, learner, point, run, config: as above; ``config`` is ``used``.
         places: :attr:`positions` as a tensor.
     """
 
@@ -91,17 +97,17 @@ class TorchModel(Model):
         point: OperatingPoint | None = None,
         touch: float | None = None,
         run: FinishedRun | None = None,
-        watched: Config | None = None,
+        used: Config | None = None,
     ) -> None:
-        self.device, self.learner, self.point, self.run, self.config = device, learner, point, run, watched
+        self.device, self.learner, self.point, self.run, self.config = device, learner, point, run, used
         self.identity, self.title = ("none", "untrained") if run is None else (run.identity, run.title)
         self.task, self.size = device.task, device.size
         self.window, self.rate = example.readings.shape[1], example.rate
         self.places, self.positions = example.positions, example.positions.numpy()
         self.threshold = None if point is None else point.threshold
         self.learned, self._touch = touch is None and self.task.gate is not None, touch
-        if run is not None and watched is not None:
-            self.alarm = alarm_source(run, learner, watched)
+        if run is not None and used is not None:
+            self.alarm = alarm_source(run, learner, used)
 
     @cached_property
     def contact(self) -> float:  # type: ignore[override]
@@ -255,7 +261,7 @@ def load_run(
 def load_model(
     run: FinishedRun,
     config: Config | None = None,
-    watched: Config | None = None,
+    used: Config | None = None,
     device: AbstractDevice | None = None,
     touch: float | None = None,
     one_skin: bool = False,
@@ -266,7 +272,7 @@ def load_model(
     Args:
         run: the run.
         config: its configuration, changed as :meth:`FinishedRun.configured` does; None: not changed.
-        watched: its configuration with the device that a live view watches; None: ``config``.
+        used: its configuration with the device that a live view watches; None: ``config``.
         device: to use it on; None: that of ``config``.
         touch: as in :class:`TorchModel`.
         one_skin: as in :func:`alarm_point`.
@@ -277,15 +283,15 @@ def load_model(
     """
     config = config or run.stored
     if device is None:
-        _warn_of_unknown_skin(run.stored, config)
-    with run.described():
+        _warn_of_unknown_skin(run.stored.device, config.device, partial(build_skin, config))
+    with run.reading("config.yaml", "describes nothing that can be built"):
         device = device or _with_labels(run.stored, build_device(config))
         learner = build_learner(config)
-        data = build_frames(config, device.blank())
+        data = build_frames(config.representation, device.blank(), partial(build_skin, config))
     run.load_weights(learner, data)
     source = alarm_source(run, learner, config) if alarm else None
     point = choose_alarm_threshold(source, one_skin=one_skin) if source else None
-    return TorchModel(device, learner, data.example, point, touch, run, watched or config)
+    return TorchModel(device, learner, data.example, point, touch, run, used or config)
 
 
 def _with_labels(stored: Config, device: AbstractDevice) -> AbstractDevice:
@@ -299,21 +305,28 @@ def _with_labels(stored: Config, device: AbstractDevice) -> AbstractDevice:
     return device.with_labels(task)
 
 
-def _warn_of_unknown_skin(stored: Config, config: Config) -> None:
-    """Warn where a run that was trained on drawn skins is used on others than those."""
-    if (distributed := stored.device.get("skins")) is None:
+def _warn_of_unknown_skin(
+    trained: Mapping[str, Any], used: Mapping[str, Any], make_skin: Callable[[], SkinModel]
+) -> None:
+    """Warn where a run that was trained on drawn skins is used on others than those.
+
+    Args:
+        trained, used: settings of the devices.
+        make_skin: returns the skin that it is used on.
+    """
+    if (distributed := trained.get("skins")) is None:
         return
     from skin.device.calibration import read_calibration
     from skin.device.imperfection import outside
     from skin.device.skins import SkinDistribution
 
-    distribution, skin = configured(SkinDistribution, distributed, "device.skins"), build_skin(config)
-    unlike = distribution.outside(skin.body, skin.sensors)
-    if "skins" not in config.device:
-        path = config.device.get("calibration")
+    skin = make_skin()
+    unlike = configured(SkinDistribution, distributed, "device.skins").outside(skin.body, skin.sensors)
+    if "skins" not in used:
+        path = used.get("calibration")
         measured = {} if path is None else read_calibration(path).values()
         ranges = {name: (values.min(), values.max()) for name, values in measured.items()}
-        unlike += outside(config.device | ranges, stored.device)
+        unlike += outside({**used, **ranges}, trained)
     if unlike:
         warnings.warn(
             f"this skin is unlike those that the run was trained on: {', '.join(unlike)}; its verdicts may "
@@ -328,7 +341,7 @@ def equation10_warning(stored: Config, device: AbstractDevice | None = None) -> 
 
     Args:
         stored: the run's configuration.
-        device: the watched device; None: a real skin.
+        device: the device in use; None: a real skin.
     """
     reading = (stored.device.get("simulator") or {}).get("reading")
     if reading != "equation10" or (device is not None and not device.real):

@@ -10,7 +10,6 @@ Exit code 1 if the check fails.
 """
 
 import argparse
-import json
 import os
 import random
 import signal
@@ -84,9 +83,7 @@ class Killer:
 
     def _running(self) -> list[int]:
         """Return the processes of this machine that train now."""
-        return sorted(
-            json.loads(run.data.tags[PROCESS])[1] for run in self._store.find("RUNNING", row="rules")
-        )
+        return sorted(int(run.data.tags[PROCESS]) for run in self._store.find("RUNNING", row="rules"))
 
 
 def table(folder: Path, uri: str) -> bytes:

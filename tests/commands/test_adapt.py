@@ -97,7 +97,7 @@ def test_the_same_adaptation_is_not_repeated(run, folder, adapted):
     parent, made, _ = adapted
     before = runs(folder)
     done = run(folder, "adapt", f"run={parent}", *OTHER, "adapt.gestures=48", TEST, *QUICK)
-    assert f"run {made} did this before" in done.stdout
+    assert f"run {made} did this before" in done.stderr
     assert runs(folder) == before
 
 
@@ -174,7 +174,7 @@ def bad(run, folder, session):
         (None, ["adapt.gestures=7"], "adapt.gestures=7 must be greater than or equal to 8"),
         (None, ["device=recording", "device.path={enough}", "adapt.gestures=61"], "use adapt.gestures=60"),
         (None, ["adapt.rate=1"], "rate"),
-        (None, ["adapt.scratch=[rules]"], "adapt.scratch=rules is no learner for small data"),
+        (None, ["adapt.scratch=[rules]"], "must be 'kernel_ridge' or 'extra_trees'"),
         (None, ["learner.dropout=0.5"], "learner.dropout was fixed when the run was trained"),
     ],
 )

@@ -1,6 +1,7 @@
 """`skin design design=place` as a person runs it, and the files that it writes."""
 
 import json
+from functools import partial
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from skin.body.layout import File
 from skin.core.files import CONF
 from skin.design.place import Place
 from skin.errors import InputError
+from skin.runs.build import build_device, build_skin
 from skin.runs.configuration import validate_config
 
 SIZE = (0.12, 0.08)
@@ -30,7 +32,9 @@ def placed(tmp_path_factory):
         folder = tmp_path_factory.mktemp("placed")
         with initialize_config_dir(str(CONF), version_base="1.3"):
             config = validate_config(compose("train", overrides=[*NAIVE, *overrides]))
-        Place(**{"touches": TOUCHES} | settings).run(config, folder)
+        Place(**{"touches": TOUCHES} | settings).run(
+            build_skin(config), partial(build_device, config), folder
+        )
         return folder
 
     return place

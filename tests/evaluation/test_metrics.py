@@ -32,19 +32,13 @@ def scored():
     return (2 * labels - 1 + 1.5 * noise).sigmoid(), labels
 
 
-def test_accuracies_are_those_of_scikit_learn(scored):
+def test_accuracies_are_those_of_scikit_learn_and_overall_their_mean(scored):
     chances, labels = scored
     found = compute_metrics(chances, labels, TOUCH)
     for i, name in enumerate(TOUCH.names):
-        said = chances[:, i] > 0.5
-        assert found[f"{name}/accuracy"] == pytest.approx(accuracy_score(labels[:, i], said))
-        assert found[f"{name}/balanced_accuracy"] == pytest.approx(
-            balanced_accuracy_score(labels[:, i], said)
-        )
-
-
-def test_overall_is_the_mean_of_the_labels(scored):
-    found = compute_metrics(*scored, TOUCH)
+        truth, said = labels[:, i], chances[:, i] > 0.5
+        assert found[f"{name}/accuracy"] == pytest.approx(accuracy_score(truth, said))
+        assert found[f"{name}/balanced_accuracy"] == pytest.approx(balanced_accuracy_score(truth, said))
     each = [found[f"{name}/accuracy"] for name in TOUCH.names]
     assert found["overall/accuracy"] == pytest.approx(sum(each) / 4)
 
@@ -100,12 +94,9 @@ def test_angles_are_measured_on_touches_that_have_a_direction(scored):
     alone = compute_metrics(chances, labels, TOUCH)
     assert {name: found[name] for name in alone} == alone
     assert len(found) == len(alone) + 2
-
-
-def test_saying_no_direction_is_as_wrong_as_a_blind_guess():
-    labels = torch.tensor([[1.0, 0.0]]).repeat(1, 3)[:, :6]
-    said = torch.zeros(1, 6)
-    assert measure_angles(said, labels, TOUCH_SLIDING).tolist() == [90.0]
+    # No direction is as wrong as a blind guess.
+    label = torch.tensor([[1.0, 0.0]]).repeat(1, 3)
+    assert measure_angles(torch.zeros(1, 6), label, TOUCH_SLIDING).tolist() == [90.0]
 
 
 @pytest.mark.parametrize("dangerous", [0.0, 1.0])
@@ -135,11 +126,8 @@ def test_calibration_error_in_bins_of_equal_numbers_is_that_of_plain_python():
         gaps.append(abs(sum(said for said, _ in part) - sum(true for _, true in part)))
     assert calibration_error(chance, label) == pytest.approx(sum(gaps) / 1500, abs=1e-3)
     assert calibration_error(chance, (chance > 0.5).long()) > 0.1
-
-
-def test_equal_probabilities_share_a_bin():
-    label = torch.tensor([1, 0] * 50)
-    assert calibration_error(torch.full((100,), 0.5), label) == pytest.approx(0, abs=1e-9)
+    # Equal probabilities share a bin.
+    assert calibration_error(torch.full((100,), 0.5), torch.tensor([1, 0] * 50)) == pytest.approx(0, abs=1e-9)
 
 
 def test_means_over_gestures_are_the_metrics():

@@ -104,7 +104,7 @@ def test_one_comparison_in_single_and_double_precision():
     assert not said[-1]
 
 
-def test_reached_rates_are_counted_and_their_range_is_exact():
+def test_reached_rates_are_counted_their_range_is_exact_and_accuracy_is_at_one_half():
     chances = torch.tensor([[0.0] * 4] * 6)
     chances[:, 3] = torch.tensor([0.9, 0.25, 0.3, 0.1, 0.2, 0.26])
     labels = torch.zeros(6, 4)
@@ -114,15 +114,9 @@ def test_reached_rates_are_counted_and_their_range_is_exact():
     assert (reached.recall, reached.false_alarm_rate) == (0.5, 0.5)
     found = compute_metrics(chances, labels, TOUCH, POINT)
     assert (found["dangerous/alarm_recall"], found["dangerous/false_alarm_rate"]) == (0.5, 0.5)
+    assert found["dangerous/accuracy"] == pytest.approx(5 / 6)
     # None of ten: the upper end p has (1 - p)^10 = 0.025.
     assert Reached(0, 0, 10, 0).range == pytest.approx((0, 1 - 0.025**0.1))
-
-
-def test_accuracy_stays_that_of_one_half():
-    chances, labels = torch.full((4, 4), 0.4), torch.zeros(4, 4)
-    found = compute_metrics(chances, labels, TOUCH, POINT)
-    assert found["dangerous/accuracy"] == 1
-    assert found["dangerous/false_alarm_rate"] == 1
 
 
 def test_rates_of_no_gesture_are_undefined_and_printed_so():
@@ -198,14 +192,11 @@ def test_a_task_without_dangerous_has_no_operating_point(made_up_device):
     assert not [name for name in found.metrics if "alarm" in name]
 
 
-def test_a_threshold_that_nothing_passes_is_told():
+def test_a_threshold_that_nothing_passes_or_that_hides_dangerous_touches_is_told():
+    """The latter only where the live view chose it: a window may show less than a touch."""
     assert not POINT.silent
     assert POINT.warning() is None
     assert "no alarm will be raised" in replace(POINT, threshold=1.000001).warning()
-
-
-def test_a_threshold_that_hides_dangerous_touches_is_told():
-    """Only where the live view chose it: a window may show less than a touch."""
     point = replace(POINT, rate=100.0, dangerous=400, found=300)
     assert point.warning() is None
     hiding = replace(point, found=299)
@@ -220,27 +211,20 @@ def test_what_is_stored_reads_back_to_the_last_digit():
 
 
 @pytest.mark.parametrize(
-    "change",
+    "text",
     [
-        {"threshold": None},
-        {"threshold": math.nan},
-        {"threshold": math.inf},
-        {"threshold": -1},
-        {"target": 2},
-        {"safe": "many"},
-        {"raised": 9999},
-        {"found": 1},
-        {"label": "big"},
-        {"seed": {}},
+        "", "{}", "[]", "0.5", "[" * 5000,
+        *(
+            json.dumps(json.loads(POINT.text()) | change)
+            for change in (
+                {"threshold": None}, {"threshold": math.nan}, {"threshold": math.inf}, {"threshold": -1},
+                {"target": 2}, {"safe": "many"}, {"raised": 9999}, {"found": 1}, {"label": "big"},
+                {"seed": {}},
+            )
+        ),
     ],
-)
-def test_a_damaged_one_is_refused(change):
-    with pytest.raises(InputError, match="cannot be read"):
-        parse_operating_point(json.dumps(json.loads(POINT.text()) | change))
-
-
-@pytest.mark.parametrize("text", ["", "{}", "[]", "0.5", "[" * 5000])
-def test_what_is_no_operating_point_is_refused(text):
+)  # fmt: skip
+def test_a_damaged_one_is_refused(text):
     with pytest.raises(InputError, match="cannot be read"):
         parse_operating_point(text)
 
@@ -339,7 +323,7 @@ class Onset(Largest):
         return torch.sigmoid(change)[:, None].expand(-1, 4)
 
 
-def test_one_decision_raises_more_alarms_than_two(drawn):
+def test_one_decision_raises_more_alarms_than_two_and_a_slow_device_needs_one(drawn):
     labels = balanced(64, generator(Stream.TEST, 8))
     two, one = (
         touch_scores.touch_scores(Onset(), drawn, watching(100.0, patience=patience), labels, 9)
@@ -347,9 +331,6 @@ def test_one_decision_raises_more_alarms_than_two(drawn):
     )
     assert (one >= two).all()
     assert (one > two).any()
-
-
-def test_a_slow_device_needs_one_decision():
     assert [watching(1).decisions(rate) for rate in (5.0, 10.0, 20.0, 100.0, 500.0)] == [1, 1, 2, 2, 2]
 
 

@@ -46,14 +46,13 @@ def tried(device):
 
 def test_who_knows_the_labels_is_right_everywhere(tried):
     found = tried[0].metrics
+    assert [len(touches) for touches in tried[1]] == [48, 8, 24, 24, 24, 24]
+    assert tried[0].confusion.sum(dim=(1, 2)).tolist() == [48] * 4
+    assert tried[0].confusion[:, 0, 1].tolist() == [0] * 4
     for column in ("same", "holdout", "device_shift", "unseen_layout"):
         assert found[f"{column}/overall/accuracy"] == 1
         assert found[f"{column}/dangerous/alarm_recall"] == 1
         assert found[f"{column}/dangerous/false_alarm_rate"] == 0
-
-
-def test_each_set_has_its_size(tried):
-    assert [len(touches) for touches in tried[1]] == [48, 8, 24, 24, 24, 24]
 
 
 def test_unseen_devices_share_the_gestures_each_in_its_own_way(device, tried):
@@ -113,11 +112,6 @@ def test_predictions_tell_of_every_test_gesture(device, tried):
     assert table["speed"].to_pylist() == test.parameters["speed"].tolist()
 
 
-def test_confusion_counts_the_test_gestures(tried):
-    assert tried[0].confusion.sum(dim=(1, 2)).tolist() == [48] * 4
-    assert tried[0].confusion[:, 0, 1].tolist() == [0] * 4
-
-
 def test_a_layout_of_a_prime_number_of_sensors_makes_no_grid(configured, tmp_path):
     path = tmp_path / "seven.csv"
     path.write_text("x_m,y_m\n" + "".join(f"{0.02 * i + 0.01},0.05\n" for i in range(7)))
@@ -146,7 +140,7 @@ def test_what_is_not_defined_has_a_reason_and_is_shown_as_a_dash(made_up_device,
     assert "| dangerous/false_alarm_rate | - | - |" in evaluation_markdown(found, TOUCH, "title", "about")
 
 
-class Guesses:
+class Constant:
     """Answers 0.9 to everything."""
 
     def probabilities(self, touches):
@@ -158,7 +152,7 @@ def test_labels_that_nobody_knows_have_a_sentence_instead_of_figures(made_up_dev
     labels = touches.labels.clone()
     labels[:, [0, 3]] = torch.nan
     monkeypatch.setattr(made_up_device, "touches", lambda *_: replace(touches, labels=labels))
-    report = evaluate(Guesses(), made_up_device, SETTINGS, POINT)
+    report = evaluate(Constant(), made_up_device, SETTINGS, POINT)
     assert not [name for name in report.metrics if name.split("/")[1] in ("big", "dangerous")]
     assert {"same/press/accuracy", "same/overall/accuracy"} <= set(report.metrics)
     assert report.cannot["labels"] == "the touches of the test tell nothing of big, dangerous"

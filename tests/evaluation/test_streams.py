@@ -123,12 +123,7 @@ def test_other_lengths_are_the_same_touches_begun_elsewhere(device, whole):
     assert torch.equal(long.labels, short.labels)
     # Unpadded touches begin at once, whatever the window.
     assert (short.readings - long.readings[:, :20]).abs().max() < 0.6
-    assert found.lengths[2.0] == 1.0
-
-
-def test_who_takes_no_such_length_says_so(whole):
-    found = whole[1]
-    assert found.lengths[6.0] == "another window"
+    assert found.lengths == {2.0: 1.0, 6.0: "another window"}
     assert "window/6/overall/accuracy" not in found.metrics()
 
 
@@ -167,13 +162,10 @@ def test_an_alarm_that_lasts_is_one_and_one_that_outlasts_its_touch_is_false():
     assert count(".!!!...", ".000...").false == 0
 
 
-def test_touches_that_raised_an_alarm():
+def test_touches_that_raised_an_alarm_are_counted_once_and_unseen_ones_not():
     found = count("..!..!.......", ".000.111.222.")
     assert (found.dangerous, found.found, found.safe, found.raised) == (2, 1, 1, 1)
     assert found.false == 0
-
-
-def test_touches_that_no_window_shows_are_not_counted():
     found = count("....", "....")
     assert (found.dangerous, found.safe, found.false) == (0, 0, 0)
 

@@ -12,8 +12,7 @@ from omegaconf import OmegaConf
 
 from experiments.studies.study import chosen_studies
 from skin.core.files import CONF, ROOT
-from skin.runs.configuration import validate_config
-from skin.runs.store import shorten
+from skin.runs.configuration import shorten, validate_config
 from skin.runs.sweep import sweep_jobs
 
 # MLflow's own business with SQLAlchemy.

@@ -20,7 +20,7 @@ NAIVE = ["simulator=naive", "layout=grid", "layout.rows=2", "layout.columns=2"]
 
 @pytest.mark.parametrize(("count", "budget"), [(8, 10), (16, 20), (48, 60), (49, 62), (3230, 4038)])
 def test_the_training_split_of_the_budget_is_large_enough(count, budget):
-    assert simulated_budget(count) == budget
+    assert simulated_budget(FineTuning(gestures=count))["gestures"] == budget
     assert split_slices(budget)["train"].stop in (count, count + 1)
 
 
@@ -80,8 +80,9 @@ def test_the_threshold_of_the_alarm_may_be_for_a_profile():
             for given in (tuple(words), ())
         }
     profiled, plainly = found.values()
-    assert (profiled.twin.noise, profiled.twin.gain_spread, profiled.twin.randomise) == (0.1, 0.2, True)
-    assert (plainly.twin.noise, plainly.twin.randomise) == (0.2, False)
-    assert profiled.config.evaluation.profile == "rough"
+    (device, twin, config), (_, plain, _) = profiled, plainly
+    assert (twin.noise, twin.gain_spread, twin.randomise) == (0.1, 0.2, True)
+    assert (plain.noise, plain.randomise) == (0.2, False)
+    assert config.evaluation.profile == "rough"
     # The gestures to adapt on are measured by the described device, not by one of the profile.
-    assert profiled.device.noise == 0.3
+    assert device.noise == 0.3

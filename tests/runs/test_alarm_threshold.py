@@ -200,12 +200,9 @@ def test_more_noise_means_higher_readings_at_rest(hydra):
     assert idle["harsh"] > 2 * idle["mild"]
 
 
-def test_runs_on_other_touches_are_refused(hydra, tmp_path):
+def test_runs_on_other_touches_and_unknown_profiles_are_refused(hydra, tmp_path):
     stored = hydra("device=recording", f"device.path={tmp_path}/x.csv")
     with pytest.raises(InputError, match="trained on others"):
         threshold_device(stored, hydra("evaluation.profile=rough"))
-
-
-def test_unknown_profiles_are_refused(hydra):
     with pytest.raises(InputError, match="no profile soft: choose one of calibrated, drawn, harsh"):
         threshold_device(hydra(), hydra("evaluation.profile=soft"))

@@ -3,6 +3,7 @@
 from copy import deepcopy
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from hydra.utils import instantiate
@@ -10,8 +11,8 @@ from hydra.utils import instantiate
 from skin.errors import InputError
 from skin.learning.data import TouchData
 from skin.learning.small_data import split_folds
-from skin.runs.adaptation import FineTuning, Folds, Trial, fine_tune
-from skin.runs.build import build_learner
+from skin.runs.adaptation import Candidate, FineTuning, choose_candidate, fine_tune, learn_from_scratch
+from skin.runs.build import build_learner, default_option
 
 SMALL = FineTuning(layers=["all"], lr=[3e-3], epochs=15, patience=5)
 
@@ -24,7 +25,7 @@ def once():
 
 @pytest.fixture
 def trained(configured, made_up_device, once):
-    """Return a learner that has learnt the touches of the made-up device, and its data."""
+    """Return a copy of a learner that has learnt the touches of the made-up device, and its data."""
     if not once:
         config = configured(
             "representation=features", "model=mlp", "model.widths=[]", "fusion.head=residual",
@@ -34,13 +35,7 @@ def trained(configured, made_up_device, once):
         learner = build_learner(config)
         learner.fit(data)
         once.extend((learner, data))
-    return once
-
-
-@pytest.fixture
-def network(trained):
-    """Return a copy of the network: tests change it."""
-    return deepcopy(trained[0].network)
+    return deepcopy(once[0]), once[1]
 
 
 def other_skin(touches):
@@ -49,65 +44,85 @@ def other_skin(touches):
     return replace(touches, readings=touches.readings * gains)
 
 
-def loss(network, data, touches):
+def loss(learner, data, touches):
+    network = learner.network.eval()
     with torch.no_grad():
-        return float(network.loss(network.eval()(data.frames(touches)[0]), touches.known_labels))
+        return float(network.loss(network(data.frames(touches)[0]), touches.known_labels))
 
 
 def equal(one, other):
     return all(torch.equal(one[name], other[name]) for name in one)
 
 
-def test_another_skin_is_learnt_from_few_gestures(trained, network):
-    _, data = trained
-    before = deepcopy(network)
-    found = fine_tune(network, data, other_skin(data.touches("validation")), SMALL)
-    assert found.better
-    unseen = other_skin(data.touches("test"))
-    assert loss(network, data, unseen) < 0.8 * loss(before, data, unseen)
+def adapted(learner, data, touches, settings):
+    """Return the candidates, the chosen one, and the judged probabilities; train the learner with it."""
+    candidates = fine_tune(learner, data, touches, settings)
+    best, judged = choose_candidate(candidates, touches, data.task, settings)
+    best.train()
+    return candidates, best, judged
 
 
-def test_what_is_not_better_leaves_the_network_as_it_was(trained, network):
-    _, data = trained
-    before = deepcopy(network.state_dict())
-    found = fine_tune(network, data, data.touches("validation"), replace(SMALL, lr=[1e3]))
-    assert not found.better
-    assert found.choice == ""
-    assert equal(network.state_dict(), before)
+def test_another_skin_is_learnt_from_few_gestures(trained):
+    learner, data = trained
+    before, unseen = deepcopy(learner), other_skin(data.touches("test"))
+    _, best, _ = adapted(learner, data, other_skin(data.touches("validation")), SMALL)
+    assert best.name.startswith("layers=all lr=0.003 epochs=")
+    assert loss(learner, data, unseen) < 0.8 * loss(before, data, unseen)
 
 
-def test_a_fold_is_judged_by_the_choice_of_the_others(trained, network):
+def test_what_is_not_better_leaves_the_network_as_it_was(trained):
+    learner, data = trained
+    before = deepcopy(learner.network.state_dict())
+    candidates, best, judged = adapted(learner, data, data.touches("validation"), replace(SMALL, lr=[1e3]))
+    assert best is candidates[0]
+    assert best.name == ""
+    assert judged is best.chances
+    assert equal(learner.network.state_dict(), before)
+
+
+def test_a_fold_is_judged_by_the_choice_of_the_others(trained):
     """Lowest of all is a candidate that is right on one fold only; that fold must not count for it."""
     _, data = trained
     touches = data.touches("validation")
-    problem = Folds(network, data, touches, SMALL)
-    right, held = 8 * (touches.known_labels - 0.5), (problem.fold == 0)[:, None]
-    first = torch.where(held, -right, right)
-    lucky = torch.where(held, right, 0.9 * right)
-    losses = [float(network.loss(logits, touches.known_labels)) for logits in (first, lucky)]
-    assert losses[1] < losses[0]
-    judged = problem.judged([Trial("all", 1e-3, losses, torch.stack([first, lucky]))])
-    assert torch.equal(judged, torch.where(held, first, lucky))
+    fold = split_folds(touches.known_labels, 4, 0)
+    right, held = touches.known_labels.numpy() * 0.96 + 0.02, (fold == 0).numpy()[:, None]
+    first = np.where(held, 1 - right, right)
+    lucky = np.where(held, right, 0.9 * right + 0.05)
+    candidates = [Candidate(name, chances, None) for name, chances in (("", first), ("lucky", lucky))]
+    assert choose_candidate(candidates, touches, data.task, SMALL)[0].name == ""
 
 
-def test_gestures_are_held_out_of_what_predicts_them(trained, network):
+def test_gestures_are_held_out_of_what_predicts_them(trained):
     """Labels at random can be learnt by heart only."""
-    _, data = trained
-    touches = data.touches("train")[:48]
+    learner, data = trained
     labels = torch.rand(48, 4, generator=torch.Generator().manual_seed(2)).round()
+    touches = replace(data.touches("train")[:48], labels=labels)
     long = replace(SMALL, epochs=20, patience=20, lr=[1e-2])
-    found = fine_tune(network, data, replace(touches, labels=labels), long)
-    assert ((found.after > 0.5) == (labels > 0.5)).float().mean() < 0.65
-    assert len(found.trials[0].losses) == 21
+    candidates = fine_tune(learner, data, touches, long)
+    assert len(candidates) == 21
+    assert ((candidates[-1].chances > 0.5) == (labels.numpy() > 0.5)).mean() < 0.65
+    (scratch,) = learn_from_scratch(
+        touches, data.task, long, {"kernel_ridge": default_option("learner", "kernel_ridge")}
+    )
+    assert ((scratch.chances > 0.5) == (labels.numpy() > 0.5)).mean() < 0.65
+
+
+def test_learners_from_scratch_need_each_label_outside_of_each_fold(trained, capsys):
+    _, data = trained
+    touches = data.touches("train")[:16]
+    touches = replace(touches, labels=torch.zeros_like(touches.labels))
+    options = {"kernel_ridge": default_option("learner", "kernel_ridge")}
+    assert not [*learn_from_scratch(touches, data.task, SMALL, options)]
+    assert "kernel_ridge is not compared: all training touches have the same label" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("layers", ["head", "all"])
-def test_the_chosen_layers_are_trained_and_batch_norms_keep_their_statistics(trained, network, layers):
-    _, data = trained
-    before = deepcopy(network.state_dict())
+def test_the_chosen_layers_are_trained_and_batch_norms_keep_their_statistics(trained, layers):
+    learner, data = trained
+    before = deepcopy(learner.network.state_dict())
     settings = replace(SMALL, layers=[layers], epochs=4)
-    assert fine_tune(network, data, other_skin(data.touches("validation")), settings).better
-    after = network.state_dict()
+    assert adapted(learner, data, other_skin(data.touches("validation")), settings)[1].name
+    after = learner.network.state_dict()
     changed = {name for name in before if not torch.equal(after[name], before[name])}
     statistics = {name for name in before if "running" in name or "num_batches" in name}
     assert statistics
@@ -115,26 +130,19 @@ def test_the_chosen_layers_are_trained_and_batch_norms_keep_their_statistics(tra
     assert changed == {name for name in trainable if layers == "all" or name.startswith("head.")}
 
 
-def test_the_choice_with_the_lowest_held_out_loss_is_taken(trained, network):
-    _, data = trained
-    wide = replace(SMALL, layers=["head", "all"], lr=[1e-6, 3e-3], epochs=6)
-    found = fine_tune(network, data, other_skin(data.touches("validation")), wide)
-    assert len(found.trials) == 4
-    lowest = min(found.trials, key=lambda trial: min(trial.losses))
-    epochs = lowest.losses.index(min(lowest.losses))
-    assert found.choice == f"layers={lowest.layers} lr=0.003 epochs={epochs}"
-
-
-def test_a_seed_gives_the_same_weights_and_leaves_the_random_state(trained, network):
-    _, data = trained
-    twin, touches = deepcopy(network), other_skin(data.touches("validation"))
+def test_the_choice_with_the_lowest_held_out_loss_is_taken_and_a_seed_gives_the_same_weights(trained):
+    learner, data = trained
+    twin, touches = deepcopy(learner), other_skin(data.touches("validation"))
+    wide = replace(SMALL, layers=["head", "all"], lr=[1e-6, 3e-3], epochs=4)
+    candidates, best, _ = adapted(learner, data, touches, wide)
+    assert len({one.name.rsplit(" ", 1)[0] for one in candidates}) == 5
+    assert " lr=0.003 " in best.name
     torch.manual_seed(5)
     expected = torch.rand(1)
     torch.manual_seed(5)
-    fine_tune(network, data, touches, replace(SMALL, epochs=3))
+    assert adapted(twin, data, touches, wide)[1].name == best.name
     assert torch.equal(torch.rand(1), expected)
-    fine_tune(twin, data, touches, replace(SMALL, epochs=3))
-    assert equal(network.state_dict(), twin.state_dict())
+    assert equal(learner.network.state_dict(), twin.network.state_dict())
 
 
 def test_folds_have_equal_shares_of_each_combination():

@@ -51,12 +51,9 @@ def store(tmp_path_factory):
     return store
 
 
-def test_latest_is_the_last_training_that_finished(store):
-    assert find_run(Tracking(store.uri), "latest").title == "newer"
-
-
-def test_the_beginning_of_an_id_is_enough(store):
+def test_a_run_is_latest_or_begins_with_an_id(store):
     run = find_run(Tracking(store.uri), "latest")
+    assert run.title == "newer"
     assert find_run(Tracking(store.uri), run.identity[:12]).identity == run.identity
 
 

@@ -12,7 +12,7 @@ from skin.device.files import DataSet, Manifest
 from skin.device.touches import concatenate
 from skin.errors import InputError
 from skin.runs.build import build_device
-from skin.runs.configuration import validate_config
+from skin.runs.configuration import settings_of, validate_config
 from skin.runs.generation import generate_data_set, generate_file
 
 SMALL = [
@@ -32,7 +32,7 @@ def composed(*overrides):
 
 def generate(folder, *overrides) -> str:
     config = composed(*overrides)
-    return generate_data_set(build_device(config), config, folder)
+    return generate_data_set(build_device(config), settings_of(config), folder)
 
 
 @pytest.fixture(autouse=True)
@@ -172,12 +172,12 @@ def test_only_one_process_generates_a_folder(tmp_path):
 def test_a_file_larger_than_memory_is_refused(tmp_path):
     config = composed("n=100000000")
     with pytest.raises(InputError, match=r"n=100000000 in one file needs about .* GB .*: add out=FOLDER"):
-        generate_file(build_device(config), config, tmp_path / "x.parquet")
+        generate_file(build_device(config), settings_of(config), tmp_path / "x.parquet")
 
 
 def test_a_recording_becomes_a_data_set(tmp_path):
     config = composed()
-    generate_file(build_device(config), config, tmp_path / "x.csv")
+    generate_file(build_device(config), settings_of(config), tmp_path / "x.csv")
     said = generate(tmp_path / "touches", "device=recording", f"device.path={tmp_path / 'x.csv'}")
     assert said.startswith("80 gestures in 1 shards")
     whole, found = build_device(config).recording(), DataSet(tmp_path / "touches").read(0)

@@ -78,5 +78,5 @@ def test_one_warning_counts_reused_results_of_other_code(run, tmp_path):
         store.client.set_tag(one.info.run_id, "source_commit", "0" * 40)
     again = run(tmp_path, "train", *words, apart=True)  # it warns as it ends
     assert again.returncode == 0
-    assert again.stderr.count("\n") == 1
+    assert again.stderr.count("\n") == 3
     assert "reused 2 finished runs, such as rules naive" in again.stderr

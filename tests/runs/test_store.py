@@ -7,6 +7,7 @@ import subprocess
 import sys
 from base64 import b64encode
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing, suppress
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from threading import Thread
 
@@ -14,10 +15,9 @@ import pytest
 
 from skin.core.files import ROOT
 from skin.errors import InputError
-from skin.runs import store as tracking
 from skin.runs.configuration import Tracking, hide_password, reveal_password, source_tags
 from skin.runs.run import FinishedRun
-from skin.runs.store import TAGS, Store, print_table_link
+from skin.runs.store import Store, print_table_link
 from skin.runs.torch_model import load_run
 from tests.budget import free
 
@@ -54,26 +54,20 @@ def status(store, run):
     return store.client.get_run(run.info.run_id).info.status
 
 
-def test_a_run_that_ends_by_itself_is_finished(store):
-    with store.run("good", {"fingerprint": "a"}) as run:
+@pytest.mark.parametrize(
+    ("error", "expected"), [(None, "FINISHED"), (ValueError, "FAILED"), (KeyboardInterrupt, "KILLED")]
+)
+def test_a_run_is_finished_only_if_it_ends_by_itself(store, error, expected):
+    identity = f"print {expected}"
+    with suppress(ValueError, KeyboardInterrupt), store.run("run", {"fingerprint": identity}) as run:
         assert status(store, run) == "RUNNING"
-        assert not store.find("FINISHED", fingerprint="a")
-    assert status(store, run) == "FINISHED"
-    assert [found.info.run_id for found in store.find("FINISHED", fingerprint="a")] == [run.info.run_id]
-
-
-def test_a_run_that_raises_is_failed_and_says_why(store):
-    with pytest.raises(ValueError, match="broken"), store.run("bad", {"fingerprint": "b"}) as run:
-        raise ValueError("broken")
-    assert status(store, run) == "FAILED"
-    assert store.client.get_run(run.info.run_id).data.tags["error"] == "ValueError: broken"
-    assert not store.find("FINISHED", fingerprint="b")
-
-
-def test_an_interrupted_run_is_killed(store):
-    with pytest.raises(KeyboardInterrupt), store.run("stopped", {"fingerprint": "c"}) as run:
-        raise KeyboardInterrupt
-    assert status(store, run) == "KILLED"
+        assert not store.find("FINISHED", fingerprint=identity)
+        if error:
+            raise error("broken")
+    assert status(store, run) == expected
+    assert len(store.find("FINISHED", fingerprint=identity)) == (error is None)
+    tags = store.client.get_run(run.info.run_id).data.tags
+    assert tags.get("error") == ("ValueError: broken" if error is ValueError else None)
 
 
 @pytest.mark.slow("trains until a signal")
@@ -100,7 +94,7 @@ def test_a_second_signal_does_not_interrupt_the_end_of_a_run(store, monkeypatch)
         signal.raise_signal(signal.SIGTERM)
         ended.append(status)
 
-    monkeypatch.setattr(Store, "_end", end)
+    monkeypatch.setattr(Store, "end", end)
     # Else a signal that is not expected would end the tests.
     signal.signal(signal.SIGTERM, lambda *_: pytest.fail("a signal was not expected"))
     try:
@@ -111,27 +105,18 @@ def test_a_second_signal_does_not_interrupt_the_end_of_a_run(store, monkeypatch)
     assert ended == ["KILLED"]
 
 
-def test_a_run_whose_process_is_gone_is_called_killed(settings, store):
-    here, number, started = json.loads(tracking._identify_process())
-    with subprocess.Popen([sys.executable, "-c", ""]) as ended:
-        pass
-    tags = {
-        "gone": json.dumps([here, ended.pid, started]),
-        "number given anew": json.dumps([here, number, started - 3600]),
-        "another machine": json.dumps(["elsewhere", ended.pid, started]),
-        "no process": "x",
-    }
-    runs = {
-        name: store.client.create_run(store.experiment, run_name=name, tags={"process": process})
-        for name, process in tags.items()
-    }
-    with store.run("mine", {}) as runs["mine"]:
+def test_a_run_without_a_process_is_closed(settings, store):
+    """One whose lock is not here is one of another machine."""
+    abandoned, elsewhere = (store.create(name, {}) for name in ("abandoned", "elsewhere"))
+    (store.folder / f"{abandoned.info.run_id}.lock").touch()
+    with store.run("mine", {}) as mine:
         Store.open(settings)
-        found = {name: status(store, run) for name, run in runs.items()}
-    killed = {name for name, said in found.items() if said == "KILLED"}
-    assert killed == {"gone", "number given anew"}
-    assert set(found.values()) == {"KILLED", "RUNNING"}
-    assert status(store, runs["mine"]) == "FINISHED"
+        assert [status(store, run) for run in (abandoned, elsewhere, mine)] == [
+            "KILLED",
+            "RUNNING",
+            "RUNNING",
+        ]
+    assert not (store.folder / f"{mine.info.run_id}.lock").exists()
 
 
 def test_a_child_knows_its_parent(store):
@@ -140,22 +125,14 @@ def test_a_child_knows_its_parent(store):
         assert source_tags().items() <= child.data.tags.items()
 
 
-def test_opening_twice_gives_the_same_experiment(settings, store):
-    assert Store.open(settings).experiment == store.experiment
-
-
-def test_artifacts_lie_where_they_were_meant_to(settings, store):
+def test_a_store_is_opened_again_with_its_files_and_read_while_it_is_written(settings, store):
+    assert Store.open(settings).experiment == Store.existing(settings).experiment == store.experiment
     with store.run("with a file", {}) as run:
         store.client.log_text(run.info.run_id, "hello", "note.txt")
     (found,) = (ROOT / settings.artifacts).glob("**/note.txt")
     assert found.read_text() == "hello"
-
-
-def test_readers_and_writers_work_side_by_side(settings, store):
-    path = settings.uri.removeprefix("sqlite:///")
-    database = sqlite3.connect(path)
-    assert database.execute("PRAGMA journal_mode").fetchone() == ("wal",)
-    database.close()
+    with closing(sqlite3.connect(settings.uri.removeprefix("sqlite:///"))) as database:
+        assert database.execute("PRAGMA journal_mode").fetchone() == ("wal",)
 
 
 @pytest.mark.slow("imports MLflow in several processes")
@@ -177,13 +154,6 @@ def test_the_experiment_has_the_tags_of_the_run_table(store):
     assert tags["mlflow.experimentKind"] == "custom_model_development"
     view = json.loads(tags["mlflow.sharedViewState.skin"])
     assert "metrics.`same/overall/accuracy`" in view["selectedColumns"]
-
-
-def test_an_experiment_of_an_earlier_version_gets_the_tags(store, settings):
-    for name in TAGS:
-        store.client.delete_experiment_tag(store.experiment, name)
-    assert not store.client.get_experiment(store.experiment).tags
-    assert Store.open(settings).client.get_experiment(store.experiment).tags == TAGS
 
 
 def test_the_link_opens_the_runs_of_the_experiment(tmp_path, monkeypatch, capsys):
@@ -211,10 +181,6 @@ def test_a_store_without_a_database_has_no_runs_and_makes_no_file(tmp_path):
     store = Store.existing(Tracking(f"sqlite:///{tmp_path}/m.db", None, "skin", True, None))
     assert store.find("FINISHED", fingerprint="a") == []
     assert not list(tmp_path.iterdir())
-
-
-def test_an_existing_database_is_opened(settings, store):
-    assert Store.existing(settings).experiment == store.experiment
 
 
 @pytest.mark.parametrize(

@@ -12,8 +12,8 @@ from omegaconf import OmegaConf
 
 from skin.core.files import CONF
 from skin.errors import InputError
-from skin.runs.configuration import Tracking
-from skin.runs.store import Store, shorten
+from skin.runs.configuration import Tracking, shorten
+from skin.runs.store import Store
 from skin.runs.sweep import SweepCallback, sweep_jobs, sweep_title
 
 # MLflow's own business with SQLAlchemy.
@@ -36,28 +36,19 @@ def named(seed, more=""):
     return shorten(name, f" seed {seed}")
 
 
-def test_jobs_come_in_hydras_order():
+def test_jobs_come_in_hydras_order_and_the_command_line_wins_over_the_sweeps_file():
     found = sweep_jobs(["seed=0,1", "row=x"], {"simulator": "naive,fem"})
     assert [(job["simulator"], job["seed"], job["row"]) for job in found] == [
-        ("naive", "0", "x"),
-        ("naive", "1", "x"),
-        ("fem", "0", "x"),
-        ("fem", "1", "x"),
+        (simulator, seed, "x") for simulator in ("naive", "fem") for seed in ("0", "1")
     ]
-
-
-def test_the_command_line_wins_over_the_sweeps_file():
     found = sweep_jobs(["simulator=fem"], {"simulator": "naive,fem", "experiment": "rules,features"})
-    assert [job["experiment"] for job in found] == ["rules", "features"]
-    assert {job["simulator"] for job in found} == {"fem"}
+    assert found == [{"simulator": "fem", "experiment": name} for name in ("rules", "features")]
 
 
 @pytest.mark.parametrize(
     ("override", "values"),
     [
         ("seed=range(0,3)", ["0", "1", "2"]),
-        ("seed=choice(4,2)", ["4", "2"]),
-        ("seed=sort(4,2)", ["2", "4"]),
         ("model.widths=[32,32],[32,128]", ["[32,32]", "[32,128]"]),
         ("+device.calibration='a,b.yaml',c.yaml", ["'a,b.yaml'", "c.yaml"]),
     ],
@@ -98,16 +89,15 @@ def runs(folder):
 @pytest.mark.slow("trains several runs")
 def test_a_sweep_that_was_killed_goes_on_where_it_was(run, begin, tmp_path):
     with begin(tmp_path, *sweep(tmp_path, "seed=0,1,2")) as first:
-        next(line for line in first.lines() if line.startswith("[2/3]"))
+        next(line for line in first.lines() if line.startswith("[1/3]"))
     assert [one[:2] for one in runs(tmp_path)][:2] == [
         ("seed=0,1,2", "RUNNING"),
         (named(0), "FINISHED"),
     ]
     again = run(tmp_path, *sweep(tmp_path, "seed=0,1,2"), store=False)
     assert again.returncode == 0, again.stderr
-    assert [line for line in again.stdout.splitlines() if "finished before" in line] == [
-        line for line in again.stdout.splitlines() if line.startswith("[1/3]") and "…" not in line
-    ]
+    assert again.stderr.count("did this before") == 1
+    assert "[3/3] seed=2: done" in again.stdout
     finished = [name for name, status, parent in runs(tmp_path) if status == "FINISHED" and parent]
     assert finished == [named(0), named(1), named(2)]
 
@@ -232,7 +222,7 @@ def test_a_shard_of_a_search_is_refused(tmp_path, monkeypatch):
     sweeper = {"_target_": "hydra_plugins.x.Search"}
     hydra = {"sweeper": sweeper, "overrides": {"task": ["seed=interval(0,3)"]}}
     with pytest.raises(InputError, match=r"^shard=1/2 divides a list of jobs, which this sweeper does not"):
-        SweepCallback()._open(OmegaConf.create({"shard": "1/2", "hydra": hydra}))
+        SweepCallback()._begin(OmegaConf.create({"shard": "1/2", "hydra": hydra}))
 
 
 @pytest.mark.slow("trains several runs")
@@ -240,8 +230,7 @@ def test_a_run_is_nested_under_the_sweep_that_trained_it(run, tmp_path):
     for seeds in ("0,1,0", "1,0", "shuffle(0,1,2)"):
         done = run(tmp_path, *sweep(tmp_path, f"seed={seeds}"), store=False)
         assert done.returncode == 0, done.stderr
-    labels = [line for line in done.stdout.splitlines() if line.endswith("finished before")]
-    assert sorted(line.split()[1] for line in labels) == ["seed=0", "seed=1"]
+    assert done.stderr.count("did this before") == 2
     second, first = parents(tmp_path)  # the one in between trained nothing
     assert (first.info.run_name, first.info.status) == ("seed=0,1", "FINISHED")
     children = {one[0]: one[2] for one in runs(tmp_path) if one[2]}

@@ -1,6 +1,5 @@
 """A training that is killed continues, and ends as if nothing had happened."""
 
-import json
 import os
 import re
 import signal
@@ -20,8 +19,8 @@ from pytorch_lightning.loggers import MLFlowLogger
 from skin.errors import InputError
 from skin.learning.network import LAST
 from skin.runs.configuration import Tracking, source_tags
-from skin.runs.store import PROCESS, Store
-from skin.runs.train import RunLogger, alone, find_unfinished
+from skin.runs.store import Store
+from skin.runs.train import RunLogger, find_unfinished
 
 # MLflow's own business with SQLAlchemy.
 pytestmark = pytest.mark.filterwarnings("ignore:The ``noload`` loader strategy")
@@ -72,7 +71,7 @@ def test_a_killed_training_ends_with_the_weights_of_one_that_was_not(run, begin,
     own = [f"tracking.uri=sqlite:///{killed}/m.db", f"tracking.artifacts={killed}/a"]
     with begin(killed, *TRAINING, *own) as first:
         last = wait_for(2, killed, first)
-    settings, store = stored(killed)
+    _, store = stored(killed)
     (left,) = store.find("KILLED")
     again = run(killed, *TRAINING)
     assert again.returncode == 0, again.stderr
@@ -82,7 +81,7 @@ def test_a_killed_training_ends_with_the_weights_of_one_that_was_not(run, begin,
     assert found.info.run_id == left.info.run_id
     assert epochs(killed, found) == epochs(whole, expected)
     assert all(torch.equal(weights[name], same[name]) for name in weights)
-    assert find_unfinished(store, settings, found.data.tags["fingerprint"]) is None
+    assert find_unfinished(store, found.data.tags["fingerprint"]) is None
 
 
 @pytest.mark.slow("trains several times")
@@ -90,14 +89,12 @@ def test_other_code_and_resume_false_begin_again_and_a_complete_training_is_eval
     own = [f"tracking.uri=sqlite:///{tmp_path}/m.db", f"tracking.artifacts={tmp_path}/a"]
     with begin(tmp_path, *TRAINING, *own) as first:
         wait_for(7, tmp_path, first)
-    settings, store = stored(tmp_path)
+    _, store = stored(tmp_path)
     (left,) = store.find("KILLED")
     identity, commit = left.data.tags["fingerprint"], left.data.tags["source_commit"]
-    assert find_unfinished(store, settings, "another") is None
-    fresh = Tracking(settings.uri, settings.artifacts, "skin", False, None)
-    assert find_unfinished(store, fresh, identity) is None
+    assert find_unfinished(store, "another") is None
     store.client.set_tag(left.info.run_id, "source_commit", "another")
-    assert find_unfinished(store, settings, identity) is None
+    assert find_unfinished(store, identity) is None
     store.client.set_tag(left.info.run_id, "source_commit", commit)
     again = run(tmp_path, *TRAINING)
     assert again.returncode == 0, again.stderr
@@ -218,25 +215,24 @@ def test_a_training_in_progress_is_refused_and_a_killed_one_is_not(run, begin, t
 
 
 def test_only_one_process_trains_a_configuration(tmp_path):
-    settings, _ = stored(tmp_path)
+    _, store = stored(tmp_path)
     refused = pytest.raises(InputError, match="wait for it")
-    with alone(settings, "a"), alone(settings, "b"), refused, alone(settings, "a"):
+    with store.hold("a"), store.hold("b"), refused, store.hold("a"):
         pass
-    with alone(settings, "a"):
+    with store.hold("a"):
         pass
 
 
-def test_a_run_of_another_machine_is_continued_where_its_folder_is_here(tmp_path):
+def test_a_killed_run_of_another_machine_is_continued_where_its_folder_is_here(tmp_path):
     settings, store = stored(tmp_path)
-    tags = source_tags() | {"fingerprint": "a", PROCESS: json.dumps(["another machine", 1, 0.0])}
-    runs = [store.client.create_run(store.experiment, tags=tags) for _ in range(2)]
-    folder = tmp_path / "a" / "unfinished" / runs[0].info.run_id
+    run = store.create("killed", source_tags() | {"fingerprint": "a"})
+    folder = store.folder / run.info.run_id
     folder.mkdir(parents=True)
-    assert find_unfinished(store, settings, "a") is None
-    statuses = [store.client.get_run(run.info.run_id).info.status for run in runs]
-    assert statuses == ["KILLED", "RUNNING"]
+    folder.with_name(f"{run.info.run_id}.lock").touch()
+    store = Store.open(settings)
+    assert find_unfinished(store, "a") is None
     (folder / LAST).touch()
-    assert find_unfinished(store, settings, "a").info.run_id == runs[0].info.run_id
+    assert find_unfinished(store, "a").info.run_id == run.info.run_id
 
 
 def test_metrics_that_a_server_did_not_take_are_sent_by_the_next_logger(tmp_path, monkeypatch):

@@ -53,7 +53,7 @@ def changed(path, folder, change):
         (lambda known: known.update(rate="fast"), "rate=fast"),
         (lambda known: known.update(labels=[]), "labels"),
         (lambda known: known.update(sensors=7), "6 positions for 7 sensors"),
-        (lambda known: known.update(window=20), "not readings and valid of"),
+        (lambda known: known.update(window=20), "not readings .float. and valid .bool. of"),
     ],
 )
 def test_a_wrong_description_is_refused(exported, tmp_path, change, message):
@@ -65,7 +65,7 @@ def test_other_files_are_refused(tmp_path):
     with pytest.raises(InputError, match="there is no file"):
         OnnxModel(tmp_path / "none.onnx")
     (tmp_path / "text.onnx").write_text("no model")
-    with pytest.raises(InputError, match="no model that ONNX Runtime can load"):
+    with pytest.raises(InputError, match="ONNX Runtime cannot load"):
         OnnxModel(tmp_path / "text.onnx")
     with pytest.raises(InputError, match="was not written by skin export"):
         ModelMetadata.parse({}, "x.onnx")

@@ -34,8 +34,8 @@ from skin.inference.candidates import FingertipPrior
 from skin.inference.noise import Noise
 from skin.inference.posterior import FrameEstimate, Posterior
 from skin.mechanics.simulator.solid import Solid
-from skin.touch.gesture import GestureSettings
-from skin.touch.shapes import Shapes, draw_bodies
+from skin.touch.gestures import GestureSettings, draw_bodies
+from skin.touch.shapes import Shapes
 
 CELL = 0.005  # m
 POISSON = {"Dragon Skin 10 Medium": 0.49}

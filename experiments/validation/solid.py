@@ -344,8 +344,8 @@ def _under_discs(body: Sheet, sensors: Sensors) -> np.ndarray:
     at = (sensors.positions[:, None, :2] + _BESIDE).reshape(-1, 2)
     turn, felt = np.zeros(len(at)), []
     for radius in _RADII:
-        moments = shapes.press(turn.astype(int), turn, turn + radius / spread, at).moments.flatten(1).double()
-        every = (moments.numpy() @ operator.T).reshape(len(sensors), len(_BESIDE), -1)
+        moments, _, _ = shapes.press(turn.astype(int), turn, turn + radius / spread, at)
+        every = (moments.flatten(1).double().numpy() @ operator.T).reshape(len(sensors), len(_BESIDE), -1)
         felt.append(every.diagonal(axis1=0, axis2=2).T * np.pi * radius**2 / np.prod(body.cell))
     return np.stack(felt)
 

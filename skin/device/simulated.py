@@ -28,9 +28,9 @@ from skin.mechanics.geometry import sensor_geometry
 from skin.mechanics.relaxation import Relaxing, relaxes
 from skin.mechanics.simulator.base import AbstractSimulator
 from skin.touch.fingertips import read_touch
-from skin.touch.gesture import TouchSettings
 from skin.touch.labels import TOUCH, TOUCH_OR_NOT, TOUCH_SLIDING
 from skin.touch.movie import Movie
+from skin.touch.paths import TouchSettings
 from skin.touch.sampler import AbstractContact, AbstractSampler
 from skin.touch.splines import footprints
 
@@ -185,11 +185,12 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
                 "a skin that relaxes is simulated touch by touch from rest, where it stays, got "
                 "data.stream=true: leave that out, or the materials' relaxation"
             )
-        self.task = TOUCH_OR_NOT if self.stream else TOUCH_SLIDING if self.direction else TOUCH
         self.size, self.sensors = self.body.size, self.layout.sensors(self.body)
         errors = self.position_error, self.seed, self.footprint_error
         self.true_sensors = misplace(self.sensors, self.size, *errors)
         settings = read_touch(self.touch)
+        task = TOUCH_OR_NOT if self.stream else TOUCH_SLIDING if self.direction else TOUCH
+        self.task = task.with_labels(tuple(settings.labels))
         self.window, self.model_rate = settings.frames.window, float(settings.rate)
         check_rate(self.slowest, self.model_rate, "device.rate")
         self.model = build_model(self.simulator, self.body, self.true_sensors, self.model_rate)
@@ -370,9 +371,10 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
         )
         strain = self.model.strain(movie.frames, movie.shear) if complete else None
         true_values = {} if strain is None else {"strain": (strain[movie.index] * movie.scale).amax(1)}
-        # Windows of streams get other labels.
-        about = TOUCH if self.stream else self.task, self.size, self.sensors.footprint
-        return Recording(touches, *about, movie.force, displacement, movie.parameters | true_values)
+        # Windows of streams get the label touch, too.
+        task = TOUCH.with_labels(tuple(self.sampler.settings.labels)) if self.stream else self.task
+        measured = movie.force, displacement, movie.parameters | true_values
+        return Recording(touches, task, self.size, self.sensors.footprint, *measured)
 
     def _apply_imperfections(self, true: Recording, noise: np.random.Generator) -> Recording:
         """Return true readings with the imperfections of the device."""

@@ -31,8 +31,8 @@ from skin.mechanics.simulator.fem import PlatesAndBeams
 from skin.mechanics.simulator.naive import Naive
 from skin.mechanics.simulator.solid import Solid
 from skin.touch.fingertips import read_touch
-from skin.touch.gesture import TouchSettings
 from skin.touch.labels import TOUCH
+from skin.touch.paths import TouchSettings
 
 Range = Annotated[tuple[PositiveFloat, PositiveFloat], RISING]
 Kind = Literal["grid", "scattered", "hexagonal", "random", "clustered", "spread"]
@@ -327,8 +327,9 @@ class Skins(ImperfectionSettings, AbstractDevice):
 
     def __post_init__(self) -> None:
         self.distribution = configured(SkinDistribution, self.skins, "device.skins")
-        self.task, self.size, self.sensors = TOUCH, self.body.size, self.layout.sensors(self.body)
-        self.window = read_touch(self.touch).frames.window
+        settings = read_touch(self.touch)
+        self.task, self.window = TOUCH.with_labels(tuple(settings.labels)), settings.frames.window
+        self.size, self.sensors = self.body.size, self.layout.sensors(self.body)
         self._wider = wider_touch(self.touch, self.training_touch)
         self._kept: dict[str, Touches] = {}
 

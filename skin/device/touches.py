@@ -14,7 +14,7 @@ from torch.nn.functional import pad
 
 from skin.body.base import GEOMETRY
 from skin.errors import InputError
-from skin.touch.labels import CONTACT, TOUCH_OR_NOT, Task
+from skin.touch.labels import CONTACT, TOUCH, TOUCH_OR_NOT, Task
 from skin.touch.movie import Movie, join_movies
 from skin.touch.sampler import AbstractSampler
 
@@ -281,9 +281,8 @@ class Timeline:
 
         Returns:
             The gesture with the most frames in each window, (W,), the first in a tie, -1 without contact; the
-            fraction of its contact frames in the window, (W,), 0 to 1; its labels, (W, 5), float32, in the
-            order of ``skin.touch.labels.TOUCH_OR_NOT``, even if the window shows a part of it, all 0 without
-            contact.
+            fraction of its contact frames in the window, (W,), 0 to 1; its labels and ``touch``, (W, L + 1),
+            float32, even if the window shows a part of it, all 0 without contact.
         """
         nearest = torch.searchsorted(self.end, starts, right=True)
         last = torch.searchsorted(self.begin, starts + window)
@@ -363,7 +362,7 @@ class TouchStream:
                 motion=along(gestures.touches.motion),
                 contacts=along(gestures.touches.contacts, nan),
             ),
-            task=TOUCH_OR_NOT,
+            task=TOUCH_OR_NOT.with_labels(gestures.task.names[len(TOUCH) :]),
             force=along(gestures.force),
             displacement=along(gestures.displacement),
             parameters={},

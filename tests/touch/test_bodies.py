@@ -13,9 +13,8 @@ from skin.body.layout import Grid
 from skin.device.balance import accuracy_from_shape, check_label_leakage
 from skin.errors import InputError
 from skin.mechanics.contact.prescribed import Prescribed
-from skin.touch.gesture import GestureSettings
-from skin.touch.sampler import TouchSampler
-from skin.touch.shapes import Fit, Shapes, draw_bodies
+from skin.touch.gestures import Fit, GestureSettings, TouchSampler, draw_bodies
+from skin.touch.shapes import Shapes
 
 LAYER = [{"material": "EcoFlex 00-30", "thickness": 0.005}]
 DEFAULT = Sheet((0.16, 0.16), (32, 32), LAYER)

@@ -9,7 +9,7 @@ from skin.body.layout import Grid
 from skin.errors import InputError
 from skin.mechanics.contact.prescribed import Prescribed
 from skin.touch.fingertips import FingertipSampler, FingertipSettings, read_touch
-from skin.touch.gesture import GestureSettings
+from skin.touch.gestures import GestureSettings
 from skin.touch.labels import Thresholds
 from skin.touch.movie import join_movies
 from tests.touch.movie_labels import movie_labels

@@ -11,7 +11,7 @@ from skin.body.layout import Grid
 from skin.core.rng import Stream, generator
 from skin.device.touches import draw_timeline
 from skin.mechanics.contact.prescribed import Prescribed
-from skin.touch.sampler import TouchSampler
+from skin.touch.gestures import TouchSampler
 
 BODY = Sheet([0.16, 0.16], [32, 32], [{"material": "EcoFlex 00-30", "thickness": 0.005}])
 SENSORS = Grid(5, 5).sensors(BODY)

@@ -11,7 +11,7 @@ from skin.device.simulated import Simulated
 from skin.device.touches import Timeline
 from skin.errors import InputError
 from skin.mechanics.simulator.naive import Naive
-from skin.touch.gesture import GestureSettings
+from skin.touch.gestures import GestureSettings
 from skin.touch.labels import TOUCH_OR_NOT
 from tests.touch.movie_labels import movie_labels
 

@@ -14,9 +14,10 @@ from skin.mechanics.contact.prescribed import Prescribed
 from skin.mechanics.contact.rigid import Rigid
 from skin.mechanics.simulator.base import AbstractSimulator, Response
 from skin.mechanics.simulator.naive import Naive
-from skin.touch.gesture import GestureSettings, Trajectories
-from skin.touch.sampler import ContactProblem, TouchSampler
-from skin.touch.shapes import Shapes
+from skin.touch.gestures import GestureSettings, TouchSampler
+from skin.touch.paths import Trajectories
+from skin.touch.sampler import ContactProblem
+from skin.touch.shapes import Pose, Shapes
 from tests.touch.movie_labels import movie_labels
 
 from .halfspace import love
@@ -61,10 +62,13 @@ def still(
     count = len(shares)
     return Trajectories(
         np.zeros(count, int),
-        np.zeros(count, int),
-        np.zeros(count),
-        np.full(count, scale),
-        np.tile(place, (count, 1)),
+        Pose(
+            np.zeros(count, int),
+            np.zeros(count),
+            np.full(count, scale),
+            np.tile(place, (count, 1)),
+            np.ones(count),
+        ),
         np.array(shares),
         torch.arange(count)[None],
         torch.tensor([shares]),

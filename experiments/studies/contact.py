@@ -25,9 +25,10 @@ from scipy.stats import binomtest
 from experiments import run_script, script_settings
 from experiments.studies.pages import csv_text
 from experiments.validation.references import Discs, Slab
-from skin.body.base import AbstractBody, Layer, Sensors, Sheet
+from skin.body.base import AbstractBody, Layer, Sensors
 from skin.body.layout import AbstractLayout, Grid, Hexagonal, Random
 from skin.body.material import Material
+from skin.body.sheet import Sheet
 from skin.core.files import ROOT, write
 from skin.errors import InputError
 from skin.inference.candidates import FingertipPrior

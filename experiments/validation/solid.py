@@ -26,7 +26,9 @@ from experiments.validation.references import (
     solve_block,
     square_punch,
 )
-from skin.body.base import AbstractBody, Arm, Sensors, Sheet
+from skin.body.arm import Arm
+from skin.body.base import AbstractBody, Sensors
+from skin.body.sheet import Sheet
 from skin.mechanics.contact.rigid import solve_contact as press
 from skin.mechanics.contact.rigid import stabilise_checkerboard
 from skin.mechanics.simulator._hexahedra import Hexahedra

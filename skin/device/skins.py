@@ -16,9 +16,11 @@ from rich.progress import track
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from skin.body.base import GEOMETRY, AbstractBody, Arm, Layer, Sensors, Sheet
+from skin.body.arm import Arm
+from skin.body.base import GEOMETRY, AbstractBody, Layer, Sensors
 from skin.body.layout import AbstractLayout, Footprint, Grid, Hexagonal, Listed, Random, Scattered
 from skin.body.material import Material
+from skin.body.sheet import Sheet
 from skin.core.rng import Stream, generator
 from skin.core.settings import RISING, checked, configured
 from skin.device.base import AbstractDevice, Blank, Split, in_threads, split_slices

@@ -73,7 +73,16 @@ class FingertipSettings(TouchSettings):
         padded: bool,
         moments: np.ndarray | None,
     ) -> "FingertipSampler":
-        """Return what draws fingertips."""
+        """Return what draws fingertips.
+
+        Raises:
+            InputError: a contact that solves for the pressure.
+        """
+        if not contact.proportional:
+            raise InputError(
+                "fingertips are softer than the skin and press as their picture: set contact=prescribed, or "
+                "touch=gestures for rigid objects"
+            )
         return FingertipSampler(body, footprints, contact, self, padded, moments)
 
 
@@ -172,8 +181,7 @@ def peak_per_newton(shapes: Shapes, shape: np.ndarray, radius: np.ndarray) -> np
         shape: indices.
         radius: half the larger extent of each, m.
     """
-    covers = np.array([_cover(name, shapes.contact) for name in shapes.names])
-    return 1 / (covers[shape] * radius**2)
+    return 1 / (np.array([_cover(name, shapes.contact) for name in shapes.names])[shape] * radius**2)
 
 
 @cache
@@ -196,27 +204,11 @@ class FingertipSampler(AbstractSampler):
         settings: ranges of the fingertips.
 
     Raises:
-        InputError: settings or pictures that cannot be used, or a contact that solves for the pressure.
+        InputError: settings or pictures that cannot be used.
     """
 
     chosen = ("dynamic", "press")
     settings: FingertipSettings
-
-    def __init__(
-        self,
-        body: AbstractBody,
-        footprints: np.ndarray,
-        contact: AbstractContact,
-        settings: FingertipSettings,
-        padded: bool = True,
-        moments: np.ndarray | None = None,
-    ) -> None:
-        if not contact.proportional:
-            raise InputError(
-                "fingertips are softer than the skin and press as their picture: set contact=prescribed, or "
-                "touch=gestures for rigid objects"
-            )
-        super().__init__(body, footprints, contact, settings, padded, moments)
 
     @torch.no_grad()
     def sample(self, count: int, generator: np.random.Generator, labels: np.ndarray | None = None) -> Movie:
@@ -305,7 +297,6 @@ class FingertipSampler(AbstractSampler):
         shape, scale = drawn["tips"], drawn["radius"] / half_extents(self.shapes)[drawn["tips"]]
         frames = torch.zeros(len(owner), *self.body.shape)
         highest, areas = torch.zeros(2, len(owner))
-        cell = float(np.prod(self.body.cell))
         for k in range(scale.shape[1]):
             rows = np.flatnonzero(drawn["number"][owner] > k)
             # Sorted by scale, because frames of one texture level are rendered together.
@@ -313,7 +304,7 @@ class FingertipSampler(AbstractSampler):
             mine, todo = owner[rows], torch.from_numpy(rows)
             centres = place[rows] + drawn["offset"][mine, k]
             pose = shape[mine, k], np.zeros(len(rows)), scale[mine, k], centres
-            full = torch.from_numpy(drawn["forces"][mine, k] / cell).float()
+            full = torch.from_numpy(drawn["forces"][mine, k] / float(np.prod(self.body.cell))).float()
             if self.shapes.fine:
                 spread, peak, area = self.shapes.press(*pose)
                 areas[todo] += torch.from_numpy(area).float()

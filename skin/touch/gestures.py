@@ -372,8 +372,8 @@ class TouchSampler(AbstractSampler):
         if len(pending):
             raise self._explain_impossible(wanted[pending[0]])
         movie = join_movies(movies)[torch.from_numpy(np.concatenate(finished).argsort())]
-        contact = settings.thresholds.contact
-        return add_second(movie, settings.second, contact, generator) if settings.second else movie
+        second = settings.second, settings.thresholds.contact
+        return add_second(movie, *second, generator) if settings.second else movie
 
     def _round(
         self,
@@ -397,8 +397,9 @@ class TouchSampler(AbstractSampler):
         drawn = {name: values[rows] for name, values in gestures.items()}
         drawn |= draw_paths(wanted[rows], drawn, self.settings, self.body.size, random[turns, rows])
         movie, pressed = self._press(drawn | {"draws": draws[rows] + turns + 1}, wanted[rows])
-        labels = movie.labels[:, : len(TOUCH)].numpy()
-        right = ((labels == wanted[rows]).all(axis=1) & ~pressed.refused).reshape(-1, ahead)
+        right = (
+            (movie.labels[:, : len(TOUCH)].numpy() == wanted[rows]).all(axis=1) & ~pressed.refused
+        ).reshape(-1, ahead)
         chosen = right.any(axis=1)
         first = np.arange(len(pending)) * ahead + right.argmax(axis=1)
         draws[pending] += ahead
@@ -410,15 +411,15 @@ class TouchSampler(AbstractSampler):
 
     def _press(self, gestures: Draws, wanted: np.ndarray) -> tuple[Movie, ContactResult]:
         """Return the movie of gestures (B,) with its labels."""
-        settings = self.settings
-        paths = sample_paths(gestures, wanted, settings, self.contact.proportional)
-        problem = ContactProblem(self.shapes, self.footprints, settings)
-        pressed = self.contact.press(paths.trajectories, problem)
+        paths = sample_paths(gestures, wanted, self.settings, self.contact.proportional)
+        pressed = self.contact.press(
+            paths.trajectories, ContactProblem(self.shapes, self.footprints, self.settings)
+        )
         index, profile, frames = paths.trajectories.index, paths.trajectories.profile, pressed.frames
         area = None if pressed.area is None else torch.from_numpy(pressed.area).float()
         weights = self.footprints if area is None or self.moments is None else self.moments
         measures = measure_gestures(
-            frames, index, profile, weights, self.body.cell, settings.thresholds.contact, area
+            frames, index, profile, weights, self.body.cell, self.settings.thresholds.contact, area
         )
         if self.moments is not None and area is None:
             down, across = (torch.from_numpy(splines.of_cells(count)).float() for count in self.body.shape)

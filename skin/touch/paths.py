@@ -213,8 +213,7 @@ def draw_times(
     least = np.where(dynamic, np.maximum(least, frames.slide), least)
     random = generator.random((len(labels), 2))
     duration = least + (random[:, 0] * (most - least + 1)).astype(int)
-    free = frames.window - duration if padded else np.zeros_like(duration)
-    onset = (random[:, 1] * (free + 1)).astype(int)
+    onset = (random[:, 1] * (1 + padded * (frames.window - duration))).astype(int)
     if padded and settings.ongoing:
         ongoing, moment = generator.random((2, len(labels)))
         # Whether a touch is a press, and whether it moves, shows after so many frames.

@@ -165,11 +165,16 @@ class AbstractSampler(ABC):
         drawn |= dict(zip("xy", paths.trajectories.poses.place[paths.first].T, strict=True))
         floats = {name: torch.from_numpy(drawn[name]).float() for name in _PARAMETERS}
         floats |= {name: value.float() for name, value in measures._asdict().items()}
-        shear, trajectories = None, paths.trajectories
-        if self.settings.shear:
-            shear = torch.from_numpy(self.settings.shear * heading(paths.place, paths.first)).float()
+        trajectories, friction = paths.trajectories, self.settings.shear
+        drag = torch.from_numpy(friction * heading(paths.place, paths.first)).float()
         movie = Movie(
-            frames, trajectories.index, trajectories.profile, torch.empty(0), floats, shear, contacts
+            frames,
+            trajectories.index,
+            trajectories.profile,
+            torch.empty(0),
+            floats,
+            drag if friction else None,
+            contacts,
         )
         held = [label.measure(movie, self.body) > label.above for label in self.labels.values()]
         return replace(movie, labels=torch.stack(held, dim=1).float())

@@ -15,7 +15,8 @@ from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, grid_sample
 
-from skin.body.base import AbstractBody, Sheet
+from skin.body.base import AbstractBody
+from skin.body.sheet import Sheet
 from skin.touch import splines
 from skin.touch.images import halve, hulls, load_image, pyramid
 

@@ -8,8 +8,8 @@ from sklearn.ensemble import HistGradientBoostingClassifier
 from sklearn.metrics import balanced_accuracy_score
 from sklearn.model_selection import cross_val_predict
 
-from skin.body.base import Sheet
 from skin.body.layout import Grid
+from skin.body.sheet import Sheet
 from skin.device.balance import accuracy_from_shape, check_label_leakage
 from skin.errors import InputError
 from skin.mechanics.contact.prescribed import Prescribed

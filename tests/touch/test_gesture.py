@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from omegaconf import OmegaConf
 
-from skin.body.base import Sheet
+from skin.body.sheet import Sheet
 from skin.errors import InputError
 from skin.touch.fingertips import FingertipSettings, read_touch
 from skin.touch.gestures import GestureSettings, draw_bodies, draw_paths

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from skin.body.base import Sheet
 from skin.body.layout import Grid
+from skin.body.sheet import Sheet
 from skin.core.rng import Stream, generator
 from skin.device.touches import draw_timeline
 from skin.mechanics.contact.prescribed import Prescribed

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from skin.body.base import Sheet
 from skin.body.layout import Scattered
+from skin.body.sheet import Sheet
 from skin.errors import InputError
 from skin.mechanics.contact.prescribed import Prescribed
 from skin.touch.gestures import TouchSampler

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from skin.body.base import Sheet
 from skin.body.layout import Scattered
+from skin.body.sheet import Sheet
 from skin.device.files import read_recording, write_recording
 from skin.device.simulated import Simulated
 from skin.device.touches import Timeline

@@ -32,7 +32,7 @@ QUANTITIES = {
     "quantum": 0.0,
     "exponent": 1.0,
 }
-"""Quantities per sensor, as in :class:`skin.device.imperfection.Constants`, with defaults."""
+"""Quantities per sensor, as in :class:`skin.device.effects.Constants`, with defaults."""
 _SIGNED = ("offset", "drift")
 _SHOWN = 80  # characters of values, in a message
 _LARGEST = 1e12  # of any quantity: no force, time or gain of a device is near it

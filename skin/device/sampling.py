@@ -9,9 +9,9 @@ from scipy.sparse import csr_array
 from scipy.special import ndtri
 from torch import Tensor
 
-from skin.device.imperfection import Constants, Imperfection
+from skin.device.effects import Constants
+from skin.device.imperfection import Imperfection
 from skin.device.resampling import frame_ages, highest_each, resample
-from skin.mechanics.relaxation import quantize
 
 _QUANTILES = 20000
 _NUMBERS = tuple(np.geomspace(1, 1000, 61).tolist())  # of frames in an interval; between them, 0.001 s.d.
@@ -110,7 +110,7 @@ def _measure_each(
     Offset, drift in the middle of the interval, and rounding are added to the maximum of the interval.
     Hysteresis, lag and curve act before the converter and are computed at five times the model's rate.
     """
-    batch, window, sensors = force.shape
+    batch, window, _ = force.shape
     ratios = np.maximum(np.broadcast_to(constants.rate.numpy().ravel(), batch) / model_rate, 1)
     shifts = noise.random(batch)
     if imperfection.aligned:
@@ -123,17 +123,16 @@ def _measure_each(
         framed = noise.random(batch) < imperfection.framed
         ratios, shifts = np.where(framed, 1, ratios), np.where(framed, 0, shifts)
     padded, fine = torch.nn.functional.pad(force, (0, 0, 0, 1)), 1
-    if not imperfection.is_static(constants, sensors):
+    if not imperfection.is_static(constants):
         fine = _SENSED
         padded = between_frames(padded, model_rate, fine * model_rate)
     time = torch.arange(padded.shape[1], device=force.device) / (fine * model_rate)
     sensed = imperfection.sense(padded, constants, time)
     highest, saturated = _read_each(sensed, fine, constants, ratios, shifts, window, noise)
-    output = highest.to(force.device) + (constants.offset - constants.baseline)
-    if constants.drift.any():
-        output += constants.drift * ((torch.arange(window)[:, None] + 0.5) / model_rate).to(output)
-    if constants.quantum.any():
-        output = quantize(output + constants.baseline, constants.quantum) - constants.baseline
+    output = highest.to(force.device)
+    time = ((torch.arange(window) + 0.5) / model_rate).to(output)
+    for effect in imperfection.converter[1:]:  # clipped, with noise
+        output = effect.apply(output, constants, time, None)
     dead = constants.dead.expand(output.shape)
     output = imperfection.undo_curve(output, constants)
     return output.masked_fill(dead, 0.0), ~dead, saturated.to(force.device) & ~dead

@@ -93,12 +93,14 @@ def test_a_folder_is_converted_and_trained_on_by_person(run, converted, tmp_path
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ([], "skin convert needs from= and out=, as in from=map.yaml out=x.parquet"),
+        ([], "skin convert needs from= or reader=, and out=, as in from=map.yaml out=x.parquet"),
         (["from=map.yaml", "out=x.txt"], "a recording is a .parquet or .csv file, got x.txt"),
         (["from=map.yaml", "out=x.csv", "path=nowhere"], "nowhere has no file */*.csv"),
         (["from=none.yaml", "out=x.csv"], "cannot read the mapping none.yaml"),
-        (["from=efles", "out=x.csv"], "from=efles is no format: give map.yaml, or one of cost, eflesh_force"),
-        (["from=epi", "out=x.csv"], "from=epi needs path=FOLDER"),
+        (["from=efles", "out=x.csv"], "from=efles is no format: give map.yaml, or one of eflesh_force"),
+        (["from=sdu", "out=x.csv"], "from=sdu needs path=FOLDER"),
+        (["reader=skin.device.readers.epi", "out=x.csv"], "reader=skin.device.readers.epi needs path="),
+        (["reader=os.getcwd", "path=.", "out=x.csv", "options={a: 1}"], "options has no setting a"),
     ],
 )
 def test_bad_input_ends_with_a_sentence(run, tmp_path, words, message):

@@ -144,7 +144,7 @@ def test_a_run_is_found_by_what_simulated_it_and_not_by_the_name_of_its_data(con
         assert skin.runs.train.tags(configured(f"simulator={simulator}"))["simulator"] == simulator
 
 
-@pytest.mark.parametrize("device", ["recording", "serial", "cost"])
+@pytest.mark.parametrize("device", ["recording", "serial"])
 def test_a_device_without_simulator_stands_in_its_place(device, configured):
     assert skin.runs.train.tags(configured(f"device={device}"))["simulator"] == device
 

@@ -6,7 +6,6 @@ file.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
@@ -34,17 +33,7 @@ from skin.device.touches import CLASS, GROUP, Recording, Touches, one_hot
 from skin.errors import InputError
 from skin.touch.labels import TOUCH, Task
 
-
-@dataclass(frozen=True)
-class _Touch:
-    """A touch: its frames (T, S), N, its rate (Hz), and what is known of it."""
-
-    frames: np.ndarray
-    rate: float
-    targets: dict[str, float]
-    labels: dict[str, Any]
-    groups: dict[str, Any]
-    kind: Any
+_Touch = dict[str, Any]  # frames (T, S), N, rate, Hz; targets, labels and groups by name, and kind, its class
 
 
 def convert_files(
@@ -72,17 +61,18 @@ def convert_files(
     touches = [touch for path in paths for touch in _read_touches(mapping, path, folder)]
     if not touches:
         raise InputError(f"{folder} has no touch: lower segments.threshold, or segments.frames")
-    kinds, names = [touch.kind for touch in touches], None
+    kinds, names = [touch["kind"] for touch in touches], None
     if mapping.classes is not None and (given := mapping.classes.names):
         given = given if isinstance(given, dict) else {name: name for name in given}
         words = {key: _SWITCH[name] if isinstance(name, bool) else str(name) for key, name in given.items()}
         kinds, names = [_lookup(words, kind) for kind in kinds], list(words.values())
     return build_recording(
-        np.stack([touch.frames for touch in touches]),
-        float(np.median([touch.rate for touch in touches])),
-        targets={name: [touch.targets[name] for touch in touches] for name in touches[0].targets},
-        labels={name: [touch.labels[name] for touch in touches] for name in touches[0].labels},
-        groups={name: [touch.groups[name] for touch in touches] for name in touches[0].groups},
+        np.stack([touch["frames"] for touch in touches]),
+        float(np.median([touch["rate"] for touch in touches])),
+        **{
+            part: {name: [touch[part][name] for touch in touches] for name in touches[0][part]}
+            for part in ("targets", "labels", "groups")
+        },
         kinds=None if mapping.classes is None else kinds,
         names=names,
         about=mapping.about,
@@ -139,9 +129,8 @@ def _read_touches(mapping: ForeignFormat, path: Path, folder: Path) -> list[_Tou
                 raise InputError(
                     f"{where}: groups: each touch needs one {name}, got {' and '.join(map(str, found[:3]))}"
                 )
-        touches.append(
-            _Touch(frames, rate, measured, labels, {name: found[0] for name, found in grouped.items()}, kind)
-        )
+        known = {"targets": measured, "labels": labels, "groups": {k: v[0] for k, v in grouped.items()}}
+        touches.append(known | {"frames": frames, "rate": rate, "kind": kind})
     return touches
 
 
@@ -317,6 +306,10 @@ def _label(
 # Build a recording.
 
 
+Positions = Sensors | Sequence[Sequence[float]] | str | None
+"""Sensors of a configuration, a position (x, y) or (x, y, depth) of each sensor, m, or ``unknown``."""
+
+
 def build_recording(
     readings: np.ndarray,
     rate: float,
@@ -327,11 +320,10 @@ def build_recording(
     kinds: Sequence[str | None] | None = None,
     names: Sequence[str] | None = None,
     about: str = "",
-    positions: Sensors | str | Sequence[Sequence[float]] | None = "unknown",
+    positions: Positions = "unknown",
     per_sensor: int = 1,
     size: Sequence[float] | None = None,
     footprint: Sequence[float] = (0.01, 0.01),
-    pitch: float = 0.01,
 ) -> Recording:
     """Return the recording of touches of another program.
 
@@ -342,18 +334,13 @@ def build_recording(
     Args:
         readings: (B, T, S), N, NaN where there is none.
         rate: of the frames, Hz.
-        targets: name -> measured quantity of each touch.
-        labels: name -> 0, 1 or None, unknown, of each touch.
-        groups: name -> group of each touch.
+        targets, labels, groups: by name, of each touch: a quantity; 0, 1 or None; the group.
         kinds: exclusive class of each touch; None: unknown.
         names: of the classes, in their order; None: alphabetically.
         about: origin and licence.
-        positions: sensors of a configuration, a position (x, y) or (x, y, depth) of each sensor, m, or
-            ``unknown``: in a row.
+        positions: of the sensors; unknown ones are in a row.
         per_sensor: readings per sensor.
-        size: extent (x, y) of the sheet, m.
-        footprint: extent (x, y) of a sensor, m, unless given with the sensors.
-        pitch: between sensors of unknown positions, m.
+        size, footprint: extent (x, y) of the sheet and of a sensor, m; footprints of Sensors are their own.
 
     Raises:
         InputError: labels without a value, fewer than two classes, or positions of another number of sensors.
@@ -361,67 +348,84 @@ def build_recording(
     parameters = {name: torch.tensor(values, dtype=torch.float32) for name, values in (targets or {}).items()}
     lists = {name: sorted(set(values)) for name, values in (groups or {}).items()}
     for name, values in (groups or {}).items():
-        numbers = {text: number for number, text in enumerate(lists[name])}
-        parameters[GROUP + name] = torch.tensor([numbers[text] for text in values], dtype=torch.float32)
-    word = (
-        positions if isinstance(positions, str) else "layout" if isinstance(positions, Sensors) else "stated"
-    )
+        numbers = [float(lists[name].index(text)) for text in values]
+        parameters[GROUP + name] = torch.tensor(numbers, dtype=torch.float32)
+    word = positions if isinstance(positions, str) else "stated"
+    if positions is None or isinstance(positions, Sensors):
+        word = "layout"
     metadata: dict[str, Any] = {"about": about, "positions": word, "groups": lists}
-    task, known = TOUCH, None
-    if labels:
-        task = Task(tuple(labels))
-        known = torch.tensor(
-            [[np.nan if v is None else v for v in column] for column in labels.values()]
-        ).T.float()
-        if unknown := [name for name, column in zip(labels, known.T, strict=True) if column.isnan().all()]:
-            raise InputError(
-                f"labels.{unknown[0]} is unknown in all touches: correct its values, or leave it out"
-            )
+    task, known = _binary(labels) if labels else (TOUCH, None)
     if kinds is not None:
-        order = list(names or sorted({kind for kind in kinds if kind is not None}))
-        present = [name for name in order if name in kinds]
-        if len(present) < 2:
-            raise InputError(f"the touches have fewer than two of the classes {', '.join(order) or '-'}")
-        index = torch.tensor([np.nan if kind is None else float(present.index(kind)) for kind in kinds])
+        present, numbers_of_kinds = _number(kinds, names)
         if labels:
-            parameters[CLASS], metadata["classes"] = index, present
+            parameters[CLASS], metadata["classes"] = numbers_of_kinds, present
         else:
-            task, known = Task(tuple(present), "exclusive"), one_hot(index, len(present))
-    number = readings.shape[2] // per_sensor
-    extent = size or (number * pitch, pitch)
-    if word == "unknown":
-        places = np.zeros((number, 3))
-        places[:, 0], places[:, 1] = extent[0] * (np.arange(number) + 0.5) / number, 0.5 * extent[1]
-    elif isinstance(positions, Sensors):
-        places, footprint = positions.positions, positions.footprint
-    else:
-        if positions is None or size is None:
-            raise InputError(
-                "positions need size, the extent [x, y] of the sheet, m"
-                if positions
-                else "positions: layout needs a skin: give layout=file layout.path=FILE.csv"
-            )
-        places = np.array([[*place, 0.0][:3] for place in positions], dtype=float)
-    if len(places) != number:
-        raise InputError(
-            f"the files have {readings.shape[2]} readings of {per_sensor} per sensor, positions are "
-            f"{len(places)}: correct channels.columns, or positions"
-        )
+            task, known = Task(tuple(present), "exclusive"), one_hot(numbers_of_kinds, len(present))
+    sensors, extent = _place(positions, readings.shape[2] // per_sensor, size, footprint)
     touches = Touches(
         torch.from_numpy(np.nan_to_num(readings)),
         torch.from_numpy(~np.isnan(readings)),
-        torch.from_numpy(np.repeat(places, per_sensor, axis=0)).float(),
+        torch.from_numpy(np.repeat(sensors.positions, per_sensor, axis=0)).float(),
         known,
         rate,
     )
-    return Recording(
-        touches,
-        task,
-        (extent[0], extent[1]),
-        (footprint[0], footprint[1]),
-        parameters=parameters,
-        metadata=metadata,
-    )
+    return Recording(touches, task, extent, sensors.footprint, parameters=parameters, metadata=metadata)
+
+
+def _binary(labels: Mapping[str, Sequence[int | None]]) -> tuple[Task, torch.Tensor]:
+    """Return the task and the labels (B, L), NaN where unknown."""
+    columns = [[np.nan if value is None else value for value in column] for column in labels.values()]
+    known = torch.tensor(columns).float()
+    for name, column in zip(labels, known, strict=True):
+        if column.isnan().all():
+            raise InputError(f"labels.{name} is unknown in all touches: correct its values, or leave it out")
+    return Task(tuple(labels)), known.T.contiguous()
+
+
+def _number(kinds: Sequence[str | None], names: Sequence[str] | None) -> tuple[list[str], torch.Tensor]:
+    """Return the classes that occur, and the number of the class of each touch, (B,), NaN where unknown."""
+    order = list(names or sorted({kind for kind in kinds if kind is not None}))
+    present = [name for name in order if name in kinds]
+    if len(present) < 2:
+        raise InputError(f"the touches have fewer than two of the classes {', '.join(order) or '-'}")
+    numbers = [float(present.index(kind)) if kind in present else np.nan for kind in kinds]
+    return present, torch.tensor(numbers, dtype=torch.float32)
+
+
+def _place(
+    positions: Positions,
+    count: int,
+    size: Sequence[float] | None,
+    footprint: Sequence[float],
+    pitch: float = 0.01,
+) -> tuple[Sensors, tuple[float, float]]:
+    """Return S sensors, in a row where positions are unknown, and the sheet's extent, m.
+
+    Args:
+        positions, size, footprint: as in :func:`build_recording`.
+        count: S.
+        pitch: between sensors of unknown positions, m.
+    """
+    width, height = size or (count * pitch, pitch)
+    if isinstance(positions, Sensors):
+        sensors = positions
+    elif positions == "unknown":
+        middles = width * (np.arange(count) + 0.5) / count
+        row = np.column_stack([middles, np.full(count, 0.5 * height), np.zeros(count)])
+        sensors = Sensors(row, (footprint[0], footprint[1]))
+    elif positions is None:
+        raise InputError("positions: layout needs a skin: give layout=file layout.path=FILE.csv")
+    elif size is None:
+        raise InputError("positions need size, the extent [x, y] of the sheet, m")
+    else:
+        points = np.array([[*point, 0.0][:3] for point in positions], dtype=float)
+        sensors = Sensors(points, (footprint[0], footprint[1]))
+    if len(sensors) != count:
+        raise InputError(
+            f"the files have readings of {count} sensors, positions are {len(sensors)}: correct "
+            "channels.columns, or positions"
+        )
+    return sensors, (width, height)
 
 
 def read_by_function(reader: str, path: Path, options: Mapping[str, Any]) -> Recording:

@@ -83,24 +83,21 @@ def cost(
     values = np.stack(scaled, axis=1).astype(np.float32)
     begins = np.append(True, np.diff(table["frame"]) <= 0)
     begins[1:] |= (np.diff(table[["subject", "variant", "gesture"]], axis=0) != 0).any(axis=1)
-    touches, kinds, subjects, rates = [], [], [], []
-    for first, last in pairwise([*np.flatnonzero(begins), len(table)]):
-        row = table.iloc[first]
-        name = GESTURES[int(row["gesture"]) - 1]
-        if name in gestures:
-            touches.append(_stretch(values[first:last], window))
-            kinds.append(f"{name}_{VARIANTS[int(row['variant']) - 1]}" if variants else name)
-            subjects.append(str(int(row["subject"])))
-            rates.append(135.0 * (window - 1) / max(1, last - first - 1))
-    names = [f"{name}_{how}" for name in gestures for how in VARIANTS] if variants else list(gestures)
-    if not touches:
+    rows = [slice(*pair) for pair in pairwise([*np.flatnonzero(begins), len(table)])]
+    firsts = table.iloc[[part.start for part in rows]]
+    gesture, variant, subject = firsts[["gesture", "variant", "subject"]].to_numpy().T
+    words = [GESTURES[int(number) - 1] for number in gesture]
+    kept = [n for n, word in enumerate(words) if word in gestures]
+    if not kept:
         raise InputError(f"{path} has no capture of {', '.join(gestures)}: CoST.csv is at {COST}")
+    ways = [f"_{VARIANTS[int(number) - 1]}" if variants else "" for number in variant]
+    lengths = np.array([max(1, rows[n].stop - rows[n].start - 1) for n in kept])
     return build_recording(
-        np.stack(touches),
-        float(np.median(rates)),
-        groups={"subject": subjects},
-        kinds=kinds,
-        names=names,
+        np.stack([_stretch(values[rows[n]], window) for n in kept]),
+        float(np.median(135.0 * (window - 1) / lengths)),
+        groups={"subject": [str(int(subject[n])) for n in kept]},
+        kinds=[words[n] + ways[n] for n in kept],
+        names=[f"{name}_{way}" for name in gestures for way in VARIANTS] if variants else gestures,
         about=f"Corpus of Social Touch, M. Jung, {DOI}, for non-commercial use",
         positions="unknown" if pitch is None else (8 * pitch * tile_centres(8, 8)[chosen]).tolist(),
         size=None if pitch is None else (8 * pitch, 8 * pitch),

@@ -22,7 +22,6 @@ from skin.errors import InputError
 from skin.touch.labels import Task, target_unit
 
 What = Literal["labels", "classes", "regression"]
-_SAME_PLACE = 1e-6  # m: the file's positions are float32
 _BYTES = 8.0  # of a reading, whether it is valid and whether it is saturated; of a number of a contact
 
 
@@ -169,7 +168,7 @@ class Recorded(AbstractDevice):
                 "it was recorded with, as in layout=file layout.path=FILE.csv"
             )
         apart = np.abs(stored.numpy() - self.sensors.positions).max(axis=1)
-        if apart.max() > _SAME_PLACE:
+        if apart.max() > 1e-6:  # m: the file's positions are float32
             number = int(apart.argmax())
             raise InputError(
                 f"{self.path} has sensor {number} at {stored[number].tolist()} m, the layout at "
@@ -312,12 +311,9 @@ def _relabelled(recording: Recording, task: Task, labels: Tensor) -> Recording:
     return replace(recording, task=task, touches=replace(recording.touches, labels=labels))
 
 
-def _few(values: Sequence[str]) -> str:
+def _few(values: Sequence[str], shown: int = 4) -> str:
     """Return the first of some names."""
-    return ", ".join(values[:_SHOWN]) + ", ..." * (len(values) > _SHOWN)
-
-
-_SHOWN = 4
+    return ", ".join(values[:shown]) + ", ..." * (len(values) > shown)
 
 
 class _File:

@@ -13,12 +13,8 @@ from skin.device.effects import Constants
 from skin.device.imperfection import Imperfection
 from skin.device.resampling import frame_ages, highest_each, resample
 
-_QUANTILES = 20000
 _NUMBERS = tuple(np.geomspace(1, 1000, 61).tolist())  # of frames in an interval; between them, 0.001 s.d.
 _SENSED = 5  # times the model's rate, of hysteresis, lag and curve; odd, so that a frame of the model is one
-_FAINT = 0.01  # standard deviations of the noise below which a sensor feels nothing
-_EXTREME = np.float32(1e-7)  # chance of the least and largest noise
-_ELEMENTS = 2**19  # frames times sensors at a time, which the cache holds
 
 
 def between_frames(force: Tensor, model_rate: float, rate: float, phase: np.ndarray | float = 0.5) -> Tensor:
@@ -146,6 +142,8 @@ def _read_each(
     shifts: np.ndarray,
     window: int,
     noise: np.random.Generator,
+    faint: float = 0.01,
+    at_once: int = 2**19,
 ) -> tuple[Tensor, Tensor]:
     """Return the largest reading of every interval, N, and whether it is saturated, (B, window, S).
 
@@ -157,6 +155,8 @@ def _read_each(
         shifts: (B,), by which touches are later, intervals.
         window: number of intervals.
         noise: source of the noise.
+        faint: readings below this number of standard deviations of the noise are noise alone.
+        at_once: readings computed at a time, which the cache holds.
     """
     batch, _, sensors = sensed.shape
     values = np.pad(sensed.cpu().numpy(), ((0, 0), (1, 1), (0, 0)))
@@ -164,10 +164,10 @@ def _read_each(
         np.broadcast_to(value.numpy(), (batch, 1, sensors))[:, 0]
         for value in (constants.clip, constants.noise)
     )
-    touched = (np.abs(values) > _FAINT * deviation[:, None]).any(axis=2)
+    touched = (np.abs(values) > faint * deviation[:, None]).any(axis=2)
     highest, limited = (np.zeros((batch, window, sensors), kind) for kind in (np.float32, bool))
     frames = np.cumsum(np.ceil(window * ratios - 0.5))
-    cuts = np.flatnonzero(np.diff(frames * sensors // _ELEMENTS, prepend=0))
+    cuts = np.flatnonzero(np.diff(frames * sensors // at_once, prepend=0))
     for first, last in pairwise(np.unique([0, *cuts, batch])):
         part = slice(first, last)
         gesture, age = frame_ages(ratios[part], window)
@@ -190,14 +190,16 @@ def _read_each(
     return torch.from_numpy(highest), torch.from_numpy(limited)
 
 
-def _draw_highest(counts: np.ndarray, sensors: int, noise: np.random.Generator) -> np.ndarray:
+def _draw_highest(
+    counts: np.ndarray, sensors: int, noise: np.random.Generator, extreme: float = 1e-7
+) -> np.ndarray:
     """Return the largest of ``counts`` (I,) standard normal values for each sensor, (I, S).
 
-    Its chance to be below x is the normal one to the power of the count, and is itself uniform.
+    Its probability to be below x is the normal one to the power of the count, and is itself uniform.
     """
     drawn = noise.standard_exponential((len(counts), sensors), dtype=np.float32)
-    # One draw in some millions is 0 or rounds to a chance of 1, whose quantiles are infinite.
-    drawn = np.clip(drawn, _EXTREME, -np.log(_EXTREME))
+    # One draw in some millions is 0 or rounds to a probability of 1, whose quantiles are infinite.
+    drawn = np.clip(drawn, np.float32(extreme), -np.log(np.float32(extreme)))
     return -ndtri(-np.expm1(-drawn / counts[:, None].astype(np.float32)))
 
 
@@ -272,9 +274,9 @@ def idle_excess(constants: Constants, model_rate: float) -> Tensor:
 
 
 @cache
-def _highest_of(number: float) -> float:
+def _highest_of(number: float, quantiles: int = 20_000) -> float:
     """Return the mean of the largest of so many standard normal values; the number need not be whole."""
     if number == 1:
         return 0.0
-    chance = (np.arange(_QUANTILES) + 0.5) / _QUANTILES
-    return float(ndtri(chance ** (1 / number)).mean())
+    probability = (np.arange(quantiles) + 0.5) / quantiles
+    return float(ndtri(probability ** (1 / number)).mean())

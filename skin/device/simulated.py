@@ -36,8 +36,6 @@ from skin.touch.splines import footprints
 
 # The true sensors of a simulated device and its model of them.
 
-_ROUNDING = 1e-9  # m
-
 
 def misplace(
     sensors: Sensors, size: tuple[float, float], error: float, seed: int, footprint_error: float = 0.0
@@ -62,7 +60,7 @@ def misplace(
     return replace(sensors, positions=positions, footprint=footprint)
 
 
-def cover_surface(body: AbstractBody, footprint: tuple[float, float]) -> Sensors:
+def cover_surface(body: AbstractBody, footprint: tuple[float, float], rounding: float = 1e-9) -> Sensors:
     """Return a sensor at each cell of a body whose footprint lies wholly on it.
 
     Their footprints are the areas over which a pressure can be dangerous anywhere.
@@ -70,7 +68,7 @@ def cover_surface(body: AbstractBody, footprint: tuple[float, float]) -> Sensors
     margins = [max(extent, cell) / 2 for extent, cell in zip(footprint, body.cell, strict=True)]
     cells = [(np.arange(count) + 0.5) * cell for count, cell in zip(body.cells, body.cell, strict=True)]
     x, y = (
-        centres[(centres >= margin - _ROUNDING) & (centres <= size - margin + _ROUNDING)]
+        centres[(centres >= margin - rounding) & (centres <= size - margin + rounding)]
         for centres, size, margin in zip(cells, body.size, margins, strict=True)
     )
     places = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
@@ -118,9 +116,6 @@ def describe(
 
 
 _BATCH = 1024
-_STRIP = 600.0  # s of simulated touches in one piece
-_FEW = 10  # gestures
-_DISC = 0.03  # share of the sheet under a press: small, and larger than any footprint
 
 
 @checked("device")
@@ -225,7 +220,7 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
 
     def blank(self) -> "Simulated":
         """Return a device with few gestures: to restore a run, only their shape matters."""
-        return self.replace(gestures=_FEW, fresh=False)
+        return self.replace(gestures=10, fresh=False)
 
     def replace(self, **changes: Any) -> "Simulated":
         """Return a device with other settings, such as ``seed=3`` for another device of the same kind."""
@@ -240,10 +235,14 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
         return self.draw(Stream.ALARM, count, self.data_seed)
 
     @torch.no_grad()
-    def press_readings(self) -> Tensor:
-        """Return the true readings (S, S), N, of a press at the limit of ``dangerous`` on each sensor."""
+    def press_readings(self, covered: float = 0.03) -> Tensor:
+        """Return the true readings (S, S), N, of a press at the limit of ``dangerous`` on each sensor.
+
+        Args:
+            covered: fraction of the sheet under a press: small, and larger than any footprint.
+        """
         (width, height), footprint = self.size, np.hypot(*self.sensors.footprint)
-        radius = max(np.sqrt(_DISC * width * height / np.pi), footprint / 2)
+        radius = max(np.sqrt(covered * width * height / np.pi), footprint / 2)
         rows, columns = self.body.shape
         y, x = np.indices((rows, columns)) + 0.5
         places = np.stack([x * width / columns, y * height / rows])
@@ -260,10 +259,10 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
         recording = self._split(split, epoch, complete)
         return replace(recording, metadata=describe(self, recording, split, epoch))
 
-    def strips(self) -> Iterator[Touches]:
-        """Yield test streams, ten minutes each, without end."""
+    def strips(self, seconds: float = 600.0) -> Iterator[Touches]:
+        """Yield test streams of so many seconds each, without end."""
         for number in count():
-            yield self.simulate_stream(max(1, round(_STRIP * self.model_rate)), number=number).whole.touches
+            yield self.simulate_stream(max(1, round(seconds * self.model_rate)), number=number).whole.touches
 
     def _split(self, split: Split | None, epoch: int, complete: bool) -> Recording:
         if split == "test":

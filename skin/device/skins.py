@@ -40,12 +40,6 @@ Range = Annotated[tuple[PositiveFloat, PositiveFloat], RISING]
 Kind = Literal["grid", "scattered", "hexagonal", "random", "clustered", "spread"]
 Make = Callable[[AbstractBody, Sensors], AbstractSimulator]
 
-_POISSON = 0.49
-_TRIES = 2000
-_LEAST_CELLS = 8
-_ROUNDS = 20
-_EQUAL = 1e-6
-
 
 @dataclass(frozen=True)
 class DrawnSkin:
@@ -149,8 +143,8 @@ class SkinDistribution:
         error = generator.uniform(*self.position_error)
         return DrawnSkin(body, layout, simulator, error, self.footprint_error if mixed else 0.0, described)
 
-    def outside(self, body: AbstractBody, sensors: Sensors) -> list[str]:
-        """Return what of a skin lies outside the ranges, as "number of sensors 100 (4 to 64)"."""
+    def outside(self, body: AbstractBody, sensors: Sensors, rounding: float = 1e-6) -> list[str]:
+        """Return the quantities of a skin outside the ranges, as "number of sensors 100 (4 to 64)"."""
         shorter, longer = sorted(body.size)
         numbers: list[tuple[str, float, tuple[float, float], str]] = [
             ("longer side", longer, self.length, " m"),
@@ -175,20 +169,22 @@ class SkinDistribution:
         return [
             f"{name} {value:.3g}{unit} ({low:g} to {high:g}{unit})"
             for name, value, (low, high), unit in numbers
-            if not low * (1 - _EQUAL) <= value <= high * (1 + _EQUAL)
+            if not low * (1 - rounding) <= value <= high * (1 + rounding)
         ]
 
-    def _body(self, generator: np.random.Generator) -> AbstractBody:
+    def _body(
+        self, generator: np.random.Generator, poisson: float = 0.49, fewest_cells: int = 8
+    ) -> AbstractBody:
         longer = generator.uniform(*self.length)
         shorter = longer / generator.uniform(*self.aspect)
         sides = (longer, shorter) if generator.random() < 0.5 else (shorter, longer)
         base, top = generator.uniform(*self.base), generator.uniform(*self.top)
         stiff, soft = (_logarithmic(limits, generator) for limits in (self.base_young, self.top_young))
         layers = (
-            Layer(Material("base", stiff, _POISSON), base),
-            Layer(Material("top", soft, _POISSON), top),
+            Layer(Material("base", stiff, poisson), base),
+            Layer(Material("top", soft, poisson), top),
         )
-        across, along = (max(_LEAST_CELLS, round(side / self.cell)) for side in sides)
+        across, along = (max(fewest_cells, round(side / self.cell)) for side in sides)
         radius = max(generator.uniform(*self.radius), 1.2 * (base + top))
         if generator.random() < self.arms and sides[0] < 1.8 * math.pi * radius:
             cells = (across, along)
@@ -246,14 +242,14 @@ def _listed(places: np.ndarray, footprint: Footprint, depth: float) -> Listed:
 
 
 def _clustered(
-    count: int, size: tuple[float, float], side: float, generator: np.random.Generator
+    count: int, size: tuple[float, float], side: float, generator: np.random.Generator, tries: int = 2000
 ) -> np.ndarray:
     """Return places (S, 2), m, around a few centres, at least ``side`` apart along x or y."""
     extent = np.array(size)
     centres = generator.random((generator.integers(2, 5), 2)) * extent
     spread, places = 0.15 * extent, np.empty((0, 2))
-    for attempt in range(_TRIES):
-        wide = spread * (1 + 4 * attempt / _TRIES)
+    for attempt in range(tries):
+        wide = spread * (1 + 4 * attempt / tries)
         candidate = centres[generator.integers(len(centres))] + wide * generator.normal(size=2)
         candidate = np.clip(candidate, side / 2, extent - side / 2)
         if (np.abs(places - candidate) >= side).any(axis=1).all():
@@ -263,14 +259,16 @@ def _clustered(
     return places[np.argsort(places[:, 1], kind="stable")]
 
 
-def _spread(count: int, size: tuple[float, float], generator: np.random.Generator) -> np.ndarray:
+def _spread(
+    count: int, size: tuple[float, float], generator: np.random.Generator, rounds: int = 20
+) -> np.ndarray:
     """Return places (S, 2), m, that divide the surface evenly without rows, as informative layouts do.
 
     Each place is in the middle of the region that is nearer to it than to the others (Lloyd's algorithm).
     """
     extent = np.array(size)
     samples, places = (generator.random((number, 2)) * extent for number in (50 * count, count))
-    for _ in range(_ROUNDS):
+    for _ in range(rounds):
         nearest = cKDTree(places).query(samples)[1]
         shares = np.bincount(nearest, minlength=count)[:, None]
         sums = np.stack([np.bincount(nearest, values, count) for values in samples.T], axis=1)
@@ -281,9 +279,6 @@ def _spread(count: int, size: tuple[float, float], generator: np.random.Generato
 # Touches on many skins, each drawn at random.
 
 
-_GROUP = 128  # largest number of gestures on one skin at a time; fewer take longer
-_DEAD = 4  # at most one of so many sensors is dead
-_TRAINING, _TEST = 0, 1
 _NUMBERS = {"train": 0, "validation": 1, "holdout": 2, "test": 3}
 
 
@@ -338,12 +333,12 @@ class Skins(ImperfectionSettings, AbstractDevice):
     @cached_property
     def training_skins(self) -> list[Simulated]:
         """The skins to train on; their mechanics are solved at the first use, and cached on disk."""
-        return self._prepare(_TRAINING, self.count)
+        return self._prepare(True, self.count)
 
     @cached_property
     def unseen_skins(self) -> list[Simulated]:
         """The skins to test on."""
-        return self._prepare(_TEST, self.test_skins)
+        return self._prepare(False, self.test_skins)
 
     @property
     def reference(self) -> Simulated:
@@ -354,27 +349,26 @@ class Skins(ImperfectionSettings, AbstractDevice):
         """Yield test streams on :attr:`reference`, without end."""
         return self.reference.strips()
 
-    def _prepare(self, part: int, count: int) -> list[Simulated]:
+    def _prepare(self, training: bool, count: int) -> list[Simulated]:
         console, terminal = Console(stderr=True), sys.stderr.isatty()
         numbers = track(range(count), "preparing skins", console=console, disable=not terminal)
         for number in numbers:
             # What solves a skin keeps large factors; made again, it reads its operator from the disk.
-            self._skin(part, number).geometry  # noqa: B018
-        return [self._skin(part, number) for number in range(count)]
+            self._skin(training, number).geometry  # noqa: B018
+        return [self._skin(training, number) for number in range(count)]
 
-    def _skin(self, part: int, number: int) -> Simulated:
-        random = generator(Stream.SKIN, self.skin_seed, part, number)
-        touch = self._wider if part == _TRAINING else self.touch
-        return self._simulated(self.distribution.draw(random, mixed=part == _TRAINING), number, touch)
+    def _skin(self, training: bool, number: int) -> Simulated:
+        random = generator(Stream.SKIN, self.skin_seed, int(not training), number)
+        touch = self._wider if training else self.touch
+        return self._simulated(self.distribution.draw(random, mixed=training), number, touch)
 
     def _simulated(
         self, skin: DrawnSkin, number: int, touch: Mapping[str, Any] | TouchSettings | None
     ) -> Simulated:
         imperfections = {entry.name: getattr(self, entry.name) for entry in fields(ImperfectionSettings)}
         sensors = len(skin.layout.sensors(skin.body))
-        imperfections["dead"] = [
-            min(limit, sensors // _DEAD) for limit in Imperfection.of(self, None).dead_range
-        ]
+        # At most one of four sensors is dead.
+        imperfections["dead"] = [min(limit, sensors // 4) for limit in Imperfection.of(self, None).dead_range]
         return Simulated(
             body=skin.body,
             layout=skin.layout,
@@ -403,9 +397,14 @@ class Skins(ImperfectionSettings, AbstractDevice):
             self._kept[split] = drawn
         return drawn
 
-    def _draw(self, skins: Sequence[Simulated], count: int, key: tuple[int, ...]) -> Touches:
-        """Return gestures in groups, each on a drawn skin; every skin is drawn once before any again."""
-        most = min(_GROUP, -(-count // len(skins)))
+    def _draw(
+        self, skins: Sequence[Simulated], count: int, key: tuple[int, ...], largest: int = 128
+    ) -> Touches:
+        """Return gestures in groups, each on a drawn skin; every skin is drawn once before any again.
+
+        Groups of fewer gestures than ``largest`` take longer.
+        """
+        most = min(largest, -(-count // len(skins)))
         sizes = [min(most, count - first) for first in range(0, count, most)]
         rounds = -(-len(sizes) // len(skins))
         # No skin has the key of the test touches: they keep the order of the published ones.

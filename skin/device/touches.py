@@ -234,9 +234,6 @@ def touches_hash(touches: Touches) -> str:
 # Streams: touches with idle gaps between them, and the windows cut from them.
 
 
-_LEAST = 16
-
-
 @dataclass(frozen=True)
 class Timeline:
     """The gestures of a stream and their times.
@@ -298,7 +295,11 @@ class Timeline:
 
 
 def draw_timeline(
-    sampler: AbstractSampler, length: int, gap: Sequence[int], generator: np.random.Generator
+    sampler: AbstractSampler,
+    length: int,
+    gap: Sequence[int],
+    generator: np.random.Generator,
+    fewest: int = 16,
 ) -> Timeline:
     """Draw a stream of ``length`` frames that begins with a gap.
 
@@ -307,6 +308,7 @@ def draw_timeline(
         length: F, frames.
         gap: [least, most] idle frames between two touches, drawn uniformly, both ends included.
         generator: source of randomness.
+        fewest: gestures drawn at a time.
     """
     frames = sampler.settings.frames
     typical = (sum(frames.tap) + sum(frames.press)) / 4 + sum(gap) / 2
@@ -314,7 +316,7 @@ def draw_timeline(
     begins: list[np.ndarray] = []
     filled = 0
     while filled < length:
-        count = max(_LEAST, math.ceil((length - filled) / typical))
+        count = max(fewest, math.ceil((length - filled) / typical))
         movies.append(sampler.sample(count, generator))
         duration = movies[-1].parameters["duration"].long().numpy()
         ends = filled + np.cumsum(duration + generator.integers(gap[0], gap[1], count, endpoint=True))

@@ -220,7 +220,7 @@ PRESS = {"press": {"column": "label", "values": {"press": 1, "none": 0}}}
         ({"join": {"file": "a.csv"}}, "both have a column t: give join.table.names"),
         ({"segments": {"by": "contact", "threshold": 100.0}}, "has no touch: lower segments.threshold"),
         ({"segments": {"by": "press"}}, "segments.by=press must be 'row', 'file'"),
-        ({"positions": [[0, 0]], "size": [0.1, 0.1]}, "2 readings of 1 per sensor, positions are 1"),
+        ({"positions": [[0, 0]], "size": [0.1, 0.1]}, "readings of 2 sensors, positions are 1"),
         ({"colour": "red"}, "map.yaml has no setting colour"),
     ],
 )

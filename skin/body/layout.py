@@ -65,7 +65,7 @@ class AbstractLayout(ABC):
         """Return the sensors of this layout in ``body``.
 
         Raises:
-            InputError: a sensor lies outside the body, or two lie at one place.
+            InputError: a sensor lies outside the body, or two lie at one position.
         """
 
 
@@ -99,8 +99,8 @@ def place_sensors(
     first, second, distance = _closest(positions, (1.0, 1.0))
     if distance < 1e-6:
         raise InputError(
-            f"sensors {first + 1} and {second + 1} are at one place, x = {x[first]:g} m, y = {y[first]:g} m: "
-            "move one or remove it from the layout"
+            f"sensors {first + 1} and {second + 1} are at one position, x = {x[first]:g} m, "
+            f"y = {y[first]:g} m: move one or remove it from the layout"
         )
     extent = float(footprint[0]), float(footprint[1])
     return Sensors(positions, extent) if normals is None else Sensors(positions, extent, normals)
@@ -148,7 +148,7 @@ class Listed(AbstractLayout):
         normals: of the sensors, unit vectors (x, y, into the skin); None: those of the surface.
 
     Raises:
-        InputError: two sensors at one place.
+        InputError: two sensors at one position.
     """
 
     def __init__(

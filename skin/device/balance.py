@@ -36,7 +36,7 @@ def report_balance(device: AbstractDevice, recording: Recording | None = None, s
 
 
 def class_balance(recording: Recording, sampler: AbstractSampler) -> dict[str, Any]:
-    """Return statistics of the gestures of each class, in SI units and shares of 1.
+    """Return statistics of the gestures of each class, in SI units and fractions of 1.
 
     Args:
         recording: simulated touches.
@@ -136,10 +136,10 @@ def balance_table(report: dict[str, Any]) -> list[str]:
 
 
 def _cells(side: dict[str, Any]) -> list[str]:
-    shares = [f"{100 * share:.0f}" for share in (*side["shapes"], side["area"])]
-    places = [f"{1e3 * side[axis][0]:.0f}±{1e3 * side[axis][1]:.0f}" for axis in "xy"]
+    fractions = [f"{100 * fraction:.0f}" for fraction in (*side["shapes"], side["area"])]
+    positions = [f"{1e3 * side[axis][0]:.0f}±{1e3 * side[axis][1]:.0f}" for axis in "xy"]
     lost = [f"{100 * side[kind]:.0f}" for kind in ("rejected", "misfits")]
-    return [*shares, f"{side['force']:.0f}", *places, *lost]
+    return [*fractions, f"{side['force']:.0f}", *positions, *lost]
 
 
 def check_label_leakage(report: dict[str, Any], settings: AbstractSampler | GestureSettings) -> None:
@@ -169,14 +169,14 @@ def check_label_leakage(report: dict[str, Any], settings: AbstractSampler | Gest
 
 
 def summarise(recording: Recording, body: AbstractBody) -> dict[str, Any]:
-    """Return what a simulated data set is like, as shares of 1 and SI units.
+    """Return what a simulated data set is like, as fractions of 1 and SI units.
 
     The strain is the largest of the top layer by the linear solution or, where a recording has none, its
     highest pressure by its modulus. Linear theory is good to about 0.3; beyond 1 a linear layer would be
     squeezed to nothing. The report's thresholds are kept all the same.
 
     Returns:
-        gestures; acceptance (share of draws kept); force (N: quantiles .05, .5, .95 and the largest);
+        gestures; acceptance (fraction of draws kept); force (N: quantiles .05, .5, .95 and the largest);
         strain_over_30_percent and strain_over_100_percent; strain_solved (else pressure by modulus);
         clipped and clipped_dangerous (gestures in which a sensor passes the clip, of all and of the dangerous
         ones); unconverged (frames whose pressure was not found, so that their gestures were drawn again),

@@ -377,7 +377,7 @@ def grouped(batches: Sequence[Part], metadata: Callable[[Recording], dict[str, A
 
     Args:
         batches: to group.
-        metadata: gives that of a part.
+        metadata: gives the metadata of a part.
     """
 
     def make(group: Sequence[Part]) -> Recording:

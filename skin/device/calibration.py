@@ -202,7 +202,7 @@ def read_calibration(path: str | Path) -> Calibration:
         InputError: no such file, unreadable, invalid contents, or a line ``sha256`` with the checksum of
             other contents.
     """
-    file = next((place for place in candidates(path) if place.is_file()), None)
+    file = next((candidate for candidate in candidates(path) if candidate.is_file()), None)
     if file is None:
         raise InputError(f"no calibration {path}: skin calibrate session=FILE out={path} makes one")
     try:

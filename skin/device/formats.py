@@ -206,7 +206,7 @@ class ForeignFormat:
         targets: x, y, force, force_x or force_y -> measured quantity.
         groups: columns such as a session or a person, or name -> columns that make it together; the touches
             of a group stay together in splits.
-        positions: ``unknown``, ``layout`` for that of the configuration, or a position per sensor, m.
+        positions: ``unknown``, ``layout`` for the one of the configuration, or a position per sensor, m.
         size: extent (x, y) of the sheet, m, unless of the configuration.
         footprint: extent (x, y) of a sensor, m, unless of the configuration.
     """

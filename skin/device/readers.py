@@ -108,9 +108,9 @@ def cost(
 def _spread(count: int, seed: int) -> np.ndarray:
     """Return the indices of taxels by farthest-point sampling, (S,), from 0, rising; the first is random."""
     order = generator(Stream.POSITION, seed).permutation(64)
-    places, chosen = tile_centres(8, 8)[order], [0]
+    points, chosen = tile_centres(8, 8)[order], [0]
     while len(chosen) < count:
-        apart = np.linalg.norm(places[:, None] - places[chosen], axis=2).min(axis=1)
+        apart = np.linalg.norm(points[:, None] - points[chosen], axis=2).min(axis=1)
         chosen.append(int(apart.argmax()))
     return np.sort(order[chosen])
 

@@ -90,8 +90,8 @@ class Recorded(AbstractDevice):
         self._example = self._read(0)[torch.tensor([0])]  # a copy: a slice would keep the whole
         self._groups: dict[Split, Tensor] = {}
         if self._example.metadata.get("positions") in ("unknown", "stated"):
-            places = self._example.touches.positions.double().numpy()
-            self.sensors, self.size = Sensors(places, self._example.footprint), self._example.size
+            positions = self._example.touches.positions.double().numpy()
+            self.sensors, self.size = Sensors(positions, self._example.footprint), self._example.size
             self.configured = False
         else:
             self.sensors, self.surface, self.size = layout.sensors(body), body, body.size
@@ -243,8 +243,8 @@ class Recorded(AbstractDevice):
             if part == "train":
                 self._check_classes(self._rows(0, complete, rows).touches.labels)
             return [Part(len(rows), partial(self._rows, 0, complete, rows))]
-        shares = [(0, split_rows(part, counts[0], seed))] if self._whole else split_shards(part, counts, seed)
-        return [Part(len(selected), partial(self._rows, n, complete, selected)) for n, selected in shares]
+        parts = [(0, split_rows(part, counts[0], seed))] if self._whole else split_shards(part, counts, seed)
+        return [Part(len(selected), partial(self._rows, n, complete, selected)) for n, selected in parts]
 
     def _rows(self, number: int, complete: bool, rows: Tensor) -> Recording:
         return self._read(number, complete)[rows]

@@ -40,7 +40,7 @@ from skin.touch.splines import footprints
 def misplace(
     sensors: Sensors, size: tuple[float, float], error: float, seed: int, footprint_error: float = 0.0
 ) -> Sensors:
-    """Return sensors beside their places, with footprints of another size.
+    """Return sensors beside their positions, with footprints of another size.
 
     Args:
         sensors: as touches report them.
@@ -71,8 +71,8 @@ def cover_surface(body: AbstractBody, footprint: tuple[float, float], rounding: 
         centres[(centres >= margin - rounding) & (centres <= size - margin + rounding)]
         for centres, size, margin in zip(cells, body.size, margins, strict=True)
     )
-    places = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
-    return Sensors(np.column_stack([places, np.zeros(len(places))]), footprint)
+    positions = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
+    return Sensors(np.column_stack([positions, np.zeros(len(positions))]), footprint)
 
 
 def build_model(
@@ -135,13 +135,13 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
         padded: gestures begin at a random frame of the window, not at its first.
         fresh: ``train`` draws new gestures, with new noise, in every epoch.
         stream: touches are windows of streams of gestures with idle gaps between them: a window contains part
-            of a gesture, a whole one or none, and also has the label ``touch``. Splits share no stream.
+            of a gesture, a whole one or none, and also has the label ``touch``. Splits have other streams.
         direction: the direction of sliding is a label too, as its cosines
             (``skin.touch.movie.sliding``).
         data_seed: seed of the budget.
         seed: seed of the device's constants and noise; each seed is another device.
         gain_spread, offset, noise, ... rate: :class:`skin.device.imperfection.ImperfectionSettings`. The rate
-            is that of the sensors; touches are resampled to ``touch.rate``.
+            is the one of the sensors; touches are resampled to ``touch.rate``.
         calibration: file of skin calibrate, which replaces all these but dead, tare and rate.
         randomise: measure every gesture with another device.
         position_error: standard deviation of the true sensor positions from the reported ones, m.
@@ -245,8 +245,8 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
         radius = max(np.sqrt(covered * width * height / np.pi), footprint / 2)
         rows, columns = self.body.shape
         y, x = np.indices((rows, columns)) + 0.5
-        places = np.stack([x * width / columns, y * height / rows])
-        away = self.true_sensors.positions[:, :2, None, None] - places
+        positions = np.stack([x * width / columns, y * height / rows])
+        away = self.true_sensors.positions[:, :2, None, None] - positions
         discs = torch.from_numpy(np.hypot(*away.swapaxes(0, 1)) <= radius).float()
         return self.model(self.sampler.settings.thresholds.pressure * discs).readings
 

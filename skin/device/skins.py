@@ -76,15 +76,15 @@ class SkinDistribution:
         footprint: side of the square that a sensor feels, m.
         base, top: thickness of the layers, m.
         base_young, top_young: their moduli, Pa.
-        depth: of the sensors, as a share of the thickness of the top layer.
-        arms: share of skins on a cylinder.
+        depth: of the sensors, as a fraction of the thickness of the top layer.
+        arms: fraction of skins on a cylinder.
         radius: of the cylinders, m.
         position_error: standard deviation of the sensors' true positions from those of the layout, m.
         divisions: rows of elements in each layer; None: as few as readings under a fingertip need.
-        plates: share of sheets with the mechanics of plates on beams (:mod:`skin.mechanics.simulator.fem`);
+        plates: fraction of sheets with plates on beams (:mod:`skin.mechanics.simulator.fem`);
             their sensors are between the layers.
-        naive: share of sheets without mechanics.
-        interface: share of sheets that read the forces between the layers of plates on beams, and are
+        naive: fraction of sheets without mechanics.
+        interface: fraction of sheets that read the forces between the layers of plates on beams, and are
             described as an elastic solid, because their owner does not know better.
         footprint_error: standard deviation of the logarithm of the true over the layout's side of footprints.
     """
@@ -121,7 +121,7 @@ class SkinDistribution:
 
         Args:
             generator: of random numbers.
-            mixed: with any mechanics; otherwise that of an elastic solid.
+            mixed: with any mechanics; otherwise those of an elastic solid.
         """
         body = self._body(generator)
         count = round(_logarithmic(self.sensors, generator))
@@ -130,12 +130,12 @@ class SkinDistribution:
         side = generator.uniform(*self.footprint)
         solid: Make = partial(Solid, divisions=self.divisions)
         simulator, described = solid, None
-        chance = generator.random() if mixed and isinstance(body, Sheet) else generator.random() + 1
-        if chance < self.plates:
+        drawn = generator.random() if mixed and isinstance(body, Sheet) else generator.random() + 1
+        if drawn < self.plates:
             simulator = PlatesAndBeams
-        elif chance < self.plates + self.naive:
+        elif drawn < self.plates + self.naive:
             simulator = Naive
-        elif chance < self.plates + self.naive + self.interface:
+        elif drawn < self.plates + self.naive + self.interface:
             simulator, described = partial(PlatesAndBeams, reading="interface"), solid
         # Plates on beams know forces between layers only.
         depth = depth if simulator in (solid, Naive) else top
@@ -212,18 +212,18 @@ def _layout(
         size: extent (x, y) of the surface, m.
         side: of the square that a sensor feels, m; smaller where the sensors would overlap.
         depth: of the sensors, m.
-        generator: of random places.
+        generator: of random positions.
     """
     rows = max(1, round(math.sqrt(count * size[1] / size[0])))
     columns = max(1, math.ceil(count / rows))
     pitch = min(size[0] / columns, size[1] / rows)
     seed = int(generator.integers(2**31))
     if kind == "spread":
-        places = _spread(count, size, generator)
-        apart = np.abs(places[:, None] - places).max(axis=2)[~np.eye(count, dtype=bool)]
-        return _listed(places, (min(side, float(apart.min())),) * 2, depth)
+        positions = _spread(count, size, generator)
+        apart = np.abs(positions[:, None] - positions).max(axis=2)[~np.eye(count, dtype=bool)]
+        return _listed(positions, (min(side, float(apart.min())),) * 2, depth)
     if kind in ("random", "clustered"):
-        # Random places fill less than half of the surface.
+        # Random positions fill less than half of the surface.
         footprint = (min(side, 0.6 * math.sqrt(math.prod(size) / count)),) * 2
         if kind == "random":
             return Random(count, seed, footprint, depth)
@@ -236,44 +236,44 @@ def _layout(
     return Scattered(rows, columns, 0.25, seed, footprint, depth=depth)
 
 
-def _listed(places: np.ndarray, footprint: Footprint, depth: float) -> Listed:
-    """Return sensors at places (S, 2), m, in one depth, m."""
-    return Listed(np.column_stack([places, np.full(len(places), depth)]).tolist(), footprint)
+def _listed(positions: np.ndarray, footprint: Footprint, depth: float) -> Listed:
+    """Return sensors at positions (S, 2), m, in one depth, m."""
+    return Listed(np.column_stack([positions, np.full(len(positions), depth)]).tolist(), footprint)
 
 
 def _clustered(
     count: int, size: tuple[float, float], side: float, generator: np.random.Generator, tries: int = 2000
 ) -> np.ndarray:
-    """Return places (S, 2), m, around a few centres, at least ``side`` apart along x or y."""
+    """Return positions (S, 2), m, around a few centres, at least ``side`` apart along x or y."""
     extent = np.array(size)
     centres = generator.random((generator.integers(2, 5), 2)) * extent
-    spread, places = 0.15 * extent, np.empty((0, 2))
+    spread, positions = 0.15 * extent, np.empty((0, 2))
     for attempt in range(tries):
         wide = spread * (1 + 4 * attempt / tries)
         candidate = centres[generator.integers(len(centres))] + wide * generator.normal(size=2)
         candidate = np.clip(candidate, side / 2, extent - side / 2)
-        if (np.abs(places - candidate) >= side).any(axis=1).all():
-            places = np.vstack([places, candidate])
-        if len(places) == count:
+        if (np.abs(positions - candidate) >= side).any(axis=1).all():
+            positions = np.vstack([positions, candidate])
+        if len(positions) == count:
             break
-    return places[np.argsort(places[:, 1], kind="stable")]
+    return positions[np.argsort(positions[:, 1], kind="stable")]
 
 
 def _spread(
     count: int, size: tuple[float, float], generator: np.random.Generator, rounds: int = 20
 ) -> np.ndarray:
-    """Return places (S, 2), m, that divide the surface evenly without rows, as informative layouts do.
+    """Return positions (S, 2), m, that divide the surface evenly without rows, as informative layouts do.
 
-    Each place is in the middle of the region that is nearer to it than to the others (Lloyd's algorithm).
+    Each position is in the middle of the region that is nearer to it than to the others (Lloyd's algorithm).
     """
     extent = np.array(size)
-    samples, places = (generator.random((number, 2)) * extent for number in (50 * count, count))
+    samples, positions = (generator.random((number, 2)) * extent for number in (50 * count, count))
     for _ in range(rounds):
-        nearest = cKDTree(places).query(samples)[1]
-        shares = np.bincount(nearest, minlength=count)[:, None]
+        nearest = cKDTree(positions).query(samples)[1]
+        counts = np.bincount(nearest, minlength=count)[:, None]
         sums = np.stack([np.bincount(nearest, values, count) for values in samples.T], axis=1)
-        places = np.where(shares > 0, sums / shares.clip(min=1), places)
-    return places[np.argsort(places[:, 1], kind="stable")]
+        positions = np.where(counts > 0, sums / counts.clip(min=1), positions)
+    return positions[np.argsort(positions[:, 1], kind="stable")]
 
 
 # Touches on many skins, each drawn at random.

@@ -30,8 +30,8 @@ class Touches:
             depth.
         labels: (B, L), 0 or 1, or the targets of a regression, float, NaN where unknown; or None.
         rate: frames per second, Hz.
-        motion: (B, T, S, 3), m, how far each sensor is from its place in ``positions``, along the same axes;
-            None if unknown.
+        motion: (B, T, S, 3), m, distance of each sensor from ``positions``, along the same axes; None if
+            unknown.
         saturated: (B, T, S), bool: the sensor is at its limit, so the force is at least its reading; None
             if unknown.
         geometry: (S, G) or (B, S, G), the columns :data:`GEOMETRY` of each sensor; None if unknown.
@@ -384,23 +384,23 @@ class TouchStream:
         def windows(values: Tensor | None) -> Tensor | None:
             return None if values is None else values[0][frames]
 
-        whole, felt = self.whole, self.whole.touches
+        whole, shown = self.whole, self.whole.touches
         drawn = {name: values[gesture] for name, values in self.timeline.movie.parameters.items()}
         drawn["onset"] = (self.timeline.begin[gesture] - starts).float()
         parameters = {name: values.where(gesture >= 0, 0) for name, values in drawn.items()}
-        saturated = windows(felt.saturated)
+        saturated = windows(shown.saturated)
         content = {} if saturated is None else {"clipped": saturated.flatten(1).any(1).float()}
         content |= {"share": share.float()}
         return replace(
             whole,
             touches=replace(
-                felt,
-                readings=felt.readings[0][frames],
-                valid=felt.valid[0][frames],
+                shown,
+                readings=shown.readings[0][frames],
+                valid=shown.valid[0][frames],
                 labels=labels,
-                motion=windows(felt.motion),
+                motion=windows(shown.motion),
                 saturated=saturated,
-                contacts=windows(felt.contacts),
+                contacts=windows(shown.contacts),
             ),
             force=windows(whole.force),
             displacement=windows(whole.displacement),

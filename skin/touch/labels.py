@@ -53,7 +53,7 @@ class Task:
 
     @property
     def binary(self) -> tuple[str, ...]:
-        """The names of all labels but a direction's; targets of a regression are no labels."""
+        """The names of all labels but a direction's; a regression has none."""
         return () if self.kind == "regression" else self.names[: -2 if self.direction else None]
 
     @property

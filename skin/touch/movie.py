@@ -226,16 +226,16 @@ def add_second(movie: Movie, fraction: float, contact: float, generator: np.rand
     first, second, moment = first[score >= 0], second[score >= 0], random[score >= 0, -1]
     begin, times = _overlapping(movie, first, second, moment)
 
-    shares = movie.scale[first], movie.scale[second].gather(1, times)
+    fractions = movie.scale[first], movie.scale[second].gather(1, times)
     index = movie.index[first], movie.index[second].gather(1, times)
     full = movie.parameters["force"][:, None]
-    total = full[first] * shares[0] + full[second] * shares[1]
+    total = full[first] * fractions[0] + full[second] * fractions[1]
     force = total.amax(dim=1)
     scale = total / force[:, None]
     touched = scale > 0
     parts = (
         part[touched][:, None, None] * movie.frames[rows[touched]]
-        for part, rows in zip(shares, index, strict=True)
+        for part, rows in zip(fractions, index, strict=True)
     )
     frames = sum(parts) / scale[touched][:, None, None]
     counts = touched.sum(dim=1)

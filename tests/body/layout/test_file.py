@@ -100,8 +100,11 @@ def test_a_relative_path_is_looked_for_here_first(tmp_path, monkeypatch):
         ("x_m,y_m,depth_m\n0.1,0.1,\n", "line 2: depth_m must be a number in m, got ''"),
         ("x_m,y_m\n0.1,0.1\n80,40\n", "1 of 2 sensors lie outside.*sensor 2 at x = 80 m.*in metres"),
         ("x_m,y_m,depth_m\n0.1,0.1,0.02\n", "outside the body.*depth = 0.02 m"),
-        ("x_m,y_m\n0.1,0.1\n0.05,0.1\n0.1,0.1\n", "sensors 1 and 3 are at one place, x = 0.1 m, y = 0.1 m"),
-        ("x_m,y_m,depth_m\n0.1,0.1,0\n0.1,0.1,0.005\n", "sensors 1 and 2 are at one place"),
+        (
+            "x_m,y_m\n0.1,0.1\n0.05,0.1\n0.1,0.1\n",
+            "sensors 1 and 3 are at one position, x = 0.1 m, y = 0.1 m",
+        ),
+        ("x_m,y_m,depth_m\n0.1,0.1,0\n0.1,0.1,0.005\n", "sensors 1 and 2 are at one position"),
         (
             "x_m,y_m,normal_x,normal_z\n0.1,0.1,0,1\n",
             "no column normal_y, found x_m, y_m, normal_x, normal_z",

@@ -127,7 +127,7 @@ class Gain(AbstractEffect):
 
 
 @dataclass
-class Curve(AbstractEffect):
+class SensorCurve(AbstractEffect):
     """The curve of the sensors: a power law, or a table of some of them.
 
     Attributes:
@@ -164,7 +164,7 @@ class Clip(AbstractEffect):
         return readings.clamp(-constants.clip, constants.clip)
 
 
-class Noise(AbstractEffect):
+class SensorNoise(AbstractEffect):
     """Noise in every frame, and a constant offset less the baseline of a tare."""
 
     def draw(self, values: Numbers, random: Numbers) -> Numbers:

@@ -17,13 +17,13 @@ from skin.device.effects import (
     AbstractEffect,
     Clip,
     Constants,
-    Curve,
     Drift,
     Gain,
     Hysteresis,
     Lag,
-    Noise,
     Quantise,
+    SensorCurve,
+    SensorNoise,
 )
 from skin.errors import InputError
 
@@ -141,11 +141,15 @@ class Imperfection(ImperfectionSettings):
     @property
     def converter(self) -> tuple[AbstractEffect, ...]:
         """The effects of the converter, in their order."""
-        return Clip(), Noise(), Drift(), Quantise()
+        return Clip(), SensorNoise(), Drift(), Quantise()
 
     @property
-    def _curve(self) -> Curve:
-        return Curve(table=self.table) if self.calibration is None else Curve(self.calibration.tables)
+    def _curve(self) -> SensorCurve:
+        return (
+            SensorCurve(table=self.table)
+            if self.calibration is None
+            else SensorCurve(self.calibration.tables)
+        )
 
     @property
     def dead_range(self) -> tuple[int, int]:

@@ -7,10 +7,10 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from skin.body.base import Arm as Arm
-    from skin.body.base import Sheet as Sheet
+    from skin.body.arm import Arm as Arm
     from skin.body.layout import File as LayoutFile
     from skin.body.layout import Grid as Grid
+    from skin.body.sheet import Sheet as Sheet
     from skin.device.files import read_recording as read_recording
     from skin.errors import InputError as InputError
     from skin.inference.candidates import FingertipPrior as FingertipPrior
@@ -30,12 +30,12 @@ _PLACES = {
     "FingertipPrior": "skin.inference.candidates",
     "Noise": "skin.inference.noise",
     "Posterior": "skin.inference.posterior",
-    "Arm": "skin.body.base",
+    "Arm": "skin.body.arm",
     "Grid": "skin.body.layout",
     "InputError": "skin.errors",
     "LayoutFile": "skin.body.layout:File",
     "PlatesAndBeams": "skin.mechanics.simulator.fem",
-    "Sheet": "skin.body.base",
+    "Sheet": "skin.body.sheet",
     "Solid": "skin.mechanics.simulator.solid",
     "data": "skin.runs.build:training_data",
     "load_run": "skin.runs.torch_model",

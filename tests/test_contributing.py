@@ -28,11 +28,11 @@ def own(tmp_path_factory):
         yield folder
 
 
-def test_one_option_of_each_of_four_groups_is_shown():
+def test_one_option_of_each_of_five_groups_is_shown():
     groups = {name.split("/")[1] for name in FILES if name.endswith(".yaml")}
-    assert groups == {"simulator", "representation", "model", "fusion"}
-    assert len(FILES) == 8
-    assert (len(TRAINING), len(EVALUATION)) == (4, 1)
+    assert groups == {"simulator", "representation", "model", "fusion", "touch"}
+    assert len(FILES) == 10
+    assert (len(TRAINING), len(EVALUATION)) == (5, 1)
 
 
 @pytest.mark.slow("trains and evaluates an option of every kind")

@@ -9,9 +9,10 @@ import numpy as np
 import pandas as pd
 from annotated_types import MinLen
 
-from skin.body.base import AbstractBody, Layer, Sheet
+from skin.body.base import AbstractBody, Layer
 from skin.body.layout import Listed
 from skin.body.material import Material
+from skin.body.sheet import Sheet
 from skin.errors import InputError
 from skin.inference.candidates import FingertipPrior, disc_readings
 from skin.inference.noise import Noise

@@ -25,17 +25,18 @@ from scipy.stats import binomtest
 from experiments import run_script, script_settings
 from experiments.studies.pages import csv_text
 from experiments.validation.references import Discs, Slab
-from skin.body.base import AbstractBody, Layer, Sensors, Sheet
+from skin.body.base import AbstractBody, Layer, Sensors
 from skin.body.layout import AbstractLayout, Grid, Hexagonal, Random
 from skin.body.material import Material
+from skin.body.sheet import Sheet
 from skin.core.files import ROOT, write
 from skin.errors import InputError
 from skin.inference.candidates import FingertipPrior
 from skin.inference.noise import Noise
 from skin.inference.posterior import FrameEstimate, Posterior
 from skin.mechanics.simulator.solid import Solid
-from skin.touch.gesture import GestureSettings
-from skin.touch.shapes import Shapes, draw_bodies
+from skin.touch.gestures import GestureSettings, draw_bodies
+from skin.touch.shapes import Shapes
 
 CELL = 0.005  # m
 POISSON = {"Dragon Skin 10 Medium": 0.49}

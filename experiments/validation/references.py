@@ -18,7 +18,7 @@ import numpy as np
 from scipy.interpolate import RectBivariateSpline
 from scipy.special import j0, j1
 
-from skin.body.base import Sheet
+from skin.body.sheet import Sheet
 from skin.mechanics.simulator._hexahedra import Hexahedra
 from skin.mechanics.simulator.base import factorised
 

@@ -26,7 +26,9 @@ from experiments.validation.references import (
     solve_block,
     square_punch,
 )
-from skin.body.base import AbstractBody, Arm, Sensors, Sheet
+from skin.body.arm import Arm
+from skin.body.base import AbstractBody, Sensors
+from skin.body.sheet import Sheet
 from skin.mechanics.contact.rigid import solve_contact as press
 from skin.mechanics.contact.rigid import stabilise_checkerboard
 from skin.mechanics.simulator._hexahedra import Hexahedra
@@ -344,8 +346,8 @@ def _under_discs(body: Sheet, sensors: Sensors) -> np.ndarray:
     at = (sensors.positions[:, None, :2] + _BESIDE).reshape(-1, 2)
     turn, felt = np.zeros(len(at)), []
     for radius in _RADII:
-        moments = shapes.press(turn.astype(int), turn, turn + radius / spread, at).moments.flatten(1).double()
-        every = (moments.numpy() @ operator.T).reshape(len(sensors), len(_BESIDE), -1)
+        moments, _, _ = shapes.press(turn.astype(int), turn, turn + radius / spread, at)
+        every = (moments.flatten(1).double().numpy() @ operator.T).reshape(len(sensors), len(_BESIDE), -1)
         felt.append(every.diagonal(axis1=0, axis2=2).T * np.pi * radius**2 / np.prod(body.cell))
     return np.stack(felt)
 

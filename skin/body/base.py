@@ -6,11 +6,12 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from importlib import import_module
 from typing import Annotated, Any, ClassVar, NamedTuple
 
 import numpy as np
 import psutil
-from annotated_types import Ge, Gt, Lt
+from annotated_types import Ge
 from pydantic import PositiveFloat
 
 from skin.body.material import Material
@@ -28,9 +29,9 @@ GEOMETRY = (
     *("width", "height", "thickness", "share"),
     *(f"response_{1e3 * reach:g}mm" for reach in REACHES),
 )
-"""What is known of a sensor and its skin: m, unit vectors; extent and thickness of the body, m; reading under
-uniform pressure as a share of the force on the footprint; readings under a fingertip of 1 N at the distances
-:data:`REACHES`, N."""
+"""Geometry of a sensor and its skin: m, unit vectors; extent and thickness of the body, m; reading under
+uniform pressure as a fraction of the force on the footprint; readings under a fingertip of 1 N at the
+distances :data:`REACHES`, N."""
 
 
 @dataclass(frozen=True)
@@ -40,9 +41,9 @@ class Sensors:
     Attributes:
         positions: (S, 3), m: x to the right and y downwards from the body's upper left corner, z the depth
             below the surface. The order of the sensors is the order of the readings everywhere.
-        footprint: extent (x, y) of the area over which one sensor feels, m.
-        normals: (S, 3), unit vectors n, in the local frame (x, y, into the skin), along which each sensor
-            feels: it reads n . sigma . n. One (3,) holds for all; by default they face the surface.
+        footprint: extent (x, y) of the sensitive area of one sensor, m.
+        normals: (S, 3), unit vectors n, in the local frame (x, y, into the skin), of the stress that each
+            sensor measures: it reads n . sigma . n. One (3,) holds for all; by default they face the surface.
     """
 
     positions: np.ndarray
@@ -65,13 +66,13 @@ class Sensors:
 # Check that arrays fit into memory before they are allocated.
 
 
-def require_memory(needed: float, what: str, mend: str) -> None:
+def require_memory(needed: float, what: str, advice: str) -> None:
     """Raise InputError unless ``needed`` bytes of memory are available.
 
     Args:
         needed: estimate, bytes.
         what: subject of the error message.
-        mend: end of the error message: what to set instead.
+        advice: end of the error message: what to set instead.
 
     Raises:
         InputError: the estimate exceeds the available memory.
@@ -79,12 +80,8 @@ def require_memory(needed: float, what: str, mend: str) -> None:
     available = psutil.virtual_memory().available
     if needed > available:
         raise InputError(
-            f"{what} needs about {needed / 1e9:.3g} GB of memory, {available / 1e9:.3g} GB are free: {mend}"
+            f"{what} needs about {needed / 1e9:.3g} GB of memory, {available / 1e9:.3g} GB are free: {advice}"
         )
-
-
-# What any simulator holds per cell at least: 25 sensors' float64 weights and a gesture of 30 float32 frames.
-_BYTES_PER_CELL = 25 * 8 + 30 * 4
 
 
 @checked("body.layers")
@@ -132,8 +129,9 @@ class AbstractBody(ABC):
         object.__setattr__(self, "size", tuple(map(float, self.size)))
         object.__setattr__(self, "cells", tuple(self.cells))
         object.__setattr__(self, "layers", _layers(self.layers))
+        # Any simulator holds at least 25 sensors' float64 weights and a gesture of 30 float32 frames.
         require_memory(
-            _BYTES_PER_CELL * math.prod(self.cells),
+            (25 * 8 + 30 * 4) * math.prod(self.cells),
             f"body.cells=[{self.cells[0]},{self.cells[1]}]",
             "give fewer cells, such as body.cells=[32,32]",
         )
@@ -288,7 +286,7 @@ def check_plausibility(groups: Mapping[str, Any]) -> None:
     """Refuse a configuration with a value that no skin has in the unit that is asked for.
 
     Args:
-        groups: the configuration, in plain containers. What is no number is left to the classes.
+        groups: the configuration, in plain containers. Values of other types are left to the classes.
 
     Raises:
         InputError: a value is out of its range.
@@ -310,16 +308,14 @@ def _check_ranges(name: str, group: Any, ranges: Mapping[str, Any]) -> None:
             continue
         low, high, unit = within
         for value in setting if isinstance(setting, list) else [setting]:
-            # What is no number, or not above 0, the classes refuse with a sentence of their own.
-            if _positive(value) and not low <= value <= high:
+            # The classes refuse other values with a sentence of their own.
+            if isinstance(value, bool) or not isinstance(value, int | float):
+                continue
+            if 0 < value < math.inf and not low <= value <= high:
                 raise InputError(
                     f"{name}.{key}={value:g} {unit} is not plausible: it is given in {unit}, from {low:g} to "
                     f"{high:g} {unit}; was another unit meant?"
                 )
-
-
-def _positive(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and 0 < value < math.inf
 
 
 def warn_of_surface(body: AbstractBody, sensors: Sensors) -> None:
@@ -335,85 +331,8 @@ def warn_of_surface(body: AbstractBody, sensors: Sensors) -> None:
         )
 
 
-# A flat sheet of silicone layers on a rigid base.
-
-
-@checked("body")
-@dataclass(frozen=True)
-class Sheet(AbstractBody):
-    """A rectangular sheet of layers on a rigid base; its chart is the sheet seen from above.
-
-    In space x and y are those of the chart, and z points up from the surface.
-    """
-
-    flat: ClassVar[bool] = True
-
-    def place(self, points: np.ndarray) -> np.ndarray:
-        """Return where points (..., 3) of the chart, m, are in space: (x, y, -depth), m."""
-        return np.asarray(points) * np.array([1.0, 1.0, -1.0])
-
-    def frame(self, points: np.ndarray) -> np.ndarray:
-        """Return the local axes at points (..., 3), (..., 3, 3): everywhere x, y and down."""
-        return np.broadcast_to(np.diag([1.0, 1.0, -1.0]), (*np.shape(points)[:-1], 3, 3)).copy()
-
-
-# A sleeve of silicone layers around a part of an arm.
-
-
-@checked("body")
-@dataclass(frozen=True)
-class Arm(AbstractBody):
-    """Layers on a rigid cylinder, over a part of its circumference: a rolled-up sheet (docs/adr/0005).
-
-    The chart is the unrolled outer surface: x runs around the arm, y along it. Distances on the surface are
-    those of the chart; below the surface an arc over the same x is shorter. In space y is the axis of the
-    arm, and the middle of the sleeve is at the top, along z.
-
-    Attributes:
-        radius: of the outer surface, m.
-        length: of the sleeve along the arm, m.
-        angle: of the sleeve, rad; less than a full turn.
-        size: (radius * angle, length), m.
-        cells, layers: as in :class:`skin.body.base.AbstractBody`; layers from the core outwards.
-
-    Raises:
-        InputError: as in :class:`skin.body.base.AbstractBody`, and a closed sleeve, or layers that are
-            thicker than the radius.
-    """
-
-    size: tuple[float, float] = field(init=False)
-    radius: PositiveFloat = field(kw_only=True)
-    length: PositiveFloat = field(kw_only=True)
-    angle: Annotated[float, Gt(0), Lt(2 * math.pi)] = field(kw_only=True)
-
-    flat: ClassVar[bool] = False
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "size", (self.radius * self.angle, self.length))
-        super().__post_init__()
-        if self.thickness >= self.radius:
-            raise InputError(
-                f"layers of {self.thickness:g} m together leave no core within "
-                f"body.radius={self.radius:g} m: give a larger body.radius or thinner layers"
-            )
-
-    def resized(self, size: tuple[float, float]) -> str:
-        """Return the overrides that give the sleeve an extent (x, y), m."""
-        return f"body.angle={size[0] / self.radius:g} body.length={size[1]:g}"
-
-    def place(self, points: np.ndarray) -> np.ndarray:
-        """Return where points (..., 3) of the chart, m, are in space, (..., 3), m."""
-        x, y, depth = np.moveaxis(np.asarray(points, dtype=float), -1, 0)
-        turn, radius = self._turn(x), self.radius - depth
-        return np.stack([radius * np.sin(turn), y, radius * np.cos(turn)], axis=-1)
-
-    def frame(self, points: np.ndarray) -> np.ndarray:
-        """Return the local axes at points (..., 3), (..., 3, 3): around the arm, along it, to its axis."""
-        turn = self._turn(np.asarray(points, dtype=float)[..., 0])
-        sine, cosine, none = np.sin(turn), np.cos(turn), np.zeros_like(turn)
-        around, along, inwards = (cosine, none, -sine), (none, none + 1, none), (-sine, none, -cosine)
-        return np.stack([np.stack(axis, axis=-1) for axis in (around, along, inwards)], axis=-2)
-
-    def _turn(self, x: np.ndarray) -> np.ndarray:
-        """Return the angle from the middle of the sleeve at a place around it (...,), m, in rad."""
-        return x / self.radius - self.angle / 2
+def __getattr__(name: str) -> Any:
+    """Return ``Sheet`` or ``Arm``, which configurations of stored runs name by this module."""
+    if name in ("Arm", "Sheet"):
+        return getattr(import_module(f"skin.body.{name.lower()}"), name)
+    raise AttributeError(name)

@@ -22,7 +22,7 @@ class Relaxation:
 
     Attributes:
         time: tau, s.
-        strength: g, what an instantaneous strain feels beyond the relaxed modulus E, as a share of it.
+        strength: g, fraction by which the modulus of an instantaneous strain exceeds the relaxed one, E.
 
     Raises:
         InputError: a time or a strength that is not a positive number.
@@ -39,7 +39,7 @@ class Material:
 
     Attributes:
         name: of the material; it does not affect the mechanics.
-        young: Young's modulus E, Pa; of a material that relaxes, that which is left in the end.
+        young: Young's modulus E, Pa; of a material that relaxes, the value in the end.
         poisson: Poisson's ratio nu. The plate-and-beam model takes -1 < nu < 1, where its shear modulus
             E / 2(1 + nu) and its plate stiffness E / (1 - nu^2) are positive. A solid needs nu < 0.5.
         relaxation: how stress relaxes; None: not at all.
@@ -125,10 +125,10 @@ def _known() -> str:
 
 def _missing(name: str, young: float | None, poisson: float | None) -> str:
     need = " and ".join(key for key, value in (("young (Pa)", young), ("poisson", poisson)) if value is None)
-    mend = (
+    advice = (
         f"give {need}, as in {{'name': {name!r}, 'young': 100e3, 'poisson': 0.49}} in Python "
         f"or {{name: {name}, young: 100e3, poisson: 0.49}} on the command line"
     )
     if _key(name) == "ecoflexgel":
-        return f"EcoFlex Gel has no constants of its own: the report's measurement was unreliable; {mend}"
-    return f"unknown material {name}: {_known()}; or {mend}"
+        return f"EcoFlex Gel has no constants of its own: the report's measurement was unreliable; {advice}"
+    return f"unknown material {name}: {_known()}; or {advice}"

@@ -139,7 +139,7 @@ def check_groups(config: Mapping[str, Any]) -> None:
         if (target := part.get("_target_")) is None and name in _INNER:
             raise InputError(f"{name} chooses no option: leave it out, or give one that --help lists")
         if target is not None and not str(target).startswith(_LIBRARIES):
-            check_settings(import_target(target, name), part, name)
+            check_settings(import_target(target, f"{name}._target_"), part, name)
 
 
 def import_target(target: str, name: str) -> Callable[..., Any]:
@@ -147,7 +147,7 @@ def import_target(target: str, name: str) -> Callable[..., Any]:
 
     Args:
         target: the name.
-        name: of the part of the configuration that has it as ``_target_``.
+        name: of the setting that has it, as in ``model._target_``.
 
     Raises:
         InputError: it cannot be imported.
@@ -156,7 +156,7 @@ def import_target(target: str, name: str) -> Callable[..., Any]:
         return _locate(str(target))
     except (ImportError, ValueError) as error:
         raise InputError(
-            f"{name}._target_={target} cannot be imported: {error.__cause__ or error}: correct "
+            f"{name}={target} cannot be imported: {error.__cause__ or error}: correct "
             "the name, or add the folder of its module to PYTHONPATH"
         ) from error
 

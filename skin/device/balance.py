@@ -11,8 +11,8 @@ import torch
 from skin.body.base import AbstractBody
 from skin.device.base import AbstractDevice
 from skin.device.touches import Recording, only_touches
-from skin.touch.gesture import GestureSettings
-from skin.touch.labels import OPPOSITE
+from skin.touch.gestures import GestureSettings
+from skin.touch.labels import ALARM
 from skin.touch.sampler import AbstractSampler
 
 _log = logging.getLogger(__name__)
@@ -29,44 +29,46 @@ def report_balance(device: AbstractDevice, recording: Recording | None = None, s
     if device.simulation is None:
         return
     sampler = device.simulation.sampler
-    balance = class_balance(recording or device.recording(None, complete=False), sampler.shapes.names)
+    balance = class_balance(recording or device.recording(None, complete=False), sampler)
     if shown:
         _log.info("\n".join(balance_table(balance)))
     check_label_leakage(balance, sampler)
 
 
-def class_balance(recording: Recording, shapes: tuple[str, ...]) -> dict[str, Any]:
-    """Return statistics of the gestures of each class, in SI units and shares of 1.
+def class_balance(recording: Recording, sampler: AbstractSampler) -> dict[str, Any]:
+    """Return statistics of the gestures of each class, in SI units and fractions of 1.
 
     Args:
         recording: simulated touches.
-        shapes: names of the shapes; the parameter ``shape`` is an index into them.
+        sampler: that drew them; the parameter ``shape`` is an index into its shapes.
 
     Returns:
-        shapes, stretched (share of touches that were stretched) and, for each label, accuracy and error (see
-        :func:`accuracy_from_shape`), and for its classes yes and no: touches, shapes (share of each), area,
-        force (N), x and y (m; mean and standard deviation of the first position), rejected (share of drawn
-        paths with other labels) and misfits (share of drawn bodies that do not fit on the sheet).
+        shapes, stretched (fraction of touches that were stretched) and, for each label, opposite, accuracy,
+        error (see :func:`accuracy_from_shape`) and for its classes yes and no: touches, shapes (fraction of
+        each), area, force (N), x and y (m; mean and standard deviation of the first position), rejected
+        (fraction of drawn paths with other labels) and misfits (fraction of drawn bodies that do not fit).
     """
     recording = only_touches(recording)
     parameters = {name: values.double().numpy() for name, values in recording.parameters.items()}
     labels = recording.touches.labels
     assert labels is not None
     report: dict[str, Any] = {
-        "shapes": list(shapes),
+        "shapes": list(sampler.shapes.names),
         "stretched": float((parameters["stretch"] != 1).mean()),
         "labels": {},
     }
     shape = parameters["shape"].astype(int)
     for column, name in enumerate(recording.task.names):
-        if name in OPPOSITE:
+        if name in sampler.labels:
             holds = labels[:, column].numpy() > 0.5
             accuracy, error = accuracy_from_shape(shape, holds)
-            classes = {
-                "yes": _class(parameters, holds, len(shapes)),
-                "no": _class(parameters, ~holds, len(shapes)),
+            report["labels"][name] = {
+                "opposite": sampler.labels[name].opposite,
+                "accuracy": accuracy,
+                "error": error,
+                "yes": _class(parameters, holds, len(sampler.shapes.names)),
+                "no": _class(parameters, ~holds, len(sampler.shapes.names)),
             }
-            report["labels"][name] = {"accuracy": accuracy, "error": error, **classes}
     return report
 
 
@@ -120,9 +122,10 @@ def balance_table(report: dict[str, Any]) -> list[str]:
     names = [Path(shape).stem for shape in report["shapes"]]
     table = [["", "accuracy", *names, "area %", "force N", "x mm", "y mm", "paths", "bodies"]]
     for name, entry in report["labels"].items():
-        for title, told, side in ((name, f"{entry['accuracy']:.2f}", "yes"), (OPPOSITE[name], "", "no")):
-            if entry[side]["touches"]:
-                table.append([title, told, *_cells(entry[side])])
+        sides = ((name, f"{entry['accuracy']:.2f}", "yes"), (entry["opposite"], "", "no"))
+        table += [
+            [title, text, *_cells(entry[side])] for title, text, side in sides if entry[side]["touches"]
+        ]
     widths = [max(map(len, column)) for column in zip(*table, strict=True)]
     rows = ["  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in table]
     return [
@@ -133,10 +136,10 @@ def balance_table(report: dict[str, Any]) -> list[str]:
 
 
 def _cells(side: dict[str, Any]) -> list[str]:
-    shares = [f"{100 * share:.0f}" for share in (*side["shapes"], side["area"])]
-    places = [f"{1e3 * side[axis][0]:.0f}±{1e3 * side[axis][1]:.0f}" for axis in "xy"]
+    fractions = [f"{100 * fraction:.0f}" for fraction in (*side["shapes"], side["area"])]
+    positions = [f"{1e3 * side[axis][0]:.0f}±{1e3 * side[axis][1]:.0f}" for axis in "xy"]
     lost = [f"{100 * side[kind]:.0f}" for kind in ("rejected", "misfits")]
-    return [*shares, f"{side['force']:.0f}", *places, *lost]
+    return [*fractions, f"{side['force']:.0f}", *positions, *lost]
 
 
 def check_label_leakage(report: dict[str, Any], settings: AbstractSampler | GestureSettings) -> None:
@@ -166,14 +169,14 @@ def check_label_leakage(report: dict[str, Any], settings: AbstractSampler | Gest
 
 
 def summarise(recording: Recording, body: AbstractBody) -> dict[str, Any]:
-    """Return what a simulated data set is like, as shares of 1 and SI units.
+    """Return what a simulated data set is like, as fractions of 1 and SI units.
 
     The strain is the largest of the top layer by the linear solution or, where a recording has none, its
     highest pressure by its modulus. Linear theory is good to about 0.3; beyond 1 a linear layer would be
     squeezed to nothing. The report's thresholds are kept all the same.
 
     Returns:
-        gestures; acceptance (share of draws kept); force (N: quantiles .05, .5, .95 and the largest);
+        gestures; acceptance (fraction of draws kept); force (N: quantiles .05, .5, .95 and the largest);
         strain_over_30_percent and strain_over_100_percent; strain_solved (else pressure by modulus);
         clipped and clipped_dangerous (gestures in which a sensor passes the clip, of all and of the dangerous
         ones); unconverged (frames whose pressure was not found, so that their gestures were drawn again),
@@ -183,7 +186,7 @@ def summarise(recording: Recording, body: AbstractBody) -> dict[str, Any]:
     assert labels is not None
     strain = parameters.get("strain", parameters["peak"] / body.layers[-1].material.young)
     force = torch.quantile(parameters["force"], torch.tensor([0.05, 0.5, 0.95, 1.0]))
-    dangerous = labels[:, recording.task.names.index("dangerous")] > 0.5
+    dangerous = labels[:, recording.task.names.index(ALARM)] > 0.5
     summary = {
         "gestures": len(recording),
         "acceptance": len(recording) / float(parameters["draws"].sum()),

@@ -18,7 +18,8 @@ from skin.errors import InputError
 from skin.touch.labels import Task
 
 if TYPE_CHECKING:
-    from skin.device.imperfection import Constants, Imperfection
+    from skin.device.effects import Constants
+    from skin.device.imperfection import Imperfection
     from skin.device.touches import TouchStream
     from skin.mechanics.simulator.base import AbstractSimulator
     from skin.touch.sampler import AbstractSampler
@@ -259,11 +260,13 @@ def split_rows(split: Split, count: int, seed: int) -> Tensor:
     return torch.from_numpy(order[split_slices(count)[split]])
 
 
-def split_groups(groups: Tensor, seed: int, test: Sequence[int] | None = None) -> dict[Split, Tensor]:
+def split_groups(
+    groups: Tensor, seed: int, test: Sequence[int] | None = None, few: int = 5
+) -> dict[Split, Tensor]:
     """Return the shuffled indices of the gestures of each split; the gestures of a group stay together.
 
     About a tenth of the groups is the holdout, and another tenth the validation. If the holdout leaves fewer
-    than five groups, the validation is a tenth of their gestures.
+    than ``few`` groups, too few to give one for validation, the validation is a tenth of their gestures.
 
     Args:
         groups: (B,), number of the group of each gesture; at least two groups.
@@ -278,14 +281,11 @@ def split_groups(groups: Tensor, seed: int, test: Sequence[int] | None = None) -
     rows = torch.from_numpy(source.permutation(len(groups)))
     numbers = groups[rows]
     holdout, others = torch.isin(numbers, torch.tensor(held)), rows[torch.isin(numbers, torch.tensor(left))]
-    if len(left) < _FEW_GROUPS:
+    if len(left) < few:
         edge = max(1, round(0.1 * len(others)))
         return {"train": others[edge:], "validation": others[:edge], "holdout": rows[holdout]}
     middle = torch.isin(groups[others], torch.tensor(left[:tenth]))
     return {"train": others[~middle], "validation": others[middle], "holdout": rows[holdout]}
-
-
-_FEW_GROUPS = 5  # with fewer, a whole group for validation would leave too little to train on
 
 
 def split_shards(split: Split, counts: Sequence[int], seed: int) -> Iterator[tuple[int, Tensor]]:
@@ -377,7 +377,7 @@ def grouped(batches: Sequence[Part], metadata: Callable[[Recording], dict[str, A
 
     Args:
         batches: to group.
-        metadata: gives that of a part.
+        metadata: gives the metadata of a part.
     """
 
     def make(group: Sequence[Part]) -> Recording:

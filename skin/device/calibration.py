@@ -32,10 +32,8 @@ QUANTITIES = {
     "quantum": 0.0,
     "exponent": 1.0,
 }
-"""Quantities per sensor, as in :class:`skin.device.imperfection.Constants`, with defaults."""
+"""Quantities per sensor, as in :class:`skin.device.effects.Constants`, with defaults."""
 _SIGNED = ("offset", "drift")
-_SHOWN = 80  # characters of values, in a message
-_LARGEST = 1e12  # of any quantity: no force, time or gain of a device is near it
 BROKEN = ("dead", "stuck", "saturated")
 """Kinds of broken sensors; ``stuck`` and ``saturated`` ones always read their ``offset``."""
 
@@ -204,7 +202,7 @@ def read_calibration(path: str | Path) -> Calibration:
         InputError: no such file, unreadable, invalid contents, or a line ``sha256`` with the checksum of
             other contents.
     """
-    file = next((place for place in candidates(path) if place.is_file()), None)
+    file = next((candidate for candidate in candidates(path) if candidate.is_file()), None)
     if file is None:
         raise InputError(f"no calibration {path}: skin calibrate session=FILE out={path} makes one")
     try:
@@ -289,11 +287,11 @@ def _check(name: str, values: Sequence[float]) -> None:
         least = "" if name in _SIGNED else " from 0 up"
         least += " (a channel whose values fall with force has polarity: -1)" if name == "gain" else ""
         text = str(values)
-        raise InputError(f"{name} must be numbers{least}, got {text[:_SHOWN]}")
+        raise InputError(f"{name} must be numbers{least}, got {text[:80]}")
 
 
-def _is_number(name: str, value: Any) -> bool:
+def _is_number(name: str, value: Any, largest: float = 1e12) -> bool:
     """Return whether a value is a number that a device can have; a limit may be infinite."""
     if not isinstance(value, int | float) or isinstance(value, bool):
         return False
-    return abs(value) <= _LARGEST or (name == "clip" and value == math.inf)
+    return abs(value) <= largest or (name == "clip" and value == math.inf)

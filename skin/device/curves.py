@@ -9,8 +9,6 @@ import numpy as np
 from skin.errors import InputError
 
 _LEAST = 1e-9  # of the reference: below, a power law is a line, whose slope is finite
-_MOST_ROWS = 1000
-_STEP = 0.01  # of a reading, over which a slope is taken
 
 Table = Sequence[Sequence[float]]
 """Linear readings and values of a curve, each rising from 0, N."""
@@ -51,9 +49,9 @@ class Curves:
 
     @property
     def slopes(self) -> np.ndarray:
-        """Change of the value per change of the linear reading at :attr:`at`, (S,); 1 where it is a line."""
+        """Change of the value per change of the linear reading at :attr:`at` within 1 %, (S,); 1: a line."""
         at = np.broadcast_to(self.at, np.shape(self.exponent)).astype(float)
-        return np.asarray((self.bend((1 + _STEP) * at) - self.bend((1 - _STEP) * at)) / (2 * _STEP * at))
+        return np.asarray((self.bend((1 + 0.01) * at) - self.bend((1 - 0.01) * at)) / (2 * 0.01 * at))
 
     def scaled(self, factor: np.ndarray) -> "Curves":
         """Return these curves for readings and values in another unit; ``factor`` (S,) of that per N."""
@@ -94,7 +92,7 @@ def read_tables(stored: Mapping[Any, Any], sensors: int) -> dict[int, Table]:
     return {number: check_table(table) for number, table in tables.items()}
 
 
-def check_table(table: Any) -> Table:
+def check_table(table: Any, most: int = 1000) -> Table:
     """Return a table whose rows, linear readings and values, rise from 0.
 
     Raises:
@@ -104,7 +102,7 @@ def check_table(table: Any) -> Table:
         rows = np.array(table, dtype=float)
     except (TypeError, ValueError):
         rows = np.empty(0)
-    fits = rows.ndim == 2 and rows.shape[0] == 2 and 2 <= rows.shape[1] <= _MOST_ROWS
+    fits = rows.ndim == 2 and rows.shape[0] == 2 and 2 <= rows.shape[1] <= most
     if not fits or not np.isfinite(rows).all() or (rows[:, 0] != 0).any() or (np.diff(rows) <= 0).any():
         raise InputError(
             "a table of a curve has two rows of numbers, readings and values in N, each rising from 0, as in "

@@ -225,7 +225,7 @@ def read_description(path: Path) -> dict[str, Any]:
 
 @contextmanager
 def _refused(path: Path) -> Iterator[None]:
-    """Turn what goes wrong with a file that is no recording into an InputError."""
+    """Turn errors of a file that cannot be read as a recording into an InputError."""
     if not path.is_file():
         raise InputError(f"no recording {path}: skin generate n=1000 out={path} makes one")
     try:

@@ -1,13 +1,16 @@
-"""Formats of foreign recordings: a mapping file that says what tables hold, and the tables themselves.
+"""Formats of foreign recordings: a mapping says what plain tables hold, and the tables themselves.
 
 A mapping is YAML with the settings of :class:`ForeignFormat`. Columns are named by the header or, without
 one, numbered from 1; the named groups of the regular expression ``fields`` become columns, too.
 """
 
+import json
 import re
 import zipfile
+from codecs import BOM_UTF16_BE, BOM_UTF16_LE
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from io import StringIO
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -21,78 +24,71 @@ from skin.core.settings import check_settings
 from skin.errors import InputError
 
 Column = str | int
-Place = tuple[float, float] | tuple[float, float, float]
+Position = tuple[float, float] | tuple[float, float, float]
 
-TIMES = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "min": 60.0}
+TIMES = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0}
 LENGTHS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "in": 0.0254}
 _G = 9.80665  # m/s^2, standard gravity
 FORCES = {
-    "N": 1.0,
-    "mN": 1e-3,
-    "kN": 1e3,
-    "g": 1e-3 * _G,
-    "gf": 1e-3 * _G,
-    "kg": _G,
-    "kgf": _G,
-    "lbf": 4.4482216,
-}
+    "N": 1.0, "mN": 1e-3, "kN": 1e3, "g": 1e-3 * _G, "gf": 1e-3 * _G, "kg": _G, "kgf": _G, "lbf": 4.4482216
+}  # fmt: skip
 TARGETS = {"x": LENGTHS, "y": LENGTHS, "force": FORCES, "force_x": FORCES, "force_y": FORCES}
 """What a touch can be measured by -> its units."""
-_SPREADSHEETS = (".xlsx", ".xlsm", ".xls", ".ods")
+TIME = " time"
+"""Column of the time, s; no header has a name that begins with a blank."""
 
 
 @dataclass(frozen=True)
 class TableFormat:
-    """How a file is written: text with a delimiter, or a spreadsheet.
+    """How a file is written: text with a delimiter, JSON lines (``.jsonl``), or a spreadsheet.
 
     Attributes:
         delimiter: between columns; ``whitespace`` takes any number of blanks and tabs.
+        begin: regular expression that the first line of the table contains; lines before it are skipped.
         header: whether the first line names the columns.
+        units: whether the row below the header holds units, and is skipped.
         names: of the columns, instead of a header.
-        encoding: of the text.
+        encoding: of the text; UTF-16 is recognised by its byte order mark.
         decimal: sign before the decimals.
         comment: sign that begins a comment.
         sheet: name or number, from 0, of a spreadsheet's sheet.
         missing: text or numbers that stand for no value, besides empty, ``nan`` and the like.
-        lines: lines that make a frame, as the rows of a mat do; their columns are numbered on.
+        long: columns of the sensor and of its value, where each row holds one reading.
     """
 
     delimiter: str = ","
+    begin: str | None = None
     header: bool = True
+    units: bool = False
     names: Sequence[str] = ()
     encoding: str = "utf-8-sig"
     decimal: str = "."
     comment: str | None = None
     sheet: int | str = 0
     missing: Sequence[str | float] = ()
-    lines: Annotated[int, Ge(1)] = 1
+    long: tuple[Column, Column] | None = None
 
 
 @dataclass(frozen=True)
 class JoinedFile:
-    """A second file for each file.
+    """A second file for each file, with as many rows in the same order.
 
     Attributes:
         file: its path from the folder of the first; ``{name}`` stands for a field of the first one's path.
-        by: ``row``, as many rows in the same order, or ``time``, the row nearest in time.
-        clock: its column of time, in the unit of the first one's.
-        tolerance: s, largest distance of rows that belong together; farther ones have no values.
         table: how it is written. Columns that the first file has, too, need other ``names``.
     """
 
     file: str
-    by: Literal["row", "time"] = "row"
-    clock: Column | None = None
-    tolerance: Annotated[float, Gt(0)] = 0.01
     table: TableFormat = TableFormat()
 
 
 @dataclass(frozen=True)
 class TimeColumn:
-    """Column of the time and its unit: s, ms, us or min."""
+    """Column of the time: numbers in a unit, or dates and times in a ``format`` of strptime."""
 
     column: Column
-    unit: Literal["s", "ms", "us", "min"]
+    unit: Literal["s", "ms", "us", "ns", "min"] = "s"
+    format: str = "ISO8601"
 
 
 @dataclass(frozen=True)
@@ -104,20 +100,12 @@ class ChannelColumns:
         unit: a force (N, mN, kN, g, gf, kg, kgf, lbf), or any other with ``scale``.
         scale: N per unit, one or one per column. A nominal one makes readings nominal.
         per_sensor: 3 where x, y and z of a sensor follow each other.
-        combine: of three channels: ``plain`` (three readings at one place), ``normal`` (the third) or
-            ``magnitude``.
-        frames: number of frames that a row holds.
-        order: where a row holds several frames, whether all columns of a ``frame`` or of a ``sensor`` follow
-            each other.
     """
 
     columns: Annotated[Sequence[Column], MinLen(1)] | str
     unit: str
     scale: float | Sequence[float] | None = None
     per_sensor: Literal[1, 3] = 1
-    combine: Literal["plain", "normal", "magnitude"] = "plain"
-    frames: Annotated[int, Ge(1)] = 1
-    order: Literal["frame", "sensor"] = "frame"
 
 
 @dataclass(frozen=True)
@@ -139,24 +127,17 @@ class SegmentRule:
     """What a touch is.
 
     Attributes:
-        by: ``row``, ``file``, ``columns`` (rows with the same values), ``windows`` or ``contact``.
-        frames: frames of each touch.
+        by: a ``row``, a ``file``, equal ``windows`` of it, or a ``contact`` with the frames around it.
+        frames: frames of each touch; shorter ones are padded with 0, longer ones cut.
         before: idle frames before a row, or frames before a contact.
-        fit: of a file or rows that are shorter or longer: ``pad`` with idle frames and cut, or ``stretch``
-            over all frames, which loses the duration.
-        columns: whose change begins a touch.
-        counter: column whose fall begins a touch, such as a frame number.
         step: frames from one window to the next; None: ``frames``.
         threshold: N, of a contact: above it any reading is, up or down.
         gap: frames below the threshold that do not end a contact.
     """
 
-    by: Literal["row", "file", "columns", "windows", "contact"]
+    by: Literal["row", "file", "windows", "contact"]
     frames: Annotated[int, Ge(1)] = 30
     before: Annotated[int, Ge(0)] = 2
-    fit: Literal["pad", "stretch"] = "pad"
-    columns: Sequence[Column] = ()
-    counter: Column | None = None
     step: Annotated[int, Ge(1)] | None = None
     threshold: Annotated[float, Gt(0)] | None = None
     gap: Annotated[int, Ge(0)] = 3
@@ -168,7 +149,7 @@ class LabelRule:
 
     Attributes:
         column: of the file or of its path; values of several columns are joined by a blank.
-        values: value -> 0 or 1; others, and none, are unknown.
+        values: value -> 0 or 1; others, and none, are unknown. YAML's ``on`` and ``yes`` are 1.
         target: whose value decides.
         above: the label is 1 above it, N or m, else 0.
     """
@@ -181,10 +162,10 @@ class LabelRule:
 
 @dataclass(frozen=True)
 class ClassRule:
-    """Exclusive classes by the values of columns; ``names`` maps them to names, and others are unknown."""
+    """Exclusive classes by the values of columns; ``names`` lists them, or maps them to names."""
 
     column: Column | Sequence[Column]
-    names: dict[str | int, str] | None = None
+    names: dict[str | int | bool, str | int | bool] | list[str | int] | None = None
 
 
 @dataclass(frozen=True)
@@ -225,7 +206,7 @@ class ForeignFormat:
         targets: x, y, force, force_x or force_y -> measured quantity.
         groups: columns such as a session or a person, or name -> columns that make it together; the touches
             of a group stay together in splits.
-        positions: ``unknown``, ``layout`` for that of the configuration, or a place per sensor, m.
+        positions: ``unknown``, ``layout`` for the one of the configuration, or a position per sensor, m.
         size: extent (x, y) of the sheet, m, unless of the configuration.
         footprint: extent (x, y) of a sensor, m, unless of the configuration.
     """
@@ -244,19 +225,26 @@ class ForeignFormat:
     classes: ClassRule | None = None
     targets: Mapping[str, TargetColumn] | None = None
     groups: Sequence[Column] | Mapping[str, Sequence[Column]] = ()
-    positions: Literal["unknown", "layout"] | Sequence[Place] = "unknown"
+    positions: Literal["unknown", "layout"] | Sequence[tuple[float, float] | tuple[float, float, float]] = (
+        "unknown"
+    )
     size: tuple[Annotated[float, Gt(0)], Annotated[float, Gt(0)]] | None = None
     footprint: tuple[Annotated[float, Gt(0)], Annotated[float, Gt(0)]] = (0.01, 0.01)
 
-    @property
-    def grouping(self) -> dict[str, Sequence[Column]]:
-        """The columns of each group by its name."""
-        if isinstance(self.groups, Mapping):
-            return {str(name): columns for name, columns in self.groups.items()}
-        return {str(name): (name,) for name in self.groups}
-
 
 # Read a mapping.
+
+
+_PARTS: dict[str, type] = {
+    "table": TableFormat,
+    "join": JoinedFile,
+    "time": TimeColumn,
+    "channels": ChannelColumns,
+    "baseline": BaselineRule,
+    "segments": SegmentRule,
+    "classes": ClassRule,
+}
+_NAMED: dict[str, type] = {"labels": LabelRule, "targets": TargetColumn}
 
 
 def read_format(name: str) -> ForeignFormat:
@@ -273,7 +261,7 @@ def read_format(name: str) -> ForeignFormat:
     if path is None:
         raise InputError(f"from={name} is no format: give map.yaml, or one of {', '.join(shipped)}")
     try:
-        content = parse_yaml(read_file(path, TEXT).decode("utf-8"))
+        content = parse_yaml(read_file(path, TEXT).decode("utf-8-sig"))
     except (OSError, ValueError) as error:
         raise InputError(f"cannot read the mapping {path}: {' '.join(str(error).split())}") from error
     mapping = _build(ForeignFormat, content, path.name)
@@ -297,53 +285,20 @@ def _build(kind: Any, content: Any, name: str) -> Any:
     return kind(**values)
 
 
-_PARTS: dict[str, type] = {
-    "table": TableFormat,
-    "join": JoinedFile,
-    "time": TimeColumn,
-    "channels": ChannelColumns,
-    "baseline": BaselineRule,
-    "segments": SegmentRule,
-    "classes": ClassRule,
-}
-_NAMED: dict[str, type] = {"labels": LabelRule, "targets": TargetColumn}
-
-
 def _check(mapping: ForeignFormat, name: str) -> None:
     """Refuse settings that contradict each other."""
-    channels, segments = mapping.channels, mapping.segments
-    count = len(channels.columns) if not isinstance(channels.columns, str) else None
+    channels, targets = mapping.channels, mapping.targets or {}
     if channels.unit not in FORCES and channels.scale is None:
         raise InputError(
             f"{name}: channels.unit={channels.unit} is no force ({', '.join(FORCES)}): add channels.scale, N "
             "per unit; a nominal one, such as 1, makes readings nominal"
         )
-    if isinstance(channels.scale, Sequence) and count is not None and len(channels.scale) != count:
-        raise InputError(f"{name}: channels.scale has {len(channels.scale)} numbers for {count} columns")
-    if count is not None and count % (channels.per_sensor * channels.frames):
-        raise InputError(
-            f"{name}: {count} columns of channels are not {channels.frames} frames of sensors with "
-            f"{channels.per_sensor} channels each"
-        )
-    if channels.combine != "plain" and channels.per_sensor == 1:
-        raise InputError(f"{name}: channels.combine={channels.combine} needs channels.per_sensor: 3")
-    if channels.frames > 1 and segments.by != "row":
-        raise InputError(f"{name}: rows of {channels.frames} frames need segments.by: row")
-    if segments.by == "contact" and segments.threshold is None:
+    if mapping.segments.by == "contact" and mapping.segments.threshold is None:
         raise InputError(f"{name}: segments.by: contact needs segments.threshold, N")
-    if segments.by == "columns" and not segments.columns and segments.counter is None:
-        raise InputError(f"{name}: segments.by: columns needs segments.columns or segments.counter")
-    if mapping.time is None and mapping.rate is None and (segments.by != "row" or channels.frames > 1):
+    if mapping.time is None and (
+        mapping.table.long or (mapping.rate is None and mapping.segments.by != "row")
+    ):
         raise InputError(f"{name}: add time, as in time: {{column: 1, unit: s}}, or rate, Hz")
-    if mapping.join is not None and mapping.join.by == "time" and None in (mapping.join.clock, mapping.time):
-        raise InputError(f"{name}: join.by: time needs join.clock and time, the columns of both times")
-    if mapping.table.lines > 1 and mapping.table.header:
-        raise InputError(f"{name}: table.lines={mapping.table.lines} needs table.header: false")
-    _check_labels(mapping, name)
-
-
-def _check_labels(mapping: ForeignFormat, name: str) -> None:
-    targets = mapping.targets or {}
     for target, column in targets.items():
         if target not in TARGETS or column.unit not in TARGETS[target]:
             units = ", ".join(TARGETS.get(target, ())) or f"none, there are {', '.join(TARGETS)}"
@@ -356,94 +311,88 @@ def _check_labels(mapping: ForeignFormat, name: str) -> None:
                 "tap: 0}}, or target and above, as in {target: force, above: 4.0}, N"
             )
         if rule.values is not None and not set(rule.values.values()) <= {0, 1}:
-            raise InputError(
-                f"{name}: labels.{label}.values must be 0 or 1, got {list(rule.values.values())}"
-            )
-    if mapping.fields is not None:
+            values = list(rule.values.values())
+            raise InputError(f"{name}: labels.{label}.values must be 0 or 1, got {values}")
+    for setting, pattern in (("fields", mapping.fields), ("table.begin", mapping.table.begin)):
         try:
-            re.compile(mapping.fields)
+            re.compile(pattern or "")
         except re.error as error:
-            raise InputError(f"{name}: fields is no regular expression: {error}") from error
+            raise InputError(f"{name}: {setting} is no regular expression: {error}") from error
 
 
 # Read the tables of a mapping.
 
 
-def find_files(mapping: ForeignFormat, folder: Path) -> list[Path]:
-    """Return the files of a mapping, in the order of their paths.
-
-    Args:
-        mapping: whose pattern they match.
-        folder: where; or a file.
-
-    Raises:
-        InputError: there is none.
-    """
-    if folder.is_file():
-        return [folder]
-    paths = sorted(path for path in folder.glob(mapping.files) if path.is_file())
-    if not paths:
-        raise InputError(
-            f"{folder} has no file {mapping.files}: give the folder of the recordings, path=FOLDER"
-        )
-    return paths
-
-
 def read_table(mapping: ForeignFormat, path: Path, folder: Path) -> pd.DataFrame:
-    """Return the rows of a file with the fields of its path and the columns of its second file.
-
-    Args:
-        mapping: says how it is written.
-        path: of the file.
-        folder: from which ``fields`` sees the path.
-
-    Raises:
-        InputError: a file cannot be read, or lacks a column, or rows or times disagree.
-    """
-    table, named = _read(path, mapping.table), _fields(mapping, path, folder)
+    """Return the rows of a file with its time, the fields of its path and the columns of its second file."""
+    table, named = _read(path, mapping.table), dict[str, str]()
+    if mapping.fields is not None:
+        text = path.relative_to(folder).as_posix() if folder.is_dir() else path.as_posix()
+        match = re.search(mapping.fields, text)
+        if match is None:
+            raise InputError(f"{text} does not fit the regular expression fields: {mapping.fields}")
+        named = {name: value for name, value in match.groupdict().items() if value is not None}
+    if mapping.table.long is not None:
+        table = _widen(table, mapping, path)
     if mapping.time is not None:
-        require_columns(table, [mapping.time.column], path, "time")
-        times = parse_numbers(table, mapping.time.column, path) * TIMES[mapping.time.unit]
-        if (back := np.flatnonzero(~(np.diff(times) >= 0))).size:
+        table[TIME] = _times(table, mapping.time, path)
+    if (join := mapping.join) is not None:
+        try:
+            beside = path.parent / join.file.format(**named)
+        except (LookupError, ValueError) as error:
+            names = ", ".join(named) or "no names"
+            raise InputError(f"join.file={join.file}: fields gives {names}") from error
+        second = _read(beside, join.table)
+        if shared := [name for name in second.columns if name in table.columns]:
             raise InputError(
-                f"{path}: time goes backwards at row {back[0] + 2}, from {times[back[0]]:.6f} to "
-                f"{times[back[0] + 1]:.6f} s: split the file there, or correct time.column"
+                f"{path.name} and {beside} both have a column {shared[0]}: give join.table.names"
             )
-        table[TIME] = times
-    if mapping.join is not None:
-        table = _join(mapping, table, path, named)
+        if len(second) != len(table):
+            raise InputError(
+                f"{path} has {len(table)} rows, {beside} has {len(second)}: a second file needs as many in "
+                "the same order; others are read by a function, reader=package.function"
+            )
+        table = pd.concat([table, second], axis=1)
     return table.assign(**named)
-
-
-TIME = " time"
-"""Column of the time, s; no header has a name that begins with a blank."""
 
 
 def _read(path: Path, its: TableFormat) -> pd.DataFrame:
     """Return a file's rows, with texts as names of columns."""
-    settings: dict[str, Any] = {"header": 0 if its.header else None, "na_values": list(its.missing)}
+    rows: dict[str, Any] = {
+        "header": 0 if its.header else None,
+        "skiprows": [1] if its.units else None,
+        "na_values": list(its.missing),
+    }
     try:
-        if path.suffix.lower() in _SPREADSHEETS:
-            table = pd.read_excel(path, sheet_name=its.sheet, **settings)
+        if path.suffix.lower() in (".xlsx", ".xlsm", ".xls", ".ods"):
+            table = pd.read_excel(path, sheet_name=its.sheet, **rows)
+        elif path.suffix.lower() in (".jsonl", ".ndjson"):
+            lines = path.read_text(encoding=its.encoding).splitlines()
+            table = pd.DataFrame([json.loads(line) for line in lines if line.strip()])
+            for name in [name for name in table if isinstance(table[name].iloc[0], list)]:
+                parts = pd.DataFrame(table.pop(name).tolist()).add_prefix(str(name))
+                table = pd.concat([table, parts], axis=1)
         else:
-            delimiter = r"\s+" if its.delimiter == "whitespace" else its.delimiter
-            text = {"encoding": its.encoding, "decimal": its.decimal, "comment": its.comment}
+            with path.open("rb") as file:
+                marked = file.read(2) in (BOM_UTF16_LE, BOM_UTF16_BE)
+            text = path.read_text(encoding="utf-16" if marked else its.encoding)
+            if its.begin is not None:
+                text = text[_line_with(its.begin, text, path) :]
             table = pd.read_csv(
-                path, sep=delimiter, skipinitialspace=True, low_memory=False, **text, **settings
+                StringIO(text),
+                sep=r"\s+" if its.delimiter == "whitespace" else its.delimiter,
+                decimal=its.decimal,
+                comment=its.comment,
+                skipinitialspace=True,
+                low_memory=False,
+                **rows,
             )
     except ImportError as error:
         raise InputError(f"{path}: spreadsheets need openpyxl: pip install 'tactile-skin[data]'") from error
-    except (
-        OSError,
-        ValueError,
-        LookupError,
-        zipfile.BadZipFile,
-    ) as error:  # of pandas, openpyxl and encodings
-        raise InputError(f"cannot read {path}: {' '.join(str(error).split())}") from error
-    if its.lines > 1:
-        if len(table) % its.lines:
-            raise InputError(f"{path} has {len(table)} rows, not a multiple of table.lines={its.lines}")
-        table = pd.DataFrame(table.to_numpy().reshape(len(table) // its.lines, -1))
+    except (OSError, ValueError, LookupError, zipfile.BadZipFile) as error:
+        raise InputError(
+            f"cannot read {path}: {' '.join(str(error).split())}; table.begin skips lines before the table"
+        ) from error
     if its.names and len(its.names) != table.shape[1]:
         raise InputError(f"{path} has {table.shape[1]} columns, names are {len(its.names)}")
     names = its.names or (table.columns if its.header else range(1, table.shape[1] + 1))
@@ -455,53 +404,57 @@ def _read(path: Path, its: TableFormat) -> pd.DataFrame:
     return table
 
 
-def _fields(mapping: ForeignFormat, path: Path, folder: Path) -> dict[str, str]:
-    """Return the named groups of a file's path."""
-    if mapping.fields is None:
-        return {}
-    text = path.relative_to(folder).as_posix() if folder.is_dir() else path.as_posix()
-    match = re.search(mapping.fields, text)
+def _line_with(pattern: str, text: str, path: Path) -> int:
+    """Return where the first line that contains a pattern begins."""
+    match = re.search(pattern, text, re.M)
     if match is None:
-        raise InputError(f"{text} does not fit the regular expression fields: {mapping.fields}")
-    return {name: value for name, value in match.groupdict().items() if value is not None}
+        raise InputError(f"{path} has no line with table.begin: {pattern}")
+    return text.rfind("\n", 0, match.start()) + 1
 
 
-def _join(mapping: ForeignFormat, table: pd.DataFrame, path: Path, named: Mapping[str, str]) -> pd.DataFrame:
-    """Return the rows of a file with those of its second file."""
-    join = mapping.join
-    assert join is not None
-    try:
-        beside = path.parent / join.file.format(**named)
-    except (LookupError, ValueError) as error:
-        raise InputError(f"join.file={join.file}: fields gives {', '.join(named) or 'no names'}") from error
-    second = _read(beside, join.table)
-    if shared := [name for name in second.columns if name in table.columns]:
-        raise InputError(f"{path.name} and {beside} both have a column {shared[0]}: give join.table.names")
-    if join.by == "row":
-        if len(second) != len(table):
-            raise InputError(f"{path} has {len(table)} rows, {beside} has {len(second)}: join them by time")
-        return pd.concat([table, second], axis=1)
-    assert join.clock is not None
+def _widen(table: pd.DataFrame, mapping: ForeignFormat, path: Path) -> pd.DataFrame:
+    """Return a table with one reading per row as one with a row per time and a column per sensor."""
+    assert mapping.table.long is not None
     assert mapping.time is not None
-    require_columns(second, [join.clock], beside, "join.clock")
-    second[TIME] = parse_numbers(second, join.clock, beside) * TIMES[mapping.time.unit]
-    if not second[TIME].is_monotonic_increasing:
-        raise InputError(f"{beside}: time goes backwards: correct join.clock")
-    joined = pd.merge_asof(table, second, on=TIME, direction="nearest", tolerance=join.tolerance)
-    if joined[str(join.clock)].isna().all():
-        raise InputError(f"{beside} has no row within join.tolerance={join.tolerance:g} s of {path.name}")
-    return joined
+    sensor, value, time = map(str, (*mapping.table.long, mapping.time.column))
+    require_columns(table, [sensor, value, time], path, "table.long")
+    others = table.drop(columns=[sensor, value]).drop_duplicates(time).set_index(time)
+    if table.duplicated([time, sensor]).any():
+        raise InputError(f"{path} has several values of a sensor at one time: correct table.long")
+    wide = table.pivot(index=time, columns=sensor, values=value).add_prefix("")
+    return others.join(wide).reset_index()
 
 
-def require_columns(table: pd.DataFrame, names: Sequence[Column], path: Path, what: str) -> None:
+def _times(table: pd.DataFrame, its: TimeColumn, path: Path) -> np.ndarray:
+    """Return the time of each row, (R,), s."""
+    require_columns(table, [its.column], path, "time")
+    column = table[str(its.column)]
+    if pd.to_numeric(column, errors="coerce").isna().all():
+        dates = pd.to_datetime(column, format=its.format, utc=True, errors="coerce")
+        if (wrong := np.flatnonzero(dates.isna())).size:
+            raise InputError(
+                f"{path}: column {its.column} has {str(column.iloc[wrong[0]])[:40]!r} in row {wrong[0] + 1}, "
+                "no time: give time.format, as in '%d.%m.%Y %H:%M:%S.%f'"
+            )
+        times = (dates - dates.iloc[0]).dt.total_seconds().to_numpy()
+    else:
+        times = parse_numbers(table, its.column, path) * TIMES[its.unit]
+    if (back := np.flatnonzero(~(np.diff(times) >= 0))).size:
+        raise InputError(
+            f"{path}: time goes backwards at row {back[0] + 2}, from {times[back[0]]:.6f} to "
+            f"{times[back[0] + 1]:.6f} s: split the file there, or correct time.column"
+        )
+    return times
+
+
+def require_columns(
+    table: pd.DataFrame, names: Sequence[Column], path: Path, what: str, few: int = 12
+) -> None:
     """Raise InputError where a table lacks a column; ``what`` is the setting that names it."""
     if missing := [str(name) for name in names if str(name) not in table.columns]:
         columns = [name for name in table.columns if name != TIME]
-        named = ", ".join(columns[:_FEW]) + (f" ... {columns[-1]}" if len(columns) > _FEW else "")
-        raise InputError(f"{path} has no column {missing[0]}, which {what} names: it has {named}")
-
-
-_FEW = 12
+        shown = ", ".join(columns[:few]) + (f" ... {columns[-1]}" if len(columns) > few else "")
+        raise InputError(f"{path} has no column {missing[0]}, which {what} names: it has {shown}")
 
 
 def parse_numbers(table: pd.DataFrame, name: Column, path: Path) -> np.ndarray:
@@ -515,8 +468,8 @@ def parse_numbers(table: pd.DataFrame, name: Column, path: Path) -> np.ndarray:
     if (wrong := np.flatnonzero(values.isna() & column.notna())).size:
         text = str(column.iloc[wrong[0]])[:40]
         raise InputError(
-            f"{path}: column {name} has {text!r} in row {wrong[0] + 1}, no number: list it in table.missing, "
-            "or correct table.decimal"
+            f"{path}: column {name} has {text!r} in row {wrong[0] + 1}, no number: list it in table.missing "
+            "unless it stands for a value over the range, or correct table.decimal or table.units"
         )
     array = values.to_numpy(dtype=float, na_value=np.nan)
     return np.where(np.isfinite(array), array, np.nan)

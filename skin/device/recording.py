@@ -22,7 +22,6 @@ from skin.errors import InputError
 from skin.touch.labels import Task, target_unit
 
 What = Literal["labels", "classes", "regression"]
-_SAME_PLACE = 1e-6  # m: the file's positions are float32
 _BYTES = 8.0  # of a reading, whether it is valid and whether it is saturated; of a number of a contact
 
 
@@ -91,8 +90,8 @@ class Recorded(AbstractDevice):
         self._example = self._read(0)[torch.tensor([0])]  # a copy: a slice would keep the whole
         self._groups: dict[Split, Tensor] = {}
         if self._example.metadata.get("positions") in ("unknown", "stated"):
-            places = self._example.touches.positions.double().numpy()
-            self.sensors, self.size = Sensors(places, self._example.footprint), self._example.size
+            positions = self._example.touches.positions.double().numpy()
+            self.sensors, self.size = Sensors(positions, self._example.footprint), self._example.size
             self.configured = False
         else:
             self.sensors, self.surface, self.size = layout.sensors(body), body, body.size
@@ -169,7 +168,7 @@ class Recorded(AbstractDevice):
                 "it was recorded with, as in layout=file layout.path=FILE.csv"
             )
         apart = np.abs(stored.numpy() - self.sensors.positions).max(axis=1)
-        if apart.max() > _SAME_PLACE:
+        if apart.max() > 1e-6:  # m: the file's positions are float32
             number = int(apart.argmax())
             raise InputError(
                 f"{self.path} has sensor {number} at {stored[number].tolist()} m, the layout at "
@@ -244,8 +243,8 @@ class Recorded(AbstractDevice):
             if part == "train":
                 self._check_classes(self._rows(0, complete, rows).touches.labels)
             return [Part(len(rows), partial(self._rows, 0, complete, rows))]
-        shares = [(0, split_rows(part, counts[0], seed))] if self._whole else split_shards(part, counts, seed)
-        return [Part(len(selected), partial(self._rows, n, complete, selected)) for n, selected in shares]
+        parts = [(0, split_rows(part, counts[0], seed))] if self._whole else split_shards(part, counts, seed)
+        return [Part(len(selected), partial(self._rows, n, complete, selected)) for n, selected in parts]
 
     def _rows(self, number: int, complete: bool, rows: Tensor) -> Recording:
         return self._read(number, complete)[rows]
@@ -312,12 +311,9 @@ def _relabelled(recording: Recording, task: Task, labels: Tensor) -> Recording:
     return replace(recording, task=task, touches=replace(recording.touches, labels=labels))
 
 
-def _few(values: Sequence[str]) -> str:
+def _few(values: Sequence[str], shown: int = 4) -> str:
     """Return the first of some names."""
-    return ", ".join(values[:_SHOWN]) + ", ..." * (len(values) > _SHOWN)
-
-
-_SHOWN = 4
+    return ", ".join(values[:shown]) + ", ..." * (len(values) > shown)
 
 
 class _File:

@@ -9,55 +9,51 @@ from scipy.sparse import csr_array
 from scipy.special import ndtri
 from torch import Tensor
 
-from skin.device.imperfection import Constants, Imperfection
+from skin.device.effects import Constants
+from skin.device.imperfection import Imperfection
 from skin.device.resampling import frame_ages, highest_each, resample
-from skin.mechanics.relaxation import quantize
 
-_QUANTILES = 20000
 _NUMBERS = tuple(np.geomspace(1, 1000, 61).tolist())  # of frames in an interval; between them, 0.001 s.d.
 _SENSED = 5  # times the model's rate, of hysteresis, lag and curve; odd, so that a frame of the model is one
-_FAINT = 0.01  # standard deviations of the noise below which a sensor feels nothing
-_EXTREME = np.float32(1e-7)  # chance of the least and largest noise
-_ELEMENTS = 2**19  # frames times sensors at a time, which the cache holds
 
 
 def between_frames(force: Tensor, model_rate: float, rate: float, phase: np.ndarray | float = 0.5) -> Tensor:
     """Return true readings (B, F, S), N, at the rate of a device.
 
     A frame of the model is the force in the middle of its interval. Between two frames in contact the force
-    changes linearly: a sliding touch goes at its speed from one place of its path to the next, and its force
-    follows the profile. A touch begins and ends at the edges of its first and last interval, so it does not
-    become longer. No reading exceeds the larger of its two frames, so a safe touch stays safe.
+    changes linearly: a sliding touch goes at its speed from one position of its path to the next, and its
+    force follows the profile. A touch begins and ends at the edges of its first and last interval, so it does
+    not become longer. No reading exceeds the larger of its two frames, so a safe touch stays safe.
 
     Args:
         force: (B, T, S), true readings at the model's rate, N; a frame without contact is 0.
         model_rate: Hz.
         rate: of the device, Hz.
-        phase: when the device reads, (B,) or one for all: share of its interval, from 0 to 1.
+        phase: when the device reads, (B,) or one for all: fraction of its interval, from 0 to 1.
     """
     batch, window, _ = force.shape
     frames = round(window * rate / model_rate)
     row = np.arange(batch)[:, None]
     read = np.arange(frames) + np.reshape(phase, (-1, 1))
-    place = np.broadcast_to(np.minimum(read * model_rate / rate, window), (batch, frames))
-    now, neighbour, offset = _neighbours(place, window)
+    position = np.broadcast_to(np.minimum(read * model_rate / rate, window), (batch, frames))
+    now, neighbour, offset = _neighbours(position, window)
     padded = torch.nn.functional.pad(force, (0, 0, 1, 1))
     touched = (padded != 0).any(dim=2, keepdim=True)
-    share = torch.from_numpy(np.abs(offset)).to(force)[..., None]
+    fraction = torch.from_numpy(np.abs(offset)).to(force)[..., None]
     current, neighbour_value = padded[row, now + 1], padded[row, neighbour + 1]
     # Towards a frame without contact the force is 0 at the edge, which is half an interval away.
-    share = torch.where(touched[row, neighbour + 1], share, 2 * share)
-    return torch.where(touched[row, now + 1], torch.lerp(current, neighbour_value, share), 0.0)
+    fraction = torch.where(touched[row, neighbour + 1], fraction, 2 * fraction)
+    return torch.where(touched[row, now + 1], torch.lerp(current, neighbour_value, fraction), 0.0)
 
 
-def _neighbours(place: np.ndarray, window: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the frames at places and the nearest ones beside them, -1 to ``window``, and the distances.
+def _neighbours(position: np.ndarray, window: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the frames at positions and the nearest ones beside them, -1 to ``window``, and the distances.
 
     Places are in intervals from the begin of the window, 0 to ``window``; the distances are from the middle
     of the frame's interval, -0.5 to 0.5.
     """
-    now = np.minimum(place.astype(int), window - 1)
-    offset = place - now - 0.5
+    now = np.minimum(position.astype(int), window - 1)
+    offset = position - now - 0.5
     return now, now + np.sign(offset).astype(int), offset
 
 
@@ -110,7 +106,7 @@ def _measure_each(
     Offset, drift in the middle of the interval, and rounding are added to the maximum of the interval.
     Hysteresis, lag and curve act before the converter and are computed at five times the model's rate.
     """
-    batch, window, sensors = force.shape
+    batch, window, _ = force.shape
     ratios = np.maximum(np.broadcast_to(constants.rate.numpy().ravel(), batch) / model_rate, 1)
     shifts = noise.random(batch)
     if imperfection.aligned:
@@ -123,17 +119,16 @@ def _measure_each(
         framed = noise.random(batch) < imperfection.framed
         ratios, shifts = np.where(framed, 1, ratios), np.where(framed, 0, shifts)
     padded, fine = torch.nn.functional.pad(force, (0, 0, 0, 1)), 1
-    if not imperfection.is_static(constants, sensors):
+    if not imperfection.is_static(constants):
         fine = _SENSED
         padded = between_frames(padded, model_rate, fine * model_rate)
     time = torch.arange(padded.shape[1], device=force.device) / (fine * model_rate)
     sensed = imperfection.sense(padded, constants, time)
     highest, saturated = _read_each(sensed, fine, constants, ratios, shifts, window, noise)
-    output = highest.to(force.device) + (constants.offset - constants.baseline)
-    if constants.drift.any():
-        output += constants.drift * ((torch.arange(window)[:, None] + 0.5) / model_rate).to(output)
-    if constants.quantum.any():
-        output = quantize(output + constants.baseline, constants.quantum) - constants.baseline
+    output = highest.to(force.device)
+    time = ((torch.arange(window) + 0.5) / model_rate).to(output)
+    for effect in imperfection.converter[1:]:  # clipped, with noise
+        output = effect.apply(output, constants, time, None)
     dead = constants.dead.expand(output.shape)
     output = imperfection.undo_curve(output, constants)
     return output.masked_fill(dead, 0.0), ~dead, saturated.to(force.device) & ~dead
@@ -147,6 +142,8 @@ def _read_each(
     shifts: np.ndarray,
     window: int,
     noise: np.random.Generator,
+    faint: float = 0.01,
+    at_once: int = 2**19,
 ) -> tuple[Tensor, Tensor]:
     """Return the largest reading of every interval, N, and whether it is saturated, (B, window, S).
 
@@ -158,6 +155,8 @@ def _read_each(
         shifts: (B,), by which touches are later, intervals.
         window: number of intervals.
         noise: source of the noise.
+        faint: readings below this number of standard deviations of the noise are noise alone.
+        at_once: readings computed at a time, which the cache holds.
     """
     batch, _, sensors = sensed.shape
     values = np.pad(sensed.cpu().numpy(), ((0, 0), (1, 1), (0, 0)))
@@ -165,59 +164,67 @@ def _read_each(
         np.broadcast_to(value.numpy(), (batch, 1, sensors))[:, 0]
         for value in (constants.clip, constants.noise)
     )
-    touched = (np.abs(values) > _FAINT * deviation[:, None]).any(axis=2)
+    touched = (np.abs(values) > faint * deviation[:, None]).any(axis=2)
     highest, limited = (np.zeros((batch, window, sensors), kind) for kind in (np.float32, bool))
     frames = np.cumsum(np.ceil(window * ratios - 0.5))
-    cuts = np.flatnonzero(np.diff(frames * sensors // _ELEMENTS, prepend=0))
+    cuts = np.flatnonzero(np.diff(frames * sensors // at_once, prepend=0))
     for first, last in pairwise(np.unique([0, *cuts, batch])):
         part = slice(first, last)
         gesture, age = frame_ages(ratios[part], window)
         number = gesture * window + window - 1 - np.floor(age).astype(int)
-        place = np.clip((window - age - shifts[part][gesture]) * fine, 0, values.shape[1] - 2)
+        position = np.clip((window - age - shifts[part][gesture]) * fine, 0, values.shape[1] - 2)
         begins = np.flatnonzero(np.diff(number, prepend=-1))
         counts = np.diff(begins, append=len(number))
-        rows = touched[part][gesture, np.minimum(place.astype(int) + 1, values.shape[1] - 2)]
-        felt = np.logical_or.reduceat(rows, begins)
-        rows = np.repeat(felt, counts)
-        read = _interpolation(place[rows], gesture[rows], touched[part]) @ values[part].reshape(-1, sensors)
+        rows = touched[part][gesture, np.minimum(position.astype(int) + 1, values.shape[1] - 2)]
+        pressed = np.logical_or.reduceat(rows, begins)
+        rows = np.repeat(pressed, counts)
+        read = _interpolation(position[rows], gesture[rows], touched[part]) @ values[part].reshape(
+            -1, sensors
+        )
         if np.abs(values[part]).max() > clip[part].min():
             limit = clip[part][gesture[rows]]
-            limited[part].reshape(-1, sensors)[felt] = highest_each(np.abs(read) > limit, number[rows])
+            limited[part].reshape(-1, sensors)[pressed] = highest_each(np.abs(read) > limit, number[rows])
             read = np.clip(read, -limit, limit)
         read += noise.standard_normal(read.shape, dtype=np.float32) * deviation[part][gesture[rows]]
         result = highest[part].reshape(-1, sensors)
-        result[felt] = highest_each(read, number[rows])
-        result[~felt] = _draw_highest(counts[~felt], sensors, noise) * deviation[part][gesture[begins[~felt]]]
+        result[pressed] = highest_each(read, number[rows])
+        result[~pressed] = (
+            _draw_highest(counts[~pressed], sensors, noise) * deviation[part][gesture[begins[~pressed]]]
+        )
     return torch.from_numpy(highest), torch.from_numpy(limited)
 
 
-def _draw_highest(counts: np.ndarray, sensors: int, noise: np.random.Generator) -> np.ndarray:
+def _draw_highest(
+    counts: np.ndarray, sensors: int, noise: np.random.Generator, extreme: float = 1e-7
+) -> np.ndarray:
     """Return the largest of ``counts`` (I,) standard normal values for each sensor, (I, S).
 
-    Its chance to be below x is the normal one to the power of the count, and is itself uniform.
+    Its probability to be below x is the normal one to the power of the count, and is itself uniform.
     """
     drawn = noise.standard_exponential((len(counts), sensors), dtype=np.float32)
-    # One draw in some millions is 0 or rounds to a chance of 1, whose quantiles are infinite.
-    drawn = np.clip(drawn, _EXTREME, -np.log(_EXTREME))
+    # One draw in some millions is 0 or rounds to a probability of 1, whose quantiles are infinite.
+    drawn = np.clip(drawn, np.float32(extreme), -np.log(np.float32(extreme)))
     return -ndtri(-np.expm1(-drawn / counts[:, None].astype(np.float32)))
 
 
-def _interpolation(place: np.ndarray, gesture: np.ndarray, touched: np.ndarray) -> csr_array:
-    """Return the weights of frames at places between them, as in :func:`between_frames`.
+def _interpolation(position: np.ndarray, gesture: np.ndarray, touched: np.ndarray) -> csr_array:
+    """Return the weights of frames at positions between them, as in :func:`between_frames`.
 
     Args:
-        place: (N,), in frames from the begin of the window.
-        gesture: (N,), of each place.
+        position: (N,), in frames from the begin of the window.
+        gesture: (N,), of each position.
         touched: (B, F + 2), whether something touches in a frame; one more frame before the first and after
             the last.
     """
     size = touched.shape[1]
-    now, neighbour, offset = _neighbours(place, size - 2)
+    now, neighbour, offset = _neighbours(position, size - 2)
     column = np.stack([now, neighbour], axis=1) + 1 + size * gesture[:, None]
-    share = np.abs(offset) * np.where(touched.ravel()[column[:, 1]], 1, 2)
-    weights = np.stack([1 - share, share], axis=1) * touched.ravel()[column[:, :1]]
-    begins = np.arange(0, 2 * len(place) + 1, 2)
-    return csr_array((weights.ravel().astype(np.float32), column.ravel(), begins), (len(place), touched.size))
+    fraction = np.abs(offset) * np.where(touched.ravel()[column[:, 1]], 1, 2)
+    weights = np.stack([1 - fraction, fraction], axis=1) * touched.ravel()[column[:, :1]]
+    begins = np.arange(0, 2 * len(position) + 1, 2)
+    return csr_array(
+        (weights.ravel().astype(np.float32), column.ravel(), begins), (len(position), touched.size)
+    )
 
 
 def _reduce_rate(
@@ -259,7 +266,7 @@ def draw_constants(
 
 
 def idle_excess(constants: Constants, model_rate: float) -> Tensor:
-    """Return the mean of idle readings above the offset, N: that of the maximum of the noise of an interval.
+    """Return the mean of idle readings above the offset, N: the mean of the largest noise of an interval.
 
     Args:
         constants: of the device, with its rate; the result has the shape of their noise.
@@ -273,9 +280,9 @@ def idle_excess(constants: Constants, model_rate: float) -> Tensor:
 
 
 @cache
-def _highest_of(number: float) -> float:
+def _highest_of(number: float, quantiles: int = 20_000) -> float:
     """Return the mean of the largest of so many standard normal values; the number need not be whole."""
     if number == 1:
         return 0.0
-    chance = (np.arange(_QUANTILES) + 0.5) / _QUANTILES
-    return float(ndtri(chance ** (1 / number)).mean())
+    probability = (np.arange(quantiles) + 0.5) / quantiles
+    return float(ndtri(probability ** (1 / number)).mean())

@@ -28,21 +28,19 @@ from skin.mechanics.geometry import sensor_geometry
 from skin.mechanics.relaxation import Relaxing, relaxes
 from skin.mechanics.simulator.base import AbstractSimulator
 from skin.touch.fingertips import read_touch
-from skin.touch.gesture import TouchSettings
 from skin.touch.labels import TOUCH, TOUCH_OR_NOT, TOUCH_SLIDING
 from skin.touch.movie import Movie
+from skin.touch.paths import TouchSettings
 from skin.touch.sampler import AbstractContact, AbstractSampler
 from skin.touch.splines import footprints
 
 # The true sensors of a simulated device and its model of them.
 
-_ROUNDING = 1e-9  # m
-
 
 def misplace(
     sensors: Sensors, size: tuple[float, float], error: float, seed: int, footprint_error: float = 0.0
 ) -> Sensors:
-    """Return sensors beside their places, with footprints of another size.
+    """Return sensors beside their positions, with footprints of another size.
 
     Args:
         sensors: as touches report them.
@@ -62,7 +60,7 @@ def misplace(
     return replace(sensors, positions=positions, footprint=footprint)
 
 
-def cover_surface(body: AbstractBody, footprint: tuple[float, float]) -> Sensors:
+def cover_surface(body: AbstractBody, footprint: tuple[float, float], rounding: float = 1e-9) -> Sensors:
     """Return a sensor at each cell of a body whose footprint lies wholly on it.
 
     Their footprints are the areas over which a pressure can be dangerous anywhere.
@@ -70,11 +68,11 @@ def cover_surface(body: AbstractBody, footprint: tuple[float, float]) -> Sensors
     margins = [max(extent, cell) / 2 for extent, cell in zip(footprint, body.cell, strict=True)]
     cells = [(np.arange(count) + 0.5) * cell for count, cell in zip(body.cells, body.cell, strict=True)]
     x, y = (
-        centres[(centres >= margin - _ROUNDING) & (centres <= size - margin + _ROUNDING)]
+        centres[(centres >= margin - rounding) & (centres <= size - margin + rounding)]
         for centres, size, margin in zip(cells, body.size, margins, strict=True)
     )
-    places = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
-    return Sensors(np.column_stack([places, np.zeros(len(places))]), footprint)
+    positions = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
+    return Sensors(np.column_stack([positions, np.zeros(len(positions))]), footprint)
 
 
 def build_model(
@@ -118,9 +116,6 @@ def describe(
 
 
 _BATCH = 1024
-_STRIP = 600.0  # s of simulated touches in one piece
-_FEW = 10  # gestures
-_DISC = 0.03  # share of the sheet under a press: small, and larger than any footprint
 
 
 @checked("device")
@@ -140,13 +135,13 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
         padded: gestures begin at a random frame of the window, not at its first.
         fresh: ``train`` draws new gestures, with new noise, in every epoch.
         stream: touches are windows of streams of gestures with idle gaps between them: a window contains part
-            of a gesture, a whole one or none, and also has the label ``touch``. Splits share no stream.
+            of a gesture, a whole one or none, and also has the label ``touch``. Splits have other streams.
         direction: the direction of sliding is a label too, as its cosines
             (``skin.touch.movie.sliding``).
         data_seed: seed of the budget.
         seed: seed of the device's constants and noise; each seed is another device.
         gain_spread, offset, noise, ... rate: :class:`skin.device.imperfection.ImperfectionSettings`. The rate
-            is that of the sensors; touches are resampled to ``touch.rate``.
+            is the one of the sensors; touches are resampled to ``touch.rate``.
         calibration: file of skin calibrate, which replaces all these but dead, tare and rate.
         randomise: measure every gesture with another device.
         position_error: standard deviation of the true sensor positions from the reported ones, m.
@@ -185,11 +180,12 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
                 "a skin that relaxes is simulated touch by touch from rest, where it stays, got "
                 "data.stream=true: leave that out, or the materials' relaxation"
             )
-        self.task = TOUCH_OR_NOT if self.stream else TOUCH_SLIDING if self.direction else TOUCH
         self.size, self.sensors = self.body.size, self.layout.sensors(self.body)
         errors = self.position_error, self.seed, self.footprint_error
         self.true_sensors = misplace(self.sensors, self.size, *errors)
         settings = read_touch(self.touch)
+        task = TOUCH_OR_NOT if self.stream else TOUCH_SLIDING if self.direction else TOUCH
+        self.task = task.with_labels(tuple(settings.labels))
         self.window, self.model_rate = settings.frames.window, float(settings.rate)
         check_rate(self.slowest, self.model_rate, "device.rate")
         self.model = build_model(self.simulator, self.body, self.true_sensors, self.model_rate)
@@ -224,7 +220,7 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
 
     def blank(self) -> "Simulated":
         """Return a device with few gestures: to restore a run, only their shape matters."""
-        return self.replace(gestures=_FEW, fresh=False)
+        return self.replace(gestures=10, fresh=False)
 
     def replace(self, **changes: Any) -> "Simulated":
         """Return a device with other settings, such as ``seed=3`` for another device of the same kind."""
@@ -239,14 +235,18 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
         return self.draw(Stream.ALARM, count, self.data_seed)
 
     @torch.no_grad()
-    def press_readings(self) -> Tensor:
-        """Return the true readings (S, S), N, of a press at the limit of ``dangerous`` on each sensor."""
+    def press_readings(self, covered: float = 0.03) -> Tensor:
+        """Return the true readings (S, S), N, of a press at the limit of ``dangerous`` on each sensor.
+
+        Args:
+            covered: fraction of the sheet under a press: small, and larger than any footprint.
+        """
         (width, height), footprint = self.size, np.hypot(*self.sensors.footprint)
-        radius = max(np.sqrt(_DISC * width * height / np.pi), footprint / 2)
+        radius = max(np.sqrt(covered * width * height / np.pi), footprint / 2)
         rows, columns = self.body.shape
         y, x = np.indices((rows, columns)) + 0.5
-        places = np.stack([x * width / columns, y * height / rows])
-        away = self.true_sensors.positions[:, :2, None, None] - places
+        positions = np.stack([x * width / columns, y * height / rows])
+        away = self.true_sensors.positions[:, :2, None, None] - positions
         discs = torch.from_numpy(np.hypot(*away.swapaxes(0, 1)) <= radius).float()
         return self.model(self.sampler.settings.thresholds.pressure * discs).readings
 
@@ -259,10 +259,10 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
         recording = self._split(split, epoch, complete)
         return replace(recording, metadata=describe(self, recording, split, epoch))
 
-    def strips(self) -> Iterator[Touches]:
-        """Yield test streams, ten minutes each, without end."""
+    def strips(self, seconds: float = 600.0) -> Iterator[Touches]:
+        """Yield test streams of so many seconds each, without end."""
         for number in count():
-            yield self.simulate_stream(max(1, round(_STRIP * self.model_rate)), number=number).whole.touches
+            yield self.simulate_stream(max(1, round(seconds * self.model_rate)), number=number).whole.touches
 
     def _split(self, split: Split | None, epoch: int, complete: bool) -> Recording:
         if split == "test":
@@ -370,9 +370,10 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
         )
         strain = self.model.strain(movie.frames, movie.shear) if complete else None
         true_values = {} if strain is None else {"strain": (strain[movie.index] * movie.scale).amax(1)}
-        # Windows of streams get other labels.
-        about = TOUCH if self.stream else self.task, self.size, self.sensors.footprint
-        return Recording(touches, *about, movie.force, displacement, movie.parameters | true_values)
+        # Windows of streams get the label touch, too.
+        task = TOUCH.with_labels(tuple(self.sampler.settings.labels)) if self.stream else self.task
+        measured = movie.force, displacement, movie.parameters | true_values
+        return Recording(touches, task, self.size, self.sensors.footprint, *measured)
 
     def _apply_imperfections(self, true: Recording, noise: np.random.Generator) -> Recording:
         """Return true readings with the imperfections of the device."""

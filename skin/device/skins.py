@@ -16,9 +16,11 @@ from rich.progress import track
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from skin.body.base import GEOMETRY, AbstractBody, Arm, Layer, Sensors, Sheet
+from skin.body.arm import Arm
+from skin.body.base import GEOMETRY, AbstractBody, Layer, Sensors
 from skin.body.layout import AbstractLayout, Footprint, Grid, Hexagonal, Listed, Random, Scattered
 from skin.body.material import Material
+from skin.body.sheet import Sheet
 from skin.core.rng import Stream, generator
 from skin.core.settings import RISING, checked, configured
 from skin.device.base import AbstractDevice, Blank, Split, in_threads, split_slices
@@ -31,18 +33,12 @@ from skin.mechanics.simulator.fem import PlatesAndBeams
 from skin.mechanics.simulator.naive import Naive
 from skin.mechanics.simulator.solid import Solid
 from skin.touch.fingertips import read_touch
-from skin.touch.gesture import TouchSettings
 from skin.touch.labels import TOUCH
+from skin.touch.paths import TouchSettings
 
 Range = Annotated[tuple[PositiveFloat, PositiveFloat], RISING]
 Kind = Literal["grid", "scattered", "hexagonal", "random", "clustered", "spread"]
 Make = Callable[[AbstractBody, Sensors], AbstractSimulator]
-
-_POISSON = 0.49
-_TRIES = 2000
-_LEAST_CELLS = 8
-_ROUNDS = 20
-_EQUAL = 1e-6
 
 
 @dataclass(frozen=True)
@@ -80,15 +76,15 @@ class SkinDistribution:
         footprint: side of the square that a sensor feels, m.
         base, top: thickness of the layers, m.
         base_young, top_young: their moduli, Pa.
-        depth: of the sensors, as a share of the thickness of the top layer.
-        arms: share of skins on a cylinder.
+        depth: of the sensors, as a fraction of the thickness of the top layer.
+        arms: fraction of skins on a cylinder.
         radius: of the cylinders, m.
         position_error: standard deviation of the sensors' true positions from those of the layout, m.
         divisions: rows of elements in each layer; None: as few as readings under a fingertip need.
-        plates: share of sheets with the mechanics of plates on beams (:mod:`skin.mechanics.simulator.fem`);
+        plates: fraction of sheets with plates on beams (:mod:`skin.mechanics.simulator.fem`);
             their sensors are between the layers.
-        naive: share of sheets without mechanics.
-        interface: share of sheets that read the forces between the layers of plates on beams, and are
+        naive: fraction of sheets without mechanics.
+        interface: fraction of sheets that read the forces between the layers of plates on beams, and are
             described as an elastic solid, because their owner does not know better.
         footprint_error: standard deviation of the logarithm of the true over the layout's side of footprints.
     """
@@ -125,7 +121,7 @@ class SkinDistribution:
 
         Args:
             generator: of random numbers.
-            mixed: with any mechanics; otherwise that of an elastic solid.
+            mixed: with any mechanics; otherwise those of an elastic solid.
         """
         body = self._body(generator)
         count = round(_logarithmic(self.sensors, generator))
@@ -134,12 +130,12 @@ class SkinDistribution:
         side = generator.uniform(*self.footprint)
         solid: Make = partial(Solid, divisions=self.divisions)
         simulator, described = solid, None
-        chance = generator.random() if mixed and isinstance(body, Sheet) else generator.random() + 1
-        if chance < self.plates:
+        drawn = generator.random() if mixed and isinstance(body, Sheet) else generator.random() + 1
+        if drawn < self.plates:
             simulator = PlatesAndBeams
-        elif chance < self.plates + self.naive:
+        elif drawn < self.plates + self.naive:
             simulator = Naive
-        elif chance < self.plates + self.naive + self.interface:
+        elif drawn < self.plates + self.naive + self.interface:
             simulator, described = partial(PlatesAndBeams, reading="interface"), solid
         # Plates on beams know forces between layers only.
         depth = depth if simulator in (solid, Naive) else top
@@ -147,8 +143,8 @@ class SkinDistribution:
         error = generator.uniform(*self.position_error)
         return DrawnSkin(body, layout, simulator, error, self.footprint_error if mixed else 0.0, described)
 
-    def outside(self, body: AbstractBody, sensors: Sensors) -> list[str]:
-        """Return what of a skin lies outside the ranges, as "number of sensors 100 (4 to 64)"."""
+    def outside(self, body: AbstractBody, sensors: Sensors, rounding: float = 1e-6) -> list[str]:
+        """Return the quantities of a skin outside the ranges, as "number of sensors 100 (4 to 64)"."""
         shorter, longer = sorted(body.size)
         numbers: list[tuple[str, float, tuple[float, float], str]] = [
             ("longer side", longer, self.length, " m"),
@@ -173,20 +169,22 @@ class SkinDistribution:
         return [
             f"{name} {value:.3g}{unit} ({low:g} to {high:g}{unit})"
             for name, value, (low, high), unit in numbers
-            if not low * (1 - _EQUAL) <= value <= high * (1 + _EQUAL)
+            if not low * (1 - rounding) <= value <= high * (1 + rounding)
         ]
 
-    def _body(self, generator: np.random.Generator) -> AbstractBody:
+    def _body(
+        self, generator: np.random.Generator, poisson: float = 0.49, fewest_cells: int = 8
+    ) -> AbstractBody:
         longer = generator.uniform(*self.length)
         shorter = longer / generator.uniform(*self.aspect)
         sides = (longer, shorter) if generator.random() < 0.5 else (shorter, longer)
         base, top = generator.uniform(*self.base), generator.uniform(*self.top)
         stiff, soft = (_logarithmic(limits, generator) for limits in (self.base_young, self.top_young))
         layers = (
-            Layer(Material("base", stiff, _POISSON), base),
-            Layer(Material("top", soft, _POISSON), top),
+            Layer(Material("base", stiff, poisson), base),
+            Layer(Material("top", soft, poisson), top),
         )
-        across, along = (max(_LEAST_CELLS, round(side / self.cell)) for side in sides)
+        across, along = (max(fewest_cells, round(side / self.cell)) for side in sides)
         radius = max(generator.uniform(*self.radius), 1.2 * (base + top))
         if generator.random() < self.arms and sides[0] < 1.8 * math.pi * radius:
             cells = (across, along)
@@ -214,18 +212,18 @@ def _layout(
         size: extent (x, y) of the surface, m.
         side: of the square that a sensor feels, m; smaller where the sensors would overlap.
         depth: of the sensors, m.
-        generator: of random places.
+        generator: of random positions.
     """
     rows = max(1, round(math.sqrt(count * size[1] / size[0])))
     columns = max(1, math.ceil(count / rows))
     pitch = min(size[0] / columns, size[1] / rows)
     seed = int(generator.integers(2**31))
     if kind == "spread":
-        places = _spread(count, size, generator)
-        apart = np.abs(places[:, None] - places).max(axis=2)[~np.eye(count, dtype=bool)]
-        return _listed(places, (min(side, float(apart.min())),) * 2, depth)
+        positions = _spread(count, size, generator)
+        apart = np.abs(positions[:, None] - positions).max(axis=2)[~np.eye(count, dtype=bool)]
+        return _listed(positions, (min(side, float(apart.min())),) * 2, depth)
     if kind in ("random", "clustered"):
-        # Random places fill less than half of the surface.
+        # Random positions fill less than half of the surface.
         footprint = (min(side, 0.6 * math.sqrt(math.prod(size) / count)),) * 2
         if kind == "random":
             return Random(count, seed, footprint, depth)
@@ -238,50 +236,49 @@ def _layout(
     return Scattered(rows, columns, 0.25, seed, footprint, depth=depth)
 
 
-def _listed(places: np.ndarray, footprint: Footprint, depth: float) -> Listed:
-    """Return sensors at places (S, 2), m, in one depth, m."""
-    return Listed(np.column_stack([places, np.full(len(places), depth)]).tolist(), footprint)
+def _listed(positions: np.ndarray, footprint: Footprint, depth: float) -> Listed:
+    """Return sensors at positions (S, 2), m, in one depth, m."""
+    return Listed(np.column_stack([positions, np.full(len(positions), depth)]).tolist(), footprint)
 
 
 def _clustered(
-    count: int, size: tuple[float, float], side: float, generator: np.random.Generator
+    count: int, size: tuple[float, float], side: float, generator: np.random.Generator, tries: int = 2000
 ) -> np.ndarray:
-    """Return places (S, 2), m, around a few centres, at least ``side`` apart along x or y."""
+    """Return positions (S, 2), m, around a few centres, at least ``side`` apart along x or y."""
     extent = np.array(size)
     centres = generator.random((generator.integers(2, 5), 2)) * extent
-    spread, places = 0.15 * extent, np.empty((0, 2))
-    for attempt in range(_TRIES):
-        wide = spread * (1 + 4 * attempt / _TRIES)
+    spread, positions = 0.15 * extent, np.empty((0, 2))
+    for attempt in range(tries):
+        wide = spread * (1 + 4 * attempt / tries)
         candidate = centres[generator.integers(len(centres))] + wide * generator.normal(size=2)
         candidate = np.clip(candidate, side / 2, extent - side / 2)
-        if (np.abs(places - candidate) >= side).any(axis=1).all():
-            places = np.vstack([places, candidate])
-        if len(places) == count:
+        if (np.abs(positions - candidate) >= side).any(axis=1).all():
+            positions = np.vstack([positions, candidate])
+        if len(positions) == count:
             break
-    return places[np.argsort(places[:, 1], kind="stable")]
+    return positions[np.argsort(positions[:, 1], kind="stable")]
 
 
-def _spread(count: int, size: tuple[float, float], generator: np.random.Generator) -> np.ndarray:
-    """Return places (S, 2), m, that divide the surface evenly without rows, as informative layouts do.
+def _spread(
+    count: int, size: tuple[float, float], generator: np.random.Generator, rounds: int = 20
+) -> np.ndarray:
+    """Return positions (S, 2), m, that divide the surface evenly without rows, as informative layouts do.
 
-    Each place is in the middle of the region that is nearer to it than to the others (Lloyd's algorithm).
+    Each position is in the middle of the region that is nearer to it than to the others (Lloyd's algorithm).
     """
     extent = np.array(size)
-    samples, places = (generator.random((number, 2)) * extent for number in (50 * count, count))
-    for _ in range(_ROUNDS):
-        nearest = cKDTree(places).query(samples)[1]
-        shares = np.bincount(nearest, minlength=count)[:, None]
+    samples, positions = (generator.random((number, 2)) * extent for number in (50 * count, count))
+    for _ in range(rounds):
+        nearest = cKDTree(positions).query(samples)[1]
+        counts = np.bincount(nearest, minlength=count)[:, None]
         sums = np.stack([np.bincount(nearest, values, count) for values in samples.T], axis=1)
-        places = np.where(shares > 0, sums / shares.clip(min=1), places)
-    return places[np.argsort(places[:, 1], kind="stable")]
+        positions = np.where(counts > 0, sums / counts.clip(min=1), positions)
+    return positions[np.argsort(positions[:, 1], kind="stable")]
 
 
 # Touches on many skins, each drawn at random.
 
 
-_GROUP = 128  # largest number of gestures on one skin at a time; fewer take longer
-_DEAD = 4  # at most one of so many sensors is dead
-_TRAINING, _TEST = 0, 1
 _NUMBERS = {"train": 0, "validation": 1, "holdout": 2, "test": 3}
 
 
@@ -327,20 +324,21 @@ class Skins(ImperfectionSettings, AbstractDevice):
 
     def __post_init__(self) -> None:
         self.distribution = configured(SkinDistribution, self.skins, "device.skins")
-        self.task, self.size, self.sensors = TOUCH, self.body.size, self.layout.sensors(self.body)
-        self.window = read_touch(self.touch).frames.window
+        settings = read_touch(self.touch)
+        self.task, self.window = TOUCH.with_labels(tuple(settings.labels)), settings.frames.window
+        self.size, self.sensors = self.body.size, self.layout.sensors(self.body)
         self._wider = wider_touch(self.touch, self.training_touch)
         self._kept: dict[str, Touches] = {}
 
     @cached_property
     def training_skins(self) -> list[Simulated]:
         """The skins to train on; their mechanics are solved at the first use, and cached on disk."""
-        return self._prepare(_TRAINING, self.count)
+        return self._prepare(True, self.count)
 
     @cached_property
     def unseen_skins(self) -> list[Simulated]:
         """The skins to test on."""
-        return self._prepare(_TEST, self.test_skins)
+        return self._prepare(False, self.test_skins)
 
     @property
     def reference(self) -> Simulated:
@@ -351,27 +349,26 @@ class Skins(ImperfectionSettings, AbstractDevice):
         """Yield test streams on :attr:`reference`, without end."""
         return self.reference.strips()
 
-    def _prepare(self, part: int, count: int) -> list[Simulated]:
+    def _prepare(self, training: bool, count: int) -> list[Simulated]:
         console, terminal = Console(stderr=True), sys.stderr.isatty()
         numbers = track(range(count), "preparing skins", console=console, disable=not terminal)
         for number in numbers:
             # What solves a skin keeps large factors; made again, it reads its operator from the disk.
-            self._skin(part, number).geometry  # noqa: B018
-        return [self._skin(part, number) for number in range(count)]
+            self._skin(training, number).geometry  # noqa: B018
+        return [self._skin(training, number) for number in range(count)]
 
-    def _skin(self, part: int, number: int) -> Simulated:
-        random = generator(Stream.SKIN, self.skin_seed, part, number)
-        touch = self._wider if part == _TRAINING else self.touch
-        return self._simulated(self.distribution.draw(random, mixed=part == _TRAINING), number, touch)
+    def _skin(self, training: bool, number: int) -> Simulated:
+        random = generator(Stream.SKIN, self.skin_seed, int(not training), number)
+        touch = self._wider if training else self.touch
+        return self._simulated(self.distribution.draw(random, mixed=training), number, touch)
 
     def _simulated(
         self, skin: DrawnSkin, number: int, touch: Mapping[str, Any] | TouchSettings | None
     ) -> Simulated:
         imperfections = {entry.name: getattr(self, entry.name) for entry in fields(ImperfectionSettings)}
         sensors = len(skin.layout.sensors(skin.body))
-        imperfections["dead"] = [
-            min(limit, sensors // _DEAD) for limit in Imperfection.of(self, None).dead_range
-        ]
+        # At most one of four sensors is dead.
+        imperfections["dead"] = [min(limit, sensors // 4) for limit in Imperfection.of(self, None).dead_range]
         return Simulated(
             body=skin.body,
             layout=skin.layout,
@@ -400,9 +397,14 @@ class Skins(ImperfectionSettings, AbstractDevice):
             self._kept[split] = drawn
         return drawn
 
-    def _draw(self, skins: Sequence[Simulated], count: int, key: tuple[int, ...]) -> Touches:
-        """Return gestures in groups, each on a drawn skin; every skin is drawn once before any again."""
-        most = min(_GROUP, -(-count // len(skins)))
+    def _draw(
+        self, skins: Sequence[Simulated], count: int, key: tuple[int, ...], largest: int = 128
+    ) -> Touches:
+        """Return gestures in groups, each on a drawn skin; every skin is drawn once before any again.
+
+        Groups of fewer gestures than ``largest`` take longer.
+        """
+        most = min(largest, -(-count // len(skins)))
         sizes = [min(most, count - first) for first in range(0, count, most)]
         rounds = -(-len(sizes) // len(skins))
         # No skin has the key of the test touches: they keep the order of the published ones.

@@ -14,7 +14,7 @@ from torch.nn.functional import pad
 
 from skin.body.base import GEOMETRY
 from skin.errors import InputError
-from skin.touch.labels import CONTACT, TOUCH_OR_NOT, Task
+from skin.touch.labels import CONTACT, TOUCH, TOUCH_OR_NOT, Task
 from skin.touch.movie import Movie, join_movies
 from skin.touch.sampler import AbstractSampler
 
@@ -30,8 +30,8 @@ class Touches:
             depth.
         labels: (B, L), 0 or 1, or the targets of a regression, float, NaN where unknown; or None.
         rate: frames per second, Hz.
-        motion: (B, T, S, 3), m, how far each sensor is from its place in ``positions``, along the same axes;
-            None if unknown.
+        motion: (B, T, S, 3), m, distance of each sensor from ``positions``, along the same axes; None if
+            unknown.
         saturated: (B, T, S), bool: the sensor is at its limit, so the force is at least its reading; None
             if unknown.
         geometry: (S, G) or (B, S, G), the columns :data:`GEOMETRY` of each sensor; None if unknown.
@@ -234,9 +234,6 @@ def touches_hash(touches: Touches) -> str:
 # Streams: touches with idle gaps between them, and the windows cut from them.
 
 
-_LEAST = 16
-
-
 @dataclass(frozen=True)
 class Timeline:
     """The gestures of a stream and their times.
@@ -281,9 +278,8 @@ class Timeline:
 
         Returns:
             The gesture with the most frames in each window, (W,), the first in a tie, -1 without contact; the
-            fraction of its contact frames in the window, (W,), 0 to 1; its labels, (W, 5), float32, in the
-            order of ``skin.touch.labels.TOUCH_OR_NOT``, even if the window shows a part of it, all 0 without
-            contact.
+            fraction of its contact frames in the window, (W,), 0 to 1; its labels and ``touch``, (W, L + 1),
+            float32, even if the window shows a part of it, all 0 without contact.
         """
         nearest = torch.searchsorted(self.end, starts, right=True)
         last = torch.searchsorted(self.begin, starts + window)
@@ -299,7 +295,11 @@ class Timeline:
 
 
 def draw_timeline(
-    sampler: AbstractSampler, length: int, gap: Sequence[int], generator: np.random.Generator
+    sampler: AbstractSampler,
+    length: int,
+    gap: Sequence[int],
+    generator: np.random.Generator,
+    fewest: int = 16,
 ) -> Timeline:
     """Draw a stream of ``length`` frames that begins with a gap.
 
@@ -308,6 +308,7 @@ def draw_timeline(
         length: F, frames.
         gap: [least, most] idle frames between two touches, drawn uniformly, both ends included.
         generator: source of randomness.
+        fewest: gestures drawn at a time.
     """
     frames = sampler.settings.frames
     typical = (sum(frames.tap) + sum(frames.press)) / 4 + sum(gap) / 2
@@ -315,7 +316,7 @@ def draw_timeline(
     begins: list[np.ndarray] = []
     filled = 0
     while filled < length:
-        count = max(_LEAST, math.ceil((length - filled) / typical))
+        count = max(fewest, math.ceil((length - filled) / typical))
         movies.append(sampler.sample(count, generator))
         duration = movies[-1].parameters["duration"].long().numpy()
         ends = filled + np.cumsum(duration + generator.integers(gap[0], gap[1], count, endpoint=True))
@@ -363,7 +364,7 @@ class TouchStream:
                 motion=along(gestures.touches.motion),
                 contacts=along(gestures.touches.contacts, nan),
             ),
-            task=TOUCH_OR_NOT,
+            task=TOUCH_OR_NOT.with_labels(gestures.task.names[len(TOUCH) :]),
             force=along(gestures.force),
             displacement=along(gestures.displacement),
             parameters={},
@@ -383,23 +384,23 @@ class TouchStream:
         def windows(values: Tensor | None) -> Tensor | None:
             return None if values is None else values[0][frames]
 
-        whole, felt = self.whole, self.whole.touches
+        whole, shown = self.whole, self.whole.touches
         drawn = {name: values[gesture] for name, values in self.timeline.movie.parameters.items()}
         drawn["onset"] = (self.timeline.begin[gesture] - starts).float()
         parameters = {name: values.where(gesture >= 0, 0) for name, values in drawn.items()}
-        saturated = windows(felt.saturated)
+        saturated = windows(shown.saturated)
         content = {} if saturated is None else {"clipped": saturated.flatten(1).any(1).float()}
         content |= {"share": share.float()}
         return replace(
             whole,
             touches=replace(
-                felt,
-                readings=felt.readings[0][frames],
-                valid=felt.valid[0][frames],
+                shown,
+                readings=shown.readings[0][frames],
+                valid=shown.valid[0][frames],
                 labels=labels,
-                motion=windows(felt.motion),
+                motion=windows(shown.motion),
                 saturated=saturated,
-                contacts=windows(felt.contacts),
+                contacts=windows(shown.contacts),
             ),
             force=windows(whole.force),
             displacement=windows(whole.displacement),

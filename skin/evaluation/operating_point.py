@@ -11,14 +11,14 @@ from typing import TYPE_CHECKING, Protocol
 
 from skin.errors import InputError
 from skin.evaluation.settings import ENOUGH
-from skin.touch.labels import Task
+from skin.touch.labels import ALARM, Task
 
 if TYPE_CHECKING:
     from torch import Tensor
 
     from skin.device.touches import Touches
 
-LABEL = "dangerous"
+LABEL = ALARM
 
 
 class Predictor(Protocol):

@@ -15,7 +15,7 @@ from skin.errors import InputError
 from skin.evaluation.metrics import compute_metrics, count_confusions
 from skin.evaluation.operating_point import LABEL, OperatingPoint, Predictor
 from skin.evaluation.settings import StreamSettings
-from skin.touch.labels import TOUCH_OR_NOT, Task
+from skin.touch.labels import ALARM, TOUCH_OR_NOT, Task
 
 # Contact detection by a threshold (report, section 4.2).
 
@@ -319,7 +319,7 @@ def _listen(
         for name, gate in all_gates.items():
             raised[name].append(point.alarm(probabilities[:, dangerous]) & gate(touches, probabilities))
     gesture = stream.timeline.window_content(starts, device.window)[0]
-    truth = stream.timeline.movie.labels[:, TOUCH_OR_NOT.names.index("dangerous")] > 0.5
+    truth = stream.timeline.movie.labels[:, TOUCH_OR_NOT.names.index(ALARM)] > 0.5
     hours = stride / rate / 3600
     return {name: count_alarms(torch.cat(parts), gesture, truth, hours) for name, parts in raised.items()}
 

@@ -18,7 +18,7 @@ from skin.device.touches import Touches
 from skin.errors import InputError
 from skin.learning.data import TouchData
 from skin.learning.features import engineered_features
-from skin.touch.labels import Task
+from skin.touch.labels import ALARM, Task
 
 if TYPE_CHECKING:
     from pytorch_lightning.loggers import Logger
@@ -112,7 +112,7 @@ LOOK_AT = {
     "big": ("sensors above", "most sensors above"),
     "dynamic": ("path of", "reach of", "extent of", "way of"),
     "press": ("longest run",),
-    "dangerous": ("raw sensor maximum 1", "sensor maximum 1"),
+    ALARM: ("raw sensor maximum 1", "sensor maximum 1"),
     "touch": ("sensor maximum 1",),
 }
 """Label -> beginnings of the names of the features that its rule may use."""

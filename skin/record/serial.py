@@ -16,8 +16,8 @@ from skin.device.base import AbstractDevice, Blank, Split
 from skin.device.resampling import Frame, Window
 from skin.device.touches import Recording, Touches, join_contacts
 from skin.errors import InputError
-from skin.touch.gesture import TouchSettings, model_window
 from skin.touch.labels import TOUCH, TOUCH_OR_NOT
+from skin.touch.paths import TouchSettings, model_window
 from skin.wire.channels import UnitConversion
 from skin.wire.reader import PortSettings, SkinDisconnected, SkinTimeout
 from skin.wire.segmentation import (

@@ -366,7 +366,7 @@ def name_option(part: Mapping[str, Any], name: str) -> str:
     """Return the name of the option that a part of a configuration, called ``name``, builds."""
     if "_target_" not in part:
         raise InputError(f"{name} chooses no option: leave it out, or give one that --help lists")
-    return option_name(import_target(part["_target_"], name))
+    return option_name(import_target(part["_target_"], f"{name}._target_"))
 
 
 def name_run(identity: Mapping[str, str], changes: Mapping[str, str]) -> str:

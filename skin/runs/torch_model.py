@@ -239,7 +239,7 @@ def load_run(
             run that finished.
         uri: of the runs, as MLflow takes it; None: ``mlflow.db`` in the current folder.
         trust: allow any class in its configuration, which may run any code.
-        body: the body of the skin to use it on, such as :class:`skin.body.base.Sheet`, or the name of an
+        body: the body of the skin to use it on, such as :class:`skin.body.sheet.Sheet`, or the name of an
             option, such as ``arm``; None: that of the run.
         layout: the sensors of this skin: a layout such as :class:`skin.body.layout.Grid`, the name of an
             option, or the path of a CSV file; None: those of the run.

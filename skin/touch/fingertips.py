@@ -1,9 +1,9 @@
-"""Fingertips: one to three discs that press a skin at known places, still or sliding together."""
+"""Fingertips: one to three discs that press a skin at known positions, still or sliding together."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from functools import cache
-from typing import Annotated, Any, NamedTuple, final
+from typing import Annotated, Any, final
 
 import numpy as np
 import torch
@@ -14,23 +14,21 @@ from torch import Tensor
 from skin.body.base import AbstractBody
 from skin.core.settings import RISING, checked
 from skin.errors import InputError
-from skin.touch.gesture import (
+from skin.touch.gestures import GestureSettings
+from skin.touch.images import load_image
+from skin.touch.labels import CONTACT, TOUCH
+from skin.touch.movie import Movie, join_movies, measure_gestures
+from skin.touch.paths import (
     Draws,
-    GestureSettings,
     SampledPaths,
     TouchSettings,
     draw_motion,
     draw_times,
+    draw_until_fit,
     sample_paths,
 )
-from skin.touch.images import load_image
-from skin.touch.labels import CONTACT, TOUCH
-from skin.touch.movie import Movie, join_movies, measure_gestures
-from skin.touch.sampler import AbstractContact, AbstractSampler, describe_touches, steer
+from skin.touch.sampler import AbstractContact, AbstractSampler
 from skin.touch.shapes import Shapes
-
-_DRAWN = [TOUCH.names.index("dynamic"), TOUCH.names.index("press")]
-_TRIES = 1000
 
 
 @checked("touch")
@@ -75,7 +73,16 @@ class FingertipSettings(TouchSettings):
         padded: bool,
         moments: np.ndarray | None,
     ) -> "FingertipSampler":
-        """Return what draws fingertips."""
+        """Return what draws fingertips.
+
+        Raises:
+            InputError: a contact that solves for the pressure.
+        """
+        if not contact.proportional:
+            raise InputError(
+                "fingertips are softer than the skin and press as their picture: set contact=prescribed, or "
+                "touch=gestures for rigid objects"
+            )
         return FingertipSampler(body, footprints, contact, self, padded, moments)
 
 
@@ -100,36 +107,14 @@ def read_touch(settings: Mapping[str, Any] | TouchSettings | None) -> TouchSetti
     return FingertipSettings.of(settings) if fingertips else GestureSettings.of(settings)
 
 
-class Group(NamedTuple):
-    """Fingertips of touches, which move as one; K is the most at a time.
-
-    Attributes:
-        number: (B,), fingertips of each touch.
-        shape: (B, K), index of the shape.
-        radius: (B, K), m.
-        force: (B, K), full force, N.
-        offset: (B, K, 2), m, from the centre of the first fingertip to each centre.
-        low, high: (B, 2), m, bounding box of all around the centre of the first.
-        misfits: (B,), groups drawn before that had no room.
-    """
-
-    number: np.ndarray
-    shape: np.ndarray
-    radius: np.ndarray
-    force: np.ndarray
-    offset: np.ndarray
-    low: np.ndarray
-    high: np.ndarray
-    misfits: np.ndarray
-
-
 def draw_groups(
     count: int,
     settings: FingertipSettings,
     shapes: int,
     size: tuple[float, float],
     generator: np.random.Generator,
-) -> Group:
+    tries: int = 1000,
+) -> Draws:
     """Draw fingertips that leave ``spare`` along both axes of the sheet, and ``apart`` between them.
 
     Args:
@@ -138,6 +123,13 @@ def draw_groups(
         shapes: number of shapes.
         size: extent (x, y) of the sheet, m.
         generator: source of randomness; it draws for all touches in every round.
+        tries: largest number of rounds.
+
+    Returns:
+        number (B,) of fingertips, up to K; of each (B, K): index ``tips`` of its shape, radius (m), forces
+        (N, at full force), offset (B, K, 2) (m, from the centre of the first fingertip to its own); low and
+        high (B, 2) (m), bounding box of all around the centre of the first; misfits (B,), groups drawn before
+        that had no room.
 
     Raises:
         InputError: the sheet has no room for them.
@@ -151,36 +143,29 @@ def draw_groups(
     force = settings.force * (highest / settings.force) ** generator.random((count, most))
     absent = np.arange(most) >= number[:, None]
 
-    offset, (lows, highs) = np.empty((count, most, 2)), np.empty((2, count, 2))
-    misfits, todo = np.zeros(count), np.arange(count)
-    for _ in range(_TRIES):
-        chance = generator.random((count, most, 2))[todo]
+    def draw(todo: np.ndarray) -> Draws:
         reach = radius[todo][..., None]
-        centre = reach + chance * (np.array(size) - 2 * reach)
+        centre = reach + generator.random((count, most, 2))[todo] * (np.array(size) - 2 * reach)
         hidden = absent[todo][..., None]
-        first = centre[:, 0]
-        low = np.where(hidden, np.inf, centre - reach).min(axis=1) - first
-        high = np.where(hidden, -np.inf, centre + reach).max(axis=1) - first
-        offset[todo], lows[todo], highs[todo] = centre - first[:, None], low, high
+        low = np.where(hidden, np.inf, centre - reach).min(axis=1) - centre[:, 0]
+        high = np.where(hidden, -np.inf, centre + reach).max(axis=1) - centre[:, 0]
         fits = (high - low + settings.spare <= size).all(axis=1)
-        fits &= _separate(centre, radius[todo], absent[todo], settings.apart)
-        misfits[todo[~fits]] += 1
-        todo = todo[~fits]
-        if not len(todo):
-            return Group(number, shape, radius, force, offset, lows, highs, misfits)
-    raise InputError(
-        f"a sheet of {size[0]:g} x {size[1]:g} m has no room for {number[todo].max()} fingertips of "
-        f"touch.radius={list(settings.radius)} m with touch.spare={settings.spare:g} m: lower "
-        "touch.contacts, touch.radius, touch.apart or touch.spare"
-    )
+        first, second = np.triu_indices(most, 1)
+        near, far = radius[todo][:, first], radius[todo][:, second]
+        distance = np.linalg.norm(centre[:, first] - centre[:, second], axis=2)
+        missing = absent[todo][:, first] | absent[todo][:, second]
+        fits &= (missing | (distance >= near + far + settings.apart)).all(axis=1)
+        return {"offset": centre - centre[:, :1], "low": low, "high": high, "fits": fits}
 
+    def refuse() -> InputError:
+        return InputError(
+            f"a sheet of {size[0]:g} x {size[1]:g} m has no room for {number.max()} fingertips of "
+            f"touch.radius={list(settings.radius)} m with touch.spare={settings.spare:g} m: lower "
+            "touch.contacts, touch.radius, touch.apart or touch.spare"
+        )
 
-def _separate(centre: np.ndarray, radius: np.ndarray, absent: np.ndarray, apart: float) -> np.ndarray:
-    """Return whether all fingertips (B, K, 2) of a touch are apart, (B,), bool."""
-    first, second = np.triu_indices(centre.shape[1], 1)
-    distance = np.linalg.norm(centre[:, first] - centre[:, second], axis=2)
-    free = distance >= radius[:, first] + radius[:, second] + apart
-    return (free | absent[:, first] | absent[:, second]).all(axis=1)
+    placed = draw_until_fit(count, draw, refuse, tries)
+    return placed | {"number": number, "tips": shape, "radius": radius, "forces": force}
 
 
 def half_extents(shapes: Shapes) -> np.ndarray:
@@ -196,15 +181,14 @@ def peak_per_newton(shapes: Shapes, shape: np.ndarray, radius: np.ndarray) -> np
         shape: indices.
         radius: half the larger extent of each, m.
     """
-    covers = np.array([_cover(name, shapes.contact) for name in shapes.names])
-    return 1 / (covers[shape] * radius**2)
+    return 1 / (np.array([_cover(name, shapes.contact) for name in shapes.names])[shape] * radius**2)
 
 
 @cache
 def _cover(name: str, contact: float) -> float:
     """Return the force of a picture of 1 Pa by the square of its radius: pi for a disc."""
     picture = load_image(name)
-    extents = [np.ptp(places) + 1 for places in np.nonzero(picture > contact)]
+    extents = [np.ptp(pixels) + 1 for pixels in np.nonzero(picture > contact)]
     return picture.sum() / (max(extents) / 2) ** 2
 
 
@@ -220,27 +204,11 @@ class FingertipSampler(AbstractSampler):
         settings: ranges of the fingertips.
 
     Raises:
-        InputError: settings or pictures that cannot be used, or a contact that solves for the pressure.
+        InputError: settings or pictures that cannot be used.
     """
 
     chosen = ("dynamic", "press")
     settings: FingertipSettings
-
-    def __init__(
-        self,
-        body: AbstractBody,
-        footprints: np.ndarray,
-        contact: AbstractContact,
-        settings: FingertipSettings,
-        padded: bool = True,
-        moments: np.ndarray | None = None,
-    ) -> None:
-        if not contact.proportional:
-            raise InputError(
-                "fingertips are softer than the skin and press as their picture: set contact=prescribed, or "
-                "touch=gestures for rigid objects"
-            )
-        super().__init__(body, footprints, contact, settings, padded, moments)
 
     @torch.no_grad()
     def sample(self, count: int, generator: np.random.Generator, labels: np.ndarray | None = None) -> Movie:
@@ -255,8 +223,12 @@ class FingertipSampler(AbstractSampler):
             InputError: other labels are wanted, or the sheet has no room.
         """
         wanted = self.balanced(count, generator) if labels is None else np.asarray(labels, bool)
-        others = [n for n, name in enumerate(TOUCH.names) if name not in self.chosen]
-        if refused := [TOUCH.names[n] for n in others if wanted[:, n].any()]:
+        drawn = [TOUCH.names.index(name) for name in self.chosen]
+        if refused := [
+            name
+            for name, column in zip(TOUCH.names, wanted.T, strict=True)
+            if column.any() and name not in self.chosen
+        ]:
             raise InputError(
                 f"fingertips cannot be drawn to be {' or '.join(refused)}, only dynamic, press or neither: "
                 "set touch=gestures"
@@ -264,16 +236,15 @@ class FingertipSampler(AbstractSampler):
         pending, movies, finished = np.arange(count), list[Movie](), list[np.ndarray]()
         for attempt in range(1, self.settings.redraws + 1):
             movie = self._draw(wanted, generator, pending, attempt)
-            right = (movie.labels.numpy() == wanted[pending])[:, _DRAWN].all(axis=1)
+            right = (movie.labels[:, drawn].numpy() == wanted[pending][:, drawn]).all(axis=1)
             movies.append(movie[torch.from_numpy(np.flatnonzero(right))])
             finished.append(pending[right])
             pending = pending[~right]
             if not len(pending):
-                order = np.concatenate(finished).argsort()
-                return join_movies(movies)[torch.from_numpy(order)]
+                return join_movies(movies)[torch.from_numpy(np.concatenate(finished).argsort())]
         raise InputError(
             f"no touch of fingertips in {self.settings.redraws} draws was "
-            + ", ".join(f"{'' if wanted[pending[0], n] else 'not '}{TOUCH.names[n]}" for n in _DRAWN)
+            + ", ".join(f"{'' if wanted[pending[0], n] else 'not '}{TOUCH.names[n]}" for n in drawn)
             + ": touch.thresholds and the ranges under touch rule it out"
         )
 
@@ -282,90 +253,84 @@ class FingertipSampler(AbstractSampler):
     ) -> Movie:
         """Draw all touches and return the movie of some rows, (b,)."""
         settings, size, count = self.settings, self.body.size, len(wanted)
-        group = draw_groups(count, settings, len(self.shapes.names), size, generator)
-        drawn: Draws = {
-            "low": group.low,
-            "high": group.high,
-            "shape": group.shape[:, 0],
+        drawn = draw_groups(count, settings, len(self.shapes.names), size, generator) | {
             "angle": np.zeros(count),
             "stretch": np.ones(count),
-            "scale": group.radius[:, 0],
-            "misfits": group.misfits,
             "peak": np.zeros(count),  # of sample_paths, which only passes it on
-        } | draw_times(wanted, settings, self.padded, generator)
-        chance = generator.random((count, 4))
-        drawn |= draw_motion(wanted[:, _DRAWN[0]], drawn, settings, size, chance)
-        drawn["draws"] = np.full(count, float(attempt))
-        mine = {name: values[rows] for name, values in drawn.items()}
-        return self._render(mine, Group(*(values[rows] for values in group)), wanted[rows])
+            "draws": np.full(count, float(attempt)),
+        }
+        drawn |= {"shape": drawn["tips"][:, 0], "scale": drawn["radius"][:, 0]}
+        drawn |= draw_times(wanted, settings, self.padded, generator)
+        random = generator.random((count, 4))
+        drawn |= draw_motion(wanted.T[TOUCH.names.index("dynamic")], drawn, settings, size, random)
+        return self._render({name: values[rows] for name, values in drawn.items()}, wanted[rows])
 
-    def _render(self, drawn: Draws, group: Group, wanted: np.ndarray) -> Movie:
+    def _render(self, drawn: Draws, wanted: np.ndarray) -> Movie:
         """Return the movie of drawn touches (B,) with its labels."""
         settings = self.settings
         paths = sample_paths(drawn, wanted, settings, proportional=True)
         index, profile = paths.trajectories.index, paths.trajectories.profile
-        scale = group.radius / half_extents(self.shapes)[group.shape]
-        frames, highest, area = self._pressure(paths, group, scale)
+        frames, highest, area = self._pressure(paths, drawn)
         weights = self.footprints if self.moments is None else self.moments
-        contact = settings.thresholds.contact
-        measures = measure_gestures(frames, index, profile, weights, self.body.cell, contact, area)
-        present = np.arange(group.radius.shape[1]) < group.number[:, None]
-        peak = (highest[index] * profile).amax(1).double().numpy()
-        values = peak, (group.force * present).sum(axis=1), drawn["draws"]
-        parameters = describe_touches(drawn, paths, values, measures)
-        parameters["contacts"] = torch.from_numpy(group.number).float()
-        pressures = group.force * peak_per_newton(self.shapes, group.shape, group.radius)
-        contacts = _contacts(paths, group, pressures, present)
-        labels = measures.labels(settings.thresholds, settings.rate)
-        return Movie(frames, index, profile, labels, parameters, steer(paths, settings.shear), contacts)
+        measures = measure_gestures(
+            frames, index, profile, weights, self.body.cell, settings.thresholds.contact, area
+        )
+        present = np.arange(drawn["radius"].shape[1]) < drawn["number"][:, None]
+        full = {
+            "peak": (highest[index] * profile).amax(1).double().numpy(),
+            "force": (drawn["forces"] * present).sum(axis=1),
+        }
+        pressures = drawn["forces"] * peak_per_newton(self.shapes, drawn["tips"], drawn["radius"])
+        contacts = _contacts(paths, drawn, pressures, present)
+        movie = self._movie(frames, drawn | full, paths, measures, contacts)
+        movie.parameters["contacts"] = torch.from_numpy(drawn["number"]).float()
+        return movie
 
-    def _pressure(
-        self, paths: SampledPaths, group: Group, scale: np.ndarray
-    ) -> tuple[Tensor, Tensor, Tensor | None]:
+    def _pressure(self, paths: SampledPaths, drawn: Draws) -> tuple[Tensor, Tensor, Tensor | None]:
         """Return what all fingertips press at full force.
 
         Returns:
-            The sum of their pressures, (U, H, W), Pa, the highest one, (U,), Pa, and the share of the sheet
-            in contact, (U,), or None where cells are counted.
+            The sum of their pressures, (U, H, W), Pa, the highest one, (U,), Pa, and the fraction of the
+            sheet in contact, (U,), or None where cells are counted.
         """
-        owner, place = paths.trajectories.owner, paths.trajectories.place
+        owner, place = paths.trajectories.owner, paths.trajectories.poses.place
+        shape, scale = drawn["tips"], drawn["radius"] / half_extents(self.shapes)[drawn["tips"]]
         frames = torch.zeros(len(owner), *self.body.shape)
         highest, areas = torch.zeros(2, len(owner))
-        cell = float(np.prod(self.body.cell))
         for k in range(scale.shape[1]):
-            rows = np.flatnonzero(group.number[owner] > k)
+            rows = np.flatnonzero(drawn["number"][owner] > k)
             # Sorted by scale, because frames of one texture level are rendered together.
             rows = rows[np.argsort(scale[owner[rows], k], kind="stable")]
             mine, todo = owner[rows], torch.from_numpy(rows)
-            centres = place[rows] + group.offset[mine, k]
-            pose = group.shape[mine, k], np.zeros(len(rows)), scale[mine, k], centres
-            full = torch.from_numpy(group.force[mine, k] / cell).float()
+            centres = place[rows] + drawn["offset"][mine, k]
+            pose = shape[mine, k], np.zeros(len(rows)), scale[mine, k], centres
+            full = torch.from_numpy(drawn["forces"][mine, k] / float(np.prod(self.body.cell))).float()
             if self.shapes.fine:
-                shares, peak, area = self.shapes.press(*pose)
+                spread, peak, area = self.shapes.press(*pose)
                 areas[todo] += torch.from_numpy(area).float()
                 highest[todo] = torch.maximum(highest[todo], full * peak)
             else:
-                shares = self.shapes.render(*pose)
-            frames[todo] += shares * full[:, None, None]
+                spread = self.shapes.render(*pose)
+            frames[todo] += spread * full[:, None, None]
         if self.shapes.fine:
             return frames, highest, areas
         return frames, frames.flatten(1).amax(1), None
 
 
-def _contacts(paths: SampledPaths, group: Group, highest: np.ndarray, present: np.ndarray) -> Tensor:
+def _contacts(paths: SampledPaths, drawn: Draws, highest: np.ndarray, present: np.ndarray) -> Tensor:
     """Return the contacts at each time, (B, T, K, 5), float32, columns :data:`CONTACT`; NaN without contact.
 
     Args:
         paths: of the touches.
-        group: their fingertips.
+        drawn: their fingertips.
         highest: (B, K), highest pressure at full force, Pa.
         present: (B, K), bool.
     """
     profile = paths.trajectories.profile.double().numpy()[..., None]
-    places = paths.trajectories.place[paths.trajectories.index.numpy()]
-    centre = places[:, :, None] + group.offset[:, None]
+    positions = paths.trajectories.poses.place[paths.trajectories.index.numpy()]
+    centre = positions[:, :, None] + drawn["offset"][:, None]
     values = np.empty((*centre.shape[:3], len(CONTACT)))
-    values[..., :2], values[..., 2] = centre, group.radius[:, None]
-    values[..., 3], values[..., 4] = group.force[:, None] * profile, highest[:, None] * profile
+    values[..., :2], values[..., 2] = centre, drawn["radius"][:, None]
+    values[..., 3], values[..., 4] = drawn["forces"][:, None] * profile, highest[:, None] * profile
     values[~present[:, None] | (profile == 0)] = np.nan
     return torch.from_numpy(values).float()

@@ -17,14 +17,14 @@ _FOLDER = BUNDLED / "data" / "shapes"
 
 
 def load_image(name: str) -> np.ndarray:
-    """Return a shape's image (h, w), float64, 0 to 1.
+    """Return a shape's image (h, w), float64, 0 to 1: its brightest pixel is 1.
 
     Args:
         name: the stem of a file in ``data/shapes``, or the path of any picture; a relative path is looked
             for in the current folder, then beside the package.
 
     Raises:
-        InputError: no such picture, unreadable, empty, black, or not finite.
+        InputError: no such picture, or it is unreadable, empty or black, or has a pixel that is not finite.
     """
     path = _find(name)
     try:
@@ -42,7 +42,14 @@ def load_image(name: str) -> np.ndarray:
             f"cannot read the shape {name} ({path}): {error}; touch.shapes takes grey-scale pictures, "
             "such as a PNG, white = full pressure"
         ) from error
-    return check_image(pixels, name)
+    usable = pixels.ndim == 2 and np.isfinite(pixels).all() and pixels.min(initial=0) >= 0 and pixels.any()
+    if not usable:
+        span = f" from {pixels.min():g} to {pixels.max():g}" if pixels.size else ""
+        raise InputError(
+            f"the shape {name} must be a grey-scale picture (h, w) of finite values from 0 up, not all "
+            f"0, got {pixels.shape} pixels{span}: white = full pressure"
+        )
+    return pixels / pixels.max()
 
 
 def _find(name: str) -> Path:
@@ -55,22 +62,6 @@ def _find(name: str) -> Path:
         f"no shape {name}: touch.shapes takes {names}, or the path of a picture, as in "
         "touch.shapes=[disc,my.png]"
     )
-
-
-def check_image(pixels: np.ndarray, name: str) -> np.ndarray:
-    """Return pixels (h, w) scaled so that the brightest is 1.
-
-    Raises:
-        InputError: no pixels, a pixel that is no number or below 0, or nothing but black.
-    """
-    usable = pixels.ndim == 2 and np.isfinite(pixels).all() and pixels.min(initial=0) >= 0 and pixels.any()
-    if not usable:
-        span = f" from {pixels.min():g} to {pixels.max():g}" if pixels.size else ""
-        raise InputError(
-            f"the shape {name} must be a grey-scale picture (h, w) of finite values from 0 up, not all "
-            f"0, got {pixels.shape} pixels{span}: white = full pressure"
-        )
-    return pixels / pixels.max()
 
 
 def pyramid(images: Sequence[np.ndarray], pixels: int) -> list[Tensor]:
@@ -89,10 +80,15 @@ def pyramid(images: Sequence[np.ndarray], pixels: int) -> list[Tensor]:
         small = adaptive_avg_pool2d(torch.from_numpy(image)[None], (height, width))[0]
         top, left = (pixels - height) // 2, (pixels - width) // 2
         square[top : top + height, left : left + width] = small / small.max()
+    return [level.float() for level in halve(base)]
+
+
+def halve(base: Tensor) -> list[Tensor]:
+    """Return images (N, C, p, p), p a power of two, at resolutions p, p / 2, ... 1."""
     levels = [base]
     while levels[-1].shape[-1] > 1:
         levels.append(avg_pool2d(levels[-1], 2))
-    return [level.float() for level in levels]
+    return levels
 
 
 def hulls(images: np.ndarray, contact: float) -> np.ndarray:

@@ -1,10 +1,13 @@
-"""What is learned of a touch: labels and their thresholds, classes, or measured targets.
+"""What is learned of a touch: labels with their measures and thresholds, classes, or measured targets.
 
-torch is not imported here: an exported model needs no torch.
+Everything about a label of simulated touches is here: its name, the name of its opposite, the measure of the
+movie that decides, and the threshold. A label of one's own has the same four in ``conf/touch/NAME.yaml``
+(CONTRIBUTING.md). torch is not imported here: an exported model needs no torch.
 """
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Literal
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from annotated_types import Ge, Gt, Lt, MinLen
 
@@ -12,6 +15,9 @@ from skin.core.settings import ONCE, checked
 
 if TYPE_CHECKING:
     from torch import Tensor
+
+    from skin.body.base import AbstractBody
+    from skin.touch.movie import Movie
 
 
 @dataclass(frozen=True)
@@ -28,7 +34,7 @@ class Task:
             Both are 0 if a touch has no direction; they are then undefined.
 
     Raises:
-        ValueError: the gate is no label, or labels with a gate or a direction are not binary.
+        ValueError: an unknown gate, or labels with a gate or a direction that are not binary.
     """
 
     names: Annotated[tuple[str, ...], MinLen(1), ONCE]
@@ -38,24 +44,27 @@ class Task:
 
     def __post_init__(self) -> None:
         if self.gate is not None and (self.kind != "binary" or self.gate not in self.binary):
-            raise ValueError(f"{self.gate} is no gate of the {self.kind} labels {self.names}")
+            raise ValueError(f"{self.gate} cannot gate the {self.kind} labels {self.names}")
         if self.direction and (self.kind != "binary" or len(self.names) < 3):
-            raise ValueError(f"a direction stands behind binary labels, got {self.kind} {self.names}")
+            raise ValueError(f"a direction must follow binary labels, got {self.kind} {self.names}")
 
     def __len__(self) -> int:
         return len(self.names)
 
     @property
     def binary(self) -> tuple[str, ...]:
-        """The names of all labels but a direction's; targets of a regression are no labels."""
-        if self.kind == "regression":
-            return ()
-        return self.names[:-2] if self.direction else self.names
+        """The names of all labels but a direction's; a regression has none."""
+        return () if self.kind == "regression" else self.names[: -2 if self.direction else None]
 
     @property
     def gated(self) -> tuple[str, ...]:
         """The names of all labels but the gate and a direction's."""
         return tuple(name for name in self.binary if name != self.gate)
+
+    def with_labels(self, names: tuple[str, ...]) -> "Task":
+        """Return this task with other labels behind those of ``TOUCH``; a gate or a direction stays last."""
+        count = len(TOUCH)
+        return replace(self, names=(*self.names[:count], *names, *self.names[count:]))
 
     def counts(self, labels: "Tensor") -> "Tensor":
         """Return the mask of the labels (B, L) that are known and defined by gate and direction, bool.
@@ -72,43 +81,24 @@ class Task:
         return counts & ~labels.isnan()
 
     def shares(self, labels: "Tensor") -> "Tensor":
-        """Return labels (B, L) as what a probability should be on average, 0 to 1: cosines c as (1 + c) / 2.
+        """Return labels (B, L) as the expected probabilities, 0 to 1: cosines c become (1 + c) / 2.
 
-        The mean of c has the least cross-entropy then, as the share of true cases has it of a binary label.
+        The mean of c then minimises the cross-entropy, as the fraction of true cases does for a label.
         """
         if not self.direction:
             return labels
-        shares = labels.clone()
-        shares[:, -2:] = (1 + labels[:, -2:]) / 2
-        return shares
+        targets = labels.clone()
+        targets[:, -2:] = (1 + labels[:, -2:]) / 2
+        return targets
 
 
 def target_unit(name: str) -> str:
-    """Return the unit of a target in recordings: m of a place, N of a force, and none of others."""
+    """Return the unit of a target in recordings: m of a position, N of a force, otherwise empty."""
     return "m" if name in PLACE else "N" if name.startswith("force") else ""
 
 
 PLACE = ("x", "y")
-"""The targets that are a place together."""
-
-TOUCH = Task(("big", "dynamic", "press", "dangerous"))
-"""The four binary labels of the report, section 2.1.1."""
-
-TOUCH_OR_NOT = Task((*TOUCH.names, "touch"), gate="touch")
-"""The same with the report's fifth label (section 4.2); where it is 0 the other four are 0 too."""
-
-TOUCH_SLIDING = Task((*TOUCH.names, "slide_x", "slide_y"), direction=True)
-"""The four binary labels and the direction of sliding, as :func:`skin.touch.movie.sliding` gives it."""
-
-
-CONTACT = ("x", "y", "radius", "force", "peak")
-"""Columns of contacts: centre and radius (m), force (N) and highest pressure (Pa)."""
-
-RELEASE = 0.3
-"""s without a rise that end a contact; so long a touch that has ended is still judged."""
-
-OPPOSITE = {"big": "small", "dynamic": "static", "press": "tap", "dangerous": "safe"}
-"""Label -> name of its opposite."""
+"""The targets that together are a position."""
 
 
 @checked("touch.thresholds")
@@ -117,11 +107,11 @@ class Thresholds:
     """Thresholds of the labels (report, section 2.1.1).
 
     Attributes:
-        area: a touch is big if it covers more than this share of the sheet.
+        area: a touch is big if it covers more than this fraction of the sheet.
         duration: a touch is a press if it lasts longer than this without interruption, s.
         pressure: a touch is dangerous if some sensor's surface pressure exceeds this in some frame, Pa
             (cuff algometry, Jespersen et al.).
-        contact: cells above this share of the gesture's peak cell are in contact.
+        contact: cells above this fraction of the gesture's peak cell are in contact.
         travel: a touch is dynamic if its centre of pressure moves further than this from where it began, m.
     """
 
@@ -130,3 +120,62 @@ class Thresholds:
     pressure: float = 90.5e3
     contact: Annotated[float, Gt(0), Lt(1)] = 0.02
     travel: float = 1e-3
+
+
+@dataclass(frozen=True)
+class Label:
+    """A binary label of simulated touches: it holds where a measure of the movie is above a threshold.
+
+    Attributes:
+        opposite: name of a touch without the label.
+        measure: ``measure(movie, body)`` of a :class:`skin.touch.movie.Movie` (B) on a body gives a tensor
+            (B,). In a configuration: ``{_target_: module.function, _partial_: true}``.
+        above: the threshold, in the unit of the measure.
+    """
+
+    opposite: str
+    measure: Any
+    above: float
+
+
+def _parameter(movie: "Movie", body: "AbstractBody", name: str) -> "Tensor":
+    """Return a measure that is one of the parameters of a movie."""
+    return movie.parameters[name]
+
+
+ALARM = "dangerous"
+"""The label that raises the alarm."""
+
+
+def report_labels(thresholds: Thresholds, rate: float) -> dict[str, Label]:
+    """Return the four labels of the report (section 2.1.1) by name, in the order of ``TOUCH``.
+
+    Args:
+        thresholds: of the labels.
+        rate: frames per second of the movie, Hz: the duration of a touch is counted in frames.
+    """
+    return {
+        "big": Label("small", partial(_parameter, name="area"), thresholds.area),
+        "dynamic": Label("static", partial(_parameter, name="travel"), thresholds.travel),
+        "press": Label("tap", partial(_parameter, name="frames"), round(thresholds.duration * rate)),
+        ALARM: Label("safe", partial(_parameter, name="pressure"), thresholds.pressure),
+    }
+
+
+OPPOSITE = {name: label.opposite for name, label in report_labels(Thresholds(), 1.0).items()}
+"""Label -> name of its opposite."""
+
+TOUCH = Task(tuple(OPPOSITE))
+"""The four binary labels of the report, section 2.1.1."""
+
+TOUCH_OR_NOT = Task((*TOUCH.names, "touch"), gate="touch")
+"""The same with the report's fifth label (section 4.2); where it is 0 the other four are 0 too."""
+
+TOUCH_SLIDING = Task((*TOUCH.names, "slide_x", "slide_y"), direction=True)
+"""The four binary labels and the direction of sliding, as :func:`skin.touch.movie.sliding` gives it."""
+
+CONTACT = ("x", "y", "radius", "force", "peak")
+"""Columns of contacts: centre and radius (m), force (N) and highest pressure (Pa)."""
+
+RELEASE = 0.3
+"""Seconds without a rise that end a contact; a touch that ended within them is still classified."""

@@ -1,4 +1,4 @@
-"""Pressure movies of gestures; each distinct frame is kept once."""
+"""Pressure movies of gestures: each distinct frame is kept once. Their measures, and sums of two gestures."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,21 +8,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from skin.touch.labels import Thresholds
-
-# Measures of gestures, from which their labels follow.
-
-
-_PART = 256
-_STRAIGHT = 0.5
-
 
 class Measures(NamedTuple):
     """Measures of each gesture of a movie; every tensor is (B,).
 
     Attributes:
-        area: largest share of the sheet in contact in one frame.
-        travel: furthest distance of the centre of pressure from its first place, m.
+        area: largest fraction of the sheet in contact in one frame.
+        travel: furthest distance of the centre of pressure from its first position, m.
         frames: longest run of consecutive frames in contact.
         pressure: largest surface pressure over a sensor's footprint, Pa.
     """
@@ -32,19 +24,6 @@ class Measures(NamedTuple):
     frames: Tensor
     pressure: Tensor
 
-    def labels(self, thresholds: Thresholds, rate: float) -> Tensor:
-        """Return the labels (B, 4), 0 or 1, float32, in the order of ``TOUCH``.
-
-        Args:
-            thresholds: of the labels.
-            rate: frames per second of the movie, Hz.
-        """
-        big = self.area > thresholds.area
-        dynamic = self.travel > thresholds.travel
-        press = self.frames > round(thresholds.duration * rate)
-        dangerous = self.pressure > thresholds.pressure
-        return torch.stack([big, dynamic, press, dangerous], dim=1).float()
-
 
 def measure_gestures(
     frames: Tensor,
@@ -52,7 +31,7 @@ def measure_gestures(
     scale: Tensor,
     footprints: Tensor,
     cell: tuple[float, float],
-    contact: float = Thresholds.contact,
+    contact: float = 0.02,
     area: Tensor | None = None,
 ) -> Measures:
     """Measure gestures given as distinct frames, each processed once.
@@ -63,8 +42,8 @@ def measure_gestures(
         scale: (B, T), factor of the frame, 0 without touch.
         footprints: (S, H * W), area weights of each sensor that sum to 1.
         cell: extent (x, y) of a cell, m.
-        contact: share of the gesture's peak cell above which a cell is in contact.
-        area: (U,), share of the sheet in contact in each frame; None: cells are counted.
+        contact: fraction of the gesture's peak cell above which a cell is in contact.
+        area: (U,), fraction of the sheet in contact in each frame; None: cells are counted.
     """
     flat = frames.flatten(1)
     highest = flat.amax(1)
@@ -74,30 +53,31 @@ def measure_gestures(
     sensors, centre = _means(frames, footprints, cell)
     pressure = (sensors.amax(1)[index] * scale).amax(1)
 
-    shares = _areas(flat, index, contact * peak[:, None] / scale) if area is None else area
-    area = shares[index].where(touched, 0).amax(1)
+    fractions = _areas(flat, index, contact * peak[:, None] / scale) if area is None else area
+    area = fractions[index].where(touched, 0).amax(1)
 
     first = touched.int().argmax(1)
-    places = centre[index]
-    distance = torch.linalg.vector_norm(places - places[torch.arange(len(places)), first][:, None], dim=-1)
+    path = centre[index]
+    distance = torch.linalg.vector_norm(path - path[torch.arange(len(path)), first][:, None], dim=-1)
     travel = distance.where(touched, 0).amax(1)
     return Measures(area, travel, longest_run(touched), pressure)
 
 
-def _areas(flat: Tensor, index: Tensor, lowest: Tensor) -> Tensor:
-    """Return the share of cells of frames (U, H * W) in contact, (U,).
+def _areas(flat: Tensor, index: Tensor, lowest: Tensor, part: int = 256) -> Tensor:
+    """Return the fraction of cells of frames (U, H * W) in contact, (U,).
 
     Args:
         flat: Pa.
         index: (B, T), the frame at each time.
         lowest: (B, T), the lowest pressure of a frame that counts as contact, Pa.
+        part: number of frames compared at once: all cells at once would be as large as the movie, and these
+            stay in the cache.
     """
-    # That where a frame is shown at its strongest.
+    # The lowest pressure at the time when the frame has its largest scale.
     level = torch.full((len(flat),), torch.inf).to(flat)
     level.scatter_reduce_(0, index.flatten(), lowest.flatten(), "amin")
-    # In parts that stay in the cache: the comparison of all cells at once would be as large as the movie.
-    parts = zip(flat.split(_PART), level[:, None].split(_PART), strict=True)
-    return torch.cat([(part > limit).sum(1) for part, limit in parts]) / flat.shape[1]
+    parts = zip(flat.split(part), level[:, None].split(part), strict=True)
+    return torch.cat([(values > limit).sum(1) for values, limit in parts]) / flat.shape[1]
 
 
 def _means(frames: Tensor, footprints: Tensor, cell: tuple[float, float]) -> tuple[Tensor, Tensor]:
@@ -119,20 +99,20 @@ def longest_run(active: Tensor) -> Tensor:
     return (passed - before).amax(dim=1)
 
 
-def sliding(net: Tensor, way: Tensor) -> Tensor:
+def sliding(net: Tensor, length: Tensor, straight: float = 0.5) -> Tensor:
     """Return the cosines (B, 2) of the directions in which touches slide; 0, 0 where they have none.
 
-    It is the direction from where a touch begins to where it ends. A path that leads less than half its
-    length away, because it was turned at the edges, goes to and fro: it has no direction, like one that
-    stands still.
+    It is the direction from where a touch begins to where it ends. A path that was reflected at the edges so
+    often that it leads away by less than half its length has no direction, like a static touch.
 
     Args:
-        net: (B, 2), m, from the first place to the last.
-        way: (B,), m, the length of the path.
+        net: (B, 2), m, from the first position to the last.
+        length: (B,), m, of the path.
+        straight: fraction of the length.
     """
-    far = torch.linalg.vector_norm(net, dim=1)
-    straight = (far > 0) & (far >= _STRAIGHT * way)
-    return net / far.where(straight, 1)[:, None] * straight[:, None]
+    distance = torch.linalg.vector_norm(net, dim=1)
+    directed = (distance > 0) & (distance >= straight * length)
+    return net / distance.where(directed, 1)[:, None] * directed[:, None]
 
 
 @dataclass(frozen=True)
@@ -143,14 +123,14 @@ class Movie:
         frames: (U, H, W), Pa, the distinct frames at full force, as loads of the simulator: mean pressures of
             cells, or moments of the pressure (:mod:`skin.touch.splines`).
         index: (B, T), the frame at each time.
-        scale: (B, T), its share of full force; 0 without contact.
-        labels: (B, 4), 0 or 1, float32, in the order of ``skin.touch.labels.TOUCH``.
+        scale: (B, T), its fraction of full force; 0 without contact.
+        labels: (B, L), 0 or 1, float32: those of ``skin.touch.labels.TOUCH``, then labels of one's own.
         parameters: (B,) each: shape (index), angle (rad), stretch (``Shapes.render``), misfits (bodies drawn
             that had no room on the sheet), duration and onset (frames), direction (rad), speed (m per frame),
             peak (highest cell pressure, Pa), force (N, all cells at full force), draws (how many paths were
-            drawn until one had the wanted labels), net_x and net_y (m, from the first place of the path to
-            its last), x and y (m, that first place); area, travel, frames and pressure
-            (``skin.touch.movie.Measures``), which make the labels; and where pressure is solved for,
+            drawn until one had the wanted labels), net_x and net_y (m, from the first position of the path
+            to its last), x and y (m, that first position); area, travel, frames and pressure
+            (``skin.touch.movie.Measures``), of which the labels are made; and where pressure is solved for,
             unconverged (frames of all its draws that were not found).
         shear: (U, 2), tangential traction along x and y of each frame divided by its pressure: the
             coefficient of friction times the direction of motion, 0 for static touches; None: no friction.
@@ -215,3 +195,86 @@ def join_movies(movies: Sequence[Movie]) -> Movie:
         torch.cat(shears) if shears else None,
         torch.cat(contacts) if contacts else None,
     )
+
+
+# A second gesture at the same time, beside the first: sums of two movies of gestures.
+
+
+def add_second(movie: Movie, fraction: float, contact: float, generator: np.random.Generator) -> Movie:
+    """Return gestures of which a fraction has another gesture of the movie added.
+
+    The second gesture overlaps the first in time, nowhere on the sheet, and has no label that the first does
+    not have. The sum then keeps the labels of the first: a label holds if it holds for one of the two.
+    A gesture that leaves no room for any other of the movie stays alone. The second one ends in the window.
+
+    Args:
+        movie: gestures (B,), whose pressures add up; without friction.
+        fraction: of the gestures that get a second one, 0 to 1.
+        contact: fraction of a frame's peak above which a cell is in contact.
+        generator: source of randomness.
+
+    Returns:
+        The gestures (B,). The parameter ``contacts`` is the number of gestures at a time, 1 or 2; onset and
+        duration are those of both together, force and the measures the largest.
+    """
+    first = torch.from_numpy(np.flatnonzero(generator.random(len(movie)) < fraction))
+    random = torch.from_numpy(generator.random((len(first), len(movie) + 1)))
+    whole = movie.parameters["onset"] + movie.parameters["duration"] <= movie.index.shape[1]
+    kept = (movie.labels <= movie.labels[first][:, None]).all(dim=2)
+    allowed = whole & kept & _apart(movie, first, contact)
+    score, second = random[:, :-1].where(allowed, -1).max(dim=1)
+    first, second, moment = first[score >= 0], second[score >= 0], random[score >= 0, -1]
+    begin, times = _overlapping(movie, first, second, moment)
+
+    fractions = movie.scale[first], movie.scale[second].gather(1, times)
+    index = movie.index[first], movie.index[second].gather(1, times)
+    full = movie.parameters["force"][:, None]
+    total = full[first] * fractions[0] + full[second] * fractions[1]
+    force = total.amax(dim=1)
+    scale = total / force[:, None]
+    touched = scale > 0
+    parts = (
+        part[touched][:, None, None] * movie.frames[rows[touched]]
+        for part, rows in zip(fractions, index, strict=True)
+    )
+    frames = sum(parts) / scale[touched][:, None, None]
+    counts = touched.sum(dim=1)
+    column = (touched.cumsum(dim=1) - 1).clamp(min=0) + (counts.cumsum(0) - counts)[:, None]
+
+    parameters = {name: values.clone() for name, values in movie.parameters.items()}
+    parameters["contacts"] = torch.ones(len(movie)).index_fill_(0, first, 2)
+    for name in ("peak", *Measures._fields):
+        parameters[name][first] = torch.maximum(parameters[name][first], movie.parameters[name][second])
+    onset = torch.minimum(movie.parameters["onset"][first], begin.float())
+    parameters["onset"][first], parameters["duration"][first] = onset, counts.float()
+    parameters["force"][first] = force
+    indices, scales = movie.index.clone(), movie.scale.clone()
+    indices[first], scales[first] = column + len(movie.frames), scale
+    sums = Movie(torch.cat([movie.frames, frames]), indices, scales, movie.labels, parameters)
+    return sums[torch.arange(len(movie))]  # without the frames of first gestures alone
+
+
+def _apart(movie: Movie, first: Tensor, contact: float) -> Tensor:
+    """Return whether gestures never touch a cell that the ``first`` (N,) touch, (N, B), bool."""
+    owner = torch.zeros(len(movie.frames), dtype=torch.long)
+    owner[movie.index.flatten()] = torch.arange(len(movie)).repeat_interleave(movie.index.shape[1])
+    flat = movie.frames.flatten(1)
+    pressed = (flat > contact * flat.amax(dim=1, keepdim=True)).float()
+    covered = torch.zeros(len(movie), flat.shape[1]).index_add_(0, owner, pressed).clamp_(max=1)
+    return covered[first] @ covered.T == 0
+
+
+def _overlapping(movie: Movie, first: Tensor, second: Tensor, moment: Tensor) -> tuple[Tensor, Tensor]:
+    """Return when the second gestures begin, (N,), and what frame of theirs is at each time, (N, T).
+
+    Args:
+        movie: the gestures.
+        first, second: (N,), the gestures that overlap.
+        moment: (N,), 0 to 1, of the begins that make them overlap within the window.
+    """
+    window = movie.index.shape[1]
+    onset, duration = (movie.parameters[name].long() for name in ("onset", "duration"))
+    earliest = (onset[first] - duration[second] + 1).clamp(min=0)
+    latest = torch.minimum(onset[first] + duration[first] - 1, window - duration[second])
+    begin = earliest + (moment * (latest - earliest + 1)).long()
+    return begin, (torch.arange(window) - (begin - onset[second])[:, None]) % window

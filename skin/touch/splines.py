@@ -22,10 +22,10 @@ _GAUSS, _WEIGHTS = np.polynomial.legendre.leggauss(4)  # exact for products of t
 _PIECES = 4  # in which a cell is integrated
 
 
-def spline_values(places: np.ndarray, count: int) -> np.ndarray:
-    """Return the splines of ``count`` cells at places (P,), in cells, (P, count)."""
+def spline_values(points: np.ndarray, count: int) -> np.ndarray:
+    """Return the splines of ``count`` cells at points (P,), in cells, (P, count)."""
     middles = np.arange(-REACH, count + REACH) + 0.5
-    return fold_back(torch.from_numpy(np.nan_to_num(_PIECE(places[:, None] - middles)))).numpy()
+    return fold_back(torch.from_numpy(np.nan_to_num(_PIECE(points[:, None] - middles)))).numpy()
 
 
 def sampled(begin: np.ndarray, count: int, samples: int, least: np.ndarray, most: np.ndarray) -> torch.Tensor:
@@ -41,10 +41,10 @@ def sampled(begin: np.ndarray, count: int, samples: int, least: np.ndarray, most
         (F, count * samples, count + 5), float32, divided by ``samples``.
     """
     start, low, high = (torch.from_numpy(ends)[:, None].float() for ends in (begin, least, most))
-    places = start + (torch.arange(count * samples) + 0.5) / samples
-    inside = (places >= low) & (places <= high)
+    points = start + (torch.arange(count * samples) + 0.5) / samples
+    inside = (points >= low) & (points <= high)
     middles = torch.arange(-REACH, count + 1 + REACH) + 0.5
-    away = (places[:, :, None] - middles).abs()
+    away = (points[:, :, None] - middles).abs()
     # The spline at a distance d is ((2 - d)+^3 - 4 (1 - d)+^3) / 6.
     wide, narrow = (2 - away).clamp_(min=0), (1 - away).clamp_(min=0)
     cubes = wide.square().mul_(wide).sub_(narrow.square().mul_(narrow), alpha=4)
@@ -61,7 +61,7 @@ def fold_back(wide: torch.Tensor) -> torch.Tensor:
 
 
 def _points(low: float, high: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return Gauss points and weights between two places, in cells, by pieces of a quarter of a cell."""
+    """Return Gauss points and weights between two points, in cells, by pieces of a quarter of a cell."""
     cuts = np.unique([low, *(np.arange(np.ceil(low * _PIECES), high * _PIECES) / _PIECES), high])
     middle, half = (cuts[1:] + cuts[:-1]) / 2, np.diff(cuts) / 2
     return (middle[:, None] + np.outer(half, _GAUSS)).ravel(), np.outer(half, _WEIGHTS).ravel()
@@ -70,14 +70,14 @@ def _points(low: float, high: float) -> tuple[np.ndarray, np.ndarray]:
 @lru_cache
 def of_cells(count: int) -> np.ndarray:
     """Return the moments (count, count) of 1 Pa on each cell (columns) along one axis."""
-    places, weights = _points(0, count)
-    return (weights[:, None] * spline_values(places, count)).reshape(count, -1, count).sum(1).T
+    points, weights = _points(0, count)
+    return (weights[:, None] * spline_values(points, count)).reshape(count, -1, count).sum(1).T
 
 
 @lru_cache
 def _gram(count: int) -> np.ndarray:
-    places, weights = _points(0, count)
-    splines = spline_values(places, count)
+    points, weights = _points(0, count)
+    splines = spline_values(points, count)
     return splines.T @ (weights[:, None] * splines)
 
 
@@ -87,9 +87,9 @@ def fit_nodes(count: int, nodes: int) -> np.ndarray:
 
     Evenly spaced nodes, ends included, are joined by a cubic spline, which the splines of the cells fit.
     """
-    places, weights = _points(0, count)
-    joined = make_interp_spline(np.linspace(0, count, nodes), np.eye(nodes), k=min(3, nodes - 1))(places)
-    return np.linalg.solve(_gram(count), spline_values(places, count).T @ (weights[:, None] * joined))
+    points, weights = _points(0, count)
+    joined = make_interp_spline(np.linspace(0, count, nodes), np.eye(nodes), k=min(3, nodes - 1))(points)
+    return np.linalg.solve(_gram(count), spline_values(points, count).T @ (weights[:, None] * joined))
 
 
 def footprints(body: AbstractBody, sensors: Sensors) -> np.ndarray:
@@ -102,7 +102,7 @@ def footprints(body: AbstractBody, sensors: Sensors) -> np.ndarray:
         middle, half = sensors.positions[:, axis] / cell, sensors.footprint[axis] / cell / 2
         rows = []
         for low, high in zip(np.maximum(middle - half, 0), np.minimum(middle + half, count), strict=True):
-            places, shares = _points(low, high)
-            rows.append(shares @ spline_values(places, count) / (high - low))
+            points, fractions = _points(low, high)
+            rows.append(fractions @ spline_values(points, count) / (high - low))
         weights.append(np.linalg.solve(_gram(count), np.array(rows).T).T)
     return np.einsum("sh,sw->shw", weights[1], weights[0]).reshape(len(sensors), -1)

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from skin.body.base import Arm, Sheet
+from skin.body.arm import Arm
 from skin.body.layout import Grid
+from skin.body.sheet import Sheet
 from skin.errors import InputError
 from skin.mechanics.simulator.fem import PlatesAndBeams
 from skin.mechanics.simulator.naive import Naive

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from skin.body.base import Sheet
+from skin.body.sheet import Sheet
 from skin.errors import InputError
 from skin.runs.build import build_device
 

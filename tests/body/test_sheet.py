@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from skin.body.base import Sensors, Sheet
+from skin.body.base import Sensors
+from skin.body.sheet import Sheet
 from skin.errors import InputError
 
 LAYERS = [

@@ -88,10 +88,18 @@ def test_a_folder_is_converted_and_trained_on_by_person(run, converted, tmp_path
     assert losses == [(0,)] * (settings is NETWORK)
 
 
-def test_a_folder_without_files_is_refused(run, tmp_path):
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["from=map.yaml", "path=nowhere"], "nowhere has no file */*.csv"),
+        (["reader=skin.device.readers.epi"], "reader=skin.device.readers.epi needs path="),
+        (["reader=os.getcwd", "path=.", "options={a: 1}"], "options has no setting a"),
+    ],
+)
+def test_what_cannot_be_converted_is_refused(run, tmp_path, words, message):
     write(tmp_path, persons=1, touches=3)
-    done = run(tmp_path, "convert", "from=map.yaml", "out=x.csv", "path=nowhere", store=False, code=2)
-    assert "nowhere has no file */*.csv" in done.stderr
+    done = run(tmp_path, "convert", *words, "out=x.csv", store=False, code=2)
+    assert message in done.stderr
     assert not list(tmp_path.glob("x.*"))
 
 

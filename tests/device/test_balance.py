@@ -7,7 +7,7 @@ import pytest
 
 from skin.device.balance import accuracy_from_shape, balance_table, check_label_leakage, class_balance
 from skin.runs.build import build_device
-from skin.touch.gesture import GestureSettings
+from skin.touch.gestures import GestureSettings
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +32,7 @@ def test_the_accuracy_is_the_overlap_of_two_distributions():
 
 def test_the_balance_is_what_the_parameters_say(device):
     recording = device.recording(None, complete=False)
-    report = class_balance(recording, device.sampler.shapes.names)
+    report = class_balance(recording, device.sampler)
     big = recording.touches.labels[:, 0] > 0.5
     yes, known = report["labels"]["big"]["yes"], recording.parameters
     assert yes["touches"] == int(big.sum())
@@ -52,7 +52,7 @@ def telling(device):
     recording = device.recording(None, complete=False)
     big = recording.touches.labels[:, 0]
     known = recording.parameters | {"shape": big * 3}
-    return class_balance(replace(recording, parameters=known), device.sampler.shapes.names)
+    return class_balance(replace(recording, parameters=known), device.sampler)
 
 
 def test_a_shape_that_tells_a_label_is_warned_of(device):
@@ -63,5 +63,5 @@ def test_a_shape_that_tells_a_label_is_warned_of(device):
 
 
 def test_the_default_gestures_pass(device):
-    report = class_balance(device.recording(None, complete=False), device.sampler.shapes.names)
+    report = class_balance(device.recording(None, complete=False), device.sampler)
     check_label_leakage(report, GestureSettings())

@@ -5,8 +5,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from skin.body.base import Sheet
 from skin.body.layout import Grid
+from skin.body.sheet import Sheet
 from skin.core.rng import Stream
 from skin.device.files import describe_recording, read_description, read_recording, write_recording
 from skin.device.simulated import Simulated

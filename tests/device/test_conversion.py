@@ -125,20 +125,6 @@ def test_sdu_is_a_spreadsheet_whose_places_are_groups(tmp_path):
     assert recording.parameters["x"][:3].tolist() == pytest.approx([0, 0.002, 0.004])
 
 
-def test_epi_has_a_touch_in_each_row(tmp_path):
-    values = np.arange(11 * 1200).reshape(11, 12, 100)
-    lines = "\n".join(",".join(map(str, row.ravel())) for row in values)
-    (tmp_path / "training_data_x.csv").write_text(lines)
-    (tmp_path / "training_data_y.csv").write_text("\n".join(map(str, range(10, -1, -1))))
-    recording = convert_files(read_format("epi"), tmp_path)
-    assert torch.allclose(recording.touches.readings[3], torch.tensor(0.1 * values[3].T).float())
-    assert recording.task.names == ("big", "dynamic", "press")
-    assert recording.touches.labels[[10, 3]].tolist() == [[1, 0, 1], [1, 0, 0]]  # hold and slap
-    assert recording.touches.labels[7].isnan().tolist() == [False, True, True]  # pick
-    assert recording.metadata["classes"][:2] == ["hold", "rub"]
-    assert recording.parameters["class"].tolist() == list(range(10, -1, -1))
-
-
 def test_a_folder_has_contacts_and_persons(tmp_path):
     for person in ("anna", "ben"):
         (tmp_path / person).mkdir()
@@ -158,49 +144,6 @@ def test_a_folder_has_contacts_and_persons(tmp_path):
     assert recording.metadata["groups"] == {"person": ["anna", "ben"]}
 
 
-def test_a_second_file_is_joined_by_time(tmp_path):
-    """As a velostat sensor at 143 Hz and a gauge at 333 Hz, both separated by blanks."""
-    sensor = "\n".join(f"{n}   {1.7e9 + 0.007 * n:.6f}" for n in range(10))
-    gauge = "\n".join(f"{100 * n} {1.7e9 + 0.003 * n:.6f}" for n in range(12))
-    blanks = {"header": False, "delimiter": "whitespace"}
-    settings = {
-        "files": "velostat.csv",
-        "table": blanks,
-        "join": {
-            "file": "gauge.csv",
-            "by": "time",
-            "clock": "clock",
-            "tolerance": 0.002,
-            "table": blanks | {"names": ["gauge", "clock"]},
-        },
-        "time": {"column": 2, "unit": "s"},
-        "channels": {"columns": [1], "unit": "adc", "scale": 0.5},
-        "segments": {"by": "row", "frames": 1, "before": 0},
-        "targets": {"force": {"column": "gauge", "unit": "mN"}},
-    }
-    recording = convert(tmp_path, settings, **{"velostat.csv": sensor, "gauge.csv": gauge})
-    assert recording.touches.readings.flatten().tolist() == [0.5 * n for n in range(10)]
-    near = [round(7 * n / 3) for n in range(5)]  # the gauge ends at 33 ms, within 2 ms of row 5
-    assert recording.parameters["force"][:5].tolist() == pytest.approx([0.1 * n for n in near])
-    assert recording.parameters["force"][6:].isnan().all()
-
-
-def test_rows_of_a_mat_are_one_frame(tmp_path):
-    frames = np.arange(3 * 4 * 5).reshape(3, 4, 5)
-    text = "\n".join(";".join(f"{value:03d},5" for value in row) for frame in frames for row in frame)
-    settings = {
-        "files": "mat.txt",
-        "table": {"header": False, "delimiter": ";", "decimal": ",", "lines": 4},
-        "rate": 25.0,
-        "channels": {"columns": "*", "unit": "counts", "scale": 1.0},
-        "segments": {"by": "windows", "frames": 2, "step": 1},
-    }
-    recording = convert(tmp_path, settings, **{"mat.txt": text})
-    assert recording.touches.readings.shape == (2, 2, 20)
-    assert torch.equal(recording.touches.readings[1, 0], torch.tensor(frames[1].ravel() + 0.5).float())
-    assert recording.touches.rate == 25
-
-
 @pytest.mark.parametrize(
     ("baseline", "first"),
     [
@@ -215,15 +158,6 @@ def test_a_baseline_is_subtracted(tmp_path, baseline, first):
     channels = {"columns": ["s0"], "unit": "N"}
     recording = convert(tmp_path, plain(baseline=baseline, channels=channels), **{"a.csv": text})
     assert recording.touches.readings.flatten().tolist() == pytest.approx(first)
-
-
-@pytest.mark.parametrize(("combine", "value"), [("normal", [12, 3]), ("magnitude", [13, 5])])
-def test_three_axes_become_one_reading(tmp_path, combine, value):
-    text = "t,a,b,c,d,e,f\n0,3,4,12,0,4,3\n100,3,4,12,0,4,3\n"
-    channels = {"columns": list("abcdef"), "unit": "N", "per_sensor": 3, "combine": combine}
-    recording = convert(tmp_path, plain(channels=channels), **{"a.csv": text})
-    assert recording.touches.readings[0, 0].tolist() == value
-    assert recording.touches.positions.shape == (2, 3)
 
 
 def test_a_missing_value_is_invalid(tmp_path):
@@ -259,29 +193,34 @@ PRESS = {"press": {"column": "label", "values": {"press": 1, "none": 0}}}
         ({"channels": {"columns": ["s0"]}}, "channels needs unit, got columns"),
         ({"channels": {"columns": ["s0"], "unit": "V"}}, "unit=V is no force .*: add channels.scale"),
         ({"channels": {"columns": ["label"], "unit": "N"}}, "column label has 'none' in row 1, no number"),
-        ({"channels": {"columns": ["s0"], "unit": "N", "per_sensor": 3}}, "1 columns of channels are not"),
+        ({"channels": {"columns": ["s0"], "unit": "N", "per_sensor": 3}}, "1 channels, not sensors with 3"),
         ({"time": {"column": "clock", "unit": "s"}}, "has no column clock, which time names: it has t, s0"),
-        ({"time": {"column": "t", "unit": "hours"}}, "time.unit=hours must be 's', 'ms', 'us' or 'min'"),
+        ({"time": {"column": "t", "unit": "hours"}}, "time.unit=hours must be 's', 'ms', 'us', 'ns'"),
         ({"time": None}, "add time, as in time: .* or rate, Hz"),
         (
             {"targets": {"force": {"column": "s0", "unit": "mm"}}},
             "targets.force with unit mm: its units are N",
         ),
         ({"targets": {"weight": {"column": "s0", "unit": "N"}}}, "targets.weight .* there are x, y, force"),
-        ({"labels": PRESS}, "label press contradicts itself in rows 1 to 4, with none and press"),
+        ({"labels": PRESS}, "rows 1 to 4: label press contradicts itself, with none and press"),
         ({"labels": {"press": {"column": "label", "values": {"tap": 1}}}}, "press is unknown in all touches"),
         ({"labels": {"press": {"column": "label"}}}, "labels.press needs column and values"),
         ({"labels": {"press": {"column": "label", "values": {"press": 2}}}}, "values must be 0 or 1"),
         ({"classes": {"column": "person"}}, "fewer than two of the classes anna"),
         ({"groups": ["session"]}, "has no column session, which groups names"),
-        ({"groups": ["label"]}, "each touch needs one group, got none and press"),
+        ({"groups": ["label"]}, "each touch needs one label, got none and press"),
+        ({"reader": "os.system"}, "map.yaml has no setting reader"),
+        ({"table": {"begin": "^time"}}, "has no line with table.begin: \\^time"),
+        ({"table": {"begin": "("}}, "table.begin is no regular expression"),
+        ({"rate": 50000.0}, r"rows are 0.1 s apart \(10 Hz\), rate is 50000 Hz: is the time in us\?"),
+        ({"time": {"column": "person", "unit": "s"}}, "'anna' in row 1, no time: give time.format, as in"),
         ({"fields": "(?P<a"}, "fields is no regular expression"),
         ({"fields": "(?P<person>[0-9]+)"}, "a.csv does not fit the regular expression"),
         ({"join": {"file": "none.csv"}}, "cannot read .*none.csv: .*No such file"),
         ({"join": {"file": "a.csv"}}, "both have a column t: give join.table.names"),
         ({"segments": {"by": "contact", "threshold": 100.0}}, "has no touch: lower segments.threshold"),
         ({"segments": {"by": "press"}}, "segments.by=press must be 'row', 'file'"),
-        ({"positions": [[0, 0]], "size": [0.1, 0.1]}, "2 readings of 1 per sensor, positions are 1"),
+        ({"positions": [[0, 0]], "size": [0.1, 0.1]}, "readings of 2 sensors, positions are 1"),
         ({"colour": "red"}, "map.yaml has no setting colour"),
     ],
 )
@@ -298,6 +237,7 @@ def test_a_wrong_mapping_is_one_sentence(tmp_path, changes, message):
         ("t,s0,s1\n0,1,1\n200,1,1\n100,1,1\n", "time goes backwards at row 3, from 0.200000 to 0.100000 s"),
         ("t,s0,s1\n0,1,1\n0,1,1\n", "its times do not differ"),
         ("t,s0,s1\n", "has no rows"),
+        ("t,s0,s1\nms,N,N\n0,1,1\n", "column t has 'ms' in row 1, no number: .* correct .* table.units"),
         ("", "cannot read .*No columns"),
         ("t,s0,s1\n0,1\n0,1,2,3,4\n", "cannot read .*line 3"),
         ("t,s0,s0 \n0,1,1\n", "several columns are called s0"),
@@ -335,3 +275,85 @@ def test_real_recordings_are_converted(name, folder, shape, known):
     assert recording.touches.readings.shape == shape
     assert int((~recording.touches.labels[:, 0].isnan()).sum()) == known
     assert recording.touches.valid.all()
+
+
+ROWS = [(100 * n, n, 10 * n) for n in range(4)]
+
+
+def lines(*rows: str, first: str = "t,s0,s1", name: str = "{},{},{}") -> str:
+    return "\n".join([*rows, first, *(name.format(*row) for row in ROWS)])
+
+
+@pytest.mark.parametrize(
+    ("changes", "files"),
+    [
+        ({}, {"a.csv": lines().encode("utf-16")}),
+        ({"table": {"begin": "^t,"}}, {"a.csv": lines("maker: X", "t0; 1, 2, 3", "")}),
+        ({"table": {"units": True}}, {"a.csv": lines(first="t,s0,s1\nms,g,g")}),
+        ({"time": {"column": "t"}}, {"a.csv": lines(name="2025-11-28T06:00:00.{:03d}+01:00,{},{}")}),
+        (
+            {"time": {"column": "t", "format": "%d.%m.%Y %H:%M:%S.%f %z"}},
+            {"a.csv": lines(name="28.11.2025 06:00:00.{:03d} +0100,{},{}")},
+        ),
+        ({"time": {"column": "t", "unit": "ns"}}, {"a.csv": lines(name="17643{:03d}000000,{},{}")}),
+        ({"files": "*.jsonl"}, {"a.jsonl": "\n".join(f'{{"t": {t}, "s": [{a}, {b}]}}' for t, a, b in ROWS)}),
+        (
+            {"table": {"long": ["sensor", "force"]}},
+            {"a.csv": "t,sensor,force\n" + "".join(f"{t},s1,{b}\n{t},s0,{a}\n" for t, a, b in ROWS)},
+        ),
+    ],
+    ids=["utf-16", "header lines", "row of units", "date times", "local format", "ns", "JSON lines", "long"],
+)
+def test_the_same_readings_are_read_from_every_plain_file(tmp_path, changes, files):
+    for name, text in files.items():
+        (tmp_path / name).write_bytes(text.encode() if isinstance(text, str) else text)
+    (tmp_path / "map.yaml").write_text(yaml.safe_dump(plain(**changes)))
+    touches = convert_files(read_format(str(tmp_path / "map.yaml")), tmp_path).touches
+    expected = 9.80665e-3 * np.array([[a, b] for _, a, b in ROWS])
+    assert np.allclose(touches.readings[0], expected)
+    assert touches.rate == pytest.approx(10)
+
+
+@pytest.mark.parametrize(
+    ("names", "classes"),
+    [(["press", "tap"], ["press", "tap"]), ({"press": True, "tap": False}, ["on", "off"])],
+)
+def test_classes_are_a_list_or_switches(tmp_path, names, classes):
+    mapping = yaml.safe_dump(plain(classes={"column": "label", "names": names}))
+    (tmp_path / "map.yaml").write_text("\ufeff" + mapping.replace("true", "on").replace("false", "off"))
+    for number, label in enumerate(("press", "tap", "pat")):
+        (tmp_path / f"{number}.csv").write_text(TABLE.replace("none", label).replace("press", label))
+    recording = convert_files(read_format(str(tmp_path / "map.yaml")), tmp_path)
+    assert list(recording.task.names) == classes
+    assert recording.touches.labels.nan_to_num(-1).tolist() == [[1, 0], [0, 1], [-1, -1]]
+
+
+@pytest.mark.parametrize("text", ["on", "True", "yes"])
+def test_switches_are_labels(tmp_path, text):
+    settings = plain(labels={"press": {"column": "label", "values": {True: 1, False: 0}}})
+    recording = convert(tmp_path, settings, **{"a.csv": TABLE.replace("none", text).replace("press", text)})
+    assert recording.touches.labels.tolist() == [[1]]
+
+
+@pytest.mark.parametrize(
+    ("unit", "meant"), [("s", "ns"), ("ms", "ns"), ("us", "ns")], ids=["as s", "as ms", "as us"]
+)
+def test_a_time_in_another_unit_is_refused(tmp_path, unit, meant):
+    text = lines(name="17643{:03d}000000,{},{}")
+    settings = plain(time={"column": "t", "unit": unit}, rate=10.0)
+    with pytest.raises(InputError, match=f"is the time in {meant}\\? Give time.unit: {meant}"):
+        convert(tmp_path, settings, **{"a.csv": text})
+
+
+@pytest.mark.parametrize("gaps", [True, False], ids=["at the peaks", "anywhere"])
+def test_presses_over_the_range_do_not_vanish(tmp_path, gaps):
+    """Three presses of which the sensor shows OL beyond 8, against three gaps at rest."""
+    values = np.maximum(0, 10 * np.sin(np.arange(120) / 6)).round(1)
+    texts = np.where(values > 8, "OL", values) if gaps else np.where(np.arange(120) % 37 == 30, "OL", values)
+    text = "t,s0,s1\n" + "".join(f"{100 * n},{value},1\n" for n, value in enumerate(texts))
+    settings = plain(table={"missing": ["OL"]}, segments={"by": "file", "frames": 120})
+    if not gaps:
+        assert not convert(tmp_path, settings, **{"a.csv": text}).touches.valid.all()
+        return
+    with pytest.raises(InputError, match=r"column s0 has no value .* a press over the range"):
+        convert(tmp_path, settings, **{"a.csv": text})

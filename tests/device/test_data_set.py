@@ -8,8 +8,8 @@ import pyarrow.parquet as pq
 import pytest
 import torch
 
-from skin.body.base import Sheet
 from skin.body.layout import Scattered
+from skin.body.sheet import Sheet
 from skin.device.files import DataSet, Manifest, describe_recording, write_recording
 from skin.device.simulated import Simulated
 from skin.device.touches import concatenate

@@ -5,8 +5,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from skin.body.base import Sheet
 from skin.body.layout import Grid, Scattered
+from skin.body.sheet import Sheet
 from skin.device.files import Manifest, describe_recording, read_recording, write_recording
 from skin.device.recording import Recorded
 from skin.device.simulated import Simulated

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from skin.body.base import GEOMETRY, Sheet
+from skin.body.base import GEOMETRY
 from skin.body.layout import Grid, Scattered
+from skin.body.sheet import Sheet
 from skin.core.rng import Stream, generator
 from skin.device.imperfection import ImperfectionSettings
 from skin.device.simulated import Simulated

@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 from omegaconf import OmegaConf
 
-from skin.body.base import Arm, Layer, Sheet
+from skin.body.arm import Arm
+from skin.body.base import Layer
 from skin.body.layout import Grid
 from skin.body.material import Material
+from skin.body.sheet import Sheet
 from skin.core.files import CONF
 from skin.core.rng import Stream, generator
 from skin.device.skins import SkinDistribution

@@ -152,7 +152,6 @@ def test_a_run_stays_open_until_its_results_are_logged(config, monkeypatch):
         (("simulator=naive",), "naive"),
         (("device=recording",), "recording"),
         (("device=serial",), "serial"),
-        (("device=cost",), "cost"),
     ],
 )
 def test_a_run_is_found_by_its_simulator_or_else_its_device(configured, words, name):

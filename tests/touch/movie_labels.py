@@ -3,8 +3,8 @@
 import torch
 from torch import Tensor
 
-from skin.touch.labels import Thresholds
-from skin.touch.movie import measure_gestures
+from skin.touch.labels import Thresholds, report_labels
+from skin.touch.movie import Movie, measure_gestures
 
 
 def movie_labels(
@@ -28,4 +28,6 @@ def movie_labels(
     index = torch.arange(batch * time, device=pressure.device).view(batch, time)
     scale = torch.ones(batch, time).to(pressure)
     measures = measure_gestures(pressure.flatten(0, 1), index, scale, footprints, cell, thresholds.contact)
-    return measures.labels(thresholds, rate)
+    movie = Movie(pressure, index, scale, torch.empty(0), measures._asdict())
+    labels = report_labels(thresholds, rate).values()
+    return torch.stack([label.measure(movie, None) > label.above for label in labels], dim=1).float()

@@ -8,14 +8,13 @@ from sklearn.ensemble import HistGradientBoostingClassifier
 from sklearn.metrics import balanced_accuracy_score
 from sklearn.model_selection import cross_val_predict
 
-from skin.body.base import Sheet
 from skin.body.layout import Grid
+from skin.body.sheet import Sheet
 from skin.device.balance import accuracy_from_shape, check_label_leakage
 from skin.errors import InputError
 from skin.mechanics.contact.prescribed import Prescribed
-from skin.touch.gesture import GestureSettings
-from skin.touch.sampler import TouchSampler
-from skin.touch.shapes import Fit, Shapes, draw_bodies
+from skin.touch.gestures import Fit, GestureSettings, TouchSampler, draw_bodies
+from skin.touch.shapes import Shapes
 
 LAYER = [{"material": "EcoFlex 00-30", "thickness": 0.005}]
 DEFAULT = Sheet((0.16, 0.16), (32, 32), LAYER)

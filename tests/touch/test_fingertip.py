@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from skin.body.base import Sheet
+from skin.body.sheet import Sheet
 from skin.mechanics.geometry import Fingertip
 
 SHEET = Sheet([0.12, 0.08], [24, 16], [{"material": "EcoFlex 00-30", "thickness": 0.01}])

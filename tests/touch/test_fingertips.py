@@ -4,12 +4,13 @@ import numpy as np
 import pytest
 import torch
 
-from skin.body.base import Arm, Sheet
+from skin.body.arm import Arm
 from skin.body.layout import Grid
+from skin.body.sheet import Sheet
 from skin.errors import InputError
 from skin.mechanics.contact.prescribed import Prescribed
 from skin.touch.fingertips import FingertipSampler, FingertipSettings, read_touch
-from skin.touch.gesture import GestureSettings
+from skin.touch.gestures import GestureSettings
 from skin.touch.labels import Thresholds
 from skin.touch.movie import join_movies
 from tests.touch.movie_labels import movie_labels
@@ -175,7 +176,7 @@ def test_what_cannot_be_is_refused_in_a_sentence(settings, message):
 def test_rigid_fingertips_are_refused():
     rigid = type("Rigid", (), {"proportional": False})()
     with pytest.raises(InputError, match="contact=prescribed, or touch=gestures"):
-        FingertipSampler(BODIES["sheet"], np.zeros((1, 4096)), rigid, FingertipSettings())
+        FingertipSettings().sampler(BODIES["sheet"], np.zeros((1, 4096)), rigid, True, None)
 
 
 @pytest.mark.parametrize("settings", [None, {}, {"window": 2.0}, {"shapes": ["disc"]}, GestureSettings()])

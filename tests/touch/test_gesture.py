@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 from omegaconf import OmegaConf
 
-from skin.body.base import Sheet
+from skin.body.sheet import Sheet
 from skin.errors import InputError
 from skin.touch.fingertips import FingertipSettings, read_touch
-from skin.touch.gesture import GestureSettings, draw_gestures, draw_paths, fold, heading, model_window
+from skin.touch.gestures import GestureSettings, draw_bodies, draw_paths
 from skin.touch.labels import Thresholds
+from skin.touch.paths import draw_times, fold, heading, model_window
 from skin.touch.shapes import Shapes
 
 CONF = Path(__file__).parents[2] / "conf" / "touch"
@@ -23,7 +24,7 @@ def test_the_shipped_configuration_is_the_default_difficulty(kind):
     name = {GestureSettings: "gestures", FingertipSettings: "fingertips"}[kind]
     settings = OmegaConf.to_container(OmegaConf.load(CONF / f"{name}.yaml"))
     assert read_touch(settings) == kind()
-    assert set(settings) == {entry.name for entry in fields(kind)}
+    assert set(settings) == {entry.name for entry in fields(kind)} - {"labels"}  # none are shipped
 
 
 def test_every_kind_of_touches_is_tested_above():
@@ -144,7 +145,8 @@ def drawn():
     shapes = Shapes(settings.shapes, BODY)
     generator = np.random.default_rng(0)
     labels = generator.random((4000, 4)) < 0.5
-    gestures = draw_gestures(labels, settings, shapes, True, generator)
+    gestures = draw_bodies(labels[:, 0], settings, shapes, generator)
+    gestures |= draw_times(labels, settings, True, generator)
     paths = draw_paths(labels, gestures, settings, BODY.size, generator.random((4000, 5)))
     return labels, gestures, paths
 

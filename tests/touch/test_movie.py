@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 import torch
 
-from skin.body.base import Sheet
 from skin.body.layout import Grid
+from skin.body.sheet import Sheet
 from skin.core.rng import Stream, generator
 from skin.device.touches import draw_timeline
 from skin.mechanics.contact.prescribed import Prescribed
-from skin.touch.sampler import TouchSampler
+from skin.touch.gestures import TouchSampler
 
 BODY = Sheet([0.16, 0.16], [32, 32], [{"material": "EcoFlex 00-30", "thickness": 0.005}])
 SENSORS = Grid(5, 5).sensors(BODY)

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 import torch
 
-from skin.body.base import Sheet
 from skin.body.layout import Scattered
+from skin.body.sheet import Sheet
 from skin.errors import InputError
 from skin.mechanics.contact.prescribed import Prescribed
-from skin.touch.pairs import add_second
-from skin.touch.sampler import TouchSampler
+from skin.touch.gestures import TouchSampler
+from skin.touch.movie import add_second
 
 BODY = Sheet([0.16, 0.16], [16, 16], [{"material": "EcoFlex 00-30", "thickness": 0.005}])
 WEIGHTS = BODY.footprints(Scattered(4, 4, seed=0).sensors(BODY))

@@ -6,12 +6,13 @@ import torch
 from sklearn.ensemble import HistGradientBoostingClassifier
 from sklearn.model_selection import cross_val_score
 
-from skin.body.base import Sheet
 from skin.body.layout import Scattered
+from skin.body.sheet import Sheet
 from skin.errors import InputError
 from skin.mechanics.contact.prescribed import Prescribed
+from skin.touch.gestures import TouchSampler
 from skin.touch.movie import join_movies
-from skin.touch.sampler import TouchSampler, balanced
+from skin.touch.sampler import balanced
 
 LAYER = [{"material": "EcoFlex 00-30", "thickness": 0.005}]
 SHEETS = {

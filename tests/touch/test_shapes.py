@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from skin.body.base import Sheet
+from skin.body.sheet import Sheet
 from skin.touch.shapes import Shapes
 
 LAYER = [{"material": "EcoFlex 00-30", "thickness": 0.005}]

@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 import torch
 
-from skin.body.base import Sheet
 from skin.body.layout import Scattered
+from skin.body.sheet import Sheet
 from skin.device.files import read_recording, write_recording
 from skin.device.simulated import Simulated
 from skin.device.touches import Timeline
 from skin.errors import InputError
 from skin.mechanics.simulator.naive import Naive
-from skin.touch.gesture import GestureSettings
+from skin.touch.gestures import GestureSettings
 from skin.touch.labels import TOUCH_OR_NOT
 from tests.touch.movie_labels import movie_labels
 

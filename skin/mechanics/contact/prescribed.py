@@ -7,7 +7,7 @@ import torch
 
 from skin.body.base import AbstractBody
 from skin.mechanics.simulator.base import AbstractSimulator
-from skin.touch.gesture import Trajectories
+from skin.touch.paths import Trajectories
 from skin.touch.sampler import AbstractContact, ContactProblem, ContactResult
 
 

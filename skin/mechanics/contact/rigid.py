@@ -13,8 +13,8 @@ from torch import Tensor
 from skin.body.base import AbstractBody
 from skin.core.settings import checked
 from skin.mechanics.simulator.base import AbstractSimulator
-from skin.touch.gesture import Trajectories
 from skin.touch.movie import measure_gestures
+from skin.touch.paths import Trajectories
 from skin.touch.sampler import AbstractContact, ContactProblem, ContactResult
 
 # Contact of rigid objects with an elastic surface, in batches, by projected conjugate gradients.
@@ -370,8 +370,8 @@ def _classes(pressure: torch.Tensor, problem: ContactProblem) -> tuple[np.ndarra
     frames = pressure.float().view(-1, *body.shape)
     index, once = torch.arange(len(frames))[:, None], torch.ones(len(frames), 1)
     measures = measure_gestures(frames, index, once, problem.footprints, body.cell, thresholds.contact)
-    labels = measures.labels(thresholds, problem.settings.rate)[:, [0, 3]].bool()
-    return frames.flatten(1).amax(1).double().numpy(), labels.numpy()
+    held = measures.area > thresholds.area, measures.pressure > thresholds.pressure
+    return frames.flatten(1).amax(1).double().numpy(), torch.stack(held, dim=1).numpy()
 
 
 def _halfway(target: np.ndarray, end: np.ndarray) -> np.ndarray:
@@ -451,7 +451,8 @@ class Rigid(AbstractContact):
         totals = torch.from_numpy(force[trajectories.owner[solved]] * trajectories.share[solved] / cell)
         # A static touch starts from its solution at the largest force.
         stands = (
-            trajectories.place[solved] == trajectories.place[reference][trajectories.owner[solved]]
+            trajectories.poses.place[solved]
+            == trajectories.poses.place[reference][trajectories.owner[solved]]
         ).all(axis=1)
         start = forces.pressure[owner] * torch.from_numpy(stands)[:, None]
         states = solve_contact(self.compliance, gap[rows], totals, start, self.tolerance, self.iterations)

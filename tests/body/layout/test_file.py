@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skin.body.base import Sheet
 from skin.body.layout import File, Grid
+from skin.body.sheet import Sheet
 from skin.errors import InputError
 from tests.damage import DAMAGED_FILES, damaged, opened
 
@@ -36,6 +36,21 @@ def test_order_depth_and_other_columns(sensors):
     """The rows keep their order; columns may come in any, with spaces, a byte order mark, blank lines."""
     read = sensors("\ufeffname, depth_m, y_m, x_m\nb, 0, 0.02, 0.15\n\na, 0.005, 0.01, 0.03\n")
     np.testing.assert_allclose(read.positions, [[0.15, 0.02, 0], [0.03, 0.01, 0.005]])
+
+
+def test_numbers_order_the_rows(sensors):
+    read = sensors("sensor,x_m,y_m\n3,0.15,0.02\n1,0.03,0.01\n2,0.1,0.05\n")
+    np.testing.assert_array_equal(read.positions[:, 0], [0.03, 0.1, 0.15])
+
+
+def test_a_file_of_utf_16_is_read(sensors):
+    assert len(sensors("x_m,y_m\n0.1,0.1\n".encode("utf-16"))) == 1
+
+
+def test_footprints_that_overlap_are_named(sensors):
+    with pytest.warns(UserWarning, match=r"sensors 2 and 3 overlap: .* layout.footprint=\[0.01, 0.01\] m"):
+        sensors("x_m,y_m\n0.05,0.1\n0.1,0.1\n0.109,0.105\n")
+    sensors("x_m,y_m\n0.1,0.1\n0.11,0.1\n")  # side by side
 
 
 def test_depth_defaults_to_the_interface_under_the_top_layer(sensors):
@@ -85,15 +100,23 @@ def test_a_relative_path_is_looked_for_here_first(tmp_path, monkeypatch):
         ("x_m,y_m,depth_m\n0.1,0.1,\n", "line 2: depth_m must be a number in m, got ''"),
         ("x_m,y_m\n0.1,0.1\n80,40\n", "1 of 2 sensors lie outside.*sensor 2 at x = 80 m.*in metres"),
         ("x_m,y_m,depth_m\n0.1,0.1,0.02\n", "outside the body.*depth = 0.02 m"),
-        ("x_m,y_m\n0.1,0.1\n0.05,0.1\n0.1,0.1\n", "sensors 1 and 3 are at one place, x = 0.1 m, y = 0.1 m"),
-        ("x_m,y_m,depth_m\n0.1,0.1,0\n0.1,0.1,0.005\n", "sensors 1 and 2 are at one place"),
+        (
+            "x_m,y_m\n0.1,0.1\n0.05,0.1\n0.1,0.1\n",
+            "sensors 1 and 3 are at one position, x = 0.1 m, y = 0.1 m",
+        ),
+        ("x_m,y_m,depth_m\n0.1,0.1,0\n0.1,0.1,0.005\n", "sensors 1 and 2 are at one position"),
         (
             "x_m,y_m,normal_x,normal_z\n0.1,0.1,0,1\n",
             "no column normal_y, found x_m, y_m, normal_x, normal_z",
         ),
-        (FACING + "0.1,0.1,0,0,1\n0.1,0.05,0,0,0\n", "line 3: a normal of length 0 faces nowhere"),
+        (FACING + "0.1,0.1,0,0,1\n0.1,0.05,0,0,0\n", "line 3: a normal of length 0 has no direction"),
         (FACING + "0.1,0.1,0,up,1\n", "line 2: normal_y must be a number, got 'up'"),
         (b"x_m,y_m\n\xff\xfe,0.1\n", "cannot read the layout"),
+        ("x_m,y_m\n40,13\n120,80\n", "2 of 2 sensors lie outside .*: in mm\\? positions are in metres"),
+        ("x_m,y_m\n0.04,0.013\n0.3,0.08\n", "m thick: positions are in metres"),
+        ("sensor,x_m,y_m\n1,0.1,0.1\n1,0.05,0.1\n", "the column sensor must number the sensors, each once"),
+        ("sensor,x_m,y_m\n1,0.1,0.1\n3,0.05,0.1\n", "each once and without a gap"),
+        ("sensor,x_m,y_m\nleft,0.1,0.1\n", "line 2: sensor must be a number, got 'left'"),
     ],
 )
 def test_what_is_no_layout_is_refused_by_name(sensors, text, says):
@@ -135,9 +158,9 @@ def test_more_sensors_than_any_skin_has_are_refused_before_they_take_memory(sens
         sensors(f"x_m,y_m\n{rows}")
     with pytest.raises(InputError, match="it has more than 4194304 bytes"):
         sensors("x_m,y_m\n" + "0.1,0.1\n" * 600_000)
-    assert (
-        len(sensors("x_m,y_m\n" + "".join(f"{0.00001 * number},0.1\n" for number in range(10_000)))) == 10_000
-    )
+    rows = "".join(f"{0.00001 * number},0.1\n" for number in range(10_000))
+    with pytest.warns(UserWarning, match="overlap"):
+        assert len(sensors("x_m,y_m\n" + rows)) == 10_000
 
 
 @pytest.mark.parametrize("number", ["1e300", "1e999", "nan", "-1e10"])

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from skin.body.base import Sheet
 from skin.body.layout import Hexagonal
+from skin.body.sheet import Sheet
 from skin.errors import InputError
 
 LAYERS = [{"material": "EcoFlex 00-30", "thickness": 0.005}]

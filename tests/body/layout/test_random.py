@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from skin.body.base import Sheet
 from skin.body.layout import Random
+from skin.body.sheet import Sheet
 from skin.errors import InputError
 
 BODY = Sheet([0.16, 0.08], [32, 16], [{"material": "EcoFlex 00-30", "thickness": 0.005}])

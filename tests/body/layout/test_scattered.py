@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from skin.body.base import Sheet
 from skin.body.layout import File, Grid, Scattered
+from skin.body.sheet import Sheet
 from skin.errors import InputError
 
 LAYERS = [

@@ -14,9 +14,10 @@ from skin.mechanics.contact.prescribed import Prescribed
 from skin.mechanics.contact.rigid import Rigid
 from skin.mechanics.simulator.base import AbstractSimulator, Response
 from skin.mechanics.simulator.naive import Naive
-from skin.touch.gesture import GestureSettings, Trajectories
-from skin.touch.sampler import ContactProblem, TouchSampler
-from skin.touch.shapes import Shapes
+from skin.touch.gestures import GestureSettings, TouchSampler
+from skin.touch.paths import Trajectories
+from skin.touch.sampler import ContactProblem
+from skin.touch.shapes import Pose, Shapes
 from tests.touch.movie_labels import movie_labels
 
 from .halfspace import love
@@ -61,10 +62,13 @@ def still(
     count = len(shares)
     return Trajectories(
         np.zeros(count, int),
-        np.zeros(count, int),
-        np.zeros(count),
-        np.full(count, scale),
-        np.tile(place, (count, 1)),
+        Pose(
+            np.zeros(count, int),
+            np.zeros(count),
+            np.full(count, scale),
+            np.tile(place, (count, 1)),
+            np.ones(count),
+        ),
         np.array(shares),
         torch.arange(count)[None],
         torch.tensor([shares]),
@@ -146,9 +150,7 @@ def test_white_touches_first_and_the_outline_is_an_arc():
     contact = rigid(relief=0.01, fillet=0.0)
     shapes = problem(shapes=["blurred_disc"])
     gap = contact.gap(still(0.06), shapes)[0]
-    grey = shapes.shapes.solids(
-        *(getattr(still(0.06), name) for name in ("shape", "angle", "scale", "place"))
-    )
+    grey = shapes.shapes.solids(*still(0.06).poses[:4])
     inside = grey.inside[0].flatten()
     expected = 0.01 * (1 - grey.grey[0].flatten()[inside])
     torch.testing.assert_close(gap[inside], expected - expected.min())
@@ -270,7 +272,7 @@ def test_prescribed_gestures_have_pictures_for_pressure():
     where = problem(shapes=["hand"])
     trajectories = still(0.06, peak=40e3)
     pressed = Prescribed().press(trajectories, where)
-    poses = (getattr(trajectories, name) for name in ("shape", "angle", "scale", "place"))
+    poses = trajectories.poses[:4]
     picture = where.shapes.render(*poses)
     torch.testing.assert_close(pressed.frames / pressed.frames.sum(), picture / picture.sum())
     assert pressed.frames.max().item() == pytest.approx(40e3)

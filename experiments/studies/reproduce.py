@@ -12,8 +12,8 @@ import pandas as pd
 from omegaconf import OmegaConf
 
 from experiments.studies.comparison import conclude
+from experiments.studies.pages import comparison_text
 from experiments.studies.study import Statement, Study, configured_study, trained_settings
-from experiments.studies.study_page import comparison_text
 from skin.core.files import CONF, ROOT, write
 from skin.core.settings import configured
 

@@ -2,8 +2,7 @@
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -353,9 +352,9 @@ def test_hertz(law: Law) -> None:
     peak = 1.5 * force / (np.pi * _HALF**2)
     lines = []
     for count in (4, 6, 8) if law.full else (4,):
-        ground = _ground(count)
-        square = (ground.middles[:, None] ** 2 + ground.middles**2).ravel()
-        pressure, approach = ground.press(square / (2 * sphere), force / 4)
+        middles, _ = _ground(count)
+        square = (middles[:, None] ** 2 + middles**2).ravel()
+        pressure, approach = _press(count, square / (2 * sphere), force / 4)
         radius = float(np.sqrt(2.5 * (pressure @ square) / pressure.sum()))  # Hertz: <r^2> = 2 a^2 / 5
         law.findings.clear()  # the finest mesh counts
         law.compare(f"contact radius, m, {count} cells long", radius, _HALF, 0.05)
@@ -380,14 +379,13 @@ def test_punch(law: Law) -> None:
     Reference: capacitance of a square plate (Read, 1997); Johnson, section 3.4.
     """
     for count in (4, 6, 8) if law.full else (4,):
-        ground = _ground(count)
-        on = ground.middles < _HALF
-        square = np.outer(on, on).ravel()
-        circle = (ground.middles[:, None] ** 2 + ground.middles**2).ravel() < _HALF**2
+        middles, _ = _ground(count)
+        square = np.outer(middles < _HALF, middles < _HALF).ravel()
+        circle = (middles[:, None] ** 2 + middles**2).ravel() < _HALF**2
         radius = (
             float(np.sqrt(4 * circle.sum() / np.pi)) * _HALF / count
         )  # of the circle as large as its cells
-        flat, round_ = (ground.press(np.where(under, 0.0, np.inf), 0.25)[1] for under in (square, circle))
+        flat, round_ = (_press(count, np.where(under, 0.0, np.inf), 0.25)[1] for under in (square, circle))
         law.findings.clear()  # the finest mesh counts
         exact = SQUARE_PUNCH * _STAR * 2 * _HALF * flat
         law.compare(f"force at its approach, N, square, {2 * count} cells a side", 1, exact, 0.05)
@@ -401,50 +399,34 @@ def _mesh_errors(count: int, law: Law) -> str:
     return f"with {count} cells over 10 mm: {', '.join(errors)}"
 
 
-@dataclass(frozen=True)
-class _Ground:
-    """A quarter of a thick block and the compliance of its finely cut middle.
+@cache  # sphere and punches share their blocks
+def _ground(count: int) -> tuple[np.ndarray, torch.Tensor]:
+    """Return the middles of cells along x and along y, m, and their compliance (contact=rigid), m/Pa.
 
-    Attributes:
+    They are the finely cut middle of a quarter of a thick block.
+
+    Args:
         count: cells per half side of the square, or per contact radius.
     """
-
-    count: int
-
-    @property
-    def middles(self) -> np.ndarray:
-        """Middles of the cells along x and along y, m."""
-        return (np.arange(self.count + self.count // 2) + 0.5) * _HALF / self.count
-
-    @cached_property
-    def compliance(self) -> torch.Tensor:
-        """As contact=rigid makes it of the elements', m/Pa."""
-        fine, cells = _HALF / self.count, len(self.middles)
-        line = graded(fine, cells, 60 * _HALF, 1.6)
-        mesh = block((line, line, graded(fine, 2, 60 * _HALF, 1.4)), _YOUNG, _RATIO)
-        inner = (np.arange(len(line) - 1)[:, None] * (len(line) - 1) + np.arange(cells))[:cells].ravel()
-        loads = mesh.loads(2)[:, inner]
-        moved = solve_block(mesh, held(mesh, _MIRRORED), loads.toarray())
-        surface = torch.from_numpy(loads.T @ moved / fine**2)
-        layers = layers_of([Slab(60 * _HALF, _YOUNG, _RATIO)])
-        body = Sheet((cells * fine, cells * fine), (cells, cells), layers)
-        return stabilise_checkerboard((surface + surface.T) / 2, body)
-
-    def press(self, gap: np.ndarray, force: float) -> tuple[np.ndarray, float]:
-        """Return the pressure (cells,), Pa, of an object on the quarter, and its approach, m."""
-        area = (_HALF / self.count) ** 2
-        contact = press(
-            self.compliance, torch.from_numpy(gap)[None], torch.tensor([force / area]), tolerance=1e-6,
-            iterations=1000,
-        )  # fmt: skip
-        pressure = contact.pressure[0].numpy()
-        if float(contact.residual[0]) > 1e-6:
-            return pressure * np.nan, np.nan
-        under = pressure > 0
-        return pressure, float(np.mean((self.compliance.numpy() @ pressure + gap)[under]))
+    fine, cells = _HALF / count, count + count // 2
+    line = graded(fine, cells, 60 * _HALF, 1.6)
+    mesh = block((line, line, graded(fine, 2, 60 * _HALF, 1.4)), _YOUNG, _RATIO)
+    inner = (np.arange(len(line) - 1)[:, None] * (len(line) - 1) + np.arange(cells))[:cells].ravel()
+    loads = mesh.loads(2)[:, inner]
+    moved = solve_block(mesh, held(mesh, _MIRRORED), loads.toarray())
+    surface = torch.from_numpy(loads.T @ moved / fine**2)
+    body = Sheet((cells * fine, cells * fine), (cells, cells), layers_of([Slab(60 * _HALF, _YOUNG, _RATIO)]))
+    return (np.arange(cells) + 0.5) * fine, stabilise_checkerboard((surface + surface.T) / 2, body)
 
 
-_ground = cache(_Ground)  # sphere and punches share their blocks
+def _press(count: int, gap: np.ndarray, force: float) -> tuple[np.ndarray, float]:
+    """Return the pressure (cells,), Pa, of an object on the quarter, and its approach, m; else NaN."""
+    compliance, load = _ground(count)[1], torch.tensor([force / (_HALF / count) ** 2])
+    contact = press(compliance, torch.from_numpy(gap)[None], load, tolerance=1e-6, iterations=1000)
+    pressure = contact.pressure[0].numpy()
+    if float(contact.residual[0]) > 1e-6:
+        return pressure * np.nan, np.nan
+    return pressure, float(np.mean((compliance.numpy() @ pressure + gap)[pressure > 0]))
 
 
 def test_arm(law: Law) -> None:
@@ -483,10 +465,8 @@ def test_tube(law: Law) -> None:
     soft, hard = SLABS
     inner, upper = (_tube(slab) for slab in (hard, soft))
     system = np.zeros((4, 4))
-    system[0, :2] = inner(core)[0]
-    system[1, :2], system[1, 2:] = inner(middle)[0], -upper(middle)[0]
-    system[2, :2], system[2, 2:] = inner(middle)[1], -upper(middle)[1]
-    system[3, 2:] = upper(outer)[1]
+    system[0, :2], system[3, 2:] = inner(core)[0], upper(outer)[1]
+    system[1:3, :2], system[1:3, 2:] = inner(middle), -upper(middle)
     amounts = np.linalg.solve(system / np.abs(system).max(axis=1, keepdims=True),
                               [0, 0, 0, -1 / np.abs(system[3]).max()])  # fmt: skip
     surface, between = upper(outer)[0] @ amounts[2:], upper(middle)[1] @ amounts[2:]

@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from importlib import import_module
-from typing import Annotated, Any, Protocol
+from typing import Annotated, Any
 
 import numpy as np
 import pandas as pd
@@ -100,11 +100,8 @@ class Subject:
         return point or OperatingPoint.default(check_evaluation(self.config.evaluation).false_alarm_rate)
 
 
-class StudyMeasure(Protocol):
-    """A frozen dataclass of settings that measures."""
-
-    def __call__(self, subject: Subject) -> pd.DataFrame:
-        """Measure; InputError where the device or the learner cannot be measured so."""
+StudyMeasure = Callable[[Subject], pd.DataFrame]
+"""A frozen dataclass of settings that measures; InputError where the device or learner cannot be measured."""
 
 
 @dataclass(frozen=True)
@@ -147,10 +144,12 @@ class Margins:
         data = frame.drop(columns=["mean", "lower", "upper"])
         groups = dict([*data.groupby(["label", "by"], sort=False)])
         spans, faint = (dict([*frame[frame.by == by].groupby("label")]) for by in ("threshold", "reading"))
-        called = {}
-        for name in ("big", "dangerous", ALARM_NAME):
-            lines = spans[name].assign(y=spans[name].said.astype(int) / spans[name].touches)
-            called[name] = lines[["mean", "y", "lower", "upper"]].to_numpy().T * [[1], [100], [100], [100]]
+        columns, scale = ["mean", "y", "lower", "upper"], [[1], [100], [100], [100]]
+        called = {
+            name: lines.assign(y=lines.said.astype(int) / lines.touches)[columns].to_numpy().T * scale
+            for name in ("big", "dangerous", ALARM_NAME)
+            for lines in [spans[name]]
+        }
         wrong = {name: 100 * faint[name].wrong / faint[name].touches for name in TOUCH.names}
         ticks = [
             f"above {row.low}\n{row.touches}"

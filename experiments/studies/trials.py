@@ -284,7 +284,7 @@ def run_trials(store: Store | None, run: StudyRun, study: Study, config: Config)
         for number, numbered in numbered_settings(study, settings):
             own = {key: value for key, value in numbered.items() if not key.startswith(MEASURE)}
             of_measure = {key.removeprefix(MEASURE): numbered[key] for key in numbered.keys() - own.keys()}
-            measure: StudyMeasure = replace(study.measure or Accuracy(), **of_measure)
+            measure = replace(study.measure or Accuracy(), **of_measure)
             line = [*as_overrides({**study.test, **own}), *changes]
             if finished:
                 general = [word for word in base if word.startswith(("hydra", "tracking"))]

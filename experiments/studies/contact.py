@@ -53,7 +53,7 @@ class Contact:
         exactly: whether neighbours are that far apart.
         gain, clip, position: of the device, as :class:`skin.inference.noise.Noise` has them.
         actual: layers of the skin that is touched, where the posterior has others.
-        grid: whether to compare with the posterior on a grid (:class:`GridPosterior`).
+        grid: whether to compare with the posterior on a grid (:func:`grid_errors`).
         seed: of the touches, with the name of the condition.
     """
 
@@ -104,7 +104,7 @@ class Contact:
             seconds.append(time.process_time() - start)
         figures = summarise_estimates(estimates, contacts[chosen], prior)
         if exact and self.grid:
-            figures |= GridPosterior(exact, body, noise, prior).errors(readings, contacts[chosen, 0])
+            figures |= grid_errors(exact, body, noise, prior, readings, contacts[chosen, 0])
         times = 1e3 * np.quantile(seconds, [0.5, 0.99])
         figures |= {"ms_median": float(times[0]), "ms_p99": float(times[1])}
         texts = {
@@ -179,43 +179,42 @@ def press_hands(device: AbstractSimulated, count: int, rng: np.random.Generator)
         return device.model(frames / frames.amax((1, 2), keepdim=True) * peak).readings.numpy().astype(float)
 
 
-class GridPosterior:
-    """Posterior of one contact on all positions of a grid, with the readings of the exact skin.
+def grid_errors(
+    skin: ExactSkin,
+    body: AbstractBody,
+    noise: Noise,
+    prior: FingertipPrior,
+    readings: np.ndarray,
+    truth: np.ndarray,
+) -> dict[str, Any]:
+    """Return the figures of the best posterior that is known: on all positions of a grid, by the exact skin.
 
     Args:
         skin: with its readings.
         body: its size counts.
         noise: of the readings.
-        prior: of the contact.
+        prior: of the contacts.
+        readings: (B, S), N.
+        truth: contacts (B, 4): x, y, radius, m, and force, N.
     """
-
-    def __init__(self, skin: ExactSkin, body: AbstractBody, noise: Noise, prior: FingertipPrior) -> None:
-        x, y = (np.arange(0.0005, side, 0.001) for side in body.size)
-        radii = np.linspace(*prior.radii, 9)
-        self._grid = np.stack(np.meshgrid(x, y, radii, indexing="ij"), -1).reshape(-1, 3)
-        self._table, self._floor = skin.readings(self._grid), noise.floor
-        self._square = (self._table**2).sum(1) / self._floor
-        self._score = np.linspace(-5, 5, 101)
-        self._force = prior.force * np.exp(prior.spread * self._score)
-
-    def estimate(self, readings: np.ndarray) -> np.ndarray:
-        """Return the mean x and y, m, and force, N, for readings (S,), N."""
-        along = self._table @ readings / self._floor
-        best = along.clip(min=0) ** 2 / self._square / 2
+    x, y = (np.arange(0.0005, side, 0.001) for side in body.size)
+    radii, score = np.linspace(*prior.radii, 9), np.linspace(-5, 5, 101)
+    grid = np.stack(np.meshgrid(x, y, radii, indexing="ij"), -1).reshape(-1, 3)
+    table, force = skin.readings(grid), prior.force * np.exp(prior.spread * score)
+    square = (table**2).sum(1) / noise.floor
+    means = []
+    for values in readings:
+        along = table @ values / noise.floor
+        best = along.clip(min=0) ** 2 / square / 2
         likely = np.flatnonzero(best > best.max() - 25)
-        fit = np.outer(along[likely], self._force) - np.outer(self._square[likely], self._force**2) / 2
-        mass = np.exp(fit - self._score**2 / 2 - fit.max())
+        fit = np.outer(along[likely], force) - np.outer(square[likely], force**2) / 2
+        mass = np.exp(fit - score**2 / 2 - fit.max())
         mass /= mass.sum()
-        return np.array([*(mass.sum(1) @ self._grid[likely, :2]), mass.sum(0) @ self._force])
-
-    def errors(self, readings: np.ndarray, truth: np.ndarray) -> dict[str, Any]:
-        """Return the figures of estimates for readings (B, S), N, of contacts (B, 4)."""
-        means = np.stack([self.estimate(values) for values in readings])
-        position = 1e3 * float(np.sqrt(np.square(means[:, :2] - truth[:, :2]).mean()))
-        return {
-            "grid_rms_mm": position,
-            "grid_force_median_%": 100 * float(np.median(np.abs(means[:, 2] / truth[:, 3] - 1))),
-        }
+        means.append([*(mass.sum(1) @ grid[likely, :2]), mass.sum(0) @ force])
+    estimates = np.array(means)
+    position = 1e3 * float(np.sqrt(np.square(estimates[:, :2] - truth[:, :2]).mean()))
+    relative = np.abs(estimates[:, 2] / truth[:, 3] - 1)
+    return {"grid_rms_mm": position, "grid_force_median_%": 100 * float(np.median(relative))}
 
 
 def summarise_estimates(
@@ -323,12 +322,6 @@ class Strip:
         strips = [replace(self, offset=float(each)) for each in offsets if 0.001 < each < end]
         return min(strips, key=lambda strip: np.square(strip.readings(x) * strip.gains - measured).sum())
 
-    @property
-    def words(self) -> str:
-        """What the calibration chose."""
-        depth = 1e3 * sum(layer.thickness for layer in self.body.layers)
-        return f"solid, {depth:g} mm thick, tip of {1e3 * self.radius:g} mm"
-
 
 def strip_readings(
     body: AbstractBody, simulator: AbstractSimulator, x: np.ndarray, radius: float | np.ndarray
@@ -399,7 +392,8 @@ class Barometers:
         whole = np.square(measured).sum(axis=1)
         close = x / 1e3 + strip.offset < LAST + PITCH / 2
         squares = np.square(posterior_errors(strip, x[close], measured[close]))
-        start = {"recording": subject.condition, "training": 20, "strip": strip.words}
+        words = f"solid, {1e3 * strip.body.thickness:g} mm thick, tip of {1e3 * strip.radius:g} mm"
+        start = {"recording": subject.condition, "training": 20, "strip": words}
         rows = [
             {"metric": "relative rms of readings, %", **self._rms(1e4 * wrong, whole, 8)},
             {"metric": "rms of positions, mm", **self._rms(squares, np.ones_like(squares), 4)},

@@ -89,20 +89,14 @@ def under_conditions(name):
     ]
 
 
-def test_conditions_are_columns_of_the_first_metric():
-    assert table([*under_conditions("a"), *under_conditions("b")], METRICS) == [
-        ["variant", "none", "5 dead"],
-        ["a", "85.0 ± 63.5", "85.0 ± 63.5"],
-        ["b", "85.0 ± 63.5", "85.0 ± 63.5"],
-    ]
-
-
-def test_conditions_of_a_single_variant_are_lines_of_all_metrics():
-    assert table(under_conditions("a"), METRICS[:2]) == [
-        ["a", "overall", "big"],
-        ["none", "85.0 ± 63.5", "85.0 ± 63.5"],
-        ["5 dead", "85.0 ± 63.5", "85.0 ± 63.5"],
-    ]
+@pytest.mark.parametrize(
+    ("variants", "head", "names"),
+    [("ab", ["variant", "none", "5 dead"], ["a", "b"]), ("a", ["a", "overall", "big"], ["none", "5 dead"])],
+)
+def test_conditions_are_columns_or_lines_of_a_single_variant(variants, head, names):
+    trials = [each for name in variants for each in under_conditions(name)]
+    cells = ["85.0 ± 63.5", "85.0 ± 63.5"]
+    assert table(trials, METRICS[:2]) == [head, *([name, *cells] for name in names)]
 
 
 @pytest.mark.parametrize(
@@ -234,17 +228,11 @@ def test_the_reports_number_stands_where_it_has_one():
 
 def test_the_margin_is_also_one_over_gestures():
     """By hand: half of 100 gestures have one of four labels wrong."""
-    codes = np.repeat(np.array([0, 1], dtype=np.uint8), 50)
+    half, right = np.repeat(np.array([0, 1], dtype=np.uint8), 50), np.zeros(100, dtype=np.uint8)
     # a standard deviation of 0.125 sqrt(100 / 99) over gestures, by sqrt(100); 1.984 of them
-    assert table([reported("rules", 0.875, outcomes=codes.tobytes())], METRICS[:1])[1] == [
-        "rules",
-        "87.5 ± 2.5",
-    ]
-    right = np.zeros(100, dtype=np.uint8)
-    assert table([reported("rules", 1.0, outcomes=right.tobytes())], METRICS[:1])[1] == [
-        "rules",
-        "100.0 ± 0.0",
-    ]
+    for codes, accuracy, text in ((half, 0.875, "87.5 ± 2.5"), (right, 1.0, "100.0 ± 0.0")):
+        trials = [reported("rules", accuracy, outcomes=codes.tobytes())]
+        assert table(trials, METRICS[:1])[1] == ["rules", text]
 
 
 def test_the_csv_has_the_reference_and_another_file_may_be_chosen(tmp_path):

@@ -20,8 +20,8 @@ ROUNDINGS := OMP_NUM_THREADS=1 OMP_NUM_THREADS=2 MKL_CBWR=COMPATIBLE MKL_CBWR=AV
 	ATEN_CPU_CAPABILITY=default OPENBLAS_CORETYPE=Haswell
 NUMERICAL := $(addprefix tests/,body design evaluation wire/test_segmentation.py wire/test_tare.py calibration record/test_line_writer.py \
 	record/test_session_log.py record/test_session_reader.py \
-	learning mechanics studies/test_embeddings.py studies/test_embedding_probe.py touch validation \
-	$(addprefix device/test_,calibration.py imperfection.py resampling.py device_sampling.py))
+	learning mechanics studies/test_embeddings.py studies/test_embedding_probe.py touch laws \
+	$(addprefix device/test_,calibration.py imperfection.py resampling.py device_sampling.py)) experiments/laws
 
 # Hundreds of tests start a command of this project; without bytecode each of them would compile the modules again.
 unexport PYTHONDONTWRITEBYTECODE
@@ -49,7 +49,7 @@ roundings: $(READY)  ## run the numerical tests (TESTS=tests: all) under several
 	done; test -z "$$failed" || { echo "failed under$$failed"; exit 1; }
 
 slow: $(PEERS)/.ready  ## run all tests under these settings, with the baseline libraries, a cluster and the documentation
-	DAMAGED=500 $(MAKE) roundings TESTS=tests MARK=
+	DAMAGED=500 $(MAKE) roundings TESTS="tests experiments/laws" MARK=
 	$(MAKE) cluster
 	$(MAKE) docs
 
@@ -61,11 +61,11 @@ check: $(READY)  ## check lint, format and types
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-bench: $(READY)  ## measure speed and memory; write results/bench.json (BENCH="only=wire against=../other")
+bench: $(READY)  ## measure speed and memory; write results/bench.json (BENCH="--only wire --against ../other")
 	$(BIN)/python -m experiments.benchmarks $(BENCH)
 
-physics: $(READY)  ## check the laws of mechanics against independent solutions (PHYSICS="quick=true laws=hertz,punch")
-	$(BIN)/python -m experiments.validation $(PHYSICS)
+physics: $(READY)  ## check the laws of mechanics against independent solutions, write docs/physics.md (PHYSICS="-k hertz": some, write nothing)
+	$(BIN)/python -m pytest experiments/laws --full --junitxml=results/physics.xml $(or $(PHYSICS),--page=docs)
 
 $(PEERS)/.ready: experiments/peers/requirements.txt experiments/peers/constraints.txt
 	$(PYTHON) -m venv $(PEERS)

@@ -23,10 +23,6 @@ Dependencies. None is part of the repository or of the wheel; pip installs them.
 the packages of constraints.txt state. `make notice` writes this list.
 
 """
-_LICENCE = "License :: "
-_LONGEST = 60  # characters of a name; a longer text is the licence itself
-# Of packages whose metadata do not name the licence that they contain or publish.
-_READ = {"huey": "MIT", "python-dateutil": "Apache-2.0 OR BSD-3-Clause", "skops": "MIT"}
 
 
 def notice(constraints: Path) -> str:
@@ -59,13 +55,13 @@ def licence(name: str) -> str:
     except PackageNotFoundError:
         raise InputError(f"{name} of constraints.txt is not installed: run make install") from None
     expression, text = (str(stated.get(key, "")).strip() for key in ("license_expression", "license"))
-    classified = [
-        each.removeprefix(_LICENCE) for each in stated.get("classifier", []) if each.startswith(_LICENCE)
-    ]
-    classes = ", ".join(each.rpartition(" :: ")[2] for each in classified)
-    # The most exact statement first.
-    statements = (_READ.get(name, ""), expression, text if len(text) <= _LONGEST else "", classes, text)
-    known = [statement.splitlines()[0] for statement in statements if statement not in ("", "UNKNOWN")]
+    classes = [each.rpartition(" :: ")[2] for each in stated.get("classifier", []) if "License ::" in each]
+    # Some packages contain or publish a licence that their metadata do not name.
+    read = {"huey": "MIT", "python-dateutil": "Apache-2.0 OR BSD-3-Clause", "skops": "MIT"}
+    # The most exact statement first; a long text is the licence itself.
+    short = text if len(text) <= 60 else ""
+    statements = (read.get(name, ""), expression, short, ", ".join(classes), text)
+    known = [each.splitlines()[0] for each in statements if each not in ("", "UNKNOWN")]
     if not known:
         raise InputError(f"{name} states no licence: read it, and add it to experiments/notice.py")
     return known[0]

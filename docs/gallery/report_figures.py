@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from hydra import compose, initialize_config_dir
 
-from experiments.studies.report_figures import draw_skin
+from experiments.studies.pages import draw_skin
 from skin.core.files import CONF
 from skin.learning.representation import Fourier, Image, Interpolation
 from skin.plot import figures

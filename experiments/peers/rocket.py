@@ -1,10 +1,9 @@
 """Random convolution kernels of aeon and a ridge, in the environment of aeon."""
 
-import json
+import pickle
 import subprocess
 import weakref
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
@@ -25,15 +24,12 @@ if TYPE_CHECKING:
 
     from skin.learning.data import TouchData
 
-WORKER = "experiments.peers.worker"
-_PART = 8192  # touches
-
 
 class Rocket(AbstractLearner):
     """Convolution kernels on the series of readings, and a ridge per label.
 
-    Fits and applies the model in a process of the other environment (``worker.py``), with files of arrays.
-    The process starts when it is needed and ends with the learner.
+    Fits and applies the model in a process of the other environment (``worker.py``), which starts when it is
+    needed and ends with the learner.
 
     References: A. Dempster et al., MiniRocket, KDD 2021; C. W. Tan et al., MultiRocket, Data Mining and
     Knowledge Discovery 2022; A. Dempster et al., Hydra, ibid. 2023.
@@ -55,11 +51,10 @@ class Rocket(AbstractLearner):
         largest: Annotated[int, Ge(1)] = 10,
         seed: int = 0,
     ) -> None:
-        self._model = {"seed": seed, "transform": transform, "kernels": kernels}
+        self._seed, self._transform, self._kernels = seed, transform, kernels
         self._channels, self._largest = channels, largest
-        self._process: subprocess.Popen[str] | None = None
+        self._process: subprocess.Popen[bytes] | None = None
         self._shape: tuple[int, ...] = ()
-        self._labels = 0
 
     def inputs(self, touches: Touches) -> Tensor:
         """Return the channels, (B, C, T), N."""
@@ -81,14 +76,13 @@ class Rocket(AbstractLearner):
 
     def fit(self, data: "TouchData", logger: "Logger | None" = None) -> None:
         """Fit to the training split; the validation split stops the training and calibrates it."""
-        arrays: dict[str, np.ndarray] = {}
+        arrays = list[np.ndarray]()
         for split in ("train", "validation"):
-            touches = data.touches(split)
-            arrays |= {split: self._array(touches), f"{split}_labels": touches.known_labels.numpy()}
-        with TemporaryDirectory() as folder:
-            path = Path(folder) / "touches.npz"
-            np.savez(path, **arrays)  # type: ignore[arg-type]
-            self.seconds_per_epoch = self._start("fit", path)
+            touches = data.touches(split)  # type: ignore[arg-type]
+            arrays += [self._array(touches), touches.known_labels.numpy()]
+        self._begin()
+        self.seconds_per_epoch = self._ask("fit", *arrays)
+        self.parameters, self._shape, _ = self._ask("describe")
 
     def probabilities(self, touches: Touches) -> Tensor:
         """Return the probability of each label, (B, L).
@@ -104,71 +98,62 @@ class Rocket(AbstractLearner):
                 f"this model takes inputs of the shape {self._shape}, got {inputs.shape[1:]}: give touches "
                 "with as many sensors and frames as in its training"
             )
-        with TemporaryDirectory() as folder:
-            path, answer = Path(folder) / "inputs.npy", Path(folder) / "answer.npy"
-            np.save(path, inputs)
-            self._ask("predict", path, to=str(answer))
-            return torch.from_numpy(np.load(answer, allow_pickle=False)).to(torch.float32)
+        return torch.from_numpy(self._ask("predict", inputs)).to(torch.float32)
 
     def save(self, folder: Path) -> Path:
         """Write the model to ``model.npz``, in which there are only numbers, and return its path."""
         path = Path(folder) / "model.npz"
-        self._ask("save", path)
+        np.savez_compressed(path, **self._ask("arrays"))
         return path
 
     def load(self, data: "TouchData", path: Path) -> None:
         """Load the model that :meth:`save` wrote."""
         self.check(data)
-        load_npz(path)
-        self._start("load", path)
-        if self._labels != len(data.task):
-            raise ValueError(f"it was trained on {self._labels} labels, not {', '.join(data.task.names)}")
+        self._begin()
+        self._ask("load", load_npz(path))
+        self.parameters, self._shape, labels = self._ask("describe")
+        if labels != len(data.task):
+            raise ValueError(f"it was trained on {labels} labels, not {', '.join(data.task.names)}")
 
     def _array(self, touches: Touches) -> np.ndarray:
         """Return all inputs, computed in parts to save memory."""
-        local = touches.to("cpu")
-        parts = [self.inputs(local[start : start + _PART]) for start in range(0, len(local), _PART)]
+        local, part = touches.to("cpu"), 8192
+        parts = [self.inputs(local[start : start + part]) for start in range(0, len(local), part)]
         return torch.cat(parts).to(torch.float32).numpy()
 
-    def _start(self, do: str, path: Path) -> float:
-        """Fit or load a model and return the duration, s."""
-        answer = self._ask(do, path, model={**self._model, "jobs": torch.get_num_threads()})
-        self._shape, self._labels = tuple(answer["shape"]), answer["labels"]
-        self.parameters = answer["parameters"]
-        return answer["seconds"]
+    def _begin(self) -> None:
+        """Start the process with the settings of the model."""
+        command = [_python(), "-m", "experiments.peers.worker"]
+        self._process = subprocess.Popen(command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+        weakref.finalize(self, _end, self._process)
+        self._ask("begin", self._seed, torch.get_num_threads(), self._kernels, self._transform)
 
-    def _ask(self, do: str, path: Path, **request: Any) -> dict[str, Any]:
-        """Send a request to the process and return its answer."""
-        if self._process is None:
-            self._process = subprocess.Popen(
-                [_python(), "-m", WORKER], cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-            )
-            weakref.finalize(self, _end, self._process)
+    def _ask(self, method: str, *values: Any) -> Any:
+        """Return what a method of the process's model returns."""
         process = self._process
+        assert process is not None
         assert process.stdin is not None
         assert process.stdout is not None
         try:
-            print(json.dumps({"do": do, "path": str(path), **request}), file=process.stdin, flush=True)
-            answer = process.stdout.readline()
-        except BrokenPipeError:
-            answer = ""
-        if not answer:
-            raise InputError(f"the process of aeon ended with exit code {process.wait()}")
-        result = json.loads(answer)
-        if "error" in result:
-            raise RuntimeError(result["error"])
-        return result
+            pickle.dump((method, *values), process.stdin)
+            process.stdin.flush()
+            answer = pickle.load(process.stdout)  # of our own process
+        except (BrokenPipeError, EOFError):
+            raise InputError(f"the process of aeon ended with exit code {process.wait()}") from None
+        if isinstance(answer, RuntimeError):
+            raise answer
+        return answer
 
 
 def _python() -> str:
     """Return the Python of the other environment."""
-    # It is no setting, because a stored run must not choose a program.
+    # It is not a setting, because a stored run must not choose a program.
     path = python()
     if not path.is_file():
         raise InputError(f"there is no {path}: make peers builds it")
     return str(path)
 
 
-def _end(process: "subprocess.Popen[str]") -> None:
+def _end(process: "subprocess.Popen[bytes]") -> None:
     process.kill()
     process.communicate()

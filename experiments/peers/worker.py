@@ -1,20 +1,11 @@
 """Fit and apply a model of aeon, in the environment of that library: nothing of ``skin`` is imported here.
 
-Reads requests from standard input, one JSON object per line, and answers each with a line of JSON:
-
-- ``{"do": "fit", "path": ..., "model": settings}`` fits a model to the arrays ``train``, ``train_labels``,
-  ``validation`` and ``validation_labels`` of an .npz file.
-- ``{"do": "load", "path": ..., "model": settings}`` with the same settings restores the model that
-  ``{"do": "save", "path": ...}`` wrote as an .npz file.
-- ``{"do": "predict", "path": ..., "to": ...}`` reads inputs (B, ...) from an .npy file and writes
-  probabilities (B, L).
-
-The answer to ``fit`` and ``load`` has the keys ``seconds``, ``parameters``, ``shape`` (of one input) and
-``labels`` (their number); the answer to a request that fails has the key ``error``.
+Reads requests from standard input and answers each on standard output, both as pickles: a request is the name
+of a method of :class:`KernelModel` and its arguments, the answer what it returns, or a RuntimeError.
 """
 
-import json
 import os
+import pickle
 import sys
 import time
 from collections.abc import Iterator
@@ -26,12 +17,7 @@ from sklearn.linear_model import LogisticRegression, RidgeCV
 from sklearn.pipeline import FeatureUnion, Pipeline, make_pipeline, make_union
 from sklearn.preprocessing import FunctionTransformer, StandardScaler
 
-Arrays = dict[str, np.ndarray]
-
-ALPHAS = np.logspace(-3, 6, 19)  # aeon stops at 1e3, but stronger ridges are selected here
-CHUNK = 1024  # touches that are transformed at a time: 54,000 features each
 STORED = ("first", "weights", "bias", "curves")
-FIRST = 4096  # touches that kernels and scales are fitted to; they are stored with the model
 
 
 class KernelModel:
@@ -39,58 +25,62 @@ class KernelModel:
 
     The kernels are computed once for all labels, the ridge may be stronger than aeon's, and Platt's logistic
     curve on the validation split converts scores to probabilities. Kernels, biases and scales are fitted to
-    the first 4096 touches; the arrays of a model contain these touches, so that the same kernels are fitted
-    again from the seed. Inputs are series (B, C, T), N.
+    the first touches; the arrays of a model contain these touches, so that the same kernels are fitted again
+    from the seed. Inputs are series (B, C, T), N.
     """
 
-    def __init__(self, seed: int, jobs: int, kernels: int | None, transform: str) -> None:
-        self.make = partial(
-            TRANSFORMS[transform], jobs, seed, {} if kernels is None else {"n_kernels": kernels}
-        )
+    first: np.ndarray
+    weights: np.ndarray
+    bias: np.ndarray
+    curves: np.ndarray
 
-    def fit(self, path: str) -> dict[str, Any]:
-        """Fit kernels, ridges and logistic curves, and describe the model.
+    def begin(self, seed: int, jobs: int, kernels: int | None, transform: str) -> None:
+        """Set the kernels."""
+        settings = {} if kernels is None else {"n_kernels": kernels}
+        self.make = partial(TRANSFORMS[transform], jobs, seed, settings)
+
+    def fit(
+        self, x: np.ndarray, labels: np.ndarray, held: np.ndarray, held_labels: np.ndarray, most: int = 4096
+    ) -> float:
+        """Fit kernels, to the first ``most`` touches, ridges and logistic curves; return the duration, s.
 
         Compilation is not part of the duration.
         """
-        data = _load_arrays(path)
-        x, held = data["train"], data["validation_labels"]
         self.make().fit_transform(x[:32])
-        began, self.first = time.perf_counter(), x[:FIRST]
+        began, self.first = time.perf_counter(), x[:most]
         self.transform = self.make().fit(self.first)
         table = np.concatenate(list(self._parts(x)))
-        ridge = RidgeCV(ALPHAS, alpha_per_target=True).fit(table, 2 * data["train_labels"] - 1)
+        # aeon's strengths end at 1e3, but stronger ridges are selected here.
+        ridge = RidgeCV(np.logspace(-3, 6, 19), alpha_per_target=True).fit(table, 2 * labels - 1)
         self.weights, self.bias = ridge.coef_.T, ridge.intercept_
-        pairs = zip(self._scores(data["validation"]).T, held.T, strict=True)
+        pairs = zip(self._scores(held).T, held_labels.T, strict=True)
         self.curves = np.array([platt(*pair) for pair in pairs])
-        return self._describe(time.perf_counter() - began)
+        return time.perf_counter() - began
 
-    def load(self, path: str) -> dict[str, Any]:
-        """Fit the kernels again, set the weights, and describe the model."""
-        arrays = _load_arrays(path)
-        self.first, self.weights, self.bias, self.curves = (arrays[name] for name in STORED)
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Return what :meth:`load` needs."""
+        return {name: getattr(self, name) for name in STORED}
+
+    def load(self, arrays: dict[str, np.ndarray]) -> None:
+        """Set the weights, and fit the kernels again."""
+        for name in STORED:
+            setattr(self, name, arrays[name])
         self.transform = self.make().fit(self.first)
-        return self._describe(0.0)
 
-    def save(self, path: str) -> None:
-        """Write what :meth:`load` needs."""
-        np.savez_compressed(path, **{name: getattr(self, name) for name in STORED})
-
-    def predict(self, path: str, to: str) -> None:
-        """Write the probability of each label, (B, L), of series (B, C, T)."""
-        slope, offset = self.curves.T
-        scores = self._scores(np.load(path, allow_pickle=False))
-        np.save(to, 1 / (1 + np.exp(-(slope * scores + offset))))
-
-    def _describe(self, seconds: float) -> dict[str, Any]:
+    def describe(self) -> tuple[int, tuple[int, ...], int]:
+        """Return the numbers of parameters, the shape of an input, and the number of labels."""
         parameters = self.weights.size + self.bias.size + self.curves.size
-        shape = self.first.shape[1:]
-        return {"seconds": seconds, "parameters": parameters, "shape": shape, "labels": len(self.bias)}
+        return parameters, self.first.shape[1:], len(self.bias)
+
+    def predict(self, x: np.ndarray) -> np.ndarray:
+        """Return the probability of each label, (B, L), of series (B, C, T)."""
+        slope, offset = self.curves.T
+        return 1 / (1 + np.exp(-(slope * self._scores(x) + offset)))
 
     def _parts(self, x: np.ndarray) -> Iterator[np.ndarray]:
-        """Yield the features of touches, (b, D), in parts."""
-        for start in range(0, len(x), CHUNK):
-            yield self.transform.transform(x[start : start + CHUNK])
+        """Yield the features of touches, (b, D), in parts: there are 54,000 features of each."""
+        for start in range(0, len(x), 1024):
+            yield self.transform.transform(x[start : start + 1024])
 
     def _scores(self, x: np.ndarray) -> np.ndarray:
         return np.concatenate([part @ self.weights + self.bias for part in self._parts(x)])
@@ -146,27 +136,23 @@ def platt(score: np.ndarray, truth: np.ndarray) -> tuple[float, float]:
     return curve.coef_.item(), curve.intercept_.item()
 
 
-def _load_arrays(path: str) -> Arrays:
-    """Return the arrays of an .npz file."""
-    with np.load(path, allow_pickle=False) as file:
-        return dict(file)
-
-
 def main() -> None:
     """Answer requests until standard input ends."""
     # What libraries print must not be read as an answer.
-    answers = os.fdopen(os.dup(sys.stdout.fileno()), "w")
+    answers = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
-    model: KernelModel | None = None
-    for line in sys.stdin:
-        request = json.loads(line)
+    model = KernelModel()
+    while True:
         try:
-            if settings := request.pop("model", None):
-                model = KernelModel(**settings)
-            answer = getattr(model, request.pop("do"))(**request) or {}
+            name, *values = pickle.load(sys.stdin.buffer)
+        except EOFError:
+            return
+        try:
+            answer: Any = getattr(model, name)(*values)
         except Exception as error:
-            answer = {"error": f"{type(error).__name__}: {error}"}
-        print(json.dumps(answer), file=answers, flush=True)
+            answer = RuntimeError(f"{type(error).__name__}: {error}")
+        pickle.dump(answer, answers)
+        answers.flush()
 
 
 if __name__ == "__main__":

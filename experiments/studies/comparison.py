@@ -1,8 +1,7 @@
 """Means, margins and paired comparisons of trials; what they decide of the statements of a study."""
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
 from statistics import fmean, stdev
 from typing import Any, Literal, NamedTuple
 
@@ -14,15 +13,9 @@ from experiments.studies.study import Statement, Study
 from skin.evaluation.metrics import decodable, decode
 from skin.touch.labels import TOUCH
 
-CONFIDENCE = 0.95
-"""Of the intervals that a margin describes."""
-
-FEWEST = 3
-"""Paired seeds below which every verdict is ``undecided``: two have a margin of 12.7 standard errors."""
-
 UNITS = {"seconds_per_epoch": "s", "parameters": "", "same/direction/degrees": "°"}
 UNITS |= {"same/place/rms_mm": "mm", "same/force/rms_N": "N"}
-"""Metrics that are no fractions -> their unit."""
+"""Metrics that are not fractions -> their unit."""
 
 By = Literal["seed", "device"]
 Gestures = tuple[np.ndarray | None, np.ndarray | None]
@@ -45,26 +38,22 @@ class Estimate(NamedTuple):
     seeds: int
 
 
-@dataclass(frozen=True)
-class Comparison:
-    """A statement, or a line of the table beside the one that it is compared with.
+class Conclusion(NamedTuple):
+    """What trials say about a statement.
 
     Attributes:
+        statement: that was tested.
         compared: name of the other side -> the comparison; fractions in percentage points.
-        verdict: agree, disagree or undecided; of lines: better, worse or undecided.
-        statement: None: of a line.
-        variant, condition: of the line.
+        verdict: agree, disagree or undecided.
     """
 
+    statement: Statement
     compared: Mapping[str, Estimate | None]
     verdict: str
-    statement: Statement | None = None
-    variant: str = ""
-    condition: str = ""
 
 
 def uncertainty(sample: Sequence[float] | np.ndarray | pd.Series) -> np.ndarray:
-    """Return the standard error of the mean of a sample and half of its interval, (2,); 0 of less than two.
+    """Return the standard error of the mean of a sample and half of its 95 % interval, (2,); 0 below two.
 
     Half of the interval is the error times the quantile of Student's t distribution: 4.30 for three seeds,
     1.96 for 4000 gestures. NaN does not count.
@@ -74,7 +63,7 @@ def uncertainty(sample: Sequence[float] | np.ndarray | pd.Series) -> np.ndarray:
     if len(values) < 2:
         return np.zeros(2)
     error = stdev(values.tolist()) / math.sqrt(len(values))
-    return error * np.array([1.0, t.interval(CONFIDENCE, len(values) - 1)[1]])
+    return error * np.array([1.0, t.interval(0.95, len(values) - 1)[1]])
 
 
 def together(*parts: np.ndarray) -> np.ndarray:
@@ -111,8 +100,7 @@ def compare_samples(
     if across is not None and not across[0].empty and not across[1].empty:
         shared = _pair(*across, ratio)
         devices = uncertainty(shared) if len(shared) > 1 else _unpaired(*across, ratio)
-    parts = seeds, devices, _over_gestures(*gestures, ratio)
-    error, margin = together(*parts)
+    error, margin = together(seeds, devices, _over_gestures(*gestures, ratio))
     return Estimate(fmean(pairs), error, margin, len(pairs))
 
 
@@ -146,9 +134,10 @@ def judge(statement: Statement, compared: Estimate | None) -> str:
     """Return ``agree``, ``disagree`` or ``undecided``.
 
     ``agree`` if the mean with its margin on either side lies wholly inside of the interval of the statement,
-    ``disagree`` if it lies wholly outside, else, and always with fewer than three pairs, ``undecided``.
+    ``disagree`` if it lies wholly outside, else, and always with fewer than three pairs, ``undecided``: two
+    pairs have a margin of 12.7 standard errors.
     """
-    if compared is None or compared.seeds < FEWEST:
+    if compared is None or compared.seeds < 3:
         return "undecided"
     low, high = compared.mean - compared.margin, compared.mean + compared.margin
     if statement.minimum < low and high < statement.maximum:
@@ -219,7 +208,7 @@ def compare(
     return compare_samples(*pairs[0], ratio, pairs[1], (by_gesture(left, metric), by_gesture(right, metric)))
 
 
-def conclude(statement: Statement, trials: pd.DataFrame) -> Comparison:
+def conclude(statement: Statement, trials: pd.DataFrame) -> Conclusion:
     """Return the comparisons of a statement, and its verdict."""
     _, first = _line(statement.one, trials)
     lines = dict(_line(chosen, trials) for chosen in statement.others)
@@ -237,7 +226,7 @@ def conclude(statement: Statement, trials: pd.DataFrame) -> Comparison:
             for name, pair in compared.items()
         }
     verdicts = [judge(statement, pair) for pair in compared.values()]
-    return Comparison(compared, combine_verdicts(verdicts), statement)
+    return Conclusion(statement, compared, combine_verdicts(verdicts))
 
 
 def _line(chosen: Mapping[str, str], trials: pd.DataFrame) -> tuple[str, pd.DataFrame]:
@@ -247,26 +236,25 @@ def _line(chosen: Mapping[str, str], trials: pd.DataFrame) -> tuple[str, pd.Data
     if matches.empty:
         return " ".join(chosen.values()), matches
     first = matches.iloc[0]
-    whole = trials[(trials.variant == first.variant) & (trials.condition == first.condition)]
-    return ", ".join(filter(None, (first.variant, first.condition))), whole
+    line = trials[(trials.variant == first.variant) & (trials.condition == first.condition)]
+    return ", ".join(filter(None, (first.variant, first.condition))), line
 
 
-def differences(study: Study, trials: pd.DataFrame) -> list[Comparison]:
+def differences(study: Study, trials: pd.DataFrame) -> Iterator[tuple[str, str, Estimate | None, str]]:
     """Compare each condition with the first one of its variant, or each variant with the first one.
 
     A comparison of devices counts these, and not the seeds of the training, as its pairs.
+
+    Yields:
+        variant, condition, the comparison, and better, worse or undecided.
     """
-    if study.differences is None:
-        return []
     words = {"agree": "better", "disagree": "worse", "undecided": "undecided"}
     limits: Any = {"minimum" if study.differences == "greater" else "maximum": 0.0}
     better = Statement("", "", {}, study.metrics[0], **limits)
     by: By = "device" if study.devices else "seed"
-    changes, first = [], dict[str, pd.DataFrame]()
+    first = dict[str, pd.DataFrame]()
     for (variant, condition), group in trials.groupby(["variant", "condition"], sort=False):
         base = first.setdefault(variant if study.conditions else "", group)
         if base is not group:
             compared = compare(group, base, study.metrics[0], by=by)
-            word = words[judge(better, compared)]
-            changes.append(Comparison({"": compared}, word, None, variant, condition))
-    return changes
+            yield variant, condition, compared, words[judge(better, compared)]

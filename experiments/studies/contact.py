@@ -1,181 +1,137 @@
-"""Measure the posterior of contacts on skins that nothing was tuned on, against layers solved exactly.
+"""The posterior of contacts, against layers that are solved exactly and against a real strip of barometers.
 
-    python -m experiments.studies.contact
-    python -m experiments.studies.contact touches=200 rows=deep,thin out=FOLDER
-
-Writes contact.csv into docs/results, or into ``out=``. ``rows=``: only rows whose name begins so. Touches
-that raise no sensor above three standard deviations of a frame are left out. Several contacts and hands take
-twenty times as long: a quarter of the touches.
-
-Fingertips press the layered solution of :mod:`experiments.validation.references`, which shares no code with
-the simulator and is endless in the plane; contacts therefore keep away from the rim. Hands and bars press
-``simulator=solid``.
+Fingertips press the layered solution of :mod:`experiments.laws.references`, which shares no code with the
+simulator and is endless in the plane; contacts therefore keep away from the rim. Hands and bars press the
+simulator of the configuration. Touches that raise no sensor above three standard deviations of a frame are
+left out.
 """
 
 import time
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from itertools import permutations
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Annotated, Any
 
 import numpy as np
+import pandas as pd
 import torch
+from annotated_types import Ge, Gt, MinLen
+from scipy.optimize import linear_sum_assignment
 from scipy.stats import binomtest
 
-from experiments import run_script, script_settings
-from experiments.studies.pages import csv_text
-from experiments.validation.references import Discs, Slab
+from experiments.laws.references import Discs, Slab
+from experiments.studies.measures import Subject
 from skin.body.base import AbstractBody, Layer, Sensors
-from skin.body.layout import AbstractLayout, Grid, Hexagonal, Random
+from skin.body.layout import Listed
 from skin.body.material import Material
 from skin.body.sheet import Sheet
-from skin.core.files import ROOT, write
+from skin.device.base import AbstractSimulated
 from skin.errors import InputError
-from skin.inference.candidates import FingertipPrior
+from skin.inference.candidates import FingertipPrior, disc_readings
 from skin.inference.noise import Noise
 from skin.inference.posterior import FrameEstimate, Posterior
+from skin.mechanics.simulator.base import AbstractSimulator
 from skin.mechanics.simulator.solid import Solid
 from skin.touch.gestures import GestureSettings, draw_bodies
 from skin.touch.shapes import Shapes
 
-CELL = 0.005  # m
-POISSON = {"Dragon Skin 10 Medium": 0.49}
-FELT = 3.0  # standard deviations of a frame
-SIDE = 0.01  # m, of the sensors' footprints
-_EDGES = np.log(np.arange(1, 32, 2) / np.arange(31, 0, -2))  # even quantiles of the logistic distribution
-
-
-def make_sheet(*layers: tuple[str, float], softer: float = 1.0, side: float = 0.16) -> Sheet:
-    """Return a sheet of materials and thicknesses, m, from the base up; moduli by a factor."""
-    made = [(Material.of(name), thickness) for name, thickness in layers]
-    return Sheet(
-        (side, side),
-        (round(side / CELL),) * 2,
-        tuple(Layer(replace(material, young=material.young * softer), thick) for material, thick in made),
-    )
-
-
-DEEP = make_sheet(("EcoFlex 00-30", 0.03))
-MIDDLE = make_sheet(("EcoFlex 00-30", 0.02))
-THIN = make_sheet(("Dragon Skin 10 Medium", 0.01), ("EcoFlex 00-30", 0.005))
-GRID = Grid(5, 5, (SIDE, SIDE))
+_COLUMNS = (
+    "rms_mm", "median_mm", "force_median_%", "peak_median_%", "peak_covered_%", "covered_%", "covered_low_%",
+    "covered_high_%", "area_median_mm2", "grid_rms_mm", "grid_force_median_%", "ms_median", "ms_p99",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
-class Row:
-    """Touches of a kind on a skin.
+class Contact:
+    """Errors of estimated contacts, and how often their regions hold the truth; a row of texts.
 
-    Attributes:
-        name: of the row.
-        body, layout: the skin.
-        depth: of the sensors, m.
-        force: median, N.
-        noise: of the readings.
+    Args:
+        touches: with one contact; a quarter as many with several and of hands, which take longer.
+        force: median of a fingertip, N.
         number: contacts at a time; 0: a hand or a bar.
-        margin: least distance from the rim, m.
+        margin: least distance of contacts from the rim, m.
         apart: least distance between contacts, m.
         exactly: whether neighbours are that far apart.
-        actual: the skin that is touched, where the posterior has another one.
+        gain, clip, position: of the device, as :class:`skin.inference.noise.Noise` has them.
+        actual: layers of the skin that is touched, where the posterior has others.
+        grid: whether to compare with the posterior on a grid (:func:`grid_errors`).
+        seed: of the touches, with the name of the condition.
     """
 
-    name: str
-    body: Sheet = DEEP
-    layout: AbstractLayout = GRID
-    depth: float = 0.0295
-    force: float = 5.0
-    noise: Noise = field(default_factory=lambda: Noise(0.05, 10))
-    number: int = 1
-    margin: float = 0.03
-    apart: float = 0.0
+    touches: Annotated[int, Ge(4)] = 2500
+    force: Annotated[float, Gt(0)] = 5.0
+    number: Annotated[int, Ge(0)] = 1
+    margin: Annotated[float, Ge(0)] = 0.03
+    apart: Annotated[float, Ge(0)] = 0.0
     exactly: bool = False
-    actual: Sheet | None = None
+    gain: float = 0.0
+    clip: float = float("inf")
+    position: float = 0.0
+    actual: Sequence[Any] = ()
+    grid: bool = False
+    seed: Annotated[int, Ge(0)] = 0
 
-    @property
-    def sensors(self) -> Sensors:
-        """Sensors where the posterior has them."""
-        places = self.layout.sensors(self.body).positions.copy()
-        places[:, 2] = self.depth
-        return Sensors(places, (SIDE, SIDE))
+    def __call__(self, subject: Subject) -> pd.DataFrame:
+        torch.set_num_threads(1)  # the times are those of one
+        device = subject.device.simulated("contacts are simulated")
+        body, sensors = device.body, device.sensors
+        assert isinstance(body, Sheet)
+        prior, noise = (
+            FingertipPrior(force=self.force),
+            Noise(0.05, 10, self.gain, self.clip, 0, self.position),
+        )
+        rng = np.random.default_rng([self.seed, *subject.condition.encode()])
+        count, exact = self.touches if self.number == 1 else self.touches // 4, None
+        shift = np.pad(noise.position * rng.standard_normal((len(sensors), 2)), ((0, 0), (0, 1)))
+        if self.number:
+            touched = Sheet(body.size, body.cells, self.actual) if self.actual else body  # type: ignore[arg-type]
+            exact = ExactSkin(touched, Sensors(sensors.positions + shift, sensors.footprint), prior)
+            contacts = self._draw_contacts(body, prior, 3 * count, rng)
+            flat = contacts.reshape(-1, 4)
+            forces = exact.readings(flat[:, :3]) * flat[:, 3:]
+            true = forces.reshape(*contacts.shape[:2], -1).sum(1)
+        else:
+            true = press_hands(device, 2 * count, rng)
+            contacts = np.zeros((len(true), 0, 4))
+        chosen = np.flatnonzero((true > 3 * noise.frame).any(1))[:count]
+        gains = 1 + noise.gain * rng.standard_normal(true.shape[1])
+        readings = gains * true[chosen]
+        readings += np.sqrt(noise.floor) * rng.standard_normal(readings.shape)
+        posterior = Posterior(device.model, noise, body, prior)
+        estimates, seconds = list[Any](), list[float]()
+        for values in readings:
+            start = time.process_time()
+            estimates.append(posterior.estimate(values))
+            seconds.append(time.process_time() - start)
+        figures = summarise_estimates(estimates, contacts[chosen], prior)
+        if exact and self.grid:
+            figures |= grid_errors(exact, body, noise, prior, readings, contacts[chosen, 0])
+        times = 1e3 * np.quantile(seconds, [0.5, 0.99])
+        figures |= {"ms_median": float(times[0]), "ms_p99": float(times[1])}
+        texts = {
+            key: f"{value:.4g}" if isinstance(value, float) else str(value) for key, value in figures.items()
+        }
+        return pd.DataFrame([{"row": subject.condition} | texts])
 
-
-@dataclass(frozen=True)
-class Ring(AbstractLayout):
-    """Sensors on a circle about the middle.
-
-    Attributes:
-        count: of sensors.
-        radius: of the circle, m.
-    """
-
-    count: int
-    radius: float
-
-    def sensors(self, body: AbstractBody) -> Sensors:
-        """Return the sensors on a body, at its surface."""
-        turn = 2 * np.pi * np.arange(self.count) / self.count
-        away = self.radius * np.stack([np.cos(turn), np.sin(turn), 0 * turn], axis=1)
-        return Sensors(np.array([*body.size, 0.0]) / 2 + away, (SIDE, SIDE))
-
-
-def rows() -> list[Row]:
-    """Return all rows of the table."""
-    thin = Row("thin", body=THIN, depth=0.005, margin=0.015)
-    clipped = Noise(0.05, 10, clip=10.0)
-    device = Noise(0.05, 10, gain=0.02, position=0.001)
-    layouts = {
-        "16": Grid(4, 4, GRID.footprint),
-        "64": Grid(8, 8, GRID.footprint),
-        "hexagonal": Hexagonal(5, 5, GRID.footprint),
-        "hexagonal_49": Hexagonal(7, 7, GRID.footprint),
-        "random": Random(25, 1, GRID.footprint),
-        "random_7": Random(7, 3, GRID.footprint),
-        "random_30": Random(30, 2, GRID.footprint),
-    }
-    return [
-        Row("deep"),
-        Row("middle", body=MIDDLE, depth=0.0195, margin=0.02),
-        thin,
-        replace(thin, name="thin_20N", force=20.0, noise=clipped),
-        *(Row(f"layout_{name}", layout=layout) for name, layout in layouts.items()),
-        Row("layout_ring_12", body=make_sheet(("EcoFlex 00-30", 0.03), side=0.2), layout=Ring(12, 0.06)),
-        *(Row(f"device_{number}", noise=device) for number in range(1, 6)),
-        *(replace(thin, name=f"thin_device_{number}", noise=device) for number in range(1, 6)),
-        Row("stiffer", actual=make_sheet(("EcoFlex 00-30", 0.03), softer=1.2)),
-        Row("softer", actual=make_sheet(("EcoFlex 00-30", 0.03), softer=0.8)),
-        Row("thicker", actual=make_sheet(("EcoFlex 00-30", 0.033))),
-        Row("thinner", actual=make_sheet(("EcoFlex 00-30", 0.03 * 0.9)), depth=0.0265),
-        *(
-            Row(f"{name}_{kind}", number=number, apart=apart, exactly=exactly)
-            for name, number in (("two", 2), ("three", 3))
-            for kind, apart, exactly in (
-                ("64mm", 0.064, False),
-                ("from_32mm", 0.032, False),
-                ("32mm", 0.032, True),
-            )
-        ),
-        Row("hands_deep", number=0),
-        replace(thin, name="hands_thin", number=0),
-        replace(thin, name="hands_thin_20N", number=0, force=20.0, noise=clipped),
-    ]
-
-
-def draw_contacts(row: Row, count: int, rng: np.random.Generator) -> np.ndarray:
-    """Return contacts (count, number, 4): x, y, radius, m, and force, N."""
-    prior, touches = FingertipPrior(force=row.force), list[np.ndarray]()
-    size = np.array(row.body.size)
-    while len(touches) < count:
-        places = row.margin + (size - 2 * row.margin) * rng.random((row.number, 2))
-        if row.exactly:
-            turn = rng.uniform(0, 2 * np.pi, row.number - 1)
-            places[1:] = row.apart * np.stack([np.cos(turn), np.sin(turn)], axis=1)
-            places = places.cumsum(0)
-        away = np.linalg.norm(places[:, None] - places, axis=2)[np.triu_indices(row.number, 1)]
-        inside = ((places >= row.margin) & (places <= size - row.margin)).all()
-        if inside and (away > row.apart - 1e-9).all():
-            radius = rng.uniform(*prior.radii, row.number)
-            force = prior.force * np.exp(prior.spread * rng.standard_normal(row.number))
-            touches.append(np.column_stack([places, radius, force]))
-    return np.array(touches)
+    def _draw_contacts(
+        self, body: AbstractBody, prior: FingertipPrior, count: int, rng: np.random.Generator
+    ) -> np.ndarray:
+        """Return contacts (count, number, 4): x, y, radius, m, and force, N."""
+        touches, size = list[np.ndarray](), np.array(body.size)
+        while len(touches) < count:
+            positions = self.margin + (size - 2 * self.margin) * rng.random((self.number, 2))
+            if self.exactly:
+                turn = rng.uniform(0, 2 * np.pi, self.number - 1)
+                positions[1:] = self.apart * np.stack([np.cos(turn), np.sin(turn)], axis=1)
+                positions = positions.cumsum(0)
+            pairs = np.triu_indices(self.number, 1)
+            distances = np.linalg.norm(positions[:, None] - positions, axis=2)[pairs]
+            inside = ((positions >= self.margin) & (positions <= size - self.margin)).all()
+            if inside and (distances > self.apart - 1e-9).all():
+                radius = rng.uniform(*prior.radii, self.number)
+                force = prior.force * np.exp(prior.spread * rng.standard_normal(self.number))
+                touches.append(np.column_stack([positions, radius, force]))
+        return np.array(touches)
 
 
 class ExactSkin:
@@ -186,182 +142,282 @@ class ExactSkin:
 
     Args:
         body: its layers count.
-        sensors: at one depth.
+        sensors: at one depth, with square footprints.
         prior: of the fingertips.
     """
 
     def __init__(self, body: Sheet, sensors: Sensors, prior: FingertipPrior) -> None:
         slabs = [
-            Slab(
-                layer.thickness,
-                layer.material.young,
-                POISSON.get(layer.material.name, layer.material.poisson),
-            )
+            # A material above 0.5 is impossible; the simulator takes 0.49, too.
+            Slab(layer.thickness, material.young, 0.49 if material.poisson > 0.5 else material.poisson)
             for layer in reversed(body.layers)
+            for material in [layer.material]
         ]
-        self._sensors, self._rims = sensors, prior.rim * _EDGES
+        edges = np.log(
+            np.arange(1, 32, 2) / np.arange(31, 0, -2)
+        )  # even quantiles of the logistic distribution
+        self._sensors, self._rims = sensors, prior.rim * edges
         depth, reach = float(sensors.positions[0, 2]), float(np.hypot(*body.size))
         self._discs = Discs(slabs, depth, prior.radii, reach, self._rims.tolist())
 
     def readings(self, fingertips: np.ndarray) -> np.ndarray:
         """Return the readings (N, S), N/N, of fingertips (N, 3) of 1 N: x, y and radius, m."""
         area = np.pi * np.square((fingertips[:, 2:] + self._rims).clip(min=0)).mean(1, keepdims=True)
-        return self._discs.forces(fingertips, self._sensors.positions[:, :2], SIDE) / area
+        side = self._sensors.footprint[0]
+        return self._discs.forces(fingertips, self._sensors.positions[:, :2], side) / area
 
 
-def press_hands(simulator: Solid, body: Sheet, count: int, rng: np.random.Generator) -> np.ndarray:
+def press_hands(device: AbstractSimulated, count: int, rng: np.random.Generator) -> np.ndarray:
     """Return the readings (count, S), N, of hands and bars of the default gestures."""
     settings = GestureSettings(shapes=("bar", "hand"))
-    shapes = Shapes(settings.shapes, THIN)
+    shapes = Shapes(settings.shapes, device.body)
     drawn = draw_bodies(rng.random(count) < 0.5, settings, shapes, rng)
-    room = np.array(body.size) - settings.spare - (drawn["high"] - drawn["low"])
-    place = settings.spare / 2 - drawn["low"] + room * rng.random((count, 2))
-    frames = shapes.render(drawn["shape"], drawn["angle"], drawn["scale"], place, drawn["stretch"])
+    room = np.array(device.size) - settings.spare - (drawn["high"] - drawn["low"])
+    position = settings.spare / 2 - drawn["low"] + room * rng.random((count, 2))
+    frames = shapes.render(drawn["shape"], drawn["angle"], drawn["scale"], position, drawn["stretch"])
     peak = torch.from_numpy(rng.uniform(10e3, 180e3, count)).float()[:, None, None]
     with torch.no_grad():
-        return simulator(frames / frames.amax((1, 2), keepdim=True) * peak).readings.numpy().astype(float)
+        return device.model(frames / frames.amax((1, 2), keepdim=True) * peak).readings.numpy().astype(float)
 
 
-def read_device(readings: np.ndarray, noise: Noise, rng: np.random.Generator) -> np.ndarray:
-    """Return what a device with gains of its own measures, (B, S), N."""
-    gain = 1 + noise.gain * rng.standard_normal(readings.shape[1])
-    return gain * readings + np.sqrt(noise.floor) * rng.standard_normal(readings.shape)
-
-
-def run_row(row: Row, count: int, seed: int) -> dict[str, object]:
-    """Return the figures of a row."""
-    rng = np.random.default_rng([seed, *row.name.encode()])
-    prior, sensors = FingertipPrior(force=row.force), row.sensors
-    shift = np.pad(row.noise.position * rng.standard_normal((len(sensors), 2)), ((0, 0), (0, 1)))
-    real = Sensors(sensors.positions + shift, sensors.footprint)
-    simulator = Solid(row.body, sensors, poisson=POISSON)
-    posterior = Posterior(simulator, row.noise, row.body, prior)
-    contacts, exact = draw_contacts(row, 3 * count if row.number else 0, rng), None
-    if row.number:
-        exact = ExactSkin(row.actual or row.body, real, prior)
-        flat = contacts.reshape(-1, 4)
-        felt = exact.readings(flat[:, :3]) * flat[:, 3:]
-        true = felt.reshape(*contacts.shape[:2], -1).sum(1)
-    else:
-        true = press_hands(simulator, row.body, 2 * count, rng)
-        contacts = np.zeros((len(true), 0, 4))
-    chosen = np.flatnonzero((true > FELT * row.noise.frame).any(1))[:count]
-    readings = read_device(true[chosen], row.noise, rng)
-    estimates, seconds = list[FrameEstimate](), list[float]()
-    for values in readings:
-        start = time.process_time()
-        estimate = posterior.estimate(values)
-        seconds.append(time.process_time() - start)
-        assert isinstance(estimate, FrameEstimate)
-        estimates.append(estimate)
-    figures = {"row": row.name} | summarise_estimates(estimates, contacts[chosen], prior)
-    if exact and row.name == "deep":
-        figures |= _summarise_grid(GridPosterior(exact, row, prior), readings, contacts[chosen, 0])
-    return figures | {
-        "ms_median": 1e3 * float(np.median(seconds)),
-        "ms_p99": 1e3 * float(np.quantile(seconds, 0.99)),
-    }
-
-
-class GridPosterior:
-    """Posterior of one contact on all places of a grid, with the readings of the exact skin: the best known.
+def grid_errors(
+    skin: ExactSkin,
+    body: AbstractBody,
+    noise: Noise,
+    prior: FingertipPrior,
+    readings: np.ndarray,
+    truth: np.ndarray,
+) -> dict[str, Any]:
+    """Return the figures of the best posterior that is known: on all positions of a grid, by the exact skin.
 
     Args:
         skin: with its readings.
-        row: size and noise.
-        prior: of the contact.
+        body: its size counts.
+        noise: of the readings.
+        prior: of the contacts.
+        readings: (B, S), N.
+        truth: contacts (B, 4): x, y, radius, m, and force, N.
     """
-
-    def __init__(self, skin: ExactSkin, row: Row, prior: FingertipPrior) -> None:
-        x, y = (np.arange(0.0005, side, 0.001) for side in row.body.size)
-        radii = np.linspace(*prior.radii, 9)
-        self._grid = np.stack(np.meshgrid(x, y, radii, indexing="ij"), -1).reshape(-1, 3)
-        self._table, self._floor = skin.readings(self._grid), row.noise.floor
-        self._square = (self._table**2).sum(1) / self._floor
-        self._score = np.linspace(-5, 5, 101)
-        self._force = prior.force * np.exp(prior.spread * self._score)
-
-    def estimate(self, readings: np.ndarray) -> np.ndarray:
-        """Return the mean x and y, m, and force, N, for readings (S,), N."""
-        along = self._table @ readings / self._floor
-        best = along.clip(min=0) ** 2 / self._square / 2
+    x, y = (np.arange(0.0005, side, 0.001) for side in body.size)
+    radii, score = np.linspace(*prior.radii, 9), np.linspace(-5, 5, 101)
+    grid = np.stack(np.meshgrid(x, y, radii, indexing="ij"), -1).reshape(-1, 3)
+    table, force = skin.readings(grid), prior.force * np.exp(prior.spread * score)
+    square = (table**2).sum(1) / noise.floor
+    means = []
+    for values in readings:
+        along = table @ values / noise.floor
+        best = along.clip(min=0) ** 2 / square / 2
         likely = np.flatnonzero(best > best.max() - 25)
-        fit = np.outer(along[likely], self._force) - np.outer(self._square[likely], self._force**2) / 2
-        mass = np.exp(fit - self._score**2 / 2 - fit.max())
+        fit = np.outer(along[likely], force) - np.outer(square[likely], force**2) / 2
+        mass = np.exp(fit - score**2 / 2 - fit.max())
         mass /= mass.sum()
-        return np.array([*(mass.sum(1) @ self._grid[likely, :2]), mass.sum(0) @ self._force])
-
-
-def _summarise_grid(grid: GridPosterior, readings: np.ndarray, truth: np.ndarray) -> dict[str, float]:
-    found = np.stack([grid.estimate(values) for values in readings])
-    return {
-        "grid_rms_mm": 1e3 * float(np.sqrt(np.square(found[:, :2] - truth[:, :2]).mean())),
-        "grid_force_median_%": 100 * float(np.median(np.abs(found[:, 2] / truth[:, 3] - 1))),
-    }
+        means.append([*(mass.sum(1) @ grid[likely, :2]), mass.sum(0) @ force])
+    estimates = np.array(means)
+    position = 1e3 * float(np.sqrt(np.square(estimates[:, :2] - truth[:, :2]).mean()))
+    relative = np.abs(estimates[:, 2] / truth[:, 3] - 1)
+    return {"grid_rms_mm": position, "grid_force_median_%": 100 * float(np.median(relative))}
 
 
 def summarise_estimates(
     estimates: Sequence[FrameEstimate], contacts: np.ndarray, prior: FingertipPrior
-) -> dict[str, object]:
+) -> dict[str, Any]:
     """Return the figures of estimates for true contacts (B, n, 4), of the touches whose number is right."""
-    number = contacts.shape[1]
-    right = [row for row, estimate in enumerate(estimates) if estimate.number == number]
-    figures: dict[str, object] = {
-        "touches": len(estimates),
-        "number_right_%": 100 * len(right) / max(len(estimates), 1) if number else "",
-        "fingertip_%": 100 * float(np.mean([estimate.fingertip for estimate in estimates])),
-    }
-    names = (
-        "rms_mm", "median_mm", "force_median_%", "peak_median_%", "peak_covered_%", "covered_%",
-        "covered_low_%", "covered_high_%", "area_median_mm2", "grid_rms_mm", "grid_force_median_%",
-    )  # fmt: skip
-    figures |= dict.fromkeys(names, "")
-    if not number or not right:
+    number, rows = contacts.shape[1], list[dict[str, Any]]()
+    right = [estimate.number == number for estimate in estimates]
+    figures: dict[str, Any] = {"touches": len(estimates)}
+    figures["number_right_%"] = 100 * float(np.mean(right)) if number else ""
+    figures["fingertip_%"] = 100 * float(np.mean([estimate.fingertip for estimate in estimates]))
+    figures |= dict.fromkeys(_COLUMNS, "")
+    for estimate, truths in zip(estimates, contacts, strict=True):
+        if not number or estimate.number != number:
+            continue
+        centres = np.array([contact.place for contact in estimate.contacts])
+        distances = np.linalg.norm(centres[:, None] - truths[:, :2], axis=2)
+        for index, true in zip(*linear_sum_assignment(distances**2), strict=True):
+            contact, (*position, radius, force) = estimate.contacts[index], truths[true]
+            region, pressure = contact.region(), force * prior.peak(radius)
+            low, high = contact.peak_interval
+            rows.append({"square": distances[index, true] ** 2 / 2, "distance": distances[index, true]})
+            rows[-1] |= {"force": abs(contact.force / force - 1), "peak": abs(contact.peak / pressure - 1)}
+            rows[-1] |= {"within": low < pressure < high, "covered": region.contains(np.array(position))}
+            rows[-1]["area"] = region.area
+    if not rows:
         return figures
-    place, force, peak, within, covered, area = [], [], [], [], [], []
-    for row in right:
-        found = estimates[row].contacts
-        away = np.array([[np.sum((c.place - t[:2]) ** 2) for t in contacts[row]] for c in found])
-        order = min(permutations(range(number)), key=lambda p: sum(away[k, p[k]] for k in range(number)))
-        for contact, index in zip(found, order, strict=True):
-            truth = contacts[row, index]
-            region, pressure = contact.region(), truth[3] * prior.peak(truth[2])
-            place.append(contact.place - truth[:2])
-            force.append(contact.force / truth[3] - 1)
-            peak.append(contact.peak / pressure - 1)
-            within.append(contact.peak_interval[0] < pressure < contact.peak_interval[1])
-            covered.append(region.contains(truth[:2]))
-            area.append(region.area)
-    interval = binomtest(sum(covered), len(covered)).proportion_ci(method="wilson")
-    values = (
-        1e3 * np.sqrt(np.square(place).mean()), 1e3 * np.median(np.linalg.norm(place, axis=1)),
-        100 * np.median(np.abs(force)), 100 * np.median(np.abs(peak)), 100 * np.mean(within),
-        100 * np.mean(covered), 100 * interval.low, 100 * interval.high, 1e6 * np.median(area),
+    frame = pd.DataFrame(rows)
+    median, mean = frame.median(), frame.mean()
+    interval = binomtest(int(frame.covered.sum()), len(frame)).proportion_ci(method="wilson")
+    numbers = (
+        1e3 * np.sqrt(mean.square), 1e3 * median.distance, 100 * median.force, 100 * median.peak,
+        100 * mean.within, 100 * mean.covered, 100 * interval.low, 100 * interval.high, 1e6 * median.area,
     )  # fmt: skip
-    return figures | dict(zip(names, map(float, values), strict=False))
+    return figures | dict(zip(_COLUMNS, map(float, numbers), strict=False))
 
 
-def main(words: Sequence[str]) -> None:
-    """Run the rows and write contact.csv."""
-    defaults = {"touches": "2500", "rows": "", "out": str(ROOT / "docs/results"), "seed": "0"}
-    settings = script_settings(words, defaults)
-    begins = tuple(settings["rows"].split(","))
-    chosen = [row for row in rows() if row.name.startswith(begins)]
-    if not chosen:
-        raise InputError(f"rows={settings['rows']} begins no row: {', '.join(row.name for row in rows())}")
-    torch.set_num_threads(1)
-    lines = list[Mapping[str, object]]()
-    for row in chosen:
-        count = int(settings["touches"]) // (1 if row.number == 1 else 4)
-        lines.append(run_row(row, count, int(settings["seed"])))
-        print(*(f"{k}={_text(v)}" for k, v in lines[-1].items()), flush=True)
-    table = [[*lines[0]], *([*map(_text, line.values())] for line in lines)]
-    print(write(csv_text(table), Path(settings["out"]) / "contact.csv"))
+# Four barometers under a strip of rubber: the simulation against a real skin.
 
 
-def _text(value: object) -> str:
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
+RIM = 5e-4  # m, of the tip
+PITCH, LAST = 0.006, 0.027  # m, between the sensors, and the last of them in the strip
 
 
-if __name__ == "__main__":
-    run_script(main)
+def read_presses(folder: Path, name: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return the position (P,), mm, and the mean readings (P, 4), 10 kPa, of presses at their full depth.
+
+    The five readings before each press are its baseline.
+
+    Args:
+        folder: of the recordings, each of a robot that presses a strip at one position after another.
+        name: beginning of the name of the file.
+
+    Raises:
+        InputError: no such file, or none of its form.
+    """
+    try:
+        (path,) = folder.glob(f"{name}*.csv")
+        table = pd.read_csv(path)
+        readings = table[[f"Sensor_{number}" for number in range(4)]].to_numpy(float) * 1e-4
+        x, depth = table["x"].to_numpy(float) / 1e3, table["z"].to_numpy(float)
+    except (OSError, ValueError, KeyError) as error:
+        raise InputError(
+            f"cannot read {folder}/{name}*.csv as a recording of four barometers: {error}"
+        ) from error
+    number, presses = np.cumsum(np.diff((depth > 0).astype(int), prepend=0) > 0), []
+    for press in range(1, int(number.max()) + 1):
+        inside = np.flatnonzero((number == press) & (depth > 0))
+        before = readings[max(0, inside[0] - 5) : inside[0]]
+        baseline = before.mean(axis=0) if len(before) else readings[inside[0]]
+        deep = inside[depth[inside] >= 0.98 * depth[inside].max()]
+        presses.append([x[deep[0]], *(readings[deep] - baseline).mean(axis=0)])
+    positions, *columns = np.array(presses).T
+    return positions, np.stack(columns, axis=1)
+
+
+@dataclass(frozen=True)
+class Strip:
+    """The simulated strip.
+
+    Attributes:
+        body, simulator: of the strip.
+        radius: of the tip, m.
+        offset: x of the strip at x = 0 of the robot, m.
+        gains: (4,), reading per simulated reading of the tip with 1 N.
+        error: (4,), rms of what the calibration leaves, in units of the simulated reading.
+    """
+
+    body: AbstractBody
+    simulator: AbstractSimulator
+    radius: float
+    offset: float
+    gains: np.ndarray
+    error: np.ndarray
+
+    def readings(self, x: np.ndarray, radius: float | np.ndarray | None = None) -> np.ndarray:
+        """Return simulated readings (N, 4) of the tip with 1 N at positions (N,) of the robot, mm."""
+        size = self.radius if radius is None else radius
+        return strip_readings(self.body, self.simulator, x / 1e3 + self.offset, size)
+
+    def moved(self, x: np.ndarray, measured: np.ndarray) -> "Strip":
+        """Return the strip at the position below the robot with which measured readings (P, 4) agree best."""
+        offsets = self.offset + np.arange(-PITCH, PITCH + 1e-6, 1e-4)
+        end = self.body.size[0] - 0.001 - x.max() / 1e3
+        strips = [replace(self, offset=float(each)) for each in offsets if 0.001 < each < end]
+        return min(strips, key=lambda strip: np.square(strip.readings(x) * strip.gains - measured).sum())
+
+
+def strip_readings(
+    body: AbstractBody, simulator: AbstractSimulator, x: np.ndarray, radius: float | np.ndarray
+) -> np.ndarray:
+    """Return readings (N, 4) of discs with 1 N in the middle of the strip at x (N,), m."""
+    discs = np.column_stack([x, np.full(len(x), body.size[1] / 2), np.broadcast_to(radius, len(x))])
+    return disc_readings(simulator, body, discs, RIM)
+
+
+def build_strip(thickness: float) -> tuple[Sheet, Solid]:
+    """Return body and simulator of the strip, with the sensors at its surface.
+
+    The pitch of the sensors is known from the board, the width from the moulds.
+    """
+    body = Sheet((0.048, 0.010), (96, 20), (Layer(Material.of("EcoFlex 00-30"), thickness),))
+    positions = [(LAST - number * PITCH, 0.005, thickness) for number in (3, 2, 1, 0)]
+    return body, Solid(body, Listed(positions, (0.001, 0.001)).sensors(body))
+
+
+def calibrate_strip(x: np.ndarray, measured: np.ndarray) -> Strip:
+    """Return the strip whose readings are nearest to measured ones (P, 4) at positions (P,), mm.
+
+    The unknown thickness, radius of the tip and x of the strip at x = 0 of the robot are chosen, too.
+    """
+    strips, losses = list[Strip](), list[float]()
+    for thickness in (0.003, 0.004, 0.005, 0.006):
+        body, simulator = build_strip(thickness)
+        grid = np.arange(0.001, body.size[0] - 0.001, 2e-4)
+        for radius in (0.0015, 0.002, 0.0025, 0.003, 0.0035, 0.0045):
+            table = strip_readings(body, simulator, grid, radius)
+            for offset in np.arange(0.006, 0.012, 1e-4):
+                at = x / 1e3 + offset
+                simulated = np.stack([np.interp(at, grid, column) for column in table.T], axis=1)
+                gains = (simulated * measured).sum(axis=0) / np.square(simulated).sum(axis=0)
+                error = np.sqrt(np.square(simulated - measured / gains).mean(axis=0))
+                losses.append(float(np.square(simulated * gains - measured).mean()))
+                strips.append(Strip(body, simulator, radius, float(offset), gains, error))
+    return strips[int(np.argmin(losses))]
+
+
+@dataclass(frozen=True)
+class Barometers:
+    """A simulated strip against measured presses: its readings, and positions by its posterior.
+
+    The strip is calibrated on every third press of a recording. In another recording the robot begins
+    elsewhere: every third press tells where. The others are the test.
+
+    Args:
+        data: folder of the recordings.
+        recordings: beginnings of the names of files: the one for gains, and another one to test.
+        seed: of the intervals, which resample presses.
+    """
+
+    data: str = "."
+    recordings: Annotated[Sequence[str], MinLen(1)] = ("test_full_20230706_175400",)
+    seed: int = 0
+
+    def __call__(self, subject: Subject) -> pd.DataFrame:
+        strip: Strip | None = None
+        for name in self.recordings:
+            x, measured = read_presses(Path(self.data).expanduser(), name)
+            chosen = np.arange(len(x)) % 3 == 1
+            known = x[chosen], measured[chosen]
+            strip = calibrate_strip(*known) if strip is None else strip.moved(*known)
+            x, measured = x[~chosen], measured[~chosen]
+        assert strip is not None
+        wrong = np.square(strip.readings(x) * strip.gains - measured).sum(axis=1)
+        whole = np.square(measured).sum(axis=1)
+        close = x / 1e3 + strip.offset < LAST + PITCH / 2
+        squares = np.square(posterior_errors(strip, x[close], measured[close]))
+        words = f"solid, {1e3 * strip.body.thickness:g} mm thick, tip of {1e3 * strip.radius:g} mm"
+        start = {"recording": subject.condition, "training": 20, "strip": words}
+        rows = [
+            {"metric": "relative rms of readings, %", **self._rms(1e4 * wrong, whole, 8)},
+            {"metric": "rms of positions, mm", **self._rms(squares, np.ones_like(squares), 4)},
+        ]
+        return pd.DataFrame([start | row for row in rows]).round(3)
+
+    def _rms(self, squares: np.ndarray, weights: np.ndarray, stream: int) -> dict[str, float]:
+        """Return the root of the weighted mean, and its 95 % interval over presses."""
+        size = (1000, len(squares))
+        draw = np.random.default_rng([self.seed, stream]).integers(len(squares), size=size)
+        roots = np.sqrt(squares[draw].sum(axis=1) / weights[draw].sum(axis=1))
+        low, high = np.quantile(roots, [0.025, 0.975])
+        value = float(np.sqrt(squares.sum() / weights.sum()))
+        return {"test": len(squares), "value": value, "low": float(low), "high": float(high)}
+
+
+def posterior_errors(strip: Strip, x: np.ndarray, measured: np.ndarray) -> np.ndarray:
+    """Return the errors of positions by the posterior of the simulated strip, mm."""
+    radii = 0.8 * strip.radius, 1.25 * strip.radius
+    prior = FingertipPrior(1.0, 0.3, radii, RIM, numbers=(0, 1, 0, 0), large=0)
+    noise = Noise(float(np.sqrt(np.square(strip.error).mean())))
+    posterior = Posterior(strip.simulator, noise, strip.body, prior, contacts=1)
+    estimates = posterior.estimate(measured / strip.gains)
+    assert isinstance(estimates, list)
+    positions = np.array([estimate.contacts[0].place[0] for estimate in estimates])
+    return 1e3 * (positions - strip.offset) - x

@@ -5,14 +5,17 @@ frames of one layout have it; what differs are the nodes' labels. Documents of s
 embedded together. An SVM tells what is in them, and the variance that labels and layouts explain.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from statistics import fmean, stdev
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import pandas as pd
-from matplotlib.axes import Axes
+from annotated_types import Ge, MinLen
 from matplotlib.figure import Figure
+from rich.console import Console
+from rich.progress import track
 from sklearn.decomposition import PCA
 from sklearn.manifold import TSNE
 from sklearn.model_selection import GridSearchCV
@@ -21,9 +24,10 @@ from sklearn.preprocessing import StandardScaler
 from sklearn.svm import SVC
 
 from experiments.studies.comparison import combine_verdicts, compare_samples, judge
-from experiments.studies.measures import ProbeSettings
+from experiments.studies.measures import Subject
 from experiments.studies.pages import Page
 from experiments.studies.study import Statement
+from skin.device.balance import report_balance
 from skin.device.base import AbstractDevice
 from skin.device.touches import Touches
 from skin.errors import InputError
@@ -32,68 +36,160 @@ from skin.learning.graph import adjacency, neighbours
 from skin.learning.learner import AbstractLearner
 from skin.plot.figures import COLOURS, MARKS
 
-_POWERS = 5
-_EIGENVALUES = 10
-_BINS = 20
-
 FRAME = "readings, one frame"
-
-_FIRST_SEED = 1_000_000  # no training draws from these
-_COSTS = (0.1, 1, 10, 100)
-_FOLDS = 3
-POINTS = 400  # touches in each panel of the figure
-_TOLERANCE = 0.02  # of the statements
-
-
 Row = dict[str, Any]
 
 
-def probe(device: AbstractDevice, settings: ProbeSettings, learner: AbstractLearner | None) -> Iterator[Row]:
-    """Yield a row for each input and seed: graph embeddings, those of a trained encoder, plain readings.
+@dataclass(frozen=True)
+class Embeddings:
+    """Accuracy of an SVM on graph embeddings, readings, and the encoder of a run, if one is given.
 
     A simulated device draws new touches for each seed, separate from all training data; other devices use
     their train and test splits, once. Embeddings use the readings of all touches, but no labels.
+    ``conf/study/embeddings.yaml`` explains the other fields.
 
-    Yields:
-        ``attribute`` (degree, reading, or nothing where the input is no graph embedding), ``name`` and
-        ``seed``; ``accuracy LABEL``, the fraction of held-out touches that an SVM labels rightly, NaN where
-        it had no choice; ``chance``, that of always predicting the commoner class; ``accuracy layout`` and
-        ``variance LABEL``, ``variance layout`` (:func:`explained`), of several layouts, NaN without;
-        of the first seed ``plane`` and ``mixed`` (:func:`planes`), with ``classes`` and ``layouts``.
+    The columns are ``attribute`` (degree, reading, or nothing where the input is not a graph embedding),
+    ``name`` and ``seed``; ``accuracy LABEL``, the fraction of held-out touches that an SVM labels rightly,
+    NaN where it had no choice; ``chance``, the accuracy of always predicting the commoner class; of several
+    layouts ``accuracy layout``, ``variance layout`` and ``variance LABEL`` (:func:`explained`), NaN without;
+    of the first seed ``plane`` and ``mixed`` (:func:`planes`), with ``classes`` and ``layouts``.
+
+    Args:
+        first: seed of the first touches; no training draws from it and those behind it.
+        drawn: number of touches in each panel of the figure.
     """
-    if device.task.direction:
-        raise InputError("embeddings are probed for labels that hold or not: set data.direction=false")
-    for seed in settings.seeds if device.simulation else settings.seeds[:1]:
-        touches, mixed = _touches(device, settings, seed), _layouts(device, settings, seed)
-        for (attribute, name), vectors in _inputs([*touches, *mixed], settings, seed, learner):
-            row = {"attribute": attribute, "name": name, "seed": seed}
-            drawn = POINTS if seed == settings.seeds[0] else 0
-            yield (
-                row
-                | _probe_labels(vectors, touches, device.task.names, drawn)
-                | _probe_layouts(vectors[sum(map(len, touches)) :], mixed, device.task.names, seed, drawn)
+
+    attributes: Annotated[Sequence[Literal["degree", "reading"]], MinLen(1)] = ("degree", "reading")
+    train: Annotated[int, Ge(20)] = 800
+    test: Annotated[int, Ge(10)] = 400
+    seeds: Annotated[Sequence[int], MinLen(1)] = (0, 1, 2)
+    layouts: Annotated[int, Ge(1)] = 3
+    levels: Annotated[int, Ge(2)] = 8
+    depth: Annotated[int, Ge(0)] = 2
+    width: Annotated[int, Ge(2)] = 128
+    epochs: Annotated[int, Ge(1)] = 50
+    graph: Mapping[str, Any] = field(default_factory=lambda: {"edges": "knn", "count": 6, "weight": "exp"})
+    first: int = 1_000_000
+    drawn: int = 400
+
+    def __call__(self, subject: Subject) -> pd.DataFrame:
+        device, learner = subject.device, subject.learner if subject.model else None
+        report_balance(device)
+        count = (len(self.attributes) * 3 + (learner is not None) + 2) * len(self.seeds)
+        steps = track(self.probe(device, learner), "probing", count, console=Console(stderr=True))
+        frame = pd.DataFrame(steps)
+        frame.attrs["labels"] = list(device.task.names)
+        return frame
+
+    def probe(self, device: AbstractDevice, learner: AbstractLearner | None) -> Iterator[Row]:
+        """Yield a row for each input and seed: graph embeddings, a trained encoder, plain readings."""
+        if device.task.direction:
+            raise InputError("embeddings are probed for labels that hold or not: set data.direction=false")
+        names = device.task.names
+        for seed in self.seeds if device.simulation else self.seeds[:1]:
+            touches, mixed = self._touches(device, seed), self._mixed(device, seed)
+            labels = _labels(touches)
+            drawn = self.drawn if seed == self.seeds[0] else 0
+            for (attribute, name), vectors in self._inputs([*touches, *mixed], seed, learner):
+                row: Row = {"attribute": attribute, "name": name, "seed": seed}
+                row |= _probe_labels(vectors[: len(labels)], labels, len(touches[0]), names, drawn)
+                yield row | _probe_layouts(vectors[len(labels) :], mixed, names, seed, drawn)
+
+    def _touches(self, device: AbstractDevice, seed: int) -> list[Touches]:
+        """Return the touches of one layout, those to train the SVM on first."""
+        if device.simulation is not None:
+            settings = {"data_seed": self.first + seed, "gestures": self.train + self.test}
+            drawn = device.simulation.replace(**settings).recording().touches
+            return [drawn[: self.train], drawn[self.train :]]
+        return [device.touches("train")[: self.train], device.touches("test")[: self.test]]
+
+    def _mixed(self, device: AbstractDevice, seed: int) -> list[Touches]:
+        """Return as many other touches on each of some scattered layouts; none where that cannot be."""
+        if device.simulation is None or self.layouts < 2:
+            return []
+        try:
+            others = list(scattered_devices(device.simulation, self.layouts))
+        except InputError:  # this number of sensors cannot form a grid
+            return []
+        draws = (self.first * (2 + number) + seed for number in range(self.layouts))
+        return [
+            other.replace(data_seed=draw, gestures=self.test).recording().touches
+            for other, draw in zip(others, draws, strict=True)
+        ]
+
+    def _inputs(
+        self, sets: Sequence[Touches], seed: int, learner: AbstractLearner | None
+    ) -> Iterator[tuple[tuple[str, str], np.ndarray]]:
+        """Yield attribute and name, and the vectors (B, E) of all touches."""
+        for attribute in self.attributes:
+            for name, vectors in self._graph_vectors(sets, attribute, seed):
+                yield (attribute, name), vectors
+        if learner is not None:
+            encoded = [learner.embeddings(touches).numpy() for touches in sets]
+            yield ("", "trained encoder"), np.concatenate(encoded)
+        yield ("", FRAME), np.concatenate([strongest(touches) for touches in sets])
+        windows = [touches.readings.where(touches.valid, 0).flatten(1).numpy() for touches in sets]
+        yield ("", "readings, window"), np.concatenate(windows)
+
+    def _graph_vectors(
+        self, sets: Sequence[Touches], attribute: str, seed: int
+    ) -> Iterator[tuple[str, np.ndarray]]:
+        """Yield each graph embedding (B, E) of the strongest frames of touches, one layout per set.
+
+        GL2Vec gives half its width to the graph and half to its line graph.
+        """
+        if any(touches.positions.ndim > 2 for touches in sets):
+            raise InputError(
+                "graph embeddings need sensors that stay in place, these have one layout per touch"
             )
+        frames = [strongest(touches) for touches in sets]
+        positions = [touches.positions.double().numpy() for touches in sets]
+        edges, count, weight = (self.graph[name] for name in ("edges", "count", "weight"))
+        weights = [adjacency(points, neighbours(points, edges, count), weight) for points in positions]
+        if attribute == "degree":
+            labels = [np.tile((w > 0).sum(0), (len(f), 1)) for w, f in zip(weights, frames, strict=True)]
+        else:
+            ends = np.cumsum([len(frame) for frame in frames])[:-1]
+            labels = np.split(levels(np.concatenate(frames), self.levels), ends)
+        pairs = list(zip(labels, weights, strict=True))
+        words = [row for label, matrix in pairs for row in subtrees(label, matrix > 0, self.depth)]
+        yield "Graph2Vec", doc2vec(words, self.width, self.epochs, seed)
+        lines = [row for pair in pairs for row in subtrees(*line_graph(*pair), self.depth)]
+        half = [doc2vec(documents, self.width // 2, self.epochs, seed) for documents in (words, lines)]
+        yield "GL2Vec", np.concatenate(half, axis=1)
+        kinds = 1 + max(int(label.max()) for label in labels)
+        yield "IGE", np.concatenate([invariant(label, matrix, kinds) for label, matrix in pairs])
+
+    def page(self, frame: pd.DataFrame, title: str) -> Page:
+        """Return the table, the verdicts, and figure 5 of the report, of the first seed."""
+        table, names = embeddings_table(frame), frame.attrs["labels"]
+        about = f"{_ABOUT}\n" + "".join(f"- {line}\n" for line in embedding_statements(frame))
+        figure = spaces(frame[frame.seed == frame.seed.iloc[0]], names)
+        return Page(about, {"What an SVM reads in embeddings, accuracy in per cent": table}, table, figure)
 
 
-def _probe_labels(vectors: np.ndarray, sets: Sequence[Touches], names: Sequence[str], drawn: int) -> Row:
-    labels, train = _labels(sets), len(sets[0])
-    own = vectors[: len(labels)]
-    held = labels[train:].mean(axis=0)
+def _probe_labels(
+    vectors: np.ndarray, labels: np.ndarray, train: int, names: Sequence[str], drawn: int
+) -> Row:
     row: Row = {
-        f"accuracy {name}": svm_accuracy(own, column, train)
+        f"accuracy {name}": svm_accuracy(vectors, column, train)
         for name, column in zip(names, labels.T, strict=True)
     }
+    held = labels[train:].mean(axis=0)
     row |= {"chance": float(np.maximum(held, 1 - held).mean()), "classes": labels[:drawn].ravel().tolist()}
-    return row | {"plane": planes(own[:drawn]).ravel().tolist() if drawn else []}
+    return row | {"plane": planes(vectors[:drawn]).ravel().tolist() if drawn else []}
+
+
+def _labels(sets: Sequence[Touches]) -> np.ndarray:
+    return np.concatenate([touches.known_labels.numpy() for touches in sets]).astype(int)
 
 
 def _probe_layouts(
     vectors: np.ndarray, sets: Sequence[Touches], names: Sequence[str], seed: int, drawn: int
 ) -> Row:
     if not sets:
-        empty = dict.fromkeys(
-            ["accuracy layout", *(f"variance {name}" for name in ("layout", *names))], np.nan
-        )
+        layout = ["accuracy layout", "variance layout"]
+        empty = dict.fromkeys([*layout, *(f"variance {name}" for name in names)], np.nan)
         return empty | {"layouts": [], "mixed": []}
     layouts = np.repeat(np.arange(len(sets)), [len(layout) for layout in sets])
     columns = dict(zip(names, _labels(sets).T, strict=True)) | {"layout": layouts}
@@ -112,98 +208,26 @@ def strongest(touches: Touches) -> np.ndarray:
 
 
 def svm_accuracy(vectors: np.ndarray, classes: np.ndarray, train: int) -> float:
-    """Return the share of ``vectors[train:]`` that an SVM trained on the others puts into its class (B,).
+    """Return the fraction of ``vectors[train:]`` that an SVM trained on the others puts into its class (B,).
 
     Radial basis functions on standardised vectors, the cost chosen by cross-validation among the training
     ones only (report, 2.2.2). nan where some class is too rare to learn.
     """
-    if np.unique(classes[:train], return_counts=True)[1].min() < _FOLDS or np.ptp(classes[:train]) == 0:
+    counts = np.unique(classes[:train], return_counts=True)[1]
+    if len(counts) < 2 or counts.min() < 3:
         return float("nan")
-    machine = make_pipeline(StandardScaler(), SVC())
-    search = GridSearchCV(machine, {"svc__C": _COSTS}, cv=_FOLDS)
+    search = GridSearchCV(make_pipeline(StandardScaler(), SVC()), {"svc__C": (0.1, 1, 10, 100)}, cv=3)
     return float(search.fit(vectors[:train], classes[:train]).score(vectors[train:], classes[train:]))
 
 
 def explained(vectors: np.ndarray, classes: np.ndarray) -> float:
-    """Return the share of the variance of vectors (B, E) that lies between classes (B,); 0 if all are one."""
+    """Return the fraction of the variance of vectors (B, E) between classes (B,); 0 if all are one."""
     centred = vectors - vectors.mean(axis=0)
-    means = [(classes == number, centred[classes == number].mean(axis=0)) for number in np.unique(classes)]
-    between = sum(which.sum() * (mean**2).sum() for which, mean in means)
+    parts = [centred[classes == number] for number in np.unique(classes)]
+    between = sum(len(part) * (part.mean(axis=0) ** 2).sum() for part in parts)
     # Where nothing but the last bit differs there is no variance to explain.
     whole = (centred**2).sum()
     return float(between / whole) if whole > 1e-12 * (vectors**2).sum() else 0.0
-
-
-def _graph_vectors(
-    sets: Sequence[Touches], attribute: str, settings: ProbeSettings, seed: int
-) -> Iterator[tuple[str, np.ndarray]]:
-    """Yield each graph embedding (B, E) of the strongest frames of touches, one layout per set.
-
-    GL2Vec gives half its width to the graph and half to its line graph.
-    """
-    if any(touches.positions.ndim > 2 for touches in sets):
-        raise InputError("graph embeddings need sensors that stay in place, these have one layout per touch")
-    frames = [strongest(touches) for touches in sets]
-    places = [touches.positions.double().numpy() for touches in sets]
-    edges, count, weight = (settings.graph[name] for name in ("edges", "count", "weight"))
-    weights = [adjacency(matrix, neighbours(matrix, edges, count), weight) for matrix in places]
-    if attribute == "degree":
-        labels = [
-            np.tile((matrix > 0).sum(0), (len(f), 1)) for matrix, f in zip(weights, frames, strict=True)
-        ]
-    else:
-        ends = np.cumsum([len(frame) for frame in frames])[:-1]
-        labels = np.split(levels(np.concatenate(frames), settings.levels), ends)
-    pairs = list(zip(labels, weights, strict=True))
-    words = [row for label, matrix in pairs for row in subtrees(label, matrix > 0, settings.depth)]
-    yield "Graph2Vec", doc2vec(words, settings.width, settings.epochs, seed)
-    lines = [row for pair in pairs for row in subtrees(*line_graph(*pair), settings.depth)]
-    half = [doc2vec(documents, settings.width // 2, settings.epochs, seed) for documents in (words, lines)]
-    yield "GL2Vec", np.concatenate(half, axis=1)
-    kinds = 1 + max(int(label.max()) for label in labels)
-    yield "IGE", np.concatenate([invariant(label, matrix, kinds) for label, matrix in pairs])
-
-
-def _inputs(
-    sets: Sequence[Touches], settings: ProbeSettings, seed: int, learner: AbstractLearner | None
-) -> Iterator[tuple[tuple[str, str], np.ndarray]]:
-    for attribute in settings.attributes:
-        for name, vectors in _graph_vectors(sets, attribute, settings, seed):
-            yield (attribute, name), vectors
-    if learner is not None:
-        encoded = [learner.embeddings(touches).numpy() for touches in sets]
-        yield ("", "trained encoder"), np.concatenate(encoded)
-    yield ("", FRAME), np.concatenate([strongest(touches) for touches in sets])
-    windows = [touches.readings.where(touches.valid, 0).flatten(1).numpy() for touches in sets]
-    yield ("", "readings, window"), np.concatenate(windows)
-
-
-def _touches(device: AbstractDevice, settings: ProbeSettings, seed: int) -> list[Touches]:
-    """Return the touches of one layout, those to train the SVM on first."""
-    count = settings.train + settings.test
-    if device.simulation is not None:
-        drawn = device.simulation.replace(data_seed=_FIRST_SEED + seed, gestures=count).recording().touches
-        return [drawn[: settings.train], drawn[settings.train :]]
-    return [device.touches("train")[: settings.train], device.touches("test")[: settings.test]]
-
-
-def _layouts(device: AbstractDevice, settings: ProbeSettings, seed: int) -> list[Touches]:
-    """Return as many other touches on each of some scattered layouts; none where that cannot be."""
-    if device.simulation is None or settings.layouts < 2:
-        return []
-    try:
-        others = list(scattered_devices(device.simulation, settings.layouts))
-    except InputError:  # this number of sensors cannot form a grid
-        return []
-    draws = (_FIRST_SEED * (2 + number) + seed for number in range(settings.layouts))
-    return [
-        other.replace(data_seed=draw, gestures=settings.test).recording().touches
-        for other, draw in zip(others, draws, strict=True)
-    ]
-
-
-def _labels(sets: Sequence[Touches]) -> np.ndarray:
-    return np.concatenate([touches.known_labels.numpy() for touches in sets]).astype(int)
 
 
 def levels(readings: np.ndarray, count: int) -> np.ndarray:
@@ -289,7 +313,9 @@ def doc2vec(documents: Sequence[np.ndarray], width: int, epochs: int, seed: int)
     return model.dv.vectors
 
 
-def invariant(labels: np.ndarray, weights: np.ndarray, count: int) -> np.ndarray:
+def invariant(
+    labels: np.ndarray, weights: np.ndarray, count: int, sizes: tuple[int, int, int] = (5, 10, 20)
+) -> np.ndarray:
     """Return the invariant embedding of graphs (Galland and Lelarge 2019, with Karate Club's three parts).
 
     The labels' mean after 1 to 5 steps of a random walk; the 10 smallest eigenvalues of the Laplacian L; and
@@ -300,6 +326,7 @@ def invariant(labels: np.ndarray, weights: np.ndarray, count: int) -> np.ndarray
         labels: (B, S), whole numbers from 0 to count - 1.
         weights: (S, S), symmetric, 0 where there is no edge.
         count: of different labels.
+        sizes: numbers of steps, of eigenvalues and of bins of the histogram.
 
     Returns:
         (B, 5 count + 10 + 20).
@@ -308,13 +335,13 @@ def invariant(labels: np.ndarray, weights: np.ndarray, count: int) -> np.ndarray
     degree = edges.sum(axis=1)
     walk = edges / np.maximum(degree, np.finfo(float).tiny)[:, None]
     values, vectors = np.linalg.eigh(np.diag(degree) - edges)
-    smallest = np.pad(values[:_EIGENVALUES], (0, max(0, _EIGENVALUES - len(values))))
+    smallest = np.pad(values[: sizes[1]], (0, max(0, sizes[1] - len(values))))
     real = values > 1e-9
     similar = vectors[:, real] / values[real] @ vectors[:, real].T
-    histogram = np.histogram(np.clip(similar, -1, 1), bins=_BINS, range=(-1, 1))[0]
+    histogram = np.histogram(np.clip(similar, -1, 1), bins=sizes[2], range=(-1, 1))[0]
     hot = np.eye(count)[labels]
     reach, parts = np.full(len(weights), 1 / len(weights)), []
-    for _ in range(_POWERS):
+    for _ in range(sizes[0]):
         reach = reach @ walk
         parts.append(np.einsum("s,bsl->bl", reach, hot))
     fixed = np.concatenate([smallest, histogram / similar.size])
@@ -340,14 +367,6 @@ usually is, they are all equal.
 """
 
 
-def embeddings_page(frame: pd.DataFrame) -> Page:
-    """Return the table, the verdicts, and figure 5 of the report, of the first seed."""
-    table, names = embeddings_table(frame), frame.attrs["labels"]
-    about = f"{_ABOUT}\n" + "".join(f"- {line}\n" for line in embedding_statements(frame))
-    figure = spaces(frame[frame.seed == frame.seed.iloc[0]], names)
-    return Page(about, {"What an SVM reads in embeddings, accuracy in per cent": table}, table, figure)
-
-
 def planes(vectors: np.ndarray) -> np.ndarray:
     """Return touches in the plane, (B, 2): PCA to 30 axes, then t-SNE (report, 2.2.2)."""
     few = np.asarray(vectors, dtype=float)
@@ -370,10 +389,14 @@ def spaces(frame: pd.DataFrame, names: Sequence[str]) -> Figure:
     axes = figure.subplots(len(frame), columns, squeeze=False)
     for panels, row in zip(axes, frame.itertuples(), strict=True):
         plane = np.reshape(row.plane, (-1, 2))
-        for axis, classes in zip(panels, np.reshape(row.classes, (len(plane), -1)).T, strict=False):
-            _scatter(axis, plane, classes)
-        if len(row.mixed):
-            _scatter(panels[-1], np.reshape(row.mixed, (-1, 2)), np.asarray(row.layouts))
+        drawn = [(plane, classes) for classes in np.reshape(row.classes, (len(plane), -1)).T]
+        drawn.append((np.reshape(row.mixed, (-1, 2)), np.asarray(row.layouts)))
+        for axis, (points, classes) in zip(panels, drawn, strict=False):
+            for number in np.unique(classes):
+                colour, mark = COLOURS[number % len(COLOURS)], MARKS[number % len(MARKS)]
+                chosen = points[classes == number]
+                axis.scatter(*chosen.T, s=7, color=colour, marker=mark, alpha=0.6, linewidths=0)
+            axis.set(xticks=[], yticks=[])
         panels[0].set_ylabel(_title((row.attribute, row.name)), fontsize=8)
     for axis, name in zip(axes[0], [*names, "layout"], strict=False):
         axis.set_title(name)
@@ -399,26 +422,29 @@ def embeddings_table(frame: pd.DataFrame) -> pd.DataFrame:
     return table.reset_index(drop=True)
 
 
+_STATEMENTS: tuple[tuple[str, str, str, Any], ...] = (
+    ("variance: layout", "variance: best label",
+     "emphasise the graph's morphology (variance explained by layout over best label)", {"minimum": 0.02}),
+    ("mean", "frame",
+     "are not purposeful on a fixed layout (mean accuracy below the readings of the same frame)",
+     {"maximum": 0.02}),
+    ("mean", "chance", "leave an SVM at chance (mean accuracy over the commoner class)", {"maximum": 0.02}),
+)  # fmt: skip
+"""Two columns of the summary, a statement about their difference, and its limit: two points of tolerance."""
+
+
 def embedding_statements(frame: pd.DataFrame) -> list[str]:
     """Return verdicts on the report's statements about pretrained embeddings (3.2.4), one line each.
 
     A statement holds if it holds for each embedding. Agree and disagree need the margin of at least
-    three seeds; "chance" has a tolerance of two points.
+    three seeds.
     """
     summary = _summary(frame).assign(attribute=frame.attribute, name=frame["name"], chance=frame.chance)
     summary.index = frame.seed
     summary["frame"] = summary.loc[(summary.attribute == "") & (summary["name"] == FRAME), "mean"]
-    claims: tuple[tuple[str, str, str, Any], ...] = (
-        ("emphasise the graph's morphology (variance explained by layout over best label)",
-         "variance: layout", "variance: best label", {"minimum": _TOLERANCE}),
-        ("are not purposeful on a fixed layout (mean accuracy below the readings of the same frame)",
-         "mean", "frame", {"maximum": _TOLERANCE}),
-        ("leave an SVM at chance (mean accuracy over the commoner class)", "mean", "chance",
-         {"maximum": _TOLERANCE}),
-    )  # fmt: skip
     lines = []
     for attribute, group in summary[summary.attribute != ""].groupby("attribute", sort=False):
-        for says, first, second, limits in claims:
+        for first, second, says, limits in _STATEMENTS:
             verdicts, details = [], []
             for name, rows in group.groupby("name", sort=False):
                 pairs = rows[[first, second]].dropna()
@@ -429,10 +455,8 @@ def embedding_statements(frame: pd.DataFrame) -> list[str]:
                     spread = f" ± {100 * difference.margin:.1f}" if difference.seeds > 1 else ""
                     text = f"{100 * difference.mean:+.1f}{spread} points"
                 details.append(f"{name} {text} ({verdicts[-1]})")
-            verdict = combine_verdicts(verdicts)
-            lines.append(
-                f"Nodes labelled by {attribute}: the embeddings {says}: **{verdict}**. {'; '.join(details)}."
-            )
+            start = f"Nodes labelled by {attribute}: the embeddings {says}"
+            lines.append(f"{start}: **{combine_verdicts(verdicts)}**. {'; '.join(details)}.")
     return lines
 
 
@@ -446,12 +470,3 @@ def _percent(values: pd.Series) -> str:
         return ""
     spread = f" ± {100 * stdev(values):.1f}" if len(values) > 1 else ""
     return f"{100 * fmean(values):.1f}{spread}"
-
-
-def _scatter(axis: Axes, plane: np.ndarray, classes: np.ndarray) -> None:
-    for number in np.unique(classes):
-        x, y = plane[classes == number].T
-        colour, mark = COLOURS[number % len(COLOURS)], MARKS[number % len(MARKS)]
-        axis.scatter(x, y, s=7, color=colour, marker=mark, alpha=0.6, linewidths=0)
-    axis.set_xticks([])
-    axis.set_yticks([])

@@ -6,7 +6,7 @@ base is uneven.
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import numpy as np
 import pandas as pd
@@ -16,6 +16,7 @@ from hydra.utils import instantiate
 from matplotlib.figure import Figure
 from scipy.ndimage import gaussian_filter
 
+from experiments.studies.measures import Subject
 from experiments.studies.pages import Page
 from skin.calibration.bench import BenchSession
 from skin.calibration.bench_protocol import Protocol
@@ -26,66 +27,54 @@ from skin.evaluation.metrics import compute_metrics
 from skin.plot.figures import COLOURS
 from skin.touch.shapes import Shapes
 
-if TYPE_CHECKING:
-    from experiments.studies.trials import Subject
-
 WEIGHT = KnownLoad(2.0, 0.02)
-PROCEDURES = {"weight once": 1, "weight twice": 2, "weight four times": 4}
-POSITION, MODULUS, UNEVEN, GAINS, NOISE = 0.002, 0.2, 0.1, 0.3, 0.1
+ROUNDS = {"weight once": 1, "weight twice": 2, "weight four times": 4}
+"""Procedure -> how often the weight is on each sensor."""
+
 _ALARMED = "weight once"
-_SHOWN, _DRAWN = 45.0, 6  # s and sensors of the figure
-_PICTURED = "default, solid"
-_WAVE = 0.01  # m, over which the pressure changes
-_PROTOCOL = Protocol(idle=10.0, rest=2.0)
 
 
-def make_skin(subject: "Subject", seed: int | None = None, **settings: Any) -> Simulated:
+def make_skin(subject: Subject, seed: int | None = None, **settings: Any) -> Simulated:
     """Return the nominal device, or with a seed one that differs in positions, moduli and gains."""
-    config = subject.config
-    body = instantiate(config.body)
+    body = instantiate(subject.config.body)
     if seed is not None:
         draw = np.random.default_rng([seed, 1])
-        materials = [
-            replace(layer.material, young=layer.material.young * draw.uniform(1 - MODULUS, 1 + MODULUS))
-            for layer in body.layers
-        ]
-        layers = zip(body.layers, materials, strict=True)
-        body = replace(body, layers=tuple(replace(layer, material=material) for layer, material in layers))
-        errors: dict[str, Any] = {"gain_spread": GAINS, "noise": NOISE, "dead": 1, "position_error": POSITION}
+        softness = [draw.uniform(0.8, 1.2) for _ in body.layers]
+        layers = tuple(
+            replace(layer, material=replace(layer.material, young=layer.material.young * factor))
+            for layer, factor in zip(body.layers, softness, strict=True)
+        )
+        body = replace(body, layers=layers)
+        errors: dict[str, Any] = {"gain_spread": 0.3, "noise": 0.1, "dead": 1, "position_error": 0.002}
         settings = {"seed": seed} | errors | settings
-    layout, simulator = instantiate(config.layout), instantiate(config.simulator)
+    layout, simulator = instantiate(subject.config.layout), instantiate(subject.config.simulator)
     return Simulated(body=body, layout=layout, simulator=simulator, **settings)
 
 
-def uneven_pressure(skin: Simulated, pressure: torch.Tensor, draw: np.random.Generator) -> torch.Tensor:
-    """Return pressures (P, H, W), Pa, with random factors and the same force."""
-    cells = _WAVE / np.array(skin.body.cell)[::-1]
+def weight_pressure(skin: Simulated, rounds: int, draw: np.random.Generator) -> torch.Tensor:
+    """Return the uneven pressures (P, H, W), Pa, of a weight on every sensor of the layout, in any order."""
+    order = np.concatenate([draw.permutation(len(skin.sensors)) for _ in range(rounds)])
+    margin, count = WEIGHT.base, len(order)
+    positions = np.clip(skin.sensors.positions[order, :2], margin, np.array(skin.size) - margin)
+    shapes = Shapes(["disc"], skin.body)
+    scale = np.full(count, WEIGHT.base / (np.ptp(shapes.hulls[0], axis=0).max() / 2))
+    images = shapes.render(np.zeros(count, dtype=int), np.zeros(count), scale, positions)
+    pressure = WEIGHT.force * images / float(np.prod(skin.body.cell))
+    # Random factors, 10 % rms, that change over 10 mm; the force stays.
+    cells = 0.01 / np.array(skin.body.cell)[::-1]
     waves = np.stack([gaussian_filter(draw.standard_normal(skin.body.shape), cells) for _ in pressure])
-    waves *= UNEVEN / waves.std(axis=(1, 2), keepdims=True)
+    waves *= 0.1 / waves.std(axis=(1, 2), keepdims=True)
     rough = pressure * torch.from_numpy(np.exp(waves)).float()
     return rough * (pressure.sum((1, 2), keepdim=True) / rough.sum((1, 2), keepdim=True))
-
-
-def weight_pressure(skin: Simulated, rounds: int, draw: np.random.Generator) -> torch.Tensor:
-    """Return the pressures of a weight on every sensor of the layout, in any order, by hand."""
-    order = np.concatenate([draw.permutation(len(skin.sensors)) for _ in range(rounds)])
-    places = skin.sensors.positions[order, :2]
-    margin = WEIGHT.base
-    places = np.clip(places, margin, np.array(skin.size) - margin)
-    shapes = Shapes(["disc"], skin.body)
-    scale = WEIGHT.base / (np.ptp(shapes.hulls[0], axis=0).max() / 2)
-    count = len(order)
-    images = shapes.render(np.zeros(count, dtype=int), np.zeros(count), np.full(count, scale), places)
-    return WEIGHT.force * images / float(np.prod(skin.body.cell))
 
 
 @torch.no_grad()
 def record(device: Simulated, procedure: str, seed: int) -> BenchSession:
     """Return the session of a device under a procedure."""
-    draw = np.random.default_rng([100 * seed + list(PROCEDURES).index(procedure), 2])
-    pressures = uneven_pressure(device, weight_pressure(device, PROCEDURES[procedure], draw), draw)
+    draw = np.random.default_rng([100 * seed + list(ROUNDS).index(procedure), 2])
+    pressures = weight_pressure(device, ROUNDS[procedure], draw)
     readings = torch.cat([device.model(part).readings for part in pressures.split(16)]).double().numpy()
-    return emulate_placements(device, readings, _PROTOCOL, draw)
+    return emulate_placements(device, readings, Protocol(idle=10.0, rest=2.0), draw)
 
 
 @dataclass(frozen=True)
@@ -98,12 +87,12 @@ class KnownLoadGains:
 
     devices: Annotated[int, Ge(1)] = 10
 
-    def __call__(self, subject: "Subject") -> pd.DataFrame:
+    def __call__(self, subject: Subject) -> pd.DataFrame:
         nominal, parts = make_skin(subject), []
         for seed in range(self.devices):
             device = make_skin(subject, seed)
             working = ~device.constants.dead.numpy()
-            for procedure in PROCEDURES:
+            for procedure in ROUNDS:
                 session = record(device, procedure, seed)
                 gains = fit_known_load(nominal, session, WEIGHT).calibration.known("gain")
                 ratio = (gains / device.constants.gain.numpy())[working]
@@ -122,7 +111,7 @@ class KnownLoadGains:
 
     def page(self, frame: pd.DataFrame, title: str) -> Page:
         """Return the rows, and of one skin a figure of a session with a weight."""
-        return Page("", {}, frame, _draw(frame.attrs["drawn"]) if frame.skin[0] == _PICTURED else None)
+        return Page("", {}, frame, _draw(frame.attrs["drawn"]) if frame.skin[0] == "default, solid" else None)
 
 
 def _errors(sensors: pd.DataFrame) -> dict[str, float]:
@@ -152,7 +141,7 @@ class KnownLoadAlarms:
     devices: Annotated[int, Ge(1)] = 10
     touches: Annotated[int, Ge(16)] = 1000
 
-    def __call__(self, subject: "Subject") -> pd.DataFrame:
+    def __call__(self, subject: Subject) -> pd.DataFrame:
         quiet: dict[str, Any] = {"noise": 0.05, "tare": True}
         nominal = make_skin(subject, gain_spread=0.02, **quiet)
         model, rows = subject.load("any_skin"), []
@@ -178,13 +167,12 @@ class KnownLoadAlarms:
 
 
 def _shown(session: BenchSession, gains: np.ndarray, true: np.ndarray) -> dict[str, Any]:
-    """Return the readings of the strongest sensors, N, by time, s, and the gains, of the figure."""
-    part = session.time < _SHOWN
-    strongest = np.argsort(-np.nanmax(session.raw[part], axis=0))[:_DRAWN]
+    """Return the readings of the six strongest sensors, N, for 45 s, and the gains, of the figure."""
+    part = session.time < 45.0
+    strongest = np.argsort(-np.nanmax(session.raw[part], axis=0))[:6]
     readings = {f"sensor {number}": session.raw[part, number].tolist() for number in strongest}
-    return {"time": session.time[part].tolist(), "readings": readings} | {
-        "gains": [true.tolist(), gains.tolist()]
-    }
+    gain_pairs = [true.tolist(), gains.tolist()]
+    return {"time": session.time[part].tolist(), "readings": readings, "gains": gain_pairs}
 
 
 def _draw(drawn: Mapping[str, Any]) -> Figure:

@@ -1,53 +1,126 @@
-"""Measures of a study: they evaluate a finished run on a device that a condition may change.
+"""Measures of a study, and what they measure: a finished run on a device that a condition may change.
 
-They import heavy packages when called, so that errors in their settings are reported early.
+A measure is a frozen dataclass of settings that maps a :class:`Subject` to a data frame, with a row for each
+touch or condition, or a single row of metrics. ``attrs`` of the frame may have ``about`` (a text for a
+person), ``metrics`` (name -> value, where the rows are something else), and ``cannot`` (why the learner does
+not accept the touches). A measure may have ``page(frame, title)``.
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from functools import partial
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+import hashlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+from importlib import import_module
+from typing import Annotated, Any
 
-from annotated_types import Ge, Gt, MinLen
+import numpy as np
+import pandas as pd
+import torch
+from annotated_types import Ge
+from hydra.utils import instantiate
+from rich.console import Console
+from rich.progress import track
+from torch import Tensor
 
+from experiments.studies.pages import Page, Panel, draw_panels
+from skin.core.rng import Stream, generator
+from skin.device.base import AbstractDevice, AbstractSimulated
+from skin.device.touches import Recording
 from skin.errors import InputError
+from skin.evaluation.alarm import SAFE_TOUCHES, AlarmSource, choose_alarm_threshold
+from skin.evaluation.margins import ALARM_NAME, MarginReport, measure_margins
+from skin.evaluation.metrics import compute_metrics, encode
+from skin.evaluation.operating_point import LABEL, OperatingPoint, Reached
 from skin.evaluation.settings import StreamSettings, check_evaluation
+from skin.evaluation.streams import WindowReport, evaluate_windows
+from skin.evaluation.touch_scores import touch_scores
+from skin.learning.graph import neighbours
+from skin.learning.learner import AbstractLearner
+from skin.live.engine import DebounceSettings
+from skin.runs.build import build_device
+from skin.runs.configuration import Config
+from skin.runs.torch_model import TorchModel, alarm_source, load_model, load_run
+from skin.touch.labels import TOUCH
 
-if TYPE_CHECKING:
-    import numpy as np
-    import pandas as pd
-    from torch import Tensor
 
-    from experiments.studies.pages import Page
-    from experiments.studies.trials import Subject
+@dataclass(frozen=True)
+class Subject:
+    """The subject of a measure.
 
-_COUNTED = 1_000_003  # seed of the touches that are counted, which chose no threshold
+    Attributes:
+        config: of the run, with the changes of the condition; that of the command without a run.
+        model: what the run learned, and the device that it was trained on; None where a study has no runs.
+        condition: name.
+        changes: overrides of the condition.
+    """
+
+    config: Config
+    model: TorchModel | None = None
+    condition: str = ""
+    changes: Sequence[str] = ()
+
+    @cached_property
+    def device(self) -> AbstractDevice:
+        """The device that ``config`` describes."""
+        return build_device(self.config)
+
+    @property
+    def trained(self) -> TorchModel:
+        """What the run learned.
+
+        Raises:
+            InputError: there is no run.
+        """
+        if self.model is None:
+            raise InputError("this study needs a finished run: study.run=latest, or study.rows=[features]")
+        return self.model
+
+    @property
+    def learner(self) -> AbstractLearner:
+        """What the run learned."""
+        return self.trained.learner
+
+    @property
+    def reloaded(self) -> TorchModel:
+        """What the run learned, with the device of the condition."""
+        assert self.trained.run is not None
+        return load_model(self.trained.run, self.config)
+
+    def load(self, name: str) -> Any:
+        """Return a finished run, pretrained model or exported one for the skin of the configuration."""
+        if name.endswith(".onnx"):
+            return load_run(name)
+        return load_run(name, body=instantiate(self.config.body), layout=instantiate(self.config.layout))
+
+    def point(self) -> OperatingPoint:
+        """Return where the run raises the alarm on this device."""
+        run, point = self.trained.run, self.trained.point
+        if run is not None:
+            point = choose_alarm_threshold(alarm_source(run, self.learner, self.config))
+        return point or OperatingPoint.default(check_evaluation(self.config.evaluation).false_alarm_rate)
+
+
+StudyMeasure = Callable[[Subject], pd.DataFrame]
+"""A frozen dataclass of settings that measures; InputError where the device or learner cannot be measured."""
 
 
 @dataclass(frozen=True)
 class Accuracy:
     """Accuracy and the like on the test touches, and alarms at the operating point of the run."""
 
-    def __call__(self, subject: "Subject") -> "pd.DataFrame":
-        import pandas as pd
-
-        from skin.evaluation.metrics import compute_metrics, encode
-
+    def __call__(self, subject: Subject) -> pd.DataFrame:
         touches, task = subject.device.touches("test"), subject.device.task
-        frame = pd.DataFrame([{"outcomes": None}])
         try:
             probabilities = subject.learner.probabilities(touches)
         except InputError as reason:  # another number of sensors, for example
+            frame = pd.DataFrame([{"outcomes": None}])
             frame.attrs["cannot"] = str(reason)
             return frame
         point = subject.point() if subject.trained.point else None
-        labels = touches.known_labels
-        codes = encode(probabilities, labels, task, point)
-        metrics = compute_metrics(probabilities, labels, task, point)
-        return pd.DataFrame(
-            [{f"same/{name}": value for name, value in metrics.items()}
-             | {"outcomes": None if codes is None else codes.tobytes()}]
-        )  # fmt: skip
+        scored = probabilities, touches.known_labels, task, point
+        codes, metrics = encode(*scored), compute_metrics(*scored)
+        outcomes = {"outcomes": None if codes is None else codes.tobytes()}
+        return pd.DataFrame([{f"same/{name}": value for name, value in metrics.items()} | outcomes])
 
 
 @dataclass(frozen=True)
@@ -63,78 +136,130 @@ class Margins:
 
     gestures: Annotated[int, Ge(1)] = 20000
 
-    def __call__(self, subject: "Subject") -> "pd.DataFrame":
-        from experiments.studies.pages import margins_frame
-        from skin.evaluation.margins import measure_margins
-
+    def __call__(self, subject: Subject) -> pd.DataFrame:
         return margins_frame(measure_margins(subject.learner, subject.device, self.gestures, subject.point()))
 
-    def page(self, frame: "pd.DataFrame", title: str) -> "Page":
-        """Return the page of a run."""
-        from experiments.studies.pages import margins_page
+    def page(self, frame: pd.DataFrame, title: str) -> Page:
+        """Return the page of a run: said against measure over threshold, errors by reading."""
+        data = frame.drop(columns=["mean", "lower", "upper"])
+        groups = dict([*data.groupby(["label", "by"], sort=False)])
+        spans, faint = (dict([*frame[frame.by == by].groupby("label")]) for by in ("threshold", "reading"))
+        columns, scale = ["mean", "y", "lower", "upper"], [[1], [100], [100], [100]]
+        called = {
+            name: lines.assign(y=lines.said.astype(int) / lines.touches)[columns].to_numpy().T * scale
+            for name in ("big", "dangerous", ALARM_NAME)
+            for lines in [spans[name]]
+        }
+        wrong = {name: 100 * faint[name].wrong / faint[name].touches for name in TOUCH.names}
+        ticks = [
+            f"above {row.low}\n{row.touches}"
+            if row.high == "inf"
+            else f"{row.low} to {row.high}\n{row.touches}"
+            for row in faint["big"].itertuples()
+        ]
+        label = "area (big) or pressure (dangerous) over its threshold"
+        courses = {name: np.stack([np.arange(len(line)), line]) for name, line in wrong.items()}
+        panels = [
+            Panel(label, "touches called so, %, with 95 %", called, limits=(0.4, 2.5)),
+            Panel("highest reading above idle, N; touches", "wrong, %", courses, ticks=ticks),
+        ]
+        tables = {" by ".join(key): group.iloc[:, 2:].astype(str) for key, group in groups.items()}
+        return Page(frame.attrs["about"], tables, data, draw_panels(title, panels))
 
-        return margins_page(frame, title)
+
+def margins_frame(report: MarginReport) -> pd.DataFrame:
+    """Return touches by their measure over its threshold, and by the highest reading.
+
+    Columns: label, by, low, high, touches, said, wrong; ``mean`` of the measure, and ``lower`` and ``upper``
+    end of the interval of said over touches. Limits are texts.
+    """
+    rows = [
+        {"label": name, "by": "threshold", "low": str(span.low), "high": str(span.high),
+         "touches": span.count, "said": str(span.said), "wrong": span.wrong, "mean": span.mean,
+         "lower": span.range[0], "upper": span.range[1]}
+        for name, spans in report.spans.items()
+        for span in spans
+    ]  # fmt: skip
+    rows += [
+        {"label": name, "by": "reading", "low": str(group.low), "high": str(group.high),
+         "touches": group.count, "said": "", "wrong": group.wrong[name]}
+        for name in TOUCH.names
+        for group in report.faint
+    ]  # fmt: skip
+    frame = pd.DataFrame(rows)
+    frame.attrs |= {"metrics": report.metrics, "about": _summarise_margins(report)}
+    return frame
+
+
+def _summarise_margins(report: MarginReport) -> str:
+    """Return the number of errors close to a threshold or on weak touches, in one line."""
+    wrong = {name: sum(span.wrong for span in report.spans[name]) for name in TOUCH.names}
+    close = {
+        name: sum(span.wrong for span in report.spans[name] if span.low >= 0.9 and span.high <= 1.1)
+        for name in ("big", "dangerous")
+    }
+    weak = sum(group.wrong["dynamic"] for group in report.faint if group.high <= 1.0)  # N
+    clear = [span for span in report.spans[ALARM_NAME] if span.low >= 1.1]
+    return (
+        f"within 10 % of their thresholds lie {close['big']} of {wrong['big']} errors of big and "
+        f"{close['dangerous']} of {wrong['dangerous']} of dangerous; no reading passes 1 N in "
+        f"{weak} of {wrong['dynamic']} errors of dynamic; {sum(span.wrong for span in clear)} of "
+        f"{sum(span.count for span in clear)} touches more than 10 % above the threshold of dangerous raise "
+        f"no alarm; {report.point.sentence()}; {report.reached.sentence()}"
+    )
 
 
 class Streams(StreamSettings):
     """False alarms per hour of a stream, and accuracy by the fraction of a touch that a window shows."""
 
-    def __call__(self, subject: "Subject") -> "pd.DataFrame":
-        from rich.console import Console
-        from rich.progress import track
+    def __call__(self, subject: Subject) -> pd.DataFrame:
+        progress = partial(track, description="streams", console=Console(stderr=True), transient=True)
+        report = evaluate_windows(subject.learner, subject.device, self, subject.point(), progress)
+        return streams_frame(report)
 
-        from experiments.studies.pages import streams_frame
-        from skin.evaluation.streams import evaluate_windows
+    def page(self, frame: pd.DataFrame, title: str) -> Page:
+        """Return the page of a run, with the accuracy by the fraction that is seen."""
+        tables = {}
+        for measure, group in frame.groupby("measure", sort=False):
+            table = group.pivot(index="name", columns="at", values="value").fillna("")
+            tables[measure] = table.reindex(columns=group["at"].unique()).reset_index()
+        accuracy = tables.get("accuracy", pd.DataFrame({"name": []})).set_index("name").astype(float)
+        lines = {name: np.stack([np.arange(len(row)), 100 * row]) for name, row in accuracy.iterrows()}
+        across, up = "fraction of the touch in the window", "accuracy, %"
+        figure = draw_panels(title, [Panel(across, up, lines, ticks=list(accuracy.columns))])
+        return Page(frame.attrs["about"], tables, frame, figure)
 
-        console = Console(stderr=True)
-        progress = partial(track, description="streams", console=console, transient=True)
-        return streams_frame(
-            evaluate_windows(subject.learner, subject.device, self, subject.point(), progress)
+
+def streams_frame(report: WindowReport) -> pd.DataFrame:
+    """Return every figure of an evaluation on streams, as texts: measure, name, at, value."""
+    rows: list[Sequence[object]] = []
+    for part in report.bins:
+        rows.append(["windows", "", part.name, part.count])
+        rows += (["accuracy", name, part.name, f"{v:.4f}"] for name, v in part.accuracy.items())
+        rows += (["majority", name, part.name, f"{v:.4f}"] for name, v in part.majority.items())
+    cells = ("idle said idle", "idle said touched", "touched said idle", "touched said touched")
+    for gate, counts in report.gates.items():
+        rows += ([cell, gate, "", int(n)] for cell, n in zip(cells, counts.flatten(), strict=True))
+    bins = (report.bins[0], report.bins[-1]) if report.bins else ()
+    parts = [f"accuracy {100 * part.overall:.1f} % at share {part.name}" for part in bins]
+    for gate, alarms in report.alarms.items():
+        rows += ([f"alarms {name}", gate, "", value] for name, value in vars(alarms).items())
+        low, high = alarms.range
+        parts.append(
+            f"gate {gate}: {alarms.per_hour:.1f} ({low:.1f} to {high:.1f}) false alarms per hour without "
+            f"touch, {alarms.found} of {alarms.dangerous} dangerous touches and {alarms.raised} of "
+            f"{alarms.safe} safe ones raised the alarm"
         )
-
-    def page(self, frame: "pd.DataFrame", title: str) -> "Page":
-        """Return the page of a run."""
-        from experiments.studies.pages import streams_page
-
-        return streams_page(frame, title)
-
-
-@dataclass(frozen=True)
-class Holds:
-    """Delay of the alarm, and whether it persists during a held press.
-
-    Feeds dangerous taps, presses, holds of 1 s to 10 min and slow ramps to the engine of ``skin live``, in
-    simulated time.
-
-    Args:
-        gestures: number of taps, presses, short holds and ramps; a tenth of it of those of ten minutes.
-        rate: of the device, Hz.
-        touch: as ``live.touch``, N.
-        drift: as ``live.drift``, N in ten minutes.
-    """
-
-    gestures: Annotated[int, Ge(1)] = 40
-    rate: Annotated[float, Gt(0)] = 100.0
-    touch: Annotated[float, Gt(0)] | None = None
-    drift: Annotated[float, Ge(0)] = 0.2
-
-    def __call__(self, subject: "Subject") -> "pd.DataFrame":
-        from rich.progress import track
-
-        from experiments.studies.alarm_timing import time_courses
-        from skin.live import engine_builder
-        from skin.live.engine import DebounceSettings
-
-        model = subject.reloaded
-        engine = engine_builder.engine_settings(
-            model, DebounceSettings(above=model.threshold), self.touch, self.drift
-        ).build()
-        device = model.device.simulated("held touches are simulated").replace(stream=False)
-        frame = time_courses(engine, device, self.gestures, self.rate, partial(track, transient=True))
-        lines = (", ".join(f"{name} {value}" for name, value in row.items() if value)
-                 for row in frame.to_dict("records"))  # fmt: skip
-        frame.attrs["about"] = "\n".join(lines)
-        return frame
+    rows += [
+        ["threshold, N", "threshold", "", f"{report.threshold:.4f}"],
+        ["stream, h", "", "", report.hours],
+    ]
+    rows += (["window, s", "overall", f"{window:g}", value] for window, value in report.lengths.items())
+    trained = "windows of streams" if report.streamed else "whole touches"
+    parts.append(f"trained on {trained}; {report.point.sentence()}")
+    frame = pd.DataFrame(rows, columns=["measure", "name", "at", "value"]).map(str)
+    frame.attrs |= {"metrics": report.metrics(), "about": "; ".join(parts)}
+    return frame
 
 
 @dataclass(frozen=True)
@@ -145,28 +270,18 @@ class TouchAlarms:
 
     Args:
         safe, dangerous: number of touches that are counted.
+        seed: of the touches that are counted; it must differ from those of training and thresholds.
     """
 
     safe: Annotated[int, Ge(1)] = 10000
     dangerous: Annotated[int, Ge(1)] = 2000
+    seed: Annotated[int, Ge(0)] = 1_000_003
 
-    def __call__(self, subject: "Subject") -> "pd.DataFrame":
-        import numpy as np
-        import pandas as pd
-
-        from skin.core.rng import Stream, generator
-        from skin.evaluation.alarm import SAFE_TOUCHES, AlarmSource, choose_alarm_threshold
-        from skin.evaluation.operating_point import LABEL, Reached
-        from skin.evaluation.touch_scores import touch_scores
-        from skin.live.engine import DebounceSettings
-        from skin.touch.labels import TOUCH
-
+    def __call__(self, subject: Subject) -> pd.DataFrame:
         trained, settings = subject.trained, check_evaluation(subject.config.evaluation)
         device = subject.device.simulated("touches are simulated")
         rate = float(np.ravel(device.rate)[0])
-        aligned = rate <= device.model_rate
-        live = trained.live_conditions(rate, DebounceSettings().alarm, aligned)
-        at_once = replace(live, patience=0.0)
+        live = trained.live_conditions(rate, DebounceSettings().alarm, rate <= device.model_rate)
         source = AlarmSource("this run", settings, subject.learner, device=device)
         touch = choose_alarm_threshold(source, live, anew=True)
         window = choose_alarm_threshold(source, anew=True)
@@ -176,21 +291,21 @@ class TouchAlarms:
         danger = labels[:, TOUCH.names.index(LABEL)]
         counted = np.concatenate([labels[~danger][: self.safe], labels[danger][: self.dangerous]])
         few = min(self.safe, SAFE_TOUCHES)
-        alarms = touch.alarm(touch_scores(subject.learner, device, live, counted, _COUNTED))
-        single = touch_scores(subject.learner, device, at_once, counted[:few], _COUNTED)
+        alarms = touch.alarm(touch_scores(subject.learner, device, live, counted, self.seed))
+        at_once = replace(live, patience=0.0)
+        single = window.alarm(touch_scores(subject.learner, device, at_once, counted[:few], self.seed))
         tests = device.touches("test")
-        raised, false = int(alarms[self.safe :].sum()), int(alarms[: self.safe].sum())
         probabilities = subject.learner.probabilities(tests)
+        raised, false = int(alarms[self.safe :].sum()), int(alarms[: self.safe].sum())
         reached = {
             "touch": Reached(self.dangerous, raised, self.safe, false),
             "window": window.reached(probabilities, tests.known_labels, trained.device.task),
-            "touch_at_window_threshold": Reached(0, 0, few, int(window.alarm(single).sum())),
+            "touch_at_window_threshold": Reached(0, 0, few, int(single.sum())),
         }
         metrics = {"touch/threshold": touch.threshold, "window/threshold": window.threshold}
         for name, alarm in reached.items():
-            rates = (alarm.false_alarm_rate, *alarm.range)
-            kinds = ("false_alarm_rate", "false_alarm_low", "false_alarm_high")
-            metrics |= {f"{name}/{kind}": value for kind, value in zip(kinds, rates, strict=True)}
+            rates = zip(("rate", "low", "high"), (alarm.false_alarm_rate, *alarm.range), strict=True)
+            metrics |= {f"{name}/false_alarm_{kind}": value for kind, value in rates}
             metrics |= {f"{name}/recall": alarm.recall} if alarm.dangerous else {}
         frame = pd.DataFrame([metrics])
         frame.attrs["about"] = "\n".join(f"{name}: {alarm.sentence()}" for name, alarm in reached.items())
@@ -209,14 +324,7 @@ class Motion:
     gestures: Annotated[int, Ge(1)] = 1000
     count: Annotated[int, Ge(1)] = 6
 
-    def __call__(self, subject: "Subject") -> "pd.DataFrame":
-        import numpy as np
-        import pandas as pd
-        import torch
-
-        from skin.core.rng import Stream, generator
-        from skin.learning.graph import neighbours
-
+    def __call__(self, subject: Subject) -> pd.DataFrame:
         device = subject.device.simulated("motions of sensors are simulated")
         positions = torch.tensor(device.sensors.positions)
         if len(positions) < 2:
@@ -234,9 +342,7 @@ class Motion:
         return frame
 
 
-def distance_changes(
-    positions: "Tensor", motion: "Tensor", first: "np.ndarray", second: "np.ndarray"
-) -> "Tensor":
+def distance_changes(positions: Tensor, motion: Tensor, first: np.ndarray, second: np.ndarray) -> Tensor:
     """Return relative changes of the distance of pairs of sensors, (..., P), without sign.
 
     Args:
@@ -251,43 +357,71 @@ def distance_changes(
     return (moved / rest - 1).abs()
 
 
+def frozen_hash(recording: Recording, overrides: Sequence[str]) -> str:
+    """Return a hash of what rounding does not change: overrides, labels, gestures and invalid readings.
+
+    Args:
+        recording: the touches of a set.
+        overrides: of the set.
+    """
+    touches, names = recording.touches, ("shape", "duration", "onset", "draws")
+    parts = [touches.known_labels.bool(), touches.valid, *(recording.parameters[name] for name in names)]
+    content = hashlib.sha256("\n".join(overrides).encode())
+    for part in parts:
+        content.update(part.contiguous().numpy().tobytes())
+    return content.hexdigest()[:16]
+
+
 @dataclass(frozen=True)
-class ProbeSettings:
-    """What is probed; ``conf/study/embeddings.yaml`` explains the fields."""
+class Frozen:
+    """Accuracies of a predictor on a set.
 
-    attributes: Annotated[Sequence[Literal["degree", "reading"]], MinLen(1)] = ("degree", "reading")
-    train: Annotated[int, Ge(20)] = 800
-    test: Annotated[int, Ge(10)] = 400
-    seeds: Annotated[Sequence[int], MinLen(1)] = (0, 1, 2)
-    layouts: Annotated[int, Ge(1)] = 3
-    levels: Annotated[int, Ge(2)] = 8
-    depth: Annotated[int, Ge(0)] = 2
-    width: Annotated[int, Ge(2)] = 128
-    epochs: Annotated[int, Ge(1)] = 50
-    graph: Mapping[str, Any] = field(default_factory=lambda: {"edges": "knn", "count": 6, "weight": "exp"})
+    Args:
+        predictor: a finished run or pretrained model, a file of ``skin export`` (for the sets of its layout),
+            or ``package.module:function`` of readings (B, T, S), N, NaN where invalid, and positions (S, 3),
+            m, that returns the probability of each label, (B, 4): big, dynamic, press, dangerous.
+        hash: of the touches.
+    """
 
+    predictor: str = "any_skin"
+    hash: str = ""
 
-class Embeddings(ProbeSettings):
-    """Accuracy of an SVM on graph embeddings, readings, and the encoder of a run, if one is given."""
+    def __call__(self, subject: Subject) -> pd.DataFrame:
+        device = subject.device.simulated("frozen sets are simulated")
+        if (predict := self._predict(subject, device)) is None:
+            return pd.DataFrame()
+        recording = device.recording("test", complete=False)
+        if (present := frozen_hash(recording, subject.changes)) != self.hash:
+            raise InputError(
+                f"the touches of the set {subject.condition} have the hash {present}, and the frozen ones "
+                f"{self.hash}: use the version of the package that they were frozen with"
+            )
+        touches = recording.touches
+        labels = touches.known_labels
+        readings = touches.readings.masked_fill(~touches.valid, torch.nan).numpy()
+        probabilities = torch.as_tensor(np.asarray(predict(readings, device.sensors.positions), np.float32))
+        if probabilities.shape != labels.shape or not probabilities.isfinite().all():
+            raise InputError(
+                f"a predictor returns finite probabilities {tuple(labels.shape)}, got "
+                f"{tuple(probabilities.shape)}"
+            )
+        metrics = compute_metrics(probabilities, labels, device.task).items()
+        accuracies = {key: round(100 * value, 2) for key, value in metrics if key.endswith("/accuracy")}
+        start = {"set": subject.condition, "hash": present, "gestures": len(touches)}
+        return pd.DataFrame([start | accuracies])
 
-    def __call__(self, subject: "Subject") -> "pd.DataFrame":
-        import pandas as pd
-        from rich.console import Console
-        from rich.progress import track
-
-        from experiments.studies.embeddings import probe
-        from skin.device.balance import report_balance
-
-        device, learner = subject.device, subject.learner if subject.model else None
-        report_balance(device)
-        count = (len(self.attributes) * 3 + (learner is not None) + 2) * len(self.seeds)
-        steps = probe(device, self, learner)
-        frame = pd.DataFrame(track(steps, "probing", count, console=Console(stderr=True)))
-        frame.attrs["labels"] = list(device.task.names)
-        return frame
-
-    def page(self, frame: "pd.DataFrame", title: str) -> "Page":
-        """Return the page of a run."""
-        from experiments.studies.embeddings import embeddings_page
-
-        return embeddings_page(frame)
+    def _predict(
+        self, subject: Subject, device: AbstractSimulated
+    ) -> Callable[[np.ndarray, np.ndarray], Any] | None:
+        """Return the predictor for the skin of a device; None: it was exported for another layout."""
+        module, _, function = self.predictor.partition(":")
+        if function:
+            try:
+                return getattr(import_module(module), function)
+            except (ImportError, AttributeError) as error:
+                raise InputError(f"predictor={self.predictor} cannot be imported: {error}") from error
+        model = subject.load(self.predictor)
+        same = model.positions.shape == device.sensors.positions.shape
+        if not same or not np.allclose(model.positions, device.sensors.positions, atol=1e-6):
+            return None
+        return lambda readings, positions: model.predict(readings)

@@ -1,20 +1,48 @@
-"""Pages: tables and panels of lines, and the pages of the measures of single runs."""
+"""Pages of results: tables with verdicts, CSV files and figures."""
 
-import csv
-import io
+import math
+import re
+from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import cycle
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
+import torch
 from matplotlib.figure import Figure
 
-from skin.core.files import whole, write
-from skin.evaluation.margins import ALARM_NAME, MarginReport
-from skin.evaluation.streams import WindowReport
-from skin.plot.figures import COLOURS, MARKS, save_figure
+from experiments.studies.comparison import (
+    UNITS,
+    Conclusion,
+    Estimate,
+    by_gesture,
+    compare_samples,
+    conclude,
+    differences,
+    estimate,
+    values,
+)
+from experiments.studies.study import Study
+from skin.core.files import candidates, whole, write
+from skin.device.base import AbstractSimulated
+from skin.errors import InputError
+from skin.evaluation.metrics import decode
+from skin.mechanics.simulator.naive import Naive
+from skin.plot.figures import (
+    COLOURS,
+    MARKS,
+    confusions,
+    force_and_reading,
+    misclassified,
+    misclassified_shares,
+    save_figure,
+    traces,
+)
+from skin.runs.build import build_device
+from skin.runs.configuration import Config
 from skin.touch.labels import TOUCH
 
 
@@ -52,17 +80,181 @@ def write_csv(frame: pd.DataFrame, path: Path) -> Path:
     return path
 
 
-def csv_text(table: Iterable[Sequence[object]]) -> str:
-    """Return a table as CSV."""
-    buffer = io.StringIO()
-    csv.writer(buffer, lineterminator="\n").writerows(table)
-    return buffer.getvalue()
-
-
 def markdown(table: pd.DataFrame) -> str:
     """Return a table of texts as Markdown."""
     lines = ["| " + " | ".join(line) + " |" for line in [list(table.columns), *table.to_numpy().tolist()]]
     return "\n".join([lines[0], "|" + "---|" * len(table.columns), *lines[1:]]) + "\n"
+
+
+def publish_study(study: Study, title: str, trials: pd.DataFrame, path: Path) -> list[Path]:
+    """Write ``path`` with the endings .md, .csv and .png, each whole, print the tables, and return the paths.
+
+    Args:
+        study: whose trials they are.
+        title: of the page.
+        trials: all of them.
+        path: without an ending.
+    """
+    reference, metric = read_reference(study.reference), study.metrics[0]
+    tables = {
+        "Variants": variants_table(trials, study.metrics, reference),
+        f"Differences in {metric_heading(metric)}": differences_table(study, trials),
+        "Statements": statements_table([conclude(statement, trials) for statement in study.statements]),
+    }
+    print(title)
+    for name, table in tables.items():
+        if len(table):
+            print(name, table.to_string(index=False, justify="left"), "", sep="\n")
+    if trials.variant.nunique() > 1 and trials.condition.any():
+        # Conditions take the columns, so that each further metric has a table.
+        further = {metric_heading(name): variants_table(trials, [name]) for name in study.metrics[1:]}
+        tables = {"Variants": tables["Variants"], **further} | tables
+    finished = trials[trials.run != ""]
+    data = finished.reindex(columns=[*identity(study), *study.metrics])
+    if reference:
+        data["reference"] = [_referred(row, metric, reference) for row in finished.itertuples()]
+    figure = study_figure(study, trials) if len(finished) else None
+    shown = {name: table for name, table in tables.items() if len(table)}
+    return publish_page(Page("", shown, data, figure), title, path)
+
+
+def publish_measured(
+    study: Study, measured: Sequence[tuple[Mapping[str, Any], Page]], path: Path
+) -> list[Path]:
+    """Write the tables of a measure: of several runs a CSV file, each line behind its trial.
+
+    Args:
+        study: whose tables they are.
+        measured: row of the trials, and page.
+        path: without an ending.
+    """
+    pages = [page for _, page in measured]
+    if len(pages) < (2 if study.has_runs else 1):
+        return []
+    if study.has_runs:
+        keys = [pd.DataFrame([{name: row[name] for name in identity(study)}]) for row, _ in measured]
+        data = [key.merge(page.data, how="cross") for key, page in zip(keys, pages, strict=True)]
+        return [write_csv(pd.concat(data), path.with_name(f"{path.name}.csv"))]
+    rows = pd.concat([page.data for page in pages])
+    about = "\n".join(page.about for page in pages if page.about)
+    figure = next((page.figure for page in pages if page.figure), None)
+    tables = {} if len(rows) < 2 else {"Measured": rows.astype(str)}
+    return publish_page(Page(about, tables, rows, figure), f"{study.name}: {study.about}", path)
+
+
+def identity(study: Study) -> list[str]:
+    """Return the columns that tell the trials of a study apart."""
+    return ["variant", "seed", *(["condition", "device"] if study.conditions else []), "run"]
+
+
+Reference = Mapping[tuple[str, str, str], float]
+"""Row, simulator and label -> value."""
+
+
+def read_reference(path: str | None) -> Reference:
+    """Return the values of a CSV file: (row, simulator, label) -> value; none without a file."""
+    if path is None:
+        return {}
+    files = [file for file in candidates(path) if file.is_file()]
+    if not files:
+        raise InputError(f"there is no file study.reference={path}: give another, or null")
+    return pd.read_csv(files[0]).set_index(["row", "simulator", "label"])["value"].to_dict()
+
+
+def metric_heading(metric: str) -> str:
+    """Return the name of a column: ``overall`` of ``same/overall/accuracy``."""
+    headings = {
+        "same/dangerous/alarm_recall": "recall",
+        "same/dangerous/false_alarm_rate": "false alarms",
+        "train_accuracy": "training",
+        "seconds_per_epoch": "s/epoch",
+        "same/direction/degrees": "degrees",
+        "same/direction/accuracy": "within 45°",
+        "device_shift/dangerous/alarm_recall": "its recall",
+        "device_shift/dangerous/false_alarm_rate": "its false alarms",
+    }
+    plain = metric.removeprefix("same/").removesuffix("/accuracy").replace("/overall", "")
+    return headings.get(metric, plain.replace("_", " "))
+
+
+def variants_table(
+    trials: pd.DataFrame, metrics: Sequence[str], reference: Reference | None = None
+) -> pd.DataFrame:
+    """Return a line per variant with the mean and margin of each metric; or of conditions.
+
+    Where one variant has conditions, each is a line. Where several do, each is a column of the first metric.
+    A value of the reference stands in brackets behind ours.
+    """
+    groups = trials.groupby(["variant", "condition"], sort=False)
+    variants, conditions = trials.variant.unique(), [name for name in trials.condition.unique() if name]
+    if conditions and len(variants) > 1:
+        cells = pd.Series({key: _cell(group, metrics[0]) for key, group in groups}).unstack(fill_value="")
+        return cells.reindex(variants, columns=conditions).fillna("").rename_axis("variant").reset_index()
+    lines = []
+    for (variant, condition), group in groups:
+        if conditions and not condition:
+            continue
+        failed = int((group.run == "").sum())
+        cells = [_cell(group, metric, reference) for metric in metrics]
+        cells = ["failed", *[""] * (len(metrics) - 1)] if failed == len(group) else cells
+        lines.append([condition or variant + (f" ({failed} failed)" if failed else ""), *cells])
+    heading = variants[0] if conditions else "variant"
+    return pd.DataFrame(lines, columns=[heading, *map(metric_heading, metrics)])
+
+
+def differences_table(study: Study, trials: pd.DataFrame) -> pd.DataFrame:
+    """Return a line per difference, ± margin; none where the study compares nothing."""
+    unit, lines = UNITS.get(study.metrics[0], "points"), []
+    for variant, condition, compared, verdict in differences(study, trials) if study.differences else ():
+        count = str(compared.seeds if compared else 0)
+        lines.append([variant, condition, _figure(compared, unit), count, verdict])
+    return pd.DataFrame(lines, columns=["variant", "condition", "difference", "n", "verdict"])
+
+
+def statements_table(conclusions: Iterable[Conclusion]) -> pd.DataFrame:
+    """Return a line per statement."""
+    lines = [
+        [each.statement.section, each.statement.says, comparison_text(each), each.verdict]
+        for each in conclusions
+    ]
+    return pd.DataFrame(lines, columns=["section", "statement", "measured", "verdict"])
+
+
+def comparison_text(conclusion: Conclusion) -> str:
+    """Return every comparison of a statement: the mean over paired seeds ± margin."""
+    statement, several = conclusion.statement, len(conclusion.compared) > 1
+    unit = "times" if statement.ratio else UNITS.get(statement.metric, "points")
+    texts = {name: _figure(comparison, unit) for name, comparison in conclusion.compared.items()}
+    return "; ".join(text + f" ({name})" if several else text for name, text in texts.items())
+
+
+def _referred(trial: Any, metric: str, reference: Reference) -> float | None:
+    """Return the value of the reference for a metric of a trial; None: it has none."""
+    label = metric.removeprefix("same/").removesuffix("/accuracy")
+    return reference.get((trial.row, trial.simulator, label))
+
+
+def _cell(trials: pd.DataFrame, metric: str, reference: Reference | None = None) -> str:
+    """Return the mean and its margin, and the reference in brackets."""
+    figures = values(trials, metric)
+    if figures.empty:
+        return "cannot" if any(metric.startswith(tuple(cannot)) for cannot in trials.cannot) else ""
+    mean, _, margin, _ = estimate(trials, metric)
+    digits = {"": 0, "s": 2, "mm": 2, "N": 2}.get(UNITS.get(metric, "%"), 1)
+    if metric in ("seconds_per_epoch", "parameters"):
+        return f"{mean:.{digits}f}"
+    several = len(figures) > 1 or margin > 0 or by_gesture(trials, metric) is not None
+    referred = _referred(next(trials.itertuples()), metric, reference or {})
+    brackets = "" if referred is None else f" ({100 * referred:.1f})"
+    return f"{mean:.{digits}f}" + (f" ± {margin:.{digits}f}" if several else "") + brackets
+
+
+def _figure(compared: Estimate | None, unit: str) -> str:
+    if compared is None:
+        return "no paired runs"
+    sign, digits = ("" if unit == "times" else "+"), (2 if unit in ("s", "times") else 1)
+    margin = "" if math.isinf(compared.margin) else f" ± {compared.margin:.{digits}f}"
+    return f"{compared.mean:{sign}.{digits}f}{margin} {unit}".rstrip()
 
 
 @dataclass(frozen=True)
@@ -111,121 +303,172 @@ def draw_panels(title: str, panels: Sequence[Panel]) -> Figure:
     return figure
 
 
-_CLOSE = (0.9, 1.1)  # times its threshold: within 10 %
-_WEAK = 1.0  # N
-_INTERVAL = ["mean", "lower", "upper"]
+def study_figure(study: Study, trials: pd.DataFrame) -> Figure:
+    """Draw the first metric: lines over the numbers in the names if the study has an axis, else strips."""
+    return _lines(study, trials) if study.axis else _strips(study, trials)
 
 
-def margins_frame(report: MarginReport) -> pd.DataFrame:
-    """Return touches by their measure over its threshold, and by the highest reading.
+def _strips(study: Study, trials: pd.DataFrame) -> Figure:
+    """Draw every trial of each variant and condition, the mean, and its 95 % interval.
 
-    Columns: label, by, low, high, touches, said, wrong; ``mean`` of the measure, and ``lower`` and ``upper``
-    end of the interval of said over touches. Limits are texts.
+    Conditions have a line each, or share the line of their variant if there are several of both.
     """
-    rows: list[dict[str, object]] = []
-    for name, spans in report.spans.items():
-        for span in spans:
-            rows.append({"label": name, "by": "threshold", "low": str(span.low), "high": str(span.high)})
-            rows[-1] |= {"touches": span.count, "said": str(span.said), "wrong": span.wrong}
-            rows[-1] |= dict(zip(_INTERVAL, (span.mean, *span.range), strict=True))
-    for name in TOUCH.names:
-        for group in report.faint:
-            rows.append({"label": name, "by": "reading", "low": str(group.low), "high": str(group.high)})
-            rows[-1] |= {"touches": group.count, "said": "", "wrong": group.wrong[name]}
-    frame = pd.DataFrame(rows)
-    frame.attrs |= {"metrics": report.metrics, "about": _summarise_margins(report)}
-    return frame
+    metric, groups = study.metrics[0], trials.groupby(["variant", "condition"], sort=False)
+    variants, conditions = list(trials.variant.unique()), list(trials.condition.unique())
+    shared = len(variants) > 1 and len(conditions) > 1
+    lines = variants if shared else [", ".join(filter(None, key)) for key, _ in groups]
+    height = 0.1 * max(len(conditions), 3) if shared else 0.3
+    figure = Figure(figsize=(8, 1.2 + height * len(lines)), layout="constrained")
+    axis = figure.subplots()
+    for number, ((variant, condition), group) in enumerate(groups):
+        if values(group, metric).empty:
+            continue
+        style = conditions.index(condition) if shared else 0
+        apart = 0.8 * ((style + 0.5) / len(conditions) - 0.5) if shared else 0.0
+        height = (variants.index(variant) if shared else number) + apart
+        colour, marker = COLOURS[style % len(COLOURS)], "osD^v<>pP*"[style % 10]
+        mean, _, margin, _ = estimate(group, metric)
+        figures = (1 if metric in UNITS else 100) * group[metric].dropna()
+        axis.plot(figures, [height] * len(figures), marker, color=colour, alpha=0.35, ms=4)
+        label = condition or "no condition"
+        label = f"_{label}" if label in axis.get_legend_handles_labels()[1] else label  # not in the legend
+        axis.errorbar(mean, height, xerr=margin, fmt=marker if shared else "|", label=label,
+                      color=colour if shared else "black", ms=4 if shared else 10, capsize=2)  # fmt: skip
+    axis.set_yticks(range(len(lines)), lines, fontsize=8)
+    axis.set_ylim(len(lines) - 0.5, -0.5)
+    axis.set_xlabel(f"{_label(metric)}: each run, mean and 95 % interval")
+    axis.set_title(study.about, fontsize=9, wrap=True)
+    if shared:
+        figure.legend(loc="outside right center", fontsize=7)
+        axis.grid(axis="y", alpha=0.2)
+    return figure
 
 
-def _summarise_margins(report: MarginReport) -> str:
-    """Return the number of errors close to a threshold or on weak touches, in one line."""
-    wrong = {name: sum(span.wrong for span in report.spans[name]) for name in TOUCH.names}
-    close = {
-        name: sum(s.wrong for s in report.spans[name] if _CLOSE[0] <= s.low and s.high <= _CLOSE[1])
-        for name in ("big", "dangerous")
-    }
-    weak = sum(group.wrong["dynamic"] for group in report.faint if group.high <= _WEAK)
-    clear = [span for span in report.spans[ALARM_NAME] if span.low >= _CLOSE[1]]
-    return (
-        f"within 10 % of their thresholds lie {close['big']} of {wrong['big']} errors of big and "
-        f"{close['dangerous']} of {wrong['dangerous']} of dangerous; no reading passes {_WEAK:g} N in "
-        f"{weak} of {wrong['dynamic']} errors of dynamic; {sum(span.wrong for span in clear)} of "
-        f"{sum(span.count for span in clear)} touches more than 10 % above the threshold of dangerous raise "
-        f"no alarm; {report.point.sentence()}; {report.reached.sentence()}"
-    )
+def _lines(study: Study, trials: pd.DataFrame) -> Figure:
+    """Draw the mean and its 95 % interval over the number at the end of a variant's or condition's name.
 
-
-def margins_page(frame: pd.DataFrame, title: str) -> Page:
-    """Return the page of :func:`margins_frame`: said against measure over threshold, errors by reading."""
-    data = frame.drop(columns=_INTERVAL)
-    groups = {" by ".join(key): group for key, group in data.groupby(["label", "by"], sort=False)}
-    spans, faint = (dict([*frame[frame.by == by].groupby("label")]) for by in ("threshold", "reading"))
-    called = {
-        name: np.stack(
-            [spans[name]["mean"], 100 * spans[name].said.astype(int) / spans[name].touches,
-             100 * spans[name].lower, 100 * spans[name].upper]
-        )
-        for name in ("big", "dangerous", ALARM_NAME)
-    }  # fmt: skip
-    wrong = {
-        name: np.stack([np.arange(len(faint[name])), 100 * faint[name].wrong / faint[name].touches])
-        for name in TOUCH.names
-    }
-    ranges = [
-        f"above {row.low}" if row.high == "inf" else f"{row.low} to {row.high}"
-        for row in faint["big"].itertuples()
-    ]
-    ticks = [f"{each}\n{count}" for each, count in zip(ranges, faint["big"].touches, strict=True)]
-    label = "area (big) or pressure (dangerous) over its threshold"
+    Names of several words before the number, as "arm grid 9", get a panel for each beginning.
+    """
+    metric, single = study.metrics[0], trials.variant.nunique() == 1
+    points: dict[tuple[str, str], list[tuple[float, ...]]] = defaultdict(list)
+    for (variant, condition), group in trials.groupby(["variant", "condition"], sort=False):
+        numbered = re.fullmatch(r"(.+) (\d+)", condition if single else variant)
+        if numbered and len(values(group, metric)):
+            panel, _, name = numbered[1].rpartition(" ")
+            mean, _, margin, _ = estimate(group, metric)
+            label = ", ".join(filter(None, (name, "" if single else condition)))
+            points[panel, label].append((int(numbered[2]), mean, mean - margin, mean + margin))
+    lines = {key: np.array(sorted(line)).T for key, line in points.items() if len(line) > 1}
+    up = f"{_label(metric)}: mean and 95 % interval"
     panels = [
-        Panel(label, "touches called so, %, with 95 %", called, limits=(0.4, 2.5)),
-        Panel("highest reading above idle, N; touches", "wrong, %", wrong, ticks=ticks),
+        Panel(study.axis or "", up, {name: line for (at, name), line in lines.items() if at == panel}, panel)
+        for panel in dict.fromkeys(panel for panel, _ in lines)
     ]
-    tables = {name: group.iloc[:, 2:].astype(str) for name, group in groups.items()}
-    return Page(frame.attrs["about"], tables, data, draw_panels(title, panels))
+    return draw_panels(study.about, panels or [Panel(study.axis or "", up, {})])
 
 
-def streams_frame(report: WindowReport) -> pd.DataFrame:
-    """Return every figure of an evaluation on streams, as texts: measure, name, at, value."""
-    rows: list[Sequence[object]] = []
-    for part in report.bins:
-        rows.append(["windows", "", part.name, part.count])
-        rows += (["accuracy", name, part.name, f"{v:.4f}"] for name, v in part.accuracy.items())
-        rows += (["majority", name, part.name, f"{v:.4f}"] for name, v in part.majority.items())
-    cells = ("idle said idle", "idle said touched", "touched said idle", "touched said touched")
-    for gate, counts in report.gates.items():
-        rows += ([cell, gate, "", int(n)] for cell, n in zip(cells, counts.flatten(), strict=True))
-    for gate, alarms in report.alarms.items():
-        rows += ([f"alarms {name}", gate, "", value] for name, value in vars(alarms).items())
-    rows.append(["threshold, N", "threshold", "", f"{report.threshold:.4f}"])
-    rows.append(["stream, h", "", "", report.hours])
-    rows += (["window, s", "overall", f"{window:g}", value] for window, value in report.lengths.items())
-    frame = pd.DataFrame(
-        [[str(value) for value in row] for row in rows], columns=["measure", "name", "at", "value"]
-    )
-    bins = (report.bins[0], report.bins[-1]) if report.bins else ()
-    parts = [f"accuracy {100 * part.overall:.1f} % at share {part.name}" for part in bins]
-    for gate, alarms in report.alarms.items():
-        low, high = alarms.range
-        parts.append(
-            f"gate {gate}: {alarms.per_hour:.1f} ({low:.1f} to {high:.1f}) false alarms per hour without "
-            f"touch, {alarms.found} of {alarms.dangerous} dangerous touches and {alarms.raised} of "
-            f"{alarms.safe} safe ones raised the alarm"
-        )
-    trained = "windows of streams" if report.streamed else "whole touches"
-    parts.append(f"trained on {trained}; {report.point.sentence()}")
-    frame.attrs |= {"metrics": report.metrics(), "about": "; ".join(parts)}
-    return frame
+def _label(metric: str) -> str:
+    unit = UNITS.get(metric, "%")
+    return f"{metric_heading(metric)}{f', {unit}' if unit else ''}"
 
 
-def streams_page(frame: pd.DataFrame, title: str) -> Page:
-    """Return the page of :func:`streams_frame`, with the accuracy by the fraction that is seen."""
-    tables = {}
-    for measure, group in frame.groupby("measure", sort=False):
-        table = group.pivot(index="name", columns="at", values="value").fillna("")
-        tables[measure] = table.reindex(columns=group["at"].unique()).reset_index()
-    accuracy = tables.get("accuracy", pd.DataFrame({"name": []})).set_index("name").astype(float)
-    lines = {name: np.stack([np.arange(len(row)), 100 * row]) for name, row in accuracy.iterrows()}
-    ticks = list(accuracy.columns)
-    panel = Panel("fraction of the touch in the window", "accuracy, %", lines, ticks=ticks)
-    return Page(frame.attrs["about"], tables, frame, draw_panels(title, [panel]))
+# Figures 7, 8, 10 and 11 of the report, from the outcomes and the skin of the study ``table``.
+
+
+def draw_report(trials: pd.DataFrame, skins: Mapping[str, Config], folder: Path) -> list[Path]:
+    """Draw figures 7 and 8 of each simulator from the outcomes of all runs of each row, and 10 and 11.
+
+    CSV files beside figures 7 and 8 have the numbers of all rows.
+
+    Args:
+        trials: of the study ``table``.
+        skins: simulator -> a configuration.
+        folder: of the figures.
+    """
+    paths, speeds = list[Path](), np.linspace(0.03, 0.20, 7)  # m/s
+    shown = ("best_fresh", "features", "temporal_graph", "sequence_graph", "sequence_image")  # in figure 7
+    simulated = "the figures of the report are of a simulated skin"
+    devices = {name: build_device(config).simulated(simulated) for name, config in skins.items()}
+    for name, group in trials[trials.outcomes.notna()].groupby("simulator", sort=False):
+        eight, seven = folder / f"figure08_confusion_{name}", folder / f"figure07_speed_{name}"
+        codes = {
+            row or "vote": np.stack([np.frombuffer(outcomes, np.uint8) for outcomes in runs.outcomes])
+            for row, runs in group.groupby("row", sort=False)
+        }
+        matrices = {row: _confusion(outcomes) for row, outcomes in codes.items()}
+        drawn = devices[name].recording("test", complete=False).parameters["speed"].numpy()
+        courses = {
+            row: misclassified_shares(drawn * devices[name].model_rate, each, speeds)
+            for row, outcomes in codes.items()
+            for each in [1 - decode(outcomes, "big/accuracy", TOUCH).mean(axis=0)]
+        }
+        some = {row: courses[row] for row in shown if row in courses} or courses
+        paths += [
+            save_figure(confusions(matrices, ("safe", "dangerous")), eight.with_suffix(".png")),
+            write_csv(confusion_rows(codes), eight.with_suffix(".csv")),
+            save_figure(misclassified(some, "big", speeds), seven.with_suffix(".png")),
+            write_csv(_speed_rows(courses, speeds), seven.with_suffix(".csv")),
+        ]
+    name = "fem" if "fem" in devices else next(iter(devices))
+    return [*paths, *draw_skin(devices[name], folder, name)]
+
+
+def _speed_rows(courses: Mapping[str, tuple[np.ndarray, np.ndarray]], speeds: np.ndarray) -> pd.DataFrame:
+    """Return a line per row and speed."""
+    slow, fast = [0.0, *speeds[:-1]], [0.0, *speeds[1:]]
+    lines = [
+        [row, f"{slowest:.4g}", f"{fastest:.4g}", f"{fraction:.4f}", f"{error:.4f}"]
+        for row, course in courses.items()
+        for slowest, fastest, fraction, error in zip(slow, fast, *course, strict=True)
+    ]
+    return pd.DataFrame(lines, columns=["row", "slowest_m_per_s", "fastest_m_per_s", "wrong", "error"])
+
+
+def _confusion(codes: np.ndarray) -> np.ndarray:
+    """Return the confusion matrix of ``dangerous``, (2, 2), over runs and gestures."""
+    right = decode(codes, "dangerous/accuracy", TOUCH) > 0.5
+    true = ~np.isnan(decode(codes, "dangerous/alarm_recall", TOUCH))
+    called = np.where(right, true, ~true)
+    return np.array([[np.sum((true == row) & (called == column)) for column in (0, 1)] for row in (0, 1)])
+
+
+def confusion_rows(codes: Mapping[str, np.ndarray]) -> pd.DataFrame:
+    """Return both kinds of errors of ``dangerous`` of each row, their difference, its error and margin.
+
+    Args:
+        codes: row -> outcomes of its runs, (N, B).
+    """
+    lines = []
+    for row, outcomes in codes.items():
+        wrong = decode(outcomes, "dangerous/accuracy", TOUCH) < 0.5
+        dangerous = ~np.isnan(decode(outcomes[0], "dangerous/alarm_recall", TOUCH))
+        kinds = wrong[:, ~dangerous], wrong[:, dangerous]
+        safe, missed = (kind.mean(axis=0) for kind in kinds)
+        first, second = (pd.Series(kind.mean(axis=1)) for kind in kinds)
+        difference = compare_samples(first, second, gestures=(safe, missed))
+        assert difference is not None
+        lines.append([row, *(f"{number:.4f}" for number in (safe.mean(), missed.mean(), *difference[:3]))])
+    columns = ["row", "safe_called_dangerous", "dangerous_called_safe", "difference", "error", "margin"]
+    return pd.DataFrame(lines, columns=columns)
+
+
+def draw_skin(device: AbstractSimulated, folder: Path, name: str = "fem") -> list[Path]:
+    """Draw figures 10 and 11 from the gestures of a skin whose simulator has a name."""
+    recording = device.recording("test", complete=False)
+    touches, drawn = recording.touches, recording.parameters
+    assert recording.force is not None
+    labels = dict(zip(device.task.names, touches.known_labels.T.bool(), strict=True))
+    movie = device.sampler.sample(64, np.random.default_rng(0))
+    chosen = int((movie.labels[:, 1:].all(1) & (movie.labels[:, 0] == 0)).nonzero()[0])
+    simulators = {"naive": Naive(device.body, device.sensors), name: device.model}
+    readings = {key: model.respond(movie).readings[chosen] for key, model in simulators.items()}
+    blurred = drawn["shape"] == device.sampler.shapes.names.index("blurred_disc")
+    presses = (blurred & ~labels["dynamic"] & labels["press"]).nonzero()[:, 0]
+    presses = presses[drawn["force"][presses].argsort()]
+    four = presses[torch.linspace(0, len(presses) - 1, 4).round().long()]
+    courses = traces(readings, device.model_rate)
+    forces = force_and_reading(recording.force[four], touches.readings[four], device.model_rate)
+    return [
+        save_figure(courses, folder / f"figure10_naive_{name}.png"),
+        save_figure(forces, folder / "figure11_force_reading.png"),
+    ]

@@ -12,8 +12,8 @@ import pandas as pd
 from omegaconf import OmegaConf
 
 from experiments.studies.comparison import conclude
+from experiments.studies.pages import comparison_text
 from experiments.studies.study import Statement, Study, configured_study, trained_settings
-from experiments.studies.study_page import comparison_text
 from skin.core.files import CONF, ROOT, write
 from skin.core.settings import configured
 
@@ -41,7 +41,7 @@ def reproduce_page() -> str:
         parts.append(f"\n## {section['title']}\n\n| statement | command | outcome |\n|---|---|---|\n")
         for name in section["studies"]:
             parts += _study_lines(*studies[name])
-        parts += [_told(line) if "told" in line else _tested(line) for line in section["statements"]]
+        parts += [_stated(line) if "outcome" in line else _tested(line) for line in section["statements"]]
     return "".join(parts)
 
 
@@ -100,11 +100,11 @@ def _line(statement: Statement, command: str, trials: pd.DataFrame) -> str:
     return f"| {says} | {command} | {comparison_text(result).replace(' points', '')}: *{result.verdict}* |\n"
 
 
-def _told(line: Mapping[str, str]) -> str:
+def _stated(line: Mapping[str, str]) -> str:
     command = line.get("command", "")
     command = f"`{command}`" if command and not command.startswith("[") else command
     commit = f" ({line['commit']})" if "commit" in line else ""
-    return f"| {line['says']} | {command} | {line['told']}{commit} |\n"
+    return f"| {line['says']} | {command} | {line['outcome']}{commit} |\n"
 
 
 if __name__ == "__main__":

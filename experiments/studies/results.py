@@ -10,6 +10,7 @@ import sys
 import traceback
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from shlex import join, split
 from typing import Annotated, Any, Literal
 
@@ -18,25 +19,9 @@ from annotated_types import Ge, Gt
 from experiments import peers
 from skin.commands._command import command
 from skin.core.files import results
-from skin.core.settings import check_settings, configured
+from skin.core.settings import configured
 from skin.errors import InputError
 from skin.runs.configuration import Config, overrides
-
-_PEERS = "experiments/peers/conf"
-_FRESH = {"uri": "sqlite:///results/fresh.db", "artifacts": "results/fresh"}  # of tracking
-
-
-@dataclass(frozen=True)
-class ResultStep:
-    """A command of a part.
-
-    Attributes:
-        run: verb and overrides.
-        hours: its duration without finished runs.
-    """
-
-    run: str
-    hours: Annotated[float, Gt(0)]
 
 
 @dataclass(frozen=True)
@@ -44,7 +29,7 @@ class PublishedResults:
     """The settings of ``conf/results.yaml``.
 
     Raises:
-        InputError: a part that there is not.
+        InputError: a part that there is not, or a verb without a smoke budget.
     """
 
     part: str
@@ -52,23 +37,46 @@ class PublishedResults:
     budget: Literal["full", "smoke"]
     jobs: Annotated[int, Ge(1)]
     fresh: bool
-    parts: Mapping[str, Sequence[Mapping[str, Any]]]
+    parts: Mapping[str, Sequence[tuple[str, Annotated[float, Gt(0)]]]]
     smoke: Mapping[str, Sequence[str]]
 
     def __post_init__(self) -> None:
-        for name, steps in self.parts.items():
-            for number, step in enumerate(steps):
-                check_settings(ResultStep, dict(step), f"results.parts.{name}[{number}]")
         if self.part not in ("all", *self.parts):
             raise InputError(f"results.part={self.part} is none of all, {', '.join(self.parts)}")
         if unknown := set(self.optional) - set(self.parts):
             raise InputError(f"results.optional={[*self.optional]}: there is no part {', '.join(unknown)}")
+        verbs = {run.split()[0] for steps in self.parts.values() for run, _ in steps}
+        if missing := verbs - self.smoke.keys():
+            verb = min(missing)
+            raise InputError(f"results.smoke has no settings for skin {verb}: add +results.smoke.{verb}=[]")
 
-    def steps(self) -> list[ResultStep]:
-        """Return the commands of the chosen part, or of all that are not optional."""
-        every = [name for name in self.parts if name not in self.optional]
-        chosen = every if self.part == "all" else [self.part]
-        return [ResultStep(**step) for name in chosen for step in self.parts[name]]
+    def lines(self, folder: Path, passed: Sequence[str]) -> Iterator[tuple[float, list[str]]]:
+        """Yield hours, and verb and overrides, of each command of the part, or of all but optional ones.
+
+        Args:
+            folder: of the results.
+            passed: overrides of every training and study.
+        """
+        smoke, every = self.budget == "smoke", [name for name in self.parts if name not in self.optional]
+        fresh = ["tracking.uri=sqlite:///results/fresh.db", "tracking.artifacts=results/fresh"]
+        parallel = {
+            "train": ["hydra/launcher=joblib", f"hydra.launcher.n_jobs={self.jobs}"],
+            "study": [f"study.jobs={self.jobs}"],
+        }
+        for run, hours in (step for part in (every if self.part == "all" else [self.part])
+                           for step in self.parts[part]):  # fmt: skip
+            verb, *words = split(run)
+            if smoke and "experiments/peers/conf" in words and not peers.python().is_file():
+                missing = f"left out without {peers.python()}, which make peers builds: skin {run}"
+                print(missing, file=sys.stderr)
+                continue
+            words += self.smoke[verb] if smoke else ()
+            if verb == "design":  # has no runs, and takes no settings of trainings
+                words = [f"out={folder / word[4:]}" if word.startswith("out=") else word for word in words]
+            else:
+                words += [*(fresh if self.fresh else []), *(parallel.get(verb, []) if self.jobs > 1 else [])]
+                words += [*([f"out={folder}"] if verb == "study" else []), *passed]
+            yield hours, [verb, *words]
 
 
 @command("results")
@@ -87,7 +95,10 @@ def _publish(chosen: PublishedResults, out: str | None) -> int:
     from experiments.studies.trials import run_command
     from skin import __main__ as cli
 
-    failed, lines = [], list(_lines(chosen, out))
+    passed = [word for word in overrides() if word.split("=")[0].split(".")[0] not in ("results", "out")]
+    # Smoke budgets are published in a folder of their own.
+    folder = results(out or ("results" if chosen.budget == "smoke" else "docs/results"))
+    failed, lines = [], list(chosen.lines(folder, passed))
     for number, (_, line) in enumerate(lines):
         left = sum(each for each, _ in lines[number:])
         estimate = f", at most {left:.1f} h left" if chosen.budget == "full" else ""
@@ -101,31 +112,3 @@ def _publish(chosen: PublishedResults, out: str | None) -> int:
     if failed:
         print("failed:", *failed, sep="\n", file=sys.stderr)
     return int(bool(failed))
-
-
-def _lines(chosen: PublishedResults, out: str | None) -> Iterator[tuple[float, list[str]]]:
-    """Yield hours, and verb and overrides, of each command; the overrides of the command line last."""
-    smoke, jobs = chosen.budget == "smoke", chosen.jobs
-    passed = [word for word in overrides() if word.split("=")[0].split(".")[0] not in ("results", "out")]
-    # Smoke budgets are published in a folder in it.
-    folder = results(out or ("results" if smoke else "docs/results"))
-    fresh = [f"tracking.{name}={value}" for name, value in _FRESH.items() if chosen.fresh]
-    parallel = {
-        "train": ["hydra/launcher=joblib", f"hydra.launcher.n_jobs={jobs}"],
-        "study": [f"study.jobs={jobs}"],
-    }
-    for step in chosen.steps():
-        verb, *words = split(step.run)
-        if smoke and _PEERS in words and not peers.python().is_file():
-            missing = f"left out without {peers.python()}, which make peers builds: skin {step.run}"
-            print(missing, file=sys.stderr)
-            continue
-        if smoke and verb not in chosen.smoke:
-            raise InputError(f"results.smoke has no settings for skin {verb}: add +results.smoke.{verb}=[]")
-        words += chosen.smoke[verb] if smoke else ()
-        if verb == "design":  # has no runs, and takes no settings of trainings
-            words = [f"out={folder / word[4:]}" if word.startswith("out=") else word for word in words]
-            yield step.hours, [verb, *words]
-            continue
-        words += [*fresh, *(parallel.get(verb, []) if jobs > 1 else [])]
-        yield step.hours, [verb, *words, *([f"out={folder}"] if verb == "study" else []), *passed]

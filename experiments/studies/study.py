@@ -202,14 +202,21 @@ def sweeps(
 
 def variants(study: Study, smoke: bool = False) -> list[Variant]:
     """Return every variant that a study trains or shows, with its configurations."""
-    untrained = () if study.rows is not None else study.finished
+    shown = () if study.rows is not None else study.finished
+    blocks = [(True, *sweep) for sweep in sweeps(study, study.trainings, smoke)]
+    blocks += [(False, *sweep) for sweep in sweeps(study, shown, smoke)]
     every = list[tuple[dict[str, str], Variant]]()
-    for block, line in sweeps(study, study.trainings, smoke):
-        every += _variants(block, line)
-    for block, line in sweeps(study, untrained, smoke):
-        # Rows of peers are in a folder of their own.
-        finished = _variants(block, line, (f"hydra.searchpath=['file://{peers.CONF}']",))
-        every += [(named, replace(variant, trained=False)) for named, variant in finished]
+    for trained, block, line in blocks:
+        # Rows of peers, which no study trains, are in a folder of their own.
+        search = [] if trained else [f"hydra.searchpath=['file://{peers.CONF}']"]
+        block_variants = dict[tuple[str, ...], tuple[dict[str, str], Variant]]()
+        for job in sweep_jobs(line, {}):
+            named, chosen = _settings(block, job)
+            words = [*search, *(f"{key}={value}" for key, value in job.items())]
+            config = validate_config(compose("train", words))
+            new = named, Variant("", chosen, {}, trained)
+            block_variants.setdefault(tuple(chosen.values()), new)[1].configs[str(config.seed)] = config
+        every += block_variants.values()
     names = _names([named for named, _ in every])
     return [replace(variant, name=name) for name, (_, variant) in zip(names, every, strict=True)]
 
@@ -223,21 +230,6 @@ def trained_settings(study: Study) -> dict[str, Mapping[str, str]]:
         words = as_overrides({key: value for key, value in chosen.items() if key != "name"})
         pairs += [_settings(chosen, job) for job in sweep_jobs(words, {})]
     return dict(zip(_names([named for named, _ in pairs]), (chosen for _, chosen in pairs), strict=True))
-
-
-def _variants(
-    block: Mapping[str, Any], line: Sequence[str], places: Sequence[str] = ()
-) -> list[tuple[dict[str, str], Variant]]:
-    """Return each variant of a sweep, with what may name it."""
-    variants = dict[tuple[str, ...], tuple[dict[str, str], Variant]]()
-    for job in sweep_jobs(list(line), {}):
-        named, chosen = _settings(block, job)
-        config = validate_config(
-            compose("train", [*places, *(f"{key}={value}" for key, value in job.items())])
-        )
-        _, variant = variants.setdefault(tuple(chosen.values()), (named, Variant("", chosen, {})))
-        variant.configs[str(config.seed)] = config
-    return list(variants.values())
 
 
 def _settings(block: Mapping[str, Any], job: Mapping[str, str]) -> tuple[dict[str, str], dict[str, str]]:

@@ -1,11 +1,8 @@
 """The runs of a study, and its trials: what a measure tells of a run, under each condition, on each device.
 
-A measure is a frozen dataclass of settings that maps a :class:`Subject` to a data frame, with a row for
-each touch or condition, or a single row of metrics. ``attrs`` of the frame may have ``about`` (a text for a
-person), ``metrics`` (name -> value, where the rows are something else), and ``cannot`` (why the learner does
-not accept the touches). Each frame is a Parquet file in ``results/trials/<study>``, named by the training and
-by all that the frame depends on. A file has one writer and is written whole, so parallel jobs and shards
-share none.
+Each frame of a measure (:mod:`experiments.studies.measures`) is a Parquet file in ``results/trials/<study>``,
+named by the training and by all that the frame depends on. A file has one writer and is written whole, so
+parallel jobs and shards share none.
 
 The trials of a study are a data frame with a row for each: ``variant``, ``seed``, ``condition``, ``device``
 (its number; empty: the run's own), ``run`` (fingerprint; empty where none finished), ``row``, ``simulator``,
@@ -19,12 +16,11 @@ import logging
 import os
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -33,14 +29,11 @@ from hydra import compose
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.singleton import Singleton
-from hydra.utils import instantiate
-from mlflow.entities import Run
 from rich.console import Console
 from rich.progress import track
 
-from experiments.studies.measures import Accuracy
-from experiments.studies.pages import Page, publish_page
-from experiments.studies.report_figures import draw_report
+from experiments.studies.measures import Accuracy, StudyMeasure, Subject
+from experiments.studies.pages import Page, draw_report, publish_measured, publish_page, publish_study
 from experiments.studies.study import (
     MEASURE,
     Study,
@@ -50,143 +43,80 @@ from experiments.studies.study import (
     sweeps,
     variants,
 )
-from experiments.studies.study_page import publish_study, publish_tables
 from skin.commands import train
 from skin.core.files import whole
 from skin.core.messages import PARENT
-from skin.device.base import AbstractDevice
 from skin.errors import InputError
-from skin.evaluation.alarm import choose_alarm_threshold
 from skin.evaluation.metrics import OUTCOMES, decode, disagreement, vote
-from skin.evaluation.operating_point import OperatingPoint
-from skin.evaluation.settings import check_evaluation
-from skin.learning.learner import AbstractLearner
-from skin.runs.build import build_device
 from skin.runs.configuration import Config, fingerprint, simulator, source_tags, validate_config
 from skin.runs.run import TAG, FinishedRun, find_run
 from skin.runs.store import Store, note_reuse, note_source
 from skin.runs.sweep import LEFT_OUT, Shard
-from skin.runs.torch_model import TorchModel, alarm_source, load_model, load_run
+from skin.runs.torch_model import TorchModel, load_model
 from skin.touch.labels import TOUCH
 
 _log = logging.getLogger(__name__)
 FOLDER = Path("results/trials")
 """Of all trials, in the current folder; those of a study are in a folder of its name."""
 
-_FRACTIONS = (
-    *(f"{label}/accuracy" for label in ("overall", *TOUCH.names)),
-    "dangerous/alarm_recall",
-    "dangerous/false_alarm_rate",
-)
-
 
 @dataclass(frozen=True)
-class Planned:
+class StudyRun:
     """A run of a study.
 
     Attributes:
         variant: that it is of.
         seed: of the training.
-        run: the newest that finished; None where none did: it failed, was killed, or never started.
+        finished: the newest that finished; None where none did: it failed, was killed, or never started.
     """
 
     variant: Variant
     seed: str
-    run: Run | None
+    finished: FinishedRun | None = None
 
+    @cached_property
+    def tags(self) -> Mapping[str, str]:
+        """Tags of the run; none of one that has not finished."""
+        return self.finished.run.data.tags if self.finished else {}
 
-@dataclass(frozen=True)
-class Subject:
-    """The subject of a measure.
-
-    Attributes:
-        config: of the run, with the changes of the condition; that of the command without a run.
-        device: as ``config`` describes it.
-        run: as MLflow has it; None where a study has no runs.
-        model: what the run learned, and the device that it was trained on.
-        condition: name.
-        changes: overrides of the condition.
-    """
-
-    config: Config
-    device: AbstractDevice
-    run: Run | None = None
-    model: TorchModel | None = None
-    condition: str = ""
-    changes: Sequence[str] = ()
-
-    @property
-    def trained(self) -> TorchModel:
-        """What the run learned.
-
-        Raises:
-            InputError: there is no run.
-        """
-        if self.model is None:
-            raise InputError("this study needs a finished run: study.run=latest, or study.rows=[features]")
-        return self.model
-
-    @property
-    def learner(self) -> AbstractLearner:
-        """What the run learned."""
-        return self.trained.learner
-
-    @property
-    def reloaded(self) -> TorchModel:
-        """What the run learned, with the device of the condition."""
-        assert self.trained.run is not None
-        return load_model(self.trained.run, self.config)
-
-    def load(self, name: str) -> Any:
-        """Return a finished run, pretrained model or exported one for the skin of the configuration."""
-        if name.endswith(".onnx"):
-            return load_run(name)
-        return load_run(name, body=instantiate(self.config.body), layout=instantiate(self.config.layout))
-
-    def point(self) -> OperatingPoint:
-        """Return where the run raises the alarm on this device."""
-        run = self.trained.run
-        point = self.trained.point
-        if run is not None:
-            point = choose_alarm_threshold(alarm_source(run, self.learner, self.config))
-        return point or OperatingPoint.default(check_evaluation(self.config.evaluation).false_alarm_rate)
-
-
-class StudyMeasure(Protocol):
-    """A frozen dataclass of settings that measures; it may have ``page(frame, title)``."""
-
-    def __call__(self, subject: Subject) -> pd.DataFrame:
-        """Measure; InputError where the device or the learner cannot be measured so."""
+    @cached_property
+    def model(self) -> TorchModel | None:
+        """What it learned."""
+        return load_model(self.finished) if self.finished else None
 
 
 def run_study(study: Study, config: Config, folder: Path, smoke: bool) -> bool:
     """Measure the runs of a study, publish the results, and return whether all runs have finished."""
     shard = Shard.parse(config.shard) if config.shard is not None else None
     store, planned = plan_runs(study, config, shard, smoke)
-    trials, tables = list[dict[str, Any]](), list[tuple[dict[str, Any], Page]]()
+    trials, measured = list[dict[str, Any]](), list[tuple[dict[str, Any], Page]]()
     console = Console(stderr=True)
     runs = track(planned, "measuring", console=console, transient=True, disable=not console.is_terminal)
     for row, page, title, name in (trial for run in runs for trial in run_trials(store, run, study, config)):
         trials.append(row)
         if page is None or page.data.empty:
             continue
-        tables.append((row, page))
+        measured.append((row, page))
         paths = publish_page(page, title, folder / name) if page.tables and store else []
-        if page.about and store:
-            print(f"{row['variant']} ({row['run'][:8]}): {page.about}", *paths, sep="\n", flush=True)
+        if page.about:
+            about = f"{row['variant']} ({row['run'][:8]}): {page.about}" if store else page.about
+            print(about, *paths, sep="\n", flush=True)
+    complete = not store or all(run.finished for run in planned)
     if shard:
         print(f"shard {config.shard} is measured: the same command without shard= writes the results")
-        return all(run.run for run in planned)
+        return complete
     frame = pd.DataFrame([*trials, *votes(study, pd.DataFrame(trials))])
     path = folder / (f"study_{study.name}" if store else study.name)
     if study.metrics and store:
         words = [word for word in passed_overrides() if not word.startswith("tracking.")]
-        small = study.small if smoke else ()
-        warning = "SMOKE, one epoch on little data, ignore the scores: " * smoke
+        warning, small = (
+            ("SMOKE, one epoch on little data, ignore the scores: ", study.small) if smoke else ("", ())
+        )
         title = warning + ", ".join([f"{study.name}: {study.about}", *small, *words])
         paths = publish_study(study, title, frame, path)
     else:
-        paths = publish_tables(study, tables, path)
+        paths = publish_measured(study, measured, path)
+    print(*paths, sep="\n")
     if study.report_figures:
         skins = {
             simulator(config.device): config for run in planned for config in run.variant.configs.values()
@@ -194,12 +124,12 @@ def run_study(study: Study, config: Config, folder: Path, smoke: bool) -> bool:
         print(f"{len(draw_report(frame, skins, folder))} figures of the report in {folder}")
     if store and (study.measure or frame.condition.any()):
         log_summary(store, study, frame, paths)
-    return not store or all(run.run for run in planned)
+    return complete
 
 
 def plan_runs(
     study: Study, config: Config, shard: Shard | None, smoke: bool
-) -> tuple[Store | None, list[Planned]]:
+) -> tuple[Store | None, list[StudyRun]]:
     """Return the store and the runs of a study, or of a shard of it; those to train are trained.
 
     A study without runs has no store, and one entry.
@@ -208,7 +138,7 @@ def plan_runs(
         InputError: there is nothing to measure, or to divide.
     """
     if study.trainings:
-        return _train(study, shard, smoke)
+        return _train(study, config, shard, smoke)
     if not study.has_runs:
         if shard:
             raise InputError(f"study={study.name} has no runs to divide: leave out shard={config.shard}")
@@ -216,46 +146,43 @@ def plan_runs(
             raise InputError(
                 f"study={study.name} has nothing to measure: set study.rows=all or study.trainings"
             )
-        return None, [Planned(Variant("", {}, {}), "", None)]
+        return None, [StudyRun(Variant("", {}, {}), "")]
     store = Store.open(config.tracking)
-    planned = find_runs(study, config, store)
-    if shard:
-        chosen = shard.part(run.run.data.tags["fingerprint"] for run in planned if run.run)
-        planned = [run for run in planned if run.run and run.run.data.tags["fingerprint"] in chosen]
-    return store, planned
+    runs = find_runs(study, config, store)
+    chosen = {run.tags["fingerprint"] for run in runs}
+    chosen = shard.part(chosen) if shard else chosen
+    return store, [run for run in runs if run.tags["fingerprint"] in chosen]
 
 
-def _train(study: Study, shard: Shard | None, smoke: bool) -> tuple[Store, list[Planned]]:
-    every = variants(study, smoke)
-    store = Store.open(next(iter(every[0].configs.values())).tracking)
-    prints = {fingerprint(config) for variant in every for config in variant.configs.values()}
+def _train(study: Study, command: Config, shard: Shard | None, smoke: bool) -> tuple[Store, list[StudyRun]]:
+    planned = [
+        (fingerprint(config), StudyRun(variant, seed))
+        for variant in variants(study, smoke)
+        for seed, config in variant.configs.items()
+    ]
+    store = Store.open(next(iter(planned[0][1].variant.configs.values())).tracking)
+    prints = {print_ for print_, _ in planned}
     if shard:
         prints = shard.part(prints)
-        every = [
-            replace(each, configs={s: c for s, c in each.configs.items() if fingerprint(c) in prints})
-            for each in every
-        ]
-    if study.train and any(run.run is None for run in _look(store, every) if run.variant.trained):
+    planned = [(print_, run) for print_, run in planned if print_ in prints]
+
+    def look() -> Iterator[StudyRun]:
+        """Yield the runs, with the newest finished one of each configuration."""
+        for print_, run in planned:
+            found = store.find("FINISHED", fingerprint=print_)[:1]
+            for each in found:
+                note_reuse(each)
+            yield replace(run, finished=FinishedRun(store, found[0], command.trust) if found else None)
+
+    if study.train and any(not run.finished for run in look() if run.variant.trained):
         parallel = ["hydra/launcher=joblib", f"hydra.launcher.n_jobs={study.jobs}"] if study.jobs > 1 else []
         for _, line in sweeps(study, study.trainings, smoke):
             divided = [f"+hydra.callbacks.sweep.runs={sorted(prints)}"] if shard else []
             multirun([*line, *parallel, *divided])
-    return store, [run for run in _look(store, every) if run.run is not None or run.variant.trained]
+    return store, [run for run in look() if run.finished or run.variant.trained]
 
 
-def _look(store: Store, every: Sequence[Variant]) -> list[Planned]:
-    """Return the newest finished run of each configuration."""
-    planned = []
-    for variant in every:
-        for seed, config in variant.configs.items():
-            runs = store.find("FINISHED", fingerprint=fingerprint(config))
-            if runs:
-                note_reuse(runs[0])
-            planned.append(Planned(variant, seed, runs[0] if runs else None))
-    return planned
-
-
-def find_runs(study: Study, config: Config, store: Store) -> list[Planned]:
+def find_runs(study: Study, config: Config, store: Store) -> list[StudyRun]:
     """Return finished runs: the named one, or the newest of rows and seeds on the simulator of ``config``.
 
     Runs of a row whose names differ in more than the seed are different variants.
@@ -265,16 +192,15 @@ def find_runs(study: Study, config: Config, store: Store) -> list[Planned]:
     """
     if study.rows is None:
         assert study.run is not None
-        return [_found(find_run(config.tracking, study.run).run)]
-    newest: dict[tuple[str, str], Planned] = {}
+        return [_found(find_run(config.tracking, study.run, config.trust))]
+    newest: dict[tuple[str, str], StudyRun] = {}
     data = simulator(config.device)
-    for run in store.find("FINISHED", simulator=data):
-        tags = run.data.tags
-        chosen = study.rows == "all" or tags["row"] in study.rows
-        if chosen and "learned" in tags and int(tags["seed"]) in study.seeds:
-            planned = _found(run)
-            newest.setdefault((planned.variant.name, planned.seed), planned)
-    rows = {planned.variant.chosen["row"] for planned in newest.values()}
+    for each in store.find("FINISHED", simulator=data):
+        run = _found(FinishedRun(store, each, config.trust))
+        chosen = study.rows == "all" or run.tags["row"] in study.rows
+        if chosen and "learned" in run.tags and int(run.seed) in study.seeds:
+            newest.setdefault((run.variant.name, run.seed), run)
+    rows = {run.variant.chosen["row"] for run in newest.values()}
     missing = [] if study.rows == "all" else [row for row in study.rows if row not in rows]
     missing = missing or ([] if rows else ["features"])
     if missing:
@@ -285,9 +211,9 @@ def find_runs(study: Study, config: Config, store: Store) -> list[Planned]:
     return [newest[key] for key in sorted(newest)]
 
 
-def _found(run: Run) -> Planned:
-    tags, name = run.data.tags, re.sub(r"( seed)? \d+$", "", run.info.run_name)
-    return Planned(Variant(name, {"row": tags.get("row", "")}, {}), tags.get("seed", ""), run)
+def _found(finished: FinishedRun) -> StudyRun:
+    tags, name = finished.run.data.tags, re.sub(r"( seed)? \d+$", "", finished.title)
+    return StudyRun(Variant(name, {"row": tags.get("row", "")}, {}), tags.get("seed", ""), finished)
 
 
 def multirun(line: Sequence[str]) -> int:
@@ -306,96 +232,77 @@ def run_command(main: Callable[[Sequence[str]], None], words: Sequence[str]) -> 
     Raises:
         SystemExit: a signal ended it.
     """
-    with _another_command():
-        try:
-            main(words)
-        except SystemExit as stop:
-            code = stop.code if isinstance(stop.code, int) else int(stop.code is not None)
-            if code > 128:
-                raise
-            return code
-    return 0
-
-
-@contextmanager
-def _another_command() -> Iterator[None]:
-    """Let Hydra run a command inside of one."""
     state, traceback = Singleton.get_state(), os.environ.pop("HYDRA_FULL_ERROR", None)
     GlobalHydra.instance().clear()
     try:
-        yield
+        main(words)
+    except SystemExit as stop:
+        code = stop.code if isinstance(stop.code, int) else int(stop.code is not None)
+        if code > 128:
+            raise
+        return code
     finally:
         Singleton.set_state(state)
         for name in (PARENT, LEFT_OUT):  # of a sweep, which has ended
             os.environ.pop(name, None)
         if traceback is not None:
             os.environ["HYDRA_FULL_ERROR"] = traceback
-
-
-def _load_outcomes(store: Store, run: Run) -> bytes | None:
-    """Return the outcomes of the test gestures of a run; None if it has none."""
-    if OUTCOMES not in {file.path for file in store.client.list_artifacts(run.info.run_id)}:
-        _log.warning(
-            "%s keeps no outcomes of its test gestures: its intervals are over trainings alone",
-            run.info.run_name,
-        )
-        return None
-    with TemporaryDirectory() as folder:
-        return np.load(FinishedRun(store, run).fetch(OUTCOMES, folder)).tobytes()
+    return 0
 
 
 Trial = tuple[dict[str, Any], Page | None, str, str]
 """Row of the trials, page, and title and name of the page."""
 
 
-def run_trials(store: Store | None, planned: Planned, study: Study, config: Config) -> Iterator[Trial]:
+def run_trials(store: Store | None, run: StudyRun, study: Study, config: Config) -> Iterator[Trial]:
     """Yield the trials of a run; measurements that exist are not made again.
 
     Args:
         store: of the run; None: a study without runs.
-        planned: the run.
+        run: that is measured.
         study: what to measure.
         config: of the command.
     """
-    variant, run = planned.variant, planned.run
-    tags = {} if run is None else run.data.tags
-    row: dict[str, Any] = {"variant": variant.name, "seed": planned.seed, "condition": "", "device": ""}
+    variant, tags, finished = run.variant, run.tags, run.finished
+    row: dict[str, Any] = {"variant": variant.name, "seed": run.seed, "condition": "", "device": ""}
     row |= {"run": tags.get("fingerprint", ""), "chosen": variant.chosen, "outcomes": None, "cannot": ()}
     row |= _row_and_simulator(variant)
-    logged = run.data.metrics if run is not None and variant.configs else {}
-    if store and run is None:
+    if store and not finished:
         yield row, None, "", ""
         return
-    if store and run and study.measure is None and not study.conditions:
+    logged = finished.run.data.metrics if finished and variant.configs else {}
+    if finished and study.measure is None and not study.conditions:
         refused = [name.removeprefix("cannot_") for name in tags if name.startswith("cannot_")]
-        yield row | {"outcomes": _load_outcomes(store, run), "cannot": refused} | logged, None, "", ""
+        yield row | {"outcomes": _load_outcomes(finished), "cannot": refused} | logged, None, "", ""
         return
-    words, selected = passed_overrides(), f"simulator={tags.get('simulator')}"
     # Trainings had these overrides. They change the device of other runs, whose simulator selected them.
+    words, selected = passed_overrides(), f"simulator={tags.get('simulator')}"
     base, changes = (words, []) if variant.configs else ([], [word for word in words if word != selected])
-    restored = RestoredRun(store, run, config)
+    # The name of a run, and not its id, which differs between databases.
+    name = finished.title if finished else study.name
+    title = f"{name}, run {tags.get('fingerprint', finished.identity)[:8]}" if finished else ""
     for condition, settings in (study.conditions or {"": {}}).items():
         for number, numbered in numbered_settings(study, settings):
             own = {key: value for key, value in numbered.items() if not key.startswith(MEASURE)}
             of_measure = {key.removeprefix(MEASURE): numbered[key] for key in numbered.keys() - own.keys()}
             measure = replace(study.measure or Accuracy(), **of_measure)
             line = [*as_overrides({**study.test, **own}), *changes]
-            subject = partial(Subject, condition=condition, changes=as_overrides(own))
-            frame, name = restored.measure(study.name, measure, subject, base, line)
-            page, measured = _page(measure, frame, restored.title), {"condition": condition, "device": number}
+            if finished:
+                general = [word for word in base if word.startswith(("hydra", "tracking"))]
+                changed = finished.configured([*general, *line])
+            else:
+                changed = validate_config(compose("train", [*base, *line]))
+            subject = Subject(changed, condition=condition, changes=as_overrides(own))
+            frame, key = measure_once(study.name, measure, run, subject, config.tracking.resume)
             cannot = ("same",) if frame.attrs.get("cannot") else ()
             metrics = frame.attrs.get("metrics", frame.iloc[0].to_dict() if len(frame) == 1 else {})
             metrics = metrics if store else {}  # rows of a skin have texts
-            results = ({} if condition else logged) | metrics | measured | {"cannot": cannot}
-            yield row | results, page, restored.title, name
-
-
-def _page(measure: StudyMeasure, frame: pd.DataFrame, title: str) -> Page:
-    """Return what is published of a measurement."""
-    if hasattr(measure, "page"):
-        return measure.page(frame, title)
-    tables = {} if len(frame) < 2 else {"Measured": frame.astype(str)}
-    return Page(frame.attrs.get("about", ""), tables, frame)
+            results = ({} if condition else logged) | metrics
+            results |= {"condition": condition, "device": number, "cannot": cannot}
+            file = f"{type(measure).__name__.lower()}_" + re.sub(r"\W+", "_", name)
+            if any(not word.startswith("tracking.") for word in line):
+                file += f"_{key[:8]}"
+            yield row | results, _page(measure, frame, title), title, file
 
 
 def _row_and_simulator(variant: Variant) -> dict[str, str]:
@@ -404,6 +311,27 @@ def _row_and_simulator(variant: Variant) -> dict[str, str]:
     chosen = variant.chosen
     row = chosen.get("row", chosen.get("experiment", ""))
     return {"row": row, "simulator": chosen.get("simulator", "")}
+
+
+def _load_outcomes(finished: FinishedRun) -> bytes | None:
+    """Return the outcomes of the test gestures of a run; None if it has none."""
+    assert finished.store is not None
+    if OUTCOMES not in {file.path for file in finished.store.client.list_artifacts(finished.identity)}:
+        _log.warning(
+            "%s keeps no outcomes of its test gestures: its intervals are over trainings alone",
+            finished.title,
+        )
+        return None
+    with TemporaryDirectory() as folder:
+        return np.load(finished.fetch(OUTCOMES, folder)).tobytes()
+
+
+def _page(measure: StudyMeasure, frame: pd.DataFrame, title: str) -> Page:
+    """Return what is published of a measurement."""
+    if hasattr(measure, "page"):
+        return measure.page(frame, title)
+    tables = {} if len(frame) < 2 else {"Measured": frame.astype(str)}
+    return Page(frame.attrs.get("about", ""), tables, frame)
 
 
 def numbered_settings(study: Study, condition: Mapping[str, Any]) -> Iterator[tuple[str, Mapping[str, Any]]]:
@@ -427,64 +355,34 @@ def numbered_settings(study: Study, condition: Mapping[str, Any]) -> Iterator[tu
         yield str(number), {**condition, **dict(zip(lists, values, strict=True))}
 
 
-class RestoredRun:
-    """A finished run, which is restored at most once; without one, the skin of the command.
+def measure_once(
+    study: str, measure: StudyMeasure, run: StudyRun, subject: Subject, resume: bool = True
+) -> tuple[pd.DataFrame, str]:
+    """Return the frame of a measure, from its file if there is one, and a key of all that it depends on.
 
     Args:
-        store, run: None without a run.
-        config: of the command.
+        study: name.
+        measure: with its settings.
+        run: that is measured.
+        subject: of the run, without its model.
+        resume: whether to read the file.
     """
-
-    def __init__(self, store: Store | None, run: Run | None, config: Config) -> None:
-        self.run, self.config = run, config
-        self.finished = FinishedRun(store, run, config.trust) if store and run else None
-
-    @property
-    def title(self) -> str:
-        """The name of the run, for pages and figures; the id of a run differs between databases."""
-        if self.run is None:
-            return ""
-        return (
-            f"{self.run.info.run_name}, run {self.run.data.tags.get('fingerprint', self.run.info.run_id)[:8]}"
-        )
-
-    @cached_property
-    def trained(self) -> TorchModel | None:
-        """What it learned."""
-        return load_model(self.finished) if self.finished else None
-
-    def measure(
-        self,
-        study: str,
-        measure: StudyMeasure,
-        subject: Callable[..., Subject],
-        base: Sequence[str],
-        line: Sequence[str],
-    ) -> tuple[pd.DataFrame, str]:
-        """Return the frame of a measure on the device that overrides describe, and a name for its files."""
-        if self.finished:
-            general = [word for word in base if word.startswith(("hydra", "tracking"))]
-            config = self.finished.configured([*general, *line])
-        else:
-            config = validate_config(compose("train", [*base, *line]))
-        depends: list[Any] = [repr(measure), fingerprint(config)]
-        identity, name = "skin", study
-        if self.run is not None:
-            # A training that was repeated has other weights, and ended at another time.
-            depends += [self.run.data.tags.get(TAG), self.run.info.end_time]
-            identity, name = self.run.data.tags["fingerprint"], self.run.info.run_name
-        key = hashlib.sha256(json.dumps(depends).encode()).hexdigest()[:16]
-        path = FOLDER / study / f"{identity}-{key}.parquet"
-        frame = read_frame(path) if self.config.tracking.resume else None
-        if frame is None:
-            frame = measure(subject(config, build_device(config), self.run, self.trained))
-            frame.attrs |= {"run": identity, "name": name, "measure": repr(measure), "source": source_tags()}
-            write_frame(frame, path)
-        else:
-            note_source(str(path), f"{study} of {name}", frame.attrs["source"])
-        changed = any(not word.startswith("tracking.") for word in line)
-        name = f"{type(measure).__name__.lower()}_" + re.sub(r"\W+", "_", name)
-        return frame, name + (f"_{key[:8]}" if changed else "")
+    depends: list[Any] = [repr(measure), fingerprint(subject.config), subject.condition]
+    identity, name = "skin", study
+    if run.finished:
+        # A training that was repeated has other weights, and ended at another time.
+        depends += [run.tags.get(TAG), run.finished.run.info.end_time]
+        identity, name = run.tags["fingerprint"], run.finished.title
+    key = hashlib.sha256(json.dumps(depends).encode()).hexdigest()[:16]
+    path = FOLDER / study / f"{identity}-{key}.parquet"
+    frame = read_frame(path) if resume else None
+    if frame is None:
+        frame = measure(replace(subject, model=run.model))
+        frame.attrs |= {"run": identity, "name": name, "measure": repr(measure), "source": source_tags()}
+        write_frame(frame, path)
+    else:
+        note_source(str(path), f"{study} of {name}", frame.attrs["source"])
+    return frame, key
 
 
 def read_frame(path: Path) -> pd.DataFrame | None:
@@ -532,22 +430,20 @@ def votes(study: Study, trials: pd.DataFrame) -> Iterator[dict[str, Any]]:
     It is computed from the outcomes of the runs on the same test gestures (report, 4.2).
     """
     members = trials[trials.outcomes.notna() & ((study.vote == "all") | trials.row.isin([*study.vote]))]
-    others = [
-        tuple(
-            item
-            for item in {**chosen, "simulator": simulated}.items()
-            if item[0] not in ("experiment", "row")
-        )
-        for chosen, simulated in zip(members.chosen, members.simulator, strict=True)
+    chosen = [
+        each | {"simulator": data} for each, data in zip(members.chosen, members.simulator, strict=True)
     ]
+    others = [tuple(item for item in each.items() if item[0] not in ("experiment", "row")) for each in chosen]
     several = len(set(others)) > 1
+    names = ("dangerous/alarm_recall", "dangerous/false_alarm_rate")
+    fractions = [f"{label}/accuracy" for label in ("overall", *TOUCH.names)]
     for (settings, seed), group in members.groupby([pd.Series(others, members.index), "seed"], sort=False):
         codes = [np.frombuffer(outcomes, np.uint8) for outcomes in group.outcomes]
         if len(codes) < 2 or len({len(code) for code in codes}) > 1:
             continue
         outcomes = vote(np.stack(codes))
         metrics = {"same/any/disagreement": disagreement(np.stack(codes))}
-        for metric in _FRACTIONS:
+        for metric in (*fractions, *names):
             counted = decode(outcomes, metric, TOUCH)
             if not np.isnan(counted).all():  # without dangerous gestures there is no recall
                 metrics[f"same/{metric}"] = float(np.nanmean(counted))

@@ -21,10 +21,10 @@ pytestmark = pytest.mark.filterwarnings("ignore:The ``noload`` loader strategy")
 SMALL = ["simulator=naive", "data.gestures=160", "device.test_gestures=64", "evaluation.devices=0",
          "evaluation.layouts=0", "evaluation.safe_gestures=64", "trainer.max_epochs=1"]  # fmt: skip
 PARTS = [
-    "results.parts.table=[{run: 'train -m experiment=rules seed=0,1,2,3', hours: 1}, "
-    "{run: 'study study=table study.rows=[rules] study.seeds=[0,1,2,3]', hours: 1}]",
-    "results.parts.studies=[{run: 'study study=ensemble study.rows=[rules] study.seeds=[0,1] "
-    "study.train=false', hours: 1}]",
+    "results.parts.table=[['train -m experiment=rules seed=0,1,2,3', 1], "
+    "['study study=table study.rows=[rules] study.seeds=[0,1,2,3]', 1]]",
+    "results.parts.studies=[['study study=ensemble study.rows=[rules] study.seeds=[0,1] "
+    "study.train=false', 1]]",
     "results.parts.table_solid=[]",
     "results.parts.best_fresh_solid=[]",
     "results.parts.sensors=[]",
@@ -73,8 +73,8 @@ def test_a_killed_command_goes_on_where_it_was(run, begin, tmp_path):
 
 @pytest.mark.slow("trains several rows")
 def test_a_command_that_fails_does_not_stop_the_others(run, tmp_path):
-    lines = "{run: 'study study=nope', hours: 1}, "
-    lines += "{run: 'study study=ensemble study.rows=[rules] study.train=false', hours: 1}"
+    lines = "['study study=nope', 1], "
+    lines += "['study study=ensemble study.rows=[rules] study.train=false', 1]"
     words = [f"results.parts.studies=[{lines}]", "results.part=studies"]
     done = run(tmp_path, "results", *PARTS, *words, *SMALL)
     assert done.returncode == 1
@@ -84,7 +84,7 @@ def test_a_command_that_fails_does_not_stop_the_others(run, tmp_path):
 
 @pytest.mark.slow("trains several rows")
 def test_bounds_are_published_in_a_folder_of_their_own(run, tmp_path):
-    parts = "results.parts.design=[{run: 'design design.touches=64 simulator=naive out=a/b', hours: 1}]"
+    parts = "results.parts.design=[['design design.touches=64 simulator=naive out=a/b', 1]]"
     done = run(tmp_path, "results", *PARTS, parts, "results.part=design", "results.budget=smoke", *SMALL)
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "docs" / "a" / "b" / "design.json").is_file()
@@ -99,7 +99,7 @@ def test_bounds_are_published_in_a_folder_of_their_own(run, tmp_path):
             "any_skin, studies, design, devices, graphs, other_skins, image_head, image_size, "
             "image_representation",
         ),
-        (["results.parts.table=[{run: study, hours: 0}]"], "hours"),
+        (["results.parts.table=[[study, 0]]"], "results.parts="),
         (["results.optional=[image]"], "results.optional=['image']: there is no part image"),
         (["results.jobs=0"], "results.jobs"),
     ],
@@ -125,7 +125,7 @@ def test_runs_in_another_precision_are_found(run, tmp_path):
     assert "best_fresh" in (tmp_path / "results" / "study_table.md").read_text()
 
 
-LINES = [step.run for steps in OmegaConf.load(CONF / "results.yaml").results.parts.values() for step in steps]
+LINES = [run for steps in OmegaConf.load(CONF / "results.yaml").results.parts.values() for run, _ in steps]
 
 
 @pytest.mark.parametrize("line", LINES)
@@ -150,14 +150,14 @@ def test_every_command_of_the_plan_composes(line):
 
 def test_the_plan_takes_a_night_and_each_part_an_evening():
     settings = OmegaConf.load(CONF / "results.yaml").results
-    hours = {name: sum(step.hours for step in steps) for name, steps in settings.parts.items()}
+    hours = {name: sum(hours for _, hours in steps) for name, steps in settings.parts.items()}
     assert max(hours.values()) <= 2.5
     assert sum(each for name, each in hours.items() if name not in settings.optional) <= 8
 
 
 def test_make_help_states_the_hours_of_each_part():
     settings = OmegaConf.load(CONF / "results.yaml").results
-    hours = {name: sum(step.hours for step in steps) for name, steps in settings.parts.items()}
+    hours = {name: sum(hours for _, hours in steps) for name, steps in settings.parts.items()}
     (text,) = (line for line in (ROOT / "Makefile").read_text().splitlines() if line.startswith("results:"))
     stated = {name: float(value) for name, value in re.findall(r"(\w+) ([\d.]+) h", text)}
     every = sum(each for name, each in hours.items() if name not in settings.optional)

@@ -52,14 +52,8 @@ def ran(run, tmp_path_factory):
             return run(folder, verb, *words)
 
     train = ["--config-dir", str(peers.CONF), "experiment=ridge", "simulator=naive", *SMALL]
-    study = [
-        "study=robustness",
-        "study.part=dead",
-        "study.rows=[ridge]",
-        "study.devices=1",
-        "simulator=naive",
-        f"out={folder}/out",
-    ]
+    study = ["study=robustness", "study.part=dead", "study.rows=[ridge]", "study.devices=1"]
+    study += ["simulator=naive", f"out={folder}/out"]
     return folder, command("train", *train), command("study", *study)
 
 

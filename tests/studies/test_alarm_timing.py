@@ -2,9 +2,10 @@
 
 import numpy as np
 import pytest
+from omegaconf import OmegaConf
 
-from experiments.studies.alarm_timing import COURSES, dangerous_touches, play_touch
-from skin.errors import InputError
+from experiments.studies.alarm_timing import dangerous_touches, play_touch
+from skin.core.files import CONF
 from skin.live.engine import DebounceSettings
 from skin.live.engine_builder import engine_settings
 from skin.runs.build import build_data, build_device, build_learner
@@ -21,6 +22,7 @@ LEARNERS = {
     ],
 }
 RATE = 10.0  # Hz, of the device
+COURSES = OmegaConf.to_container(OmegaConf.load(CONF / "study/holds.yaml").measure.courses)
 
 
 SLOW = {"ensemble": pytest.mark.slow("trains all members, and asks each of them at every frame")}
@@ -47,7 +49,8 @@ def engine(request, trained):
 @pytest.mark.parametrize("course", COURSES)
 def test_an_alarm_stays_until_the_touch_ends(engine, course):
     subject, device = engine
-    forces = dangerous_touches(device, course, 1 if "hold" in course else 2)
+    number = 1 if "hold" in course else 2
+    forces = dangerous_touches(device, number, course == "tap", COURSES[course])
     found = [play_touch(subject, device, force, RATE, number) for number, force in enumerate(forces)]
     assert not any(one.early for one in found)
     raised = [one for one in found if one.raised == one.raised]
@@ -60,14 +63,9 @@ def test_an_alarm_stays_until_the_touch_ends(engine, course):
 def test_a_hold_that_becomes_dangerous_late_is_found(engine):
     """Ten seconds of a light touch, then a press: the plain window never shows the skin untouched."""
     subject, device = engine
-    (strongest,) = dangerous_touches(device, "hold 1 s", 1)
+    (strongest,) = dangerous_touches(device, 1, False, COURSES["hold 1 s"])
     peak = strongest.max(axis=0)
     load = np.interp(np.arange(0, 20, 0.1), [0, 0.2, 10, 10.2, 18, 18.2], [0, 0.15, 0.15, 1, 1, 0])
     found = play_touch(subject, device, load[:, None] * peak, RATE, 99)
     assert found.raised > 0
     assert found.kept
-
-
-def test_courses_have_names(engine):
-    with pytest.raises(InputError, match="no course 'push'"):
-        next(dangerous_touches(engine[1], "push", 1))

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from experiments.studies.barometers import LAST, Barometers, build_strip, read_frames, strip_readings
-from experiments.studies.trials import Subject
+from experiments.studies.contact import LAST, Barometers, build_strip, read_presses, strip_readings
+from experiments.studies.measures import Subject
 from skin.errors import InputError
 
 
@@ -25,13 +25,13 @@ def test_presses_are_read_above_what_was_before_them(tmp_path):
     x = np.arange(6.0)
     readings = np.random.default_rng(0).uniform(0, 2e4, (6, 4))
     write_barometers(tmp_path / "a.csv", x, readings)
-    positions, measured = read_frames(tmp_path, "a").plateaus()
+    positions, measured = read_presses(tmp_path, "a")
     assert positions.tolist() == x.tolist()
     np.testing.assert_allclose(measured, 1e-4 * readings, atol=1e-5)
     (tmp_path / "b.csv").write_text("time,s0\n0,1\n")
     for name in ("b", "none"):
         with pytest.raises(InputError, match=r"cannot read .* as a recording of four barometers"):
-            read_frames(tmp_path, name)
+            read_presses(tmp_path, name)
 
 
 @pytest.mark.slow("fits the position of a strip")
@@ -44,7 +44,7 @@ def test_a_strip_is_found_from_a_third_of_its_presses_and_places_the_others(tmp_
         readings = strip_readings(body, simulator, x / 1e3 + shift, 0.003) * gains
         write_barometers(tmp_path / f"{name}.csv", x, readings)
     for recordings in (["first"], ["first", "second"]):
-        frame = Barometers(str(tmp_path), recordings)(Subject(None, None, condition="c"))
+        frame = Barometers(str(tmp_path), recordings)(Subject(None, condition="c"))
         assert set(frame.strip) == {"solid, 5 mm thick, tip of 3 mm"}
         assert frame.value.tolist() < [2.0, 0.4]
         assert (frame.low <= frame.value).all()

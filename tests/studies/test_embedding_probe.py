@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from experiments.studies.embeddings import FRAME, explained, probe, strongest, svm_accuracy
-from experiments.studies.measures import ProbeSettings
+from experiments.studies.embeddings import FRAME, Embeddings, explained, strongest, svm_accuracy
 from skin.device.touches import Touches
 from skin.runs.build import build_device
 
@@ -16,7 +15,7 @@ SMALL = {"train": 160, "test": 80, "seeds": [4], "epochs": 60, "width": 32, "lay
 def found(configured):
     """Everything that a small probe of the naive skin finds."""
     device = build_device(configured("simulator=naive"))
-    return {(one["attribute"], one["name"]): one for one in probe(device, ProbeSettings(**SMALL), None)}
+    return {(one["attribute"], one["name"]): one for one in Embeddings(**SMALL).probe(device, None)}
 
 
 def test_an_svm_reads_what_is_there_and_no_more():
@@ -66,6 +65,6 @@ def test_readings_tell_what_presses_but_one_frame_no_duration(found):
 
 def test_touches_of_another_seed_are_others(configured, found):
     device = build_device(configured("simulator=naive"))
-    other = next(probe(device, ProbeSettings(**SMALL | {"seeds": [5], "attributes": ["degree"]}), None))
+    other = next(Embeddings(**SMALL | {"seeds": [5], "attributes": ["degree"]}).probe(device, None))
     assert len(other["classes"]) == 240 * 4
     assert other["classes"] != found["degree", "Graph2Vec"]["classes"]

@@ -4,8 +4,7 @@ import sys
 
 import pytest
 
-from experiments.studies.frozen import Frozen, frozen_hash
-from experiments.studies.trials import Subject
+from experiments.studies.measures import Frozen, Subject, frozen_hash
 from skin.errors import InputError
 from skin.runs.build import build_device
 
@@ -33,7 +32,7 @@ def subject(configured, tmp_path, monkeypatch):
     config = configured(*WORDS)
     device = build_device(config)
     known = frozen_hash(device.recording("test", complete=False), ["device.dead=2"])
-    return Subject(config, device, condition="small", changes=["device.dead=2"]), known
+    return Subject(config, condition="small", changes=["device.dead=2"]), known
 
 
 def test_a_function_is_scored(subject):

@@ -6,7 +6,8 @@ import pytest
 import torch
 from PIL import Image
 
-from experiments.studies.pages import publish_page, streams_frame, streams_page
+from experiments.studies.measures import Streams, streams_frame
+from experiments.studies.pages import publish_page
 from skin.evaluation.operating_point import OperatingPoint
 from skin.evaluation.streams import Alarms, Bin, WindowReport
 
@@ -37,7 +38,7 @@ def test_the_line_says_what_matters():
 @pytest.fixture(scope="module")
 def files(tmp_path_factory):
     return publish_page(
-        streams_page(streams_frame(FOUND), "rules fem 0"),
+        Streams().page(streams_frame(FOUND), "rules fem 0"),
         "rules fem 0",
         tmp_path_factory.mktemp("results") / "stream_rules",
     )
@@ -45,13 +46,8 @@ def files(tmp_path_factory):
 
 def test_a_person_reads_the_same(files):
     text = files[0].read_text()
-    for row in (
-        "| press | 0.5000 | 0.9000 |",
-        "|  | 40 | 160 |",
-        "| threshold | 180 |",
-        "| overall | 0.8125 | made for 30 |",
-    ):
-        assert row in text
+    rows = ["press | 0.5000 | 0.9000", " | 40 | 160", "threshold | 180", "overall | 0.8125 | made for 30"]
+    assert all(f"| {row} |" in text for row in rows)
     assert text.startswith("# rules fem 0\n\naccuracy 50.0 %")
     assert "trained on whole touches" in text
 

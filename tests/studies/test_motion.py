@@ -4,10 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from experiments.studies.measures import Motion, distance_changes
-from experiments.studies.trials import Subject
+from experiments.studies.measures import Motion, Subject, distance_changes
 from skin.errors import InputError
-from skin.runs.build import build_device
 
 FREE = "simulator=fem", "simulator.constraint=free", "body.cells=[10,10]", "layout=grid", "layout.rows=2"
 
@@ -15,7 +13,7 @@ FREE = "simulator=fem", "simulator.constraint=free", "body.cells=[10,10]", "layo
 def measure(configured, *settings: str):
     """Return what is measured of a device."""
     config = configured(*settings)
-    return Motion(gestures=20)(Subject(config, build_device(config)))
+    return Motion(gestures=20)(Subject(config))
 
 
 def test_the_largest_change_is_that_of_two_neighbours(configured):

@@ -95,20 +95,15 @@ def test_conditions_are_compared_over_devices_of_several_trainings():
             for one in trials("max", 0.78 - n / 100, 0.88 - n / 100, condition="1 dead", device=str(n))
         ),
     ]
-    (one,) = differences(
+    ((_, condition, compared, verdict),) = differences(
         study(devices=3, conditions={"0 dead": {}, "1 dead": {}}, differences="greater"), pd.DataFrame(found)
     )
-    assert (one.condition, one.verdict, one.compared[""].seeds) == ("1 dead", "worse", 3)
+    assert (condition, verdict, compared.seeds) == ("1 dead", "worse", 3)
     # losses 2, 3 and 4: mean 3, deviation 1, by the root of 3
-    assert one.compared[""][:2] == (pytest.approx(-3), pytest.approx(3**-0.5))
+    assert compared[:2] == (pytest.approx(-3), pytest.approx(3**-0.5))
 
 
 def test_variants_are_compared_with_the_first_one_where_there_are_no_conditions():
-    found = differences(study(differences="greater"), FOUND)
-    assert [(one.variant, one.verdict) for one in found] == [
-        ("pooling=mean", "worse"),
-        ("pooling=attention", "undecided"),
-    ]
-    assert differences(study(), FOUND) == []
-    better = differences(study(differences="less"), FOUND)
-    assert better[0].verdict == "better"
+    verdicts = {variant: verdict for variant, *_, verdict in differences(study(differences="greater"), FOUND)}
+    assert verdicts == {"pooling=mean": "worse", "pooling=attention": "undecided"}
+    assert next(differences(study(differences="less"), FOUND))[-1] == "better"

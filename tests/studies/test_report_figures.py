@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from experiments.studies.report_figures import confusion_rows
+from experiments.studies.pages import confusion_rows
 from skin.evaluation.metrics import encode
 from skin.touch.labels import TOUCH
 

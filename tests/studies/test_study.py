@@ -9,8 +9,8 @@ from omegaconf import OmegaConf
 
 from experiments import peers
 from experiments.studies.comparison import Estimate, judge
+from experiments.studies.pages import read_reference
 from experiments.studies.study import chosen_studies, variants
-from experiments.studies.study_page import read_reference
 from skin.core.files import CONF
 from skin.errors import InputError
 from skin.runs.configuration import fingerprint

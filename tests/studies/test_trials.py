@@ -1,19 +1,26 @@
 """Conditions of a study and their devices."""
 
 import time
-from functools import partial
+from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 import pandas as pd
 import pytest
 
-from experiments.studies import trials
-from experiments.studies.measures import Accuracy, Margins
-from experiments.studies.study import Study
-from experiments.studies.trials import RestoredRun, Subject, numbered_settings, read_frame, votes, write_frame
+from experiments.studies.measures import Subject
+from experiments.studies.study import Study, Variant
+from experiments.studies.trials import (
+    StudyRun,
+    measure_once,
+    numbered_settings,
+    read_frame,
+    votes,
+    write_frame,
+)
 from skin.errors import InputError
 from skin.runs.configuration import fingerprint
-from skin.runs.run import find_pretrained
+from skin.runs.run import FinishedRun, find_pretrained
 from skin.runs.store import Store
 
 # MLflow's own business with SQLAlchemy.
@@ -57,34 +64,39 @@ def test_lists_of_different_lengths_are_refused():
         list(numbered_settings(study(devices=3, numbered=["device.seed"]), {"layout.seed": [1, 2]}))
 
 
+@dataclass(frozen=True)
+class Counted:
+    """A measure that counts its calls."""
+
+    gestures: int = 1
+    calls: ClassVar = []
+
+    def __call__(self, subject):
+        self.calls.append(subject.condition)
+        return measured_frame()
+
+
 @pytest.fixture
 def measured(configured, tmp_path, monkeypatch):
     """Finish a training anew, or take a given run; return a function that counts its trials."""
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(StudyRun, "model", None)
+    monkeypatch.setattr(Counted, "calls", [])
     config = configured("experiment=rules", f"tracking.uri=sqlite:///{tmp_path}/m.db")
-    store, count = Store.open(config.tracking), []
-    monkeypatch.setattr(trials, "build_device", lambda config: None)
-    monkeypatch.setattr(RestoredRun, "trained", None)
+    store = Store.open(config.tracking)
 
-    def train(run=None, **settings):
-        if run is None:
+    def train(finished=None, gestures=1):
+        if finished is None:
             with store.run("rules", {"fingerprint": fingerprint(config)}) as run:
                 pass
-            run = store.client.get_run(run.info.run_id)
-        own = RestoredRun(store, run, config)
-        own.finished.__dict__["stored"] = config
+            finished = FinishedRun(store, store.client.get_run(run.info.run_id))
+        run = StudyRun(Variant("", {}, {}), "0", finished)
 
-        class Counted(type(settings.get("measure", Accuracy()))):
-            def __call__(self, subject):
-                count.append(subject.condition)
-                return measured_frame()
-
-        measure = Counted(**vars(settings.get("measure", Accuracy())))
-
-        def trial(line="device.dead=1"):
-            frame, _ = own.measure("x", measure, partial(Subject, condition="a, b"), [], [line])
+        def trial(condition="a, b", *changes):
+            subject = Subject(configured("experiment=rules", *changes), condition=condition)
+            frame, _ = measure_once("x", Counted(gestures), run, subject)
             assert frame["same/overall/accuracy"].tolist() == [0.5]
-            return len(count)
+            return len(Counted.calls)
 
         return trial
 
@@ -94,14 +106,15 @@ def measured(configured, tmp_path, monkeypatch):
 def test_a_trial_is_measured_once_for_a_training(measured, tmp_path):
     trial = measured()
     assert [trial(), trial()] == [1, 1]
-    assert [trial("device.dead=2"), trial("device.dead=2"), trial()] == [2, 2, 2]
-    assert len(pd.read_parquet(tmp_path / "results" / "trials" / "x")) == 2
-    assert measured(measure=Margins(100))() == 3
+    assert [trial("a, b", "device.dead=2"), trial("a, b", "device.dead=2"), trial()] == [2, 2, 2]
+    assert [trial("c"), trial("c")] == [3, 3], "of conditions with the same settings, each is measured"
+    assert len(list((tmp_path / "results" / "trials" / "x").iterdir())) == 3
+    assert measured(gestures=100)() == 4
 
 
 def test_a_trial_of_a_pretrained_model_is_measured_once(measured):
     """A model's record does not say when its training ended."""
-    trial = measured(find_pretrained("default_skin"))
+    trial = measured(FinishedRun(None, find_pretrained("default_skin")))
     assert [trial(), trial()] == [1, 1]
 
 

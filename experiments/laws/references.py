@@ -22,9 +22,9 @@ from skin.body.sheet import Sheet
 from skin.mechanics.simulator._hexahedra import Hexahedra
 from skin.mechanics.simulator.base import factorised
 
-# F / (E* d side) of a rigid square punch is pi times the capacitance of a unit square plate over 4 pi eps0:
-# both ask for the density whose 1/r potential is even. 0.3667874 is F. H. Read's (J. Comput. Phys. 133,
-# 1997).
+# F / (E* d side) of a flat rigid square punch without friction, E* = E / (1 - nu^2), is pi times the
+# capacitance of a unit square plate over 4 pi eps0: both ask for the density whose 1/r potential is even.
+# 0.3667874 is F. H. Read's (J. Comput. Phys. 133, 1997).
 SQUARE_PUNCH = math.pi * 0.3667874
 
 _POINTS, _WEIGHTS = np.polynomial.legendre.leggauss(24)
@@ -49,30 +49,30 @@ class HalfSpace:
         """G, Pa."""
         return self.young / (2 * (1 + self.poisson))
 
-    def under_pressure(self, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def under_pressure(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return motion (P, 3), m, and stress (P, 3): zz, xz, yz, Pa, under pressure.
 
         Args:
-            places: (P, 3), m; not within the square itself.
+            positions: (P, 3), m; not within the square itself.
         """
-        x, y, z, r, weights = self._about(places)
+        x, y, z, r, weights = self._distances(positions)
         nu = self.poisson
         aside = z / r**3 - (1 - 2 * nu) / (r * (r + z))
         down = z**2 / r**3 + 2 * (1 - nu) / r
-        motion = np.stack([x * aside, y * aside, down], axis=-1) / (4 * np.pi * self.shear)
-        stress = -3 * z[..., None] ** 2 / (2 * np.pi * r[..., None] ** 5) * np.stack([z, x, y], axis=-1)
-        return _sum(motion, weights), _sum(stress, weights)
+        motion = np.stack([x * aside, y * aside, down]) / (4 * np.pi * self.shear)
+        stress = -3 * z**2 / (2 * np.pi * r**5) * np.stack([z, x, y])
+        return (motion @ weights).T, (stress @ weights).T
 
-    def under_shear(self, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def under_shear(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the same under a traction of 1 Pa along x."""
-        x, y, z, r, weights = self._about(places)
-        share = 1 - 2 * self.poisson
-        along = 1 / r + x**2 / r**3 + share * (1 / (r + z) - x**2 / (r * (r + z) ** 2))
-        across = x * y / r**3 - share * x * y / (r * (r + z) ** 2)
-        down = x * z / r**3 + share * x / (r * (r + z))
-        motion = np.stack([along, across, down], axis=-1) / (4 * np.pi * self.shear)
-        stress = -3 * (x * z / r**5)[..., None] / (2 * np.pi) * np.stack([z, x, y], axis=-1)
-        return _sum(motion, weights), _sum(stress, weights)
+        x, y, z, r, weights = self._distances(positions)
+        fraction = 1 - 2 * self.poisson
+        along = 1 / r + x**2 / r**3 + fraction * (1 / (r + z) - x**2 / (r * (r + z) ** 2))
+        across = x * y / r**3 - fraction * x * y / (r * (r + z) ** 2)
+        down = x * z / r**3 + fraction * x / (r * (r + z))
+        motion = np.stack([along, across, down]) / (4 * np.pi * self.shear)
+        stress = -3 * x * z / (2 * np.pi * r**5) * np.stack([z, x, y])
+        return (motion @ weights).T, (stress @ weights).T
 
     def middle(self) -> tuple[float, float]:
         """Return the displacement of the square's middle, m: down under pressure, along x under traction.
@@ -87,53 +87,13 @@ class HalfSpace:
         along = ((1 - self.poisson + self.poisson * np.cos(angle) ** 2) * edge).sum() * step
         return float(down), float(along)
 
-    def _about(self, places: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Return x, y, z and r from each point of the square (Q,) to each place (P,), and point areas."""
+    def _distances(self, positions: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Return x, y, z and r from each point of the square (Q,) to each position (P,), and areas."""
         source = self.half * np.stack(np.meshgrid(_POINTS, _POINTS), axis=-1).reshape(-1, 2)
         weights = self.half**2 * np.outer(_WEIGHTS, _WEIGHTS).ravel()
-        x, y = (places[:, axis, None] - source[:, axis] for axis in (0, 1))
-        z = np.broadcast_to(places[:, 2, None], x.shape)
+        x, y = (positions[:, axis, None] - source[:, axis] for axis in (0, 1))
+        z = np.broadcast_to(positions[:, 2, None], x.shape)
         return x, y, z, np.sqrt(x**2 + y**2 + z**2), weights
-
-
-@dataclass(frozen=True)
-class HertzContact:
-    """A rigid sphere on a half-space (Johnson, section 4.2).
-
-    Attributes:
-        radius: of the sphere, m.
-        modulus: E / (1 - nu^2), Pa.
-    """
-
-    radius: float
-    modulus: float
-
-    def force(self, approach: float) -> float:
-        """Return the force, N, at an approach, m."""
-        return 4 / 3 * self.modulus * math.sqrt(self.radius) * approach**1.5
-
-    def contact(self, force: float) -> float:
-        """Return the contact's radius, m."""
-        return (3 * force * self.radius / (4 * self.modulus)) ** (1 / 3)
-
-    def peak(self, force: float) -> float:
-        """Return the peak pressure, Pa."""
-        return 1.5 * force / (math.pi * self.contact(force) ** 2)
-
-
-def round_punch(modulus: float, radius: float, approach: float) -> float:
-    """Return the force, N, of a flat round punch without friction (Johnson, section 3.4)."""
-    return 2 * radius * modulus * approach
-
-
-def square_punch(modulus: float, side: float, approach: float) -> float:
-    """Return the force, N, of a flat square punch without friction."""
-    return SQUARE_PUNCH * modulus * side * approach
-
-
-def _sum(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Integrate (P, Q, k) over the square, (P, k)."""
-    return np.einsum("pqk,q->pk", values, weights)
 
 
 @dataclass(frozen=True)
@@ -166,26 +126,9 @@ def bonded_layer(number: float, slab: Slab) -> float:
         slab: the layer.
     """
     depth, c = number * slab.thickness, 3 - 4 * slab.poisson
-    share = 2 * c * np.sinh(2 * depth) - 4 * depth
-    share /= 2 * c * np.cosh(2 * depth) + 4 * depth**2 + 1 + c**2
-    return float(share * 2 * (1 - slab.poisson**2) / (slab.young * number))
-
-
-def waves(number: np.ndarray, slabs: Sequence[Slab], depth: float) -> np.ndarray:
-    """Return how waves of pressure of 1 Pa move and stress a depth: (n, 2), m/Pa and Pa/Pa.
-
-    The first is the motion into the skin, the second sigma_zz, both in phase with the pressure.
-
-    Args:
-        number: k, (n,), 1/m; 0 is an even pressure.
-        slabs: from the surface down; the last is bonded to a rigid base.
-        depth: m; at an interface it may belong to either layer.
-    """
-    states = np.empty((len(number), 2))
-    even = number == 0
-    states[even] = _even(slabs, depth)
-    states[~even] = _waving(number[~even], slabs, depth)
-    return states
+    fraction = 2 * c * np.sinh(2 * depth) - 4 * depth
+    fraction /= 2 * c * np.cosh(2 * depth) + 4 * depth**2 + 1 + c**2
+    return float(fraction * 2 * (1 - slab.poisson**2) / (slab.young * number))
 
 
 class Discs:
@@ -240,18 +183,17 @@ class Discs:
         return total
 
 
-def _even(slabs: Sequence[Slab], depth: float) -> tuple[float, float]:
-    """Return motion and stress under an even pressure: confined compression."""
-    bottoms = np.cumsum([slab.thickness for slab in slabs])
-    below = sum(
-        min(slab.thickness, max(bottom - depth, 0)) / slab.confined
-        for slab, bottom in zip(slabs, bottoms, strict=True)
-    )
-    return float(below), -1.0
+def waves(number: np.ndarray, slabs: Sequence[Slab], depth: float) -> np.ndarray:
+    """Return how waves of pressure of 1 Pa move and stress a depth: (n, 2), m/Pa and Pa/Pa.
 
+    The first is the motion into the skin, the second sigma_zz, both in phase with the pressure. In each slab
+    two waves fade downwards and two upwards.
 
-def _waving(number: np.ndarray, slabs: Sequence[Slab], depth: float) -> np.ndarray:
-    """Solve for two waves that fade downwards and two that fade upwards in each slab."""
+    Args:
+        number: k, (n,), 1/m, above 0.
+        slabs: from the surface down; the last is bonded to a rigid base.
+        depth: m; at an interface it may belong to either layer.
+    """
     unknowns = 4 * len(slabs)
     system = np.zeros((len(number), unknowns, unknowns))
     scale = slabs[0].shear * number[:, None, None]
@@ -379,8 +321,3 @@ def solve_block(mesh: Hexahedra, fixed: np.ndarray, forces: np.ndarray) -> np.nd
     moves = np.zeros_like(forces)
     moves[free] = factors.solve(np.ascontiguousarray(forces[free]))
     return moves
-
-
-def row_means(values: np.ndarray) -> np.ndarray:
-    """Return the middles between neighbours, (n - 1,)."""
-    return (values[1:] + values[:-1]) / 2

@@ -1,0 +1,1 @@
+"""Laws of mechanics: each is a test against an independent solution (``make physics``)."""

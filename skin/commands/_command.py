@@ -153,9 +153,9 @@ def check_quickly(config: Config, run: str | None, overrides: Sequence[str]) -> 
     check_plausibility(groups)
     device = groups.get("device", {})
     if isinstance(port := device.get("port"), str):
-        from skin.wire.reader import PortSettings, check_port
+        from skin.wire.reader import Port, check_port
 
-        PortSettings.select({name: value for name, value in device.items() if value is not None})
+        Port.select({name: value for name, value in device.items() if value is not None})
         check_port(port)
     named = {override.split("=")[0].split(".")[0] for override in overrides}
     if run is not None and not run.endswith(".onnx"):

@@ -17,7 +17,7 @@ from skin.errors import InputError
 from skin.runs.configuration import Config
 
 if TYPE_CHECKING:
-    from skin.wire.reader import PortSettings
+    from skin.wire.reader import Port
 
 _ENOUGH = 5.0  # s of a stream that show what a board sends
 
@@ -33,11 +33,11 @@ def main(config: Config, n: int | None, seconds: float | None, adapter: Any) -> 
 
     from skin.wire.formats import SensorCountError
     from skin.wire.monitor import PortMonitor
-    from skin.wire.reader import PortSettings, SkinDisconnected, SkinTimeout
+    from skin.wire.reader import Port, SkinDisconnected, SkinTimeout
     from skin.wire.skin import open_skin
 
     signal.signal(signal.SIGTERM, signal.default_int_handler)
-    settings = PortSettings.select(device)
+    settings = Port.select(device)
     if settings.frames.kind == "auto":
         _propose(settings, seconds)
         return
@@ -58,7 +58,7 @@ def main(config: Config, n: int | None, seconds: float | None, adapter: Any) -> 
         print(listener.summary())
 
 
-def _propose(settings: "PortSettings", seconds: float | None) -> None:
+def _propose(settings: "Port", seconds: float | None) -> None:
     """Print an adapter that reads the board, as YAML to paste; what it makes of it goes to standard error."""
     from skin.wire.proposal import listen_raw, propose
     from skin.wire.reader import open_stream

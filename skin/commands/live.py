@@ -17,6 +17,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
+from time import monotonic
 from typing import TYPE_CHECKING, Any
 
 from hydra import compose
@@ -158,7 +159,7 @@ def show(
                 from skin.live.terminal import show_in_terminal
 
                 opened.enter_context(show_in_terminal(display, Console()))
-            source, engine = watched.source, watched.settings.build()
+            source, engine = watched.source, watched.engine
             check = partial(watched.check, live.selftest, say, display.add_note)
             session = LiveLoop(source.skin, source.tare, engine, display, check)
             opened.callback(lambda: say(f"{session.verdicts} verdicts, {session.line}"))
@@ -220,7 +221,7 @@ def _open_views(
     span = model.window / model.rate
     info = DisplayInfo(model.title, setup.name, model.positions, model.size, live.top, span)
     display = Display(info, contacts, live.patience.calm)
-    display.set_verdict(None, "the threshold of the alarm is being chosen")
+    display.set_verdict(None, monotonic(), "the threshold of the alarm is being chosen")
     if live.log is not None:
         opened.enter_context(log_alarms(display, Path(live.log).expanduser()))
     if live.verdicts is not None:

@@ -19,13 +19,8 @@ from skin.wire.contact_lines import ContactLine, join_contact_lines, parse_conta
 from skin.wire.protocol import Announcement, parse_announcement
 from skin.wire.reader import ByteStream
 
-_LONGEST = 4096  # bytes
-_KEPT = 64  # announcements that are kept unread
-
-
 Labels = Mapping[str, int]
 
-_LATE = 0.25  # share of an announced window that may be missed at its beginning
 _INTERRUPTED = "the gesture was interrupted: the skin was unplugged or restarted"
 _UNFELT = "nothing was felt, so the gesture does not count: no working sensor read more than its noise"
 
@@ -84,16 +79,18 @@ class AnnouncementListener:
 
     Args:
         opener: opens the stream of bytes.
+        longest: bytes of a line.
+        kept: announcements that are kept unread.
 
     Attributes:
         announcements: announcements that have not been read yet.
         contacts: lines of contacts that have not been read yet.
     """
 
-    def __init__(self, opener: Callable[[], ByteStream]) -> None:
-        self._opener = opener
-        self.announcements: deque[Announcement] = deque(maxlen=_KEPT)
-        self.contacts: deque[ContactLine] = deque(maxlen=_KEPT * _LONGEST)
+    def __init__(self, opener: Callable[[], ByteStream], longest: int = 4096, kept: int = 64) -> None:
+        self._opener, self._longest = opener, longest
+        self.announcements: deque[Announcement] = deque(maxlen=kept)
+        self.contacts: deque[ContactLine] = deque(maxlen=kept * longest)
 
     def __call__(self) -> ByteStream:
         """Open the stream; called again after each disconnection."""
@@ -106,7 +103,7 @@ class AnnouncementListener:
         """Return the received bytes."""
         data = self._stream.read()
         *lines, self._rest = (self._rest + data).split(b"\n")
-        self._rest = self._rest[-_LONGEST:]
+        self._rest = self._rest[-self._longest :]
         self.announcements.extend(filter(None, map(parse_announcement, lines)))
         self.contacts.extend(filter(None, map(parse_contact_line, lines)))
         return data
@@ -173,14 +170,18 @@ class AnnouncedSegmenter(AbstractSegmenter):
         window: as in :class:`AbstractSegmenter`.
         listener: collects the announcements.
         task: the required labels; ``touch`` is always 1.
+        late: fraction of a window that may be missed at its beginning.
 
     Raises:
         InputError: a frame without a number, or an announcement without a required label.
     """
 
-    def __init__(self, window: Window, listener: AnnouncementListener, task: Task) -> None:
+    def __init__(
+        self, window: Window, listener: AnnouncementListener, task: Task, late: float = 0.25
+    ) -> None:
         super().__init__(window)
-        self._announcements, self._task, self._contacts = listener.announcements, task, listener.contacts
+        self._announcements, self._task, self._late = listener.announcements, task, late
+        self._contacts = listener.contacts
 
     def _begin(self, frame: Frame) -> RecordedGesture | None:
         if frame.seq is None:
@@ -191,7 +192,7 @@ class AnnouncedSegmenter(AbstractSegmenter):
                 return None
             self._announcements.popleft()
             # Most of a gesture that began long before the port was opened is missing.
-            if frame.seq <= announced.seq + _LATE * announced.frames:
+            if frame.seq <= announced.seq + self._late * announced.frames:
                 late = frame.seq - announced.seq
                 begin = frame.t - late * self._length / announced.frames
                 labels = {"touch": 1} | dict(announced.labels)

@@ -28,15 +28,15 @@ def test_each_change_is_a_line_with_its_time(tmp_path):
     shown, path = display(), tmp_path / "logs" / "alarms.jsonl"
     before = datetime.now(UTC)
     with log_alarms(shown, path):
-        shown.set_verdict(None, "filling the window: 20 %")
+        shown.set_verdict(None, monotonic(), "filling the window: 20 %")
         for dangerous in (False, True, True):
-            shown.set_verdict(verdict(dangerous))
-        shown.set_verdict(None, "unplugged", True)
-        shown.set_verdict(verdict(True))
-        shown.request_tare()
-        shown.set_verdict(verdict(False))
-        shown.set_verdict(verdict(True))
-    shown.set_verdict(verdict(True))  # after the end
+            shown.set_verdict(verdict(dangerous), monotonic())
+        shown.set_verdict(None, monotonic(), "unplugged", True)
+        shown.set_verdict(verdict(True), monotonic())
+        shown.request_tare(monotonic())
+        shown.set_verdict(verdict(False), monotonic())
+        shown.set_verdict(verdict(True), monotonic())
+    shown.set_verdict(verdict(True), monotonic())  # after the end
     found = [json.loads(line) for line in path.read_text().splitlines()]
     events = ["started", "resumed", "alarm", "stale", "resumed", "tare_refused", "cleared", "alarm", "ended"]
     assert [one["event"] for one in found] == events
@@ -67,7 +67,7 @@ def test_a_full_disk_ends_the_log_and_not_the_view():
     errors = []
     with LineQueue(Full(), errors.append) as lines:
         for _ in range(3):
-            lines.add(str)
+            lines.add({"event": "alarm"})
     assert [str(error) for error in errors] == ["No space left on device"]
 
 
@@ -86,6 +86,6 @@ def test_the_log_is_valid_json_whatever_a_verdict_holds(tmp_path):
         float("inf"), monotonic(), {"a": float("nan")}, True, {"a": True}, True, False, (), 1e300
     )
     with log_alarms(shown, path):
-        shown.set_verdict(broken)
+        shown.set_verdict(broken, monotonic())
     messages = [json.loads(line, parse_constant=pytest.fail) for line in path.read_text().splitlines()]
     assert {message.get("device_time") for message in messages} == {None}

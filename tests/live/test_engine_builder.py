@@ -22,7 +22,7 @@ from skin.live.engine import DebounceSettings
 from skin.live.engine_builder import LiveSettings, measured_rate, watch_exported
 from skin.runs.onnx_writer import write_model
 from skin.wire.protocol import Header, encode_header, encode_line
-from skin.wire.reader import PortSettings
+from skin.wire.reader import Port
 from skin.wire.skin import SerialSource
 
 pytest.importorskip("onnxruntime")
@@ -163,7 +163,7 @@ def test_the_rate_of_a_device_is_that_of_its_arrivals_until_its_clock_is_known(a
 
     with socket.create_server(("127.0.0.1", 0)) as server:
         Thread(target=serve, daemon=True).start()
-        settings = PortSettings(port=f"socket://127.0.0.1:{server.getsockname()[1]}")
+        settings = Port(port=f"socket://127.0.0.1:{server.getsockname()[1]}")
         with SerialSource(settings, 9, 10.0).open_source().skin as skin:
             assert measured_rate(skin) == pytest.approx(RATE, rel=0.3)
 
@@ -183,7 +183,7 @@ def test_the_command_replaces_settings_of_the_file(model, skin):
     with ExitStack() as opened:
         watched = watch_exported(str(model), {"port": skin}, said.append, opened).watch(other, said.append)
     assert said[-1] == "alarm above 0.75"
-    assert (watched.settings.detection.threshold, watched.nominal.detection.threshold) == (0.5, 0.3)
+    assert (watched.engine.detection.threshold, watched.nominal.detection.threshold) == (0.5, 0.3)
 
 
 @pytest.mark.slow("starts a process that imports anew")

@@ -11,14 +11,14 @@ import pytest
 import torch
 
 from skin.errors import InputError
-from skin.live.engine import DebounceSettings, Detection, EngineSettings
+from skin.live.engine import DebounceSettings, Detection, Engine
 from skin.live.engine_builder import SelfTest
 from skin.live.loop import STALE, Display, DisplayInfo, LiveLoop
 from skin.runs.torch_model import window_classifier
 from skin.touch.labels import TOUCH
 from skin.wire.channels import RawRange, UnitConversion
 from skin.wire.protocol import Header, encode_header, encode_line
-from skin.wire.reader import PortSettings
+from skin.wire.reader import Port
 from skin.wire.skin import SerialSource
 from tests.live.memory_view import MemoryView
 
@@ -40,7 +40,7 @@ def settings(**changes):
     classify = window_classifier(Loud(), torch.zeros(SENSORS, 3), 10.0)
     shape = SENSORS, 30, 10.0
     presses = 5.0 * np.eye(SENSORS)
-    return EngineSettings(classify, TOUCH, *shape, Detection(0.3), DebounceSettings(), presses)
+    return Engine(classify, TOUCH, *shape, Detection(0.3), DebounceSettings(), presses)
 
 
 def force(seconds, *touches):
@@ -73,9 +73,9 @@ def arriving(stream, each=1):
             waiting = b""
 
 
-def watch(stream, each=1, before=None, **port):
+def watch(stream, each=1, verify=None, **port):
     """Return the live view of the bytes of frames."""
-    return MemoryView(arriving(stream, each), settings(), before, **port)
+    return MemoryView(arriving(stream, each), settings(), verify, **port)
 
 
 def served(stream):
@@ -95,11 +95,11 @@ def served(stream):
     thread = Thread(target=serve, daemon=True)
     thread.start()
     port = f"socket://127.0.0.1:{server.getsockname()[1]}"
-    source = SerialSource(PortSettings(port=port, timeout=10.0), SENSORS, 10.0)
+    source = SerialSource(Port(port=port, timeout=10.0), SENSORS, 10.0)
     skin, _ = source.open()
     opened.set()
     display = Display(DisplayInfo("loud", port, np.zeros((SENSORS, 3)), (0.1, 0.1), 4.0))
-    display.observers.append(lambda *state: told.append(state))
+    display.observers.append(lambda assessment, now: told.append(assessment))
     with skin, server:
         LiveLoop(skin, source.tare(skin), settings().build(), display).run()
         thread.join(20)
@@ -224,13 +224,13 @@ def test_sensors_that_prove_dead_after_the_self_test_are_counted(dead):
     values[:, :dead] = 0.0
     refused = pytest.raises(InputError, match=r"sensors 0, 1, 2 .* dead, more than 2 of 9.*selftest=false")
     with refused if dead > 2 else nullcontext():
-        watch(lines(values), before=lambda conversion: (2, None))
+        watch(lines(values), verify=lambda conversion: (2, None))
 
 
 def test_sensors_that_break_later_end_no_live_view():
     values = force(15)
     values[700:, :6] = values[700, :6]
-    seen = watch(lines(values), before=lambda conversion: (2, None))
+    seen = watch(lines(values), verify=lambda conversion: (2, None))
     assert seen.states(13, 15) == {"unknown"}
 
 
@@ -239,13 +239,14 @@ class TestSelfTest:
 
     COUNTED = RawRange(0.0, 1023.0, True, (None, 1023.0))
 
-    def run(self, used=None, conversion=None, device=COUNTED, nominal=None):
+    def run(self, used=None, conversion=None, device=COUNTED, nominal=None, **limits):
         nominal = nominal or settings()
         conversion = conversion or UnitConversion(
             np.full(SENSORS, SCALE), np.full(SENSORS, 200.0), np.zeros(SENSORS, bool)
         )
         said = []
-        SelfTest(4.0 * np.eye(SENSORS), used or nominal, nominal).run(conversion, device, said.append)
+        test = SelfTest(4.0 * np.eye(SENSORS), used or nominal, nominal, **limits)
+        test.run(conversion, device, said.append)
         return said
 
     def test_nominal_settings_pass(self):
@@ -294,11 +295,10 @@ class TestSelfTest:
             test.run(conversion, self.COUNTED, print)
 
     @pytest.mark.parametrize("scale", [1e-9, 1e-300, 1e9, 0.02 / 1e6])
-    def test_a_scale_that_blinds_is_named(self, scale, monkeypatch):
-        monkeypatch.setattr("skin.live.engine_builder._SLOWLY", 1)  # slow presses take most of the time
+    def test_a_scale_that_blinds_is_named(self, scale):
         conversion = UnitConversion(np.full(SENSORS, scale), np.full(SENSORS, 200.0), np.zeros(SENSORS, bool))
         with pytest.raises(InputError, match=r"device\.scale or device\.calibration is most likely"):
-            self.run(conversion=conversion)
+            self.run(conversion=conversion, slowly=1)  # slow presses take most of the time
 
     def test_one_sensor_that_can_never_alarm_is_named(self):
         scale = np.full(SENSORS, SCALE)

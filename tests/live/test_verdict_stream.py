@@ -60,7 +60,7 @@ def wait_for(take, accepted):
 def test_a_verdict_is_a_line():
     shown = display()
     with connected(shown) as take:
-        shown.set_verdict(verdict(dangerous=True, chance=float("nan")))
+        shown.set_verdict(verdict(dangerous=True, chance=float("nan")), monotonic())
         found = wait_for(take, lambda message: message["event"] == "verdict")
     assert found["schema"] == 1
     assert (found["alarm"], found["stale"], found["touched"], found["reason"]) == (True, False, True, "")
@@ -74,7 +74,7 @@ def test_a_verdict_that_is_too_old_is_stale_and_keeps_its_alarm():
     """Also where the engine hangs, which would tell nothing itself."""
     shown = display()
     with watch_age(shown), connected(shown) as take:
-        shown.set_verdict(verdict(dangerous=True))
+        shown.set_verdict(verdict(dangerous=True), monotonic())
         began = monotonic()
         fresh = wait_for(take, lambda message: message["event"] == "verdict")
         old = wait_for(take, lambda message: message["stale"])
@@ -92,7 +92,7 @@ def test_a_verdict_that_is_too_old_is_stale_and_keeps_its_alarm():
 
 def test_the_first_line_tells_what_is_waited_for():
     shown = display()
-    shown.set_verdict(None, "the threshold of the alarm is being chosen")
+    shown.set_verdict(None, monotonic(), "the threshold of the alarm is being chosen")
     with connected(shown) as take:
         message = take()
     assert (message["event"], message["stale"], message["state"]) == ("heartbeat", True, "unknown")
@@ -103,7 +103,7 @@ def test_a_reason_is_sent_once_and_then_with_each_heartbeat():
     shown = display()
     with connected(shown) as take:
         for _ in range(3):
-            shown.set_verdict(None, "unplugged", True)
+            shown.set_verdict(None, monotonic(), "unplugged", True)
         events = [take() for _ in range(3)]
     assert [one["event"] for one in events if one["reason"] == "unplugged"] == [
         "change",
@@ -118,7 +118,7 @@ def test_each_line_is_there_at_once():
     shown = display()
     with connected(shown) as take:
         for chance in (0.25, 0.5, 0.75):
-            shown.set_verdict(verdict(chance=chance))
+            shown.set_verdict(verdict(chance=chance), monotonic())
             found = wait_for(take, lambda message: message["event"] == "verdict")
             assert found["probabilities"]["big"] == chance
 
@@ -128,7 +128,7 @@ def test_a_reader_that_is_slow_delays_nothing_and_misses_the_oldest():
     with piped(shown) as lines:
         began = monotonic()
         for _ in range(5_000):
-            shown.set_verdict(verdict())
+            shown.set_verdict(verdict(), monotonic())
         assert monotonic() - began < PATIENCE
         numbers = [json.loads(lines.readline())["number"]]
         while numbers[-1] < 5_000:
@@ -151,7 +151,7 @@ def test_what_waits_is_written_before_the_end():
     with os.fdopen(reading, "rb") as lines:
         with os.fdopen(writing, "w", buffering=1) as file, write_verdicts(shown, file):
             for _ in range(20):
-                shown.set_verdict(verdict())
+                shown.set_verdict(verdict(), monotonic())
         assert [json.loads(line)["number"] for line in lines] == [*range(1, 21)]
 
 
@@ -169,7 +169,8 @@ with watch_age(shown), print_verdicts(shown):
     shown.closed.wait(1)
     for _ in range(40):
         chances = {"big": 0.3, "dangerous": 1.0}
-        shown.set_verdict(Verdict(1.5, monotonic(), chances, True, {"dangerous": True}, True, False, (), 0.4))
+        said = Verdict(1.5, monotonic(), chances, True, {"dangerous": True}, True, False, (), 0.4)
+        shown.set_verdict(said, monotonic())
         if shown.closed.wait(0.05):
             break
 print("ended", file=sys.stderr)

@@ -10,11 +10,12 @@ from skin.device.calibration import Calibration, read_calibration, write_calibra
 from skin.device.imperfection import Imperfection
 from skin.device.resampling import Frame, Window
 from skin.errors import InputError
-from skin.wire.channels import Tare, unit_conversion
+from skin.wire.channels import unit_conversion
 from skin.wire.decoder import Decoder
 from skin.wire.protocol import Header, encode_header, encode_line
-from skin.wire.reader import PortSettings
+from skin.wire.reader import Port
 from skin.wire.skin import SerialSource, open_skin
+from skin.wire.tare import Tare
 
 FALLING = Calibration(
     {"gain": [2.0, 0.5, 1.0], "offset": [0.1, -0.2, 0.0], "clip": [10.0, 10.0, 10.0]},
@@ -80,12 +81,12 @@ def test_a_scale_may_be_negative_but_not_beside_a_calibration_and_not_0():
     conversion = unit_conversion(2, np.array([900.0, 900.0]), -0.02, None, None)
     readings, _ = conversion(np.array([900.0, 400.0]), np.ones(2, dtype=bool))
     np.testing.assert_allclose(readings, [0, 10], atol=1e-6)
-    assert SerialSource(PortSettings(scale=-0.02), 2, 10.0).polarity == [-1, -1]
+    assert SerialSource(Port(scale=-0.02), 2, 10.0).polarity == [-1, -1]
     with pytest.raises(InputError, match=r"must not be 0.*device.scale=-0.039 if values fall"):
-        SerialSource(PortSettings(scale=0.0), 2, 10.0)
+        SerialSource(Port(scale=0.0), 2, 10.0)
     for scale in (float("nan"), float("inf")):
         with pytest.raises(InputError, match=r"device.scale=(nan|inf) must be a finite number"):
-            PortSettings(scale=scale)
+            Port(scale=scale)
     with pytest.raises(InputError, match="above 0 beside a calibration"):
         unit_conversion(3, None, -0.02, FALLING, None)
 
@@ -145,7 +146,7 @@ def test_both_ends_of_the_converter_saturate_a_channel_whose_values_fall():
 
 
 def test_a_press_on_a_falling_channel_reads_its_peak_after_a_tare():
-    source = SerialSource(PortSettings(scale=-0.02, tare=1.0), 1, 10.0)
+    source = SerialSource(Port(scale=-0.02, tare=1.0), 1, 10.0)
     rng, rows = np.random.default_rng(0), []
     for number in range(200):
         force = 5.0 if 150 <= number < 155 else 0.0

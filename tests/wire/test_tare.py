@@ -6,9 +6,10 @@ import pytest
 from skin.device.calibration import Calibration
 from skin.device.resampling import Frame
 from skin.errors import InputError
-from skin.wire.channels import SkinTouched, Tare, unit_conversion
+from skin.wire.channels import unit_conversion
 from skin.wire.protocol import Header
 from skin.wire.skin import warm_up
+from skin.wire.tare import SkinTouched, Tare
 
 REST = np.array([512.0, 300.0, 40.0])
 RATE = 10.0  # Hz, of the model
@@ -36,12 +37,7 @@ class Watch:
         return self.tare.status
 
     def __call__(self, frame):
-        self.tare.add(frame)
-        known = self.tare.conversion
-        if known is None:
-            return None
-        values, valid = known(frame.values, frame.valid)
-        return frame._replace(values=values, valid=valid)
+        return self.tare.add(frame)
 
 
 def watched(scale=None, tare=1.0, known=None, header=None):
@@ -61,20 +57,20 @@ def test_force_is_counted_from_the_first_quiet_second():
     assert 90 <= first <= 180
     assert watch.status == ""
     pressed = watch(frames([REST + 200])[0])
-    np.testing.assert_allclose(pressed.values, 2.0, atol=0.021)
+    np.testing.assert_allclose(pressed.newtons, 2.0, atol=0.021)
 
 
 def test_the_baseline_is_that_of_maxima_over_the_intervals_of_the_model():
     """The window shows maxima, of which an untouched skin's must be 0."""
     watch, rows = watched(scale=1.0), noisy(400)
-    shown = [one.values for row in frames(rows) if (one := watch(row)) is not None]
+    shown = [one.newtons for row in frames(rows) if (one := watch(row)) is not None]
     highest = np.stack(shown)[: len(shown) // 10 * 10].reshape(-1, 10, 3).max(axis=1)
     assert np.median(highest, axis=0).tolist() == [0, 0, 0]
 
 
 def test_a_device_that_sends_newtons_says_so():
     watch = watched(tare=0, header=Header(unit="N"))
-    np.testing.assert_allclose(watch(frames(np.array([[1.0, 2.0, 3.0]]))[0]).values, [1, 2, 3])
+    np.testing.assert_allclose(watch(frames(np.array([[1.0, 2.0, 3.0]]))[0]).newtons, [1, 2, 3])
 
 
 def test_a_device_may_tell_its_unit_a_little_late():
@@ -126,8 +122,8 @@ def test_a_calibration_gives_scale_gains_and_broken_sensors():
     )
     raw = np.array([612.0, 612.0, 0.0])
     one = watched(tare=0, known=known)(frames([raw])[0])
-    np.testing.assert_allclose(one.values[:2], known.corrected(raw)[:2])
-    assert one.valid.tolist() == [True, True, False]
+    np.testing.assert_allclose(one.newtons[:2], known.corrected(raw)[:2])
+    assert one.usable.tolist() == [True, True, False]
 
 
 FAST = 100.0  # Hz, of the device

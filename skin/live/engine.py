@@ -303,7 +303,10 @@ class Engine:
             unknown=_numbers(unknown),
             notes=self._find_notes(unknown, below[-1], pause),
         )
-        yield _Decision(draft, t, *self._cut_window(readings, valid, lasted or 0.0), risen, last)
+        if (lasted or 0.0) * self.rate > self._shown:
+            idle, idle_valid = self._idle
+            readings, valid = (as_press(idle, readings, self._held), as_press(idle_valid, valid, self._held))
+        yield _Decision(draft, t, readings, valid, risen, last)
 
     def _fill_window(
         self, readings: np.ndarray, valid: np.ndarray, before: int
@@ -329,15 +332,6 @@ class Engine:
         notes = [Note(code, _numbers(which)) for code, which in sensors.items() if which.any()]
         notes += [Note("unreadable")] * self._losses.excessive + [Note("pause", seconds=pause)] * (pause > 0)
         return tuple(notes)
-
-    def _cut_window(
-        self, readings: np.ndarray, valid: np.ndarray, lasted: float
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the window (T, S) as the model sees it, during a contact of ``lasted`` s."""
-        if lasted * self.rate <= self._shown:
-            return readings, valid
-        idle, idle_valid = self._idle
-        return as_press(idle, readings, self._held), as_press(idle_valid, valid, self._held)
 
     def _conclude(self, decision: _Decision, probabilities: Sequence[float]) -> Verdict:
         """Return the verdict on a decision, given the probabilities of its window, one per label."""

@@ -169,21 +169,25 @@ class Glitches:
     ) -> None:
         self.shares, self._longest, self._seen, self._visible = shares, longest, seen, visible
         self._counts = Counter[tuple[int, float]]()
-        self._before: tuple[float, np.ndarray] | None = None
+        self._before: tuple[float, np.ndarray, np.ndarray] | None = None  # with newtons
         self._latest: int | None = None  # channel that jumped in the frame before
 
-    def check(self, frame: Frame, t: float, scale: np.ndarray) -> Frame:
+    def check(self, frame: Frame, t: float, conversion: UnitConversion | None) -> Frame:
         """Return a frame without its error value, which repeats the value before and is not valid.
 
         Args:
             frame: as the device sent it.
             t: s, time of the stream.
-            scale: (S,), N per unit, or any multiple of that.
+            conversion: of the values to N, always the same; None: unknown, and no value is an error.
         """
-        before, self._before, latest, self._latest = self._before, (t, frame.values), self._latest, None
-        if self.shares is None or before is None or not 0 < t - before[0] <= self._longest:
+        if self.shares is None or conversion is None:
             return frame
-        changes = (frame.values - before[1]) * scale
+        newtons = conversion.newtons(frame.values)
+        before, self._before = self._before, (t, frame.values, newtons)
+        latest, self._latest = self._latest, None
+        if before is None or not 0 < t - before[0] <= self._longest:
+            return frame
+        changes = newtons - before[2]
         channel = int(changes.argmax())
         expected = self.shares[channel] * changes[channel]
         others = np.arange(len(changes)) != channel
@@ -199,7 +203,7 @@ class Glitches:
             return frame
         values, valid = frame.values.copy(), frame.valid.copy()
         values[channel], valid[channel] = before[1][channel], False
-        self._before = t, values
+        self._before = t, values, before[2]
         mask = None if frame.mask is None else np.where(valid, frame.mask, frame.mask | Reason.MISSING)
         return frame._replace(values=values, valid=valid, mask=mask)
 
@@ -264,6 +268,7 @@ class Tare:
         self._conversion, self._header, self._seconds, self._rate = conversion, header, seconds, rate
         self._interval, self._limited, self._lags = interval, limited, lags
         self.conversion: UnitConversion | None = None
+        self._untared: UnitConversion | None = None
         self.state: TareState = "first"
         self._detail = self.warning = ""
         self.count = 0
@@ -304,8 +309,7 @@ class Tare:
             InputError: the scale is unknown, or the tare is too short.
         """
         time = self._clock(frame)
-        polarity = np.ones(len(frame.values)) if frame.polarity is None else frame.polarity
-        frame = self.glitches.check(frame, time, polarity)
+        frame = self.glitches.check(frame, time, self._untared)
         if self.conversion is None or self._deadline is not None:
             self._update(frame, time, touched)
         mask = self.freshness.check(frame, time, self.conversion)
@@ -331,7 +335,7 @@ class Tare:
         self._first = frame.t_host if self._first is None else self._first
         header = self._header()
         try:
-            plain = self._conversion(None, header)
+            self._untared = self._conversion(None, header)
         except InputError:
             # The header may arrive a little late.
             if header is not None or frame.t_host - self._first > HEADER:
@@ -339,7 +343,7 @@ class Tare:
             self.state = "header"
             return
         if not self._seconds:
-            self.conversion, self.state = plain, ""
+            self.conversion, self.state = self._untared, ""
         elif touched and not self._forced:
             self._quiet.clear()
             self.state = "waits"

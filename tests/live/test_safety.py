@@ -234,107 +234,81 @@ def test_sensors_that_break_later_end_no_live_view():
     assert seen.states(13, 15) == {"unknown"}
 
 
-class TestSelfTest:
-    """The settings of a live view against simulated presses."""
-
-    COUNTED = RawRange(0.0, 1023.0, True, (None, 1023.0))
-
-    def run(self, used=None, conversion=None, device=COUNTED, nominal=None, **limits):
-        nominal = nominal or settings()
-        conversion = conversion or UnitConversion(
-            np.full(SENSORS, SCALE), np.full(SENSORS, 200.0), np.zeros(SENSORS, bool)
-        )
-        said = []
-        test = SelfTest(4.0 * np.eye(SENSORS), used or nominal, nominal, **limits)
-        test.run(conversion, device, said.append)
-        return said
-
-    def test_nominal_settings_pass(self):
-        assert self.run() == [
-            "self-test: 14 of 14 dangerous presses raise the alarm, 14 with nominal settings; only its range "
-            "tests the scale"
-        ]
-        assert "its scale is not checked" in self.run(device=RawRange())[0]
-
-    @pytest.mark.parametrize(
-        ("change", "named"),
-        [
-            (lambda s: replace_detection(s, threshold=1000.0), "live.touch"),
-            (lambda s: replace_detection(s, drift=1e9 / 600), "live.drift"),
-            (lambda s: replace_patience(s, above=0.9999999), None),
-        ],
-    )
-    def test_settings_that_blind_are_named(self, change, named):
-        used = change(settings())
-        if named is None:
-            self.run(used)
-        else:
-            with pytest.raises(InputError, match=rf"{named} is most likely wrong.*live\.selftest=false"):
-                self.run(used)
-
-    def test_a_threshold_that_only_strong_touches_exceed_is_named(self):
-        """A network is nearly certain of touches far above the limit, and less so of those just above it."""
-
-        class Soft(Loud):
-            def probabilities(self, touches):
-                danger = torch.sigmoid(8 * (touches.readings.flatten(1).amax(1) - 4))
-                return torch.stack([danger] * 4, dim=1)
-
-        classify = window_classifier(Soft(), torch.zeros(SENSORS, 3), 10.0)
-        nominal = replace(settings(), classify=classify)
-        for above in (0.1, 0.99):
-            self.run(replace_patience(nominal, above=above), nominal=nominal)
-        with pytest.raises(InputError, match=r"0 of 14 .* 14 with .* live\.patience\.above=0\.9999 is most"):
-            self.run(replace_patience(nominal, above=0.9999), nominal=nominal)
-
-    def test_a_model_that_finds_less_than_half_of_the_presses_is_refused(self):
-        felt = np.where(np.arange(SENSORS) < SENSORS // 3, 4.0, 1e-3)
-        conversion = UnitConversion(np.full(SENSORS, SCALE), np.full(SENSORS, 200.0), np.zeros(SENSORS, bool))
-        test = SelfTest(np.diag(felt), settings(), settings())
-        with pytest.raises(InputError, match="even with nominal settings: train another run"):
-            test.run(conversion, self.COUNTED, print)
-
-    @pytest.mark.parametrize("scale", [1e-9, 1e-300, 1e9, 0.02 / 1e6])
-    def test_a_scale_that_blinds_is_named(self, scale):
-        conversion = UnitConversion(np.full(SENSORS, scale), np.full(SENSORS, 200.0), np.zeros(SENSORS, bool))
-        with pytest.raises(InputError, match=r"device\.scale or device\.calibration is most likely"):
-            self.run(conversion=conversion, slowly=1)  # slow presses take most of the time
-
-    def test_one_sensor_that_can_never_alarm_is_named(self):
-        scale = np.full(SENSORS, SCALE)
-        scale[3] = 1e-9
-        conversion = UnitConversion(scale, np.full(SENSORS, 200.0), np.zeros(SENSORS, bool))
-        with pytest.raises(InputError, match="sensor 3 cannot raise it"):
-            self.run(conversion=conversion)
-
-    def test_masked_sensors_are_counted(self):
-        broken = np.arange(SENSORS) < 3
-        conversion = UnitConversion(np.full(SENSORS, SCALE), np.full(SENSORS, 200.0), broken)
-        with pytest.raises(InputError, match=r"9 of 14 .* the mask of broken sensors"):
-            self.run(conversion=conversion)
-
-    def test_sensors_that_are_really_dead_are_counted(self):
-        conversion = UnitConversion(np.full(SENSORS, SCALE), np.full(SENSORS, 200.0), np.arange(SENSORS) < 3)
-        with pytest.raises(
-            InputError, match=r"3 of 9 sensors have no valid reading .*: they are dead, or the"
-        ):
-            self.run(conversion=conversion)
-
-    def test_one_dead_sensor_of_nine_is_no_reason_to_stop(self):
-        """Its place is shown as unknown."""
-        broken = np.arange(SENSORS) == 4
-        conversion = UnitConversion(np.full(SENSORS, SCALE), np.full(SENSORS, 200.0), broken)
-        assert "not on sensor 4" in self.run(conversion=conversion)[0]
-
-    def test_a_model_that_finds_nothing_is_refused(self):
-        nominal = replace_detection(settings(), threshold=1e308)
-        with pytest.raises(InputError, match="the contact threshold of the model"):
-            self.run(nominal=nominal)
+COUNTED = RawRange(0.0, 1023.0, True, (None, 1023.0))
+RESTS = np.full(SENSORS, 200.0)
 
 
-def replace_detection(of, **changes):
-    return replace(of, detection=replace(of.detection, **changes))
+def conversion(scale=SCALE, broken=0):
+    """Return a conversion of counts whose first sensors are broken."""
+    return UnitConversion(np.broadcast_to(scale, SENSORS), RESTS, np.arange(SENSORS) < broken)
 
 
-def replace_patience(of, **changes):
-    return replace(of, patience=replace(of.patience, **changes))
+def selftest(used=None, converted=None, device=COUNTED, nominal=None, presses=None, **limits):
+    """Run the settings of a live view against simulated presses; return what is reported."""
+    nominal, said = nominal or settings(), []
+    presses = 4.0 * np.eye(SENSORS) if presses is None else presses
+    test = SelfTest(presses, used or nominal, nominal, **limits)
+    test.run(converted or conversion(), device, said.append)
+    return said
+
+
+def detecting(**changes):
+    return replace(settings(), detection=replace(settings().detection, **changes))
+
+
+def patient(engine=None, **changes):
+    engine = engine or settings()
+    return replace(engine, patience=replace(engine.patience, **changes))
+
+
+def test_nominal_settings_pass():
+    assert selftest() == [
+        "self-test: 14 of 14 dangerous presses raise the alarm, 14 with nominal settings; only its range "
+        "tests the scale"
+    ]
+    assert "its scale is not checked" in selftest(device=RawRange())[0]
+    selftest(patient(above=0.9999999))
+    # Its place is shown as unknown.
+    one = UnitConversion(np.full(SENSORS, SCALE), RESTS, np.arange(SENSORS) == 4)
+    assert "not on sensor 4" in selftest(converted=one)[0]
+
+
+DEVICE = r"device\.limits, device\.scale or device\.calibration is most likely"
+FEW = np.diag(np.where(np.arange(SENSORS) < SENSORS // 3, 4.0, 1e-3))
+ONE = np.where(np.arange(SENSORS) == 3, 1e-9, SCALE)
+
+
+@pytest.mark.parametrize(
+    ("changes", "named"),
+    [
+        ({"used": detecting(threshold=1000.0)}, r"live\.touch is most likely wrong.*live\.selftest=false"),
+        ({"used": detecting(drift=1e9 / 600)}, r"live\.drift is most likely wrong.*live\.selftest=false"),
+        ({"presses": FEW}, "even with nominal settings: train another run"),
+        *(({"converted": conversion(scale), "slowly": 1}, DEVICE) for scale in (1e-9, 1e-300, 1e9, 2e-8)),
+        ({"converted": conversion(ONE)}, "sensor 3 cannot raise it"),
+        (
+            {"converted": conversion(broken=3)},
+            r"9 of 14 .* 3 of 9 sensors have no valid reading .*: they are dead, or the mask of broken",
+        ),
+        ({"nominal": detecting(threshold=1e308)}, "the contact threshold of the model"),
+    ],
+)
+def test_what_blinds_is_refused_and_named(changes, named):
+    with pytest.raises(InputError, match=named):
+        selftest(**changes)
+
+
+def test_a_threshold_that_only_strong_touches_exceed_is_named():
+    """A network is nearly certain of touches far above the limit, and less so of those just above it."""
+
+    class Soft(Loud):
+        def probabilities(self, touches):
+            danger = torch.sigmoid(8 * (touches.readings.flatten(1).amax(1) - 4))
+            return torch.stack([danger] * 4, dim=1)
+
+    classify = window_classifier(Soft(), torch.zeros(SENSORS, 3), 10.0)
+    nominal = replace(settings(), classify=classify)
+    for above in (0.1, 0.99):
+        selftest(patient(nominal, above=above), nominal=nominal)
+    with pytest.raises(InputError, match=r"0 of 14 .* 14 with .* live\.patience\.above=0\.9999 is most"):
+        selftest(patient(nominal, above=0.9999), nominal=nominal)

@@ -14,8 +14,9 @@ from skin.wire.channels import unit_conversion
 from skin.wire.decoder import Decoder
 from skin.wire.protocol import Header, encode_header, encode_line
 from skin.wire.reader import Port
-from skin.wire.skin import SerialSource, open_skin
+from skin.wire.skin import SerialSource
 from skin.wire.tare import Tare
+from tests.wire.memory import opened
 
 FALLING = Calibration(
     {"gain": [2.0, 0.5, 1.0], "offset": [0.1, -0.2, 0.0], "clip": [10.0, 10.0, 10.0]},
@@ -116,26 +117,11 @@ def test_frames_come_in_the_order_of_the_layout():
     assert plain.feed(b"".join(encode_line([1, 2, 3], n, 1000 * n) for n in range(4)))[0].polarity is None
 
 
-class Sent:
-    """A stream of bytes that were sent before it was opened."""
-
-    def __init__(self, data):
-        self._data = [data]
-
-    def read(self):
-        if not self._data:
-            raise OSError("end")
-        return self._data.pop()
-
-    def close(self):
-        pass
-
-
 def test_both_ends_of_the_converter_saturate_a_channel_whose_values_fall():
     rows = [[500 + n % 2, 500 + n % 2] for n in range(10)] + [[0, 0], [1023, 1023], [1, 1022]]
     data = encode_header(Header(n=2, bits=10))
     data += b"".join(encode_line(row, n, 1000 * n) for n, row in enumerate(rows))
-    with open_skin("", range(2), opener=lambda: Sent(data), polarity=[1, -1]) as skin:
+    with opened(data, layout=2, polarity=[1, -1]) as skin:
         frames = skin.read(len(rows), timeout=20)
     assert [frame.saturated.tolist() for frame in frames[-3:]] == [
         [False, True],

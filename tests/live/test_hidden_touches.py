@@ -255,24 +255,15 @@ def test_few_values_that_alternate_are_no_block():
     assert 12 <= seen.first(11) <= 12.5
 
 
-class Sure:
-    """A touch is dangerous with a probability of .98 above 4 N."""
-
-    def probabilities(self, touches):
-        from torch import where
-
-        danger = where(touches.readings.flatten(1).amax(1) > 4, 0.98, 0.02)
-        return danger[:, None].repeat(1, 4)
+def sure(readings, valid):
+    """Return probabilities: a touch is dangerous with .98 above 4 N."""
+    danger = np.where(readings.max(axis=(1, 2)) > 4, 0.98, 0.02)
+    return np.repeat(danger[:, None], 4, axis=1)
 
 
 @pytest.mark.parametrize(("above", "danger"), [(0.99, {None}), (0.9, {True})])
 def test_probably_dangerous_is_not_safe(above, danger):
-    from torch import zeros
-
-    from skin.runs.torch_model import window_classifier
-
-    classify = window_classifier(Sure(), zeros(SENSORS, 3), 10.0)
-    strict = replace(settings(), classify=classify, patience=DebounceSettings(above=above))
+    strict = replace(settings(), classify=sure, patience=DebounceSettings(above=above))
     seen = MemoryView(arriving(lines(force(12, (6, 8, 4, 6.0)))), strict)
     during = [look for look in seen.looks if 6.6 < look.t < 8]
     assert {look.danger for look in during} == danger

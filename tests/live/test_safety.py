@@ -1,25 +1,22 @@
 """Streams of boards that restart, freeze, break or come in bursts: no dangerous touch is hidden or late."""
 
-import socket
-from contextlib import nullcontext, suppress
+from contextlib import nullcontext
 from dataclasses import replace
-from threading import Event, Thread
-from time import monotonic, sleep
 
 import numpy as np
 import pytest
-import torch
 
 from skin.errors import InputError
 from skin.live.engine import DebounceSettings, Detection, Engine
 from skin.live.engine_builder import SelfTest
 from skin.live.loop import STALE, Display, DisplayInfo, LiveLoop
-from skin.runs.torch_model import window_classifier
 from skin.touch.labels import TOUCH
 from skin.wire.channels import RawRange, UnitConversion
+from skin.wire.decoder import Decoder
 from skin.wire.protocol import Header, encode_header, encode_line
-from skin.wire.reader import Port
+from skin.wire.reader import Port, SkinDisconnected, SkinTimeout
 from skin.wire.skin import SerialSource
+from skin.wire.tare import Tare
 from tests.live.memory_view import MemoryView
 
 RATE, SENSORS = 100, 9
@@ -28,19 +25,14 @@ COUNTS = encode_header(Header(n=SENSORS, rate=RATE, unit="adc", bits=10))
 SCALE = 0.02  # N per count
 
 
-class Loud:
-    """A touch is dangerous where a reading exceeds 4 N."""
-
-    def probabilities(self, touches):
-        danger = (touches.readings.flatten(1).amax(1) > 4).float()
-        return torch.stack([danger] * 4, dim=1)
+def loud(readings, valid):
+    """Return probabilities: a touch is dangerous where a reading exceeds 4 N."""
+    return np.repeat((readings.max(axis=(1, 2)) > 4)[:, None], 4, axis=1).astype(float)
 
 
-def settings(**changes):
-    classify = window_classifier(Loud(), torch.zeros(SENSORS, 3), 10.0)
-    shape = SENSORS, 30, 10.0
+def settings():
     presses = 5.0 * np.eye(SENSORS)
-    return Engine(classify, TOUCH, *shape, Detection(0.3), DebounceSettings(), presses)
+    return Engine(loud, TOUCH, SENSORS, 30, 10.0, Detection(0.3), DebounceSettings(), presses)
 
 
 def force(seconds, *touches):
@@ -78,32 +70,25 @@ def watch(stream, each=1, verify=None, **port):
     return MemoryView(arriving(stream, each), settings(), verify, **port)
 
 
-def served(stream):
-    """Return what the observers of a live view of a socket are told, as (verdict, reason, alarm)."""
-    told, opened = [], Event()
-    server = socket.create_server(("127.0.0.1", 0))
+class Paced:
+    """A skin whose clock goes on while it is read."""
 
-    def serve():
-        client, _ = server.accept()
-        opened.wait(20)
-        begin = monotonic()
-        with client, suppress(ConnectionError):  # the live view may end first
-            for now, data in arriving(stream):
-                sleep(max(0.0, begin + now - monotonic()))
-                client.sendall(data)
+    away, channels = False, ()
 
-    thread = Thread(target=serve, daemon=True)
-    thread.start()
-    port = f"socket://127.0.0.1:{server.getsockname()[1]}"
-    source = SerialSource(Port(port=port, timeout=10.0), SENSORS, 10.0)
-    skin, _ = source.open()
-    opened.set()
-    display = Display(DisplayInfo("loud", port, np.zeros((SENSORS, 3)), (0.1, 0.1), 4.0))
-    display.observers.append(lambda assessment, now: told.append(assessment))
-    with skin, server:
-        LiveLoop(skin, source.tare(skin), settings().build(), display).run()
-        thread.join(20)
-    return told
+    def __init__(self, stream):
+        self.now, self._stream, self.decoder = 0.0, list(arriving(stream)), Decoder(SENSORS)
+        self.stats = self.decoder.stats
+
+    def read(self, count, timeout):
+        end = self.now + timeout
+        while self._stream and self._stream[0][0] <= end:
+            self.now, data = self._stream.pop(0)
+            if frames := self.decoder.feed(data, self.now):
+                return frames
+        if not self._stream:
+            raise SkinDisconnected("the stream has ended")
+        self.now = end
+        raise SkinTimeout("0 of 1 frames arrived within 0.3 s: the device stopped sending")
 
 
 LATE = 0.02  # s: a frame, and the interval between decisions is in the limits
@@ -180,10 +165,16 @@ def test_bursts_without_a_clock_are_decided_like_single_frames():
 
 
 def test_silence_is_unknown_after_a_second_and_a_half():
-    told = served([*lines(force(4)), 3.0, *lines(force(1))])
-    silent = [verdict for verdict, reason, _ in told if "stopped sending" in reason]
-    assert silent
-    assert all(verdict is None for verdict in silent)
+    """In the loop as it runs; frames stop at 4 s."""
+    skin, said = Paced([*lines(force(4)), 3.0, *lines(force(1))]), []
+    tare = Tare(SerialSource(Port(), SENSORS, 10.0).convert, 2.0, 10.0, lambda: skin.decoder.header)
+    display = Display(DisplayInfo("loud", "memory", np.zeros((SENSORS, 3)), (0.1, 0.1), 4.0))
+    display.observers.append(lambda assessment, now: said.append((now, assessment)))
+    LiveLoop(skin, tare, settings(), display, clock=lambda: skin.now).run()
+    silent = [(now, one.verdict) for now, one in said if "stopped sending" in one.reason]
+    assert {verdict for _, verdict in silent} == {None}
+    assert 5.5 <= silent[0][0] <= 5.9
+    assert silent[-1][0] > 6.5
 
 
 def test_what_came_before_a_silence_is_no_verdict_of_now():
@@ -298,16 +289,14 @@ def test_what_blinds_is_refused_and_named(changes, named):
         selftest(**changes)
 
 
+def soft(readings, valid):
+    """As a network, which is nearly certain of strong touches, and less so of those just above the limit."""
+    danger = 1 / (1 + np.exp(-8 * (readings.max(axis=(1, 2)) - 4.0)))
+    return np.repeat(danger[:, None], 4, axis=1)
+
+
 def test_a_threshold_that_only_strong_touches_exceed_is_named():
-    """A network is nearly certain of touches far above the limit, and less so of those just above it."""
-
-    class Soft(Loud):
-        def probabilities(self, touches):
-            danger = torch.sigmoid(8 * (touches.readings.flatten(1).amax(1) - 4))
-            return torch.stack([danger] * 4, dim=1)
-
-    classify = window_classifier(Soft(), torch.zeros(SENSORS, 3), 10.0)
-    nominal = replace(settings(), classify=classify)
+    nominal = replace(settings(), classify=soft)
     for above in (0.1, 0.99):
         selftest(patient(nominal, above=above), nominal=nominal)
     with pytest.raises(InputError, match=r"0 of 14 .* 14 with .* live\.patience\.above=0\.9999 is most"):

@@ -266,11 +266,11 @@ class Engine:
                 self._contact.restart()
         self._latest = readings, 0.0 if self._latest is None else t - self._latest[0].t
         self._decided = False
-        # What is frozen now is left out of the whole window below, and out of no later one.
-        sent = readings._replace(mask=readings.mask & ~Reason.FROZEN)
-        self.window.add(
-            Frame(None, t, t, sent.newtons, sent.usable, 0, frame.lost, frame.after, sent.saturated)
-        )
+        # What is frozen now is left out of this whole window, and of no later one. An interval with a
+        # reading that no skin can have is unknown: the force may be beyond the range.
+        sent = readings._replace(mask=readings.mask & ~(Reason.FROZEN | Reason.IMPLAUSIBLE))
+        newtons = np.where(readings.mask & Reason.IMPLAUSIBLE, np.inf, readings.newtons)
+        self.window.add(Frame(None, t, t, newtons, sent.usable, 0, frame.lost, frame.after, sent.saturated))
         self._losses.add(frame.lost + (not frame.valid.all()), t, self.contact)
         tick, self._tick = self._tick, floor((t + 1e-6) * DECISIONS)  # a rounding of the clock
         return tick != self._tick

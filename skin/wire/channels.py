@@ -31,9 +31,11 @@ class Reason:  # plain numbers: an enumeration would cost a tenth of the time of
     STUCK = 16
     """It does not change while most others do."""
     UNKNOWN = 32
-    """It has no baseline or is broken according to the calibration, or no skin can have the reading."""
+    """It has no baseline, or is broken according to the calibration."""
     FROZEN = 64
     """It does not change, though it did while the baseline was taken."""
+    IMPLAUSIBLE = 128
+    """No skin can have the reading."""
 
 
 @dataclass(frozen=True)
@@ -224,7 +226,8 @@ class UnitConversion:
         newtons, valid = self(frame.values, frame.valid)
         sent = ~frame.valid * Reason.MISSING if frame.mask is None else frame.mask
         limited = 0 if frame.saturated is None else frame.saturated * Reason.SATURATED
-        mask = sent | limited | (frame.valid & ~valid) * Reason.UNKNOWN | mask
+        refused = (frame.valid & ~valid) * np.where(self.broken, Reason.UNKNOWN, Reason.IMPLAUSIBLE)
+        mask = sent | limited | refused | mask
         return NewtonFrame(frame.t if t is None else t, newtons, np.asarray(mask), frame)
 
     def newtons(self, values: np.ndarray) -> np.ndarray:

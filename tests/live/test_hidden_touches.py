@@ -139,12 +139,16 @@ def over_word(row):
     return ",".join("OL" if value > 3 else f"{value:.3f}" for value in row)
 
 
+def over_number(row):
+    return ",".join("3e38" if value > 3 else f"{value:.3f}" for value in row)
+
+
 def hexadecimal(row):
     """Write counts that have letters under a press alone: the whole line is unreadable."""
     return " ".join(f"{0x200 + (int(value / SCALE) if value > 0.3 else 5):03X}" for value in row)
 
 
-@pytest.mark.parametrize("write", [over_range, over_word, hexadecimal])
+@pytest.mark.parametrize("write", [over_range, over_word, over_number, hexadecimal])
 @pytest.mark.parametrize("length", [0.3, 4.0])
 def test_values_that_are_lost_under_a_press(write, length):
     presses = [(8 + 6 * n, 8 + 6 * n + length, 2 * n, 6.0) for n in range(3)]

@@ -289,10 +289,9 @@ class _Tcp(AbstractPort):
 
     def unplug(self) -> None:
         with self._lock:
-            if self._client is not None:
-                self._client.close()
-                self._client = None
-            self._server.close()
+            for end in filter(None, (self._client, self._server)):
+                end.close()
+            self._client = None
 
     @staticmethod
     def _left(client: socket.socket) -> bool:

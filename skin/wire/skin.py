@@ -219,31 +219,27 @@ class Skin:
     def _run(self) -> None:
         try:
             while not self._stop.is_set():
-                self._step()
+                try:
+                    frames = self._feed.poll(self._clock)
+                except OSError as error:
+                    self._reopen(error)
+                    continue
+                if frames:
+                    self._wait = self._backoff[0]
+                    self._push(frames)
+                    self._stop.wait(0 if self._feed.patient else self._pause)
         except Exception as error:
             with self._fresh:
                 self._error = error
                 self._fresh.notify_all()
 
-    def _step(self) -> None:
-        try:
-            frames = self._feed.poll(self._clock)
-        except OSError as error:
-            with suppress(OSError):
-                self._feed.close()
-            if not self._reconnect:
-                raise SkinDisconnected(f"the skin was unplugged: {error}") from error
-            _log.warning("the skin was unplugged (%s); trying again", error)
-            self._reopen()
-            return
-        if frames:
-            self._wait = self._backoff[0]
-            self._push(frames)
-            if not self._feed.patient:
-                self._stop.wait(self._pause)
-
-    def _reopen(self) -> None:
+    def _reopen(self, error: OSError) -> None:
         """Open the feed again; the wait between two attempts doubles until frames arrive."""
+        with suppress(OSError):
+            self._feed.close()
+        if not self._reconnect:
+            raise SkinDisconnected(f"the skin was unplugged: {error}") from error
+        _log.warning("the skin was unplugged (%s); trying again", error)
         self.away = True
         while self.away and not self._stop.wait(self._wait):
             self._wait = min(2 * self._wait, self._backoff[1])

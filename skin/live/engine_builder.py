@@ -304,8 +304,8 @@ class LiveSession:
             selftest.run(conversion, self.source.raw_range, say)
             dead = int(selftest.masked * dead)
         if presses is not None and conversion.noise is not None:
-            felt = presses >= least_visible(conversion.noise, self.engine.detection.threshold)
-            if alone := np.flatnonzero(felt.sum(axis=1) < 2).tolist():
+            visible = presses >= least_visible(conversion.noise, self.engine.detection.threshold)
+            if alone := np.flatnonzero(visible.sum(axis=1) < 2).tolist():
                 say(f"no neighbour would show that the wire of {sensor_list(alone)} breaks to its rest value")
         return dead, raised
 

@@ -61,11 +61,11 @@ class PortMonitor:
         # Of a channel that is never valid, the values that it repeats.
         rows = [row[mask] if mask.any() else row for row, mask in zip(values.T, valid.T, strict=True)]
         lines = [f"header: {self._skin.header or 'none'}", "channel     least    median   largest     noise"]
-        for channel, (row, state, share) in enumerate(zip(rows, states, valid.mean(axis=0), strict=True)):
+        for channel, (row, state, fraction) in enumerate(zip(rows, states, valid.mean(axis=0), strict=True)):
             middle = np.median(row)
             noise = 1.4826 * np.median(np.abs(row - middle))  # as of a normal distribution
-            text = state if share == 1 else f"{state}, invalid in {1 - share:.0%}"
-            if share == 0 and state == "ok":
+            text = state if fraction == 1 else f"{state}, invalid in {1 - fraction:.0%}"
+            if fraction == 0 and state == "ok":
                 text = "no value"
             elif _fails_under_touch(~valid[:, channel], touched):
                 text += ", more often in contact than at rest: beyond its range?"

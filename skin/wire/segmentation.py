@@ -22,7 +22,7 @@ from skin.wire.reader import ByteStream
 Labels = Mapping[str, int]
 
 _INTERRUPTED = "the gesture was interrupted: the skin was unplugged or restarted"
-_UNFELT = "nothing was felt, so the gesture does not count: no working sensor read more than its noise"
+_NO_RESPONSE = "nothing was felt, so the gesture does not count: no working sensor read more than its noise"
 
 
 @dataclass
@@ -225,7 +225,7 @@ class PromptedSegmenter(AbstractSegmenter):
         window: as in :class:`AbstractSegmenter`.
         plan: (number, labels) of the gestures.
         notify: called with each message for the user.
-        felt: tells whether the skin has felt something in a window.
+        responded: tells whether the skin has responded to something in a window.
         lines: typed lines; None: standard input. Lines typed before a prompt count, unless they come from a
             keyboard.
     """
@@ -235,11 +235,11 @@ class PromptedSegmenter(AbstractSegmenter):
         window: Window,
         plan: Iterator[tuple[int, Labels]],
         notify: Callable[[str], None],
-        felt: Callable[[Resampled], bool],
+        responded: Callable[[Resampled], bool],
         lines: Iterator[str] | None = None,
     ) -> None:
         super().__init__(window)
-        self._wanted, self._notify, self._felt = plan, notify, felt
+        self._wanted, self._notify, self._responded = plan, notify, responded
         self._typed: SimpleQueue[str] = SimpleQueue()
         self._asked: tuple[int, Labels] | None = None
         self._hasty = lines is None and sys.stdin.isatty()
@@ -257,10 +257,10 @@ class PromptedSegmenter(AbstractSegmenter):
         done = super().add(frame)
         if done is not None and done.labels is not None:
             done.broken = done.resampled is None or (
-                done.labels.get("touch") != 0 and not self._felt(done.resampled)
+                done.labels.get("touch") != 0 and not self._responded(done.resampled)
             )
             if done.broken:
-                self._notify(_INTERRUPTED if done.resampled is None else _UNFELT)
+                self._notify(_INTERRUPTED if done.resampled is None else _NO_RESPONSE)
                 self._ask((done.number, done.labels))
         elif self.gesture is None and self._asked is None and not self.over:
             # A frame after a gesture, so that the message about that is printed first.

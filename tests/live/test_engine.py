@@ -50,6 +50,13 @@ def engine(
     return subject
 
 
+def rested(**settings):
+    """Return an engine that has seen rest for 0.6 s."""
+    subject = engine(**settings)
+    play(subject, np.zeros((60, 4)))
+    return subject
+
+
 def push(subject, frames):
     """Push frames as the device sends them, and return the verdicts."""
     return subject.push([subject.tare.add(one) for one in frames])
@@ -122,8 +129,7 @@ def test_without_touch_nothing_is_said():
 
 
 def test_words_carry_the_probability_of_what_is_said():
-    subject = engine()
-    play(subject, np.zeros((60, 4)))
+    subject = rested()
     verdict = play(subject, np.full((40, 4), 1.0), start=0.6)[-1]
     chance = verdict.chances["big"]
     assert 0.5 < chance < 1
@@ -184,8 +190,7 @@ def test_a_place_is_known_where_another_sensor_responds():
 
 @pytest.mark.parametrize("force", [0.0, 5.0])
 def test_an_alarm_outlives_a_restart_of_the_device_until_the_contact_ends(force):
-    subject = engine()
-    play(subject, np.zeros((60, 4)))
+    subject = rested()
     assert play(subject, np.full((60, 4), 5.0), start=0.6)[-1].dangerous
     said = play(subject, np.full((300, 4), force), start=1.2, segment=1)
     assert said[0].dangerous
@@ -324,8 +329,7 @@ def test_values_that_fall_with_force_are_told():
 
 
 def test_a_word_does_not_stand_beside_the_probability_of_its_opposite():
-    subject = engine(label=0.5)
-    play(subject, np.zeros((60, 4)))
+    subject = rested(label=0.5)
     play(subject, np.full((100, 4), 1.0), start=0.6)
     said = play(subject, np.full((30, 4), 0.6), start=1.6)
     for verdict in said:
@@ -333,16 +337,14 @@ def test_a_word_does_not_stand_beside_the_probability_of_its_opposite():
 
 
 def test_an_answer_that_is_no_number_raises_the_alarm():
-    subject = engine()
-    play(subject, np.zeros((60, 4)))
+    subject = rested()
     subject.loud.probabilities = lambda touches: torch.full((1, 4), torch.nan)
     assert not play(subject, np.zeros((10, 4)), start=0.6)[-1].dangerous
     assert play(subject, np.full((10, 4), 1.0), start=0.7)[-1].dangerous
 
 
 def test_an_alarm_stays_while_the_model_changes_its_mind():
-    subject = engine()
-    play(subject, np.zeros((60, 4)))
+    subject = rested()
     play(subject, np.full((10, 4), 5.0), start=0.6)
     subject.loud.probabilities = lambda touches: torch.zeros(1, 4)
     held = play(subject, np.full((500, 4), 1.0), start=0.7)
@@ -352,8 +354,7 @@ def test_an_alarm_stays_while_the_model_changes_its_mind():
 
 
 def test_a_new_tare_takes_the_alarm_back():
-    subject = engine()
-    play(subject, np.zeros((60, 4)))
+    subject = rested()
     assert play(subject, np.full((100, 4), 5.0), start=0.6)[-1].dangerous
     subject.reset()
     tared = UnitConversion(np.ones(4), np.full(4, 5.0), np.zeros(4, bool))

@@ -244,17 +244,20 @@ def _stream(device: AbstractSimulated, engine: Engine, count: int, rate: float) 
     values = np.repeat(touches.readings[0].double().numpy(), repeats, axis=0)[: ahead + count]
     valid = np.ones(values.shape[1], dtype=bool)
     frames = [Frame(n, n / rate, n / rate, row, valid) for n, row in enumerate(values)]
-    for frame in frames[:ahead]:
-        engine.push([frame], None)
+    engine.remember([_conversion(engine).convert(frame) for frame in frames[:ahead]])
     return frames[ahead:]
+
+
+def _conversion(engine: Engine) -> UnitConversion:
+    sensors = engine.sensors
+    return UnitConversion(np.ones(sensors), np.zeros(sensors), np.zeros(sensors, dtype=bool))
 
 
 def _seconds(engine: Engine, frame: Frame) -> tuple[float, float, int]:
     """Return the duration of a frame as wall time and as processor time, s, and its number of verdicts."""
-    sensors = engine.window.sensors
-    conversion = UnitConversion(np.ones(sensors), np.zeros(sensors), np.zeros(sensors, dtype=bool))
+    conversion = _conversion(engine)
     wall, core = time.perf_counter(), time.thread_time()
-    verdicts = engine.push([frame], conversion)
+    verdicts = engine.push([conversion.convert(frame)])
     return time.perf_counter() - wall, time.thread_time() - core, len(verdicts)
 
 

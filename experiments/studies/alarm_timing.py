@@ -132,12 +132,15 @@ def play_touch(
     dead = constants.dead.numpy()
     conversion = UnitConversion(np.ones(len(dead)), constants.offset.double().numpy(), dead)
     touched = np.flatnonzero(true.any(axis=1))
-    begin, end, segment = time[touched[0]], time[touched[-1]], next(_SEGMENTS)
+    segment = next(_SEGMENTS)
+    time = time + 1e4 * segment  # longer than any course: the time of an engine never goes back
+    begin, end = time[touched[0]], time[touched[-1]]
     engine.reset()
     answers: list[tuple[float, bool]] = []
     for number, (t, row) in enumerate(zip(time.tolist(), measured, strict=True)):
         frame = Frame(number, t, t, row, ~dead, segment)
-        answers += [(verdict.t, verdict.dangerous) for verdict in engine.push([frame], conversion)]
+        verdicts = engine.push([conversion.convert(frame)])
+        answers += [(verdict.t, verdict.dangerous) for verdict in verdicts]
     return _outcome(pd.Series(dict(answers), dtype=bool), begin, end)
 
 

@@ -131,10 +131,11 @@ def check_quickly(config: Config, run: str | None, overrides: Sequence[str]) -> 
     groups: dict[str, Any] = {name: group for name in _GROUPS if (group := getattr(config, name))}
     check_groups({name: groups[name] for name in ("body", "layout") if name in groups})
     check_plausibility(groups)
-    if isinstance(port := config.device.get("port"), str):
-        from skin.wire.reader import PortSettings, check_port
+    device = groups.get("device", {})
+    if isinstance(port := device.get("port"), str):
+        from skin.wire.reader import Port, check_port
 
-        PortSettings.select({name: value for name, value in config.device.items() if value is not None})
+        Port.select({name: value for name, value in device.items() if value is not None})
         check_port(port)
     if run is not None and not run.endswith(".onnx"):
         named = groups.keys() & {override.split("=")[0].split(".")[0] for override in overrides}

@@ -31,11 +31,11 @@ def main(config: Config, n: int | None, seconds: float | None, adapter: Any) -> 
     from skin.wire.formats import SensorCountError
     from skin.wire.monitor import PortMonitor
     from skin.wire.proposal import listen_raw, propose
-    from skin.wire.reader import PortSettings, SkinDisconnected, SkinTimeout, open_stream
+    from skin.wire.reader import Port, SkinDisconnected, SkinTimeout, open_stream
     from skin.wire.skin import open_skin
 
     signal.signal(signal.SIGTERM, signal.default_int_handler)
-    settings = PortSettings.select(device)
+    settings = Port.select(device)
     if settings.frames.kind == "auto":
         with closing(open_stream(str(settings.port), settings.baudrate)) as stream:
             pieces = listen_raw(stream, _ENOUGH if seconds is None else min(seconds, _ENOUGH))

@@ -34,6 +34,8 @@ class Frame(NamedTuple):
         saturated: (S,), bool: the channel is at its limit, so the force is at least its value; None: no
             channel is.
         polarity: (S,), float64: -1 where the value falls with force, else 1; None: 1 for all.
+        mask: (S,), int: why values are not valid or at their limit, bits of
+            :class:`skin.wire.channels.Reason`; None: not known.
     """
 
     seq: int | None
@@ -46,6 +48,7 @@ class Frame(NamedTuple):
     after: After = ""
     saturated: np.ndarray | None = None
     polarity: np.ndarray | None = None
+    mask: np.ndarray | None = None
 
     def behind(self, dropped: "Frame") -> "Frame":
         """Return this frame with the previous one, which was dropped, counted as lost."""

@@ -16,7 +16,6 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from threading import Event, Lock, Thread
-from time import monotonic
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -24,7 +23,7 @@ import numpy as np
 from skin.device.resampling import Frame
 from skin.errors import InputError
 from skin.live.verdict import Verdict
-from skin.wire.channels import UnitConversion
+from skin.wire.channels import NewtonFrame, UnitConversion
 
 if TYPE_CHECKING:
     from skin.body.base import AbstractBody, Sensors
@@ -33,20 +32,9 @@ if TYPE_CHECKING:
     from skin.inference.posterior import ContactEstimate, FrameEstimate, Posterior
     from skin.mechanics.simulator.base import AbstractSimulator
 
-STALE = 0.5
-"""s after its readings from which an estimate is unknown."""
-SPAN = 0.1
-"""s of which the readings are averaged."""
 PREPARING = "being prepared"
-
-_SHARE = 0.9  # probability of a region
-_CELL = 0.002  # m, least width of its cells: a region of the default skin would have a thousand smaller ones
-_IDLE_FITS = 1e-4  # predictive probability below which the readings of an untouched skin are not noise alone
-_CALIBRATED = 0.02  # standard deviation of the gains of a calibrated device
-_PLACED = 0.001  # m, standard deviation of the positions of sensors, as made by hand
-_QUIET = 1e-3  # N, least noise
-_NICE = 5
-_MOST = 1000  # frames
+QUIET = 1e-3
+"""N, least noise: a device without any would make each reading certain."""
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
@@ -59,14 +47,15 @@ def unknown_contacts(reason: str) -> dict[str, Any]:
     return {"state": "unknown", "reason": reason, **empty, "contacts": []}
 
 
-def contact_message(estimate: "FrameEstimate", time: float) -> dict[str, Any]:
+def contact_message(estimate: "FrameEstimate", time: float, noise_fit: float = 1e-4) -> dict[str, Any]:
     """Return an estimate as JSON data, the fields of ``docs/export.md``.
 
     Args:
         estimate: of the readings.
         time: s, the device's clock at their latest frame.
+        noise_fit: predictive probability below which readings without contact are not explained by noise.
     """
-    none = estimate.number == 0 and estimate.fit >= _IDLE_FITS and estimate.large < 0.5
+    none = estimate.number == 0 and estimate.fit >= noise_fit and estimate.large < 0.5
     base = {
         "reason": estimate.unknown or "",
         "device_time": time,
@@ -90,8 +79,15 @@ def contact_message(estimate: "FrameEstimate", time: float) -> dict[str, Any]:
     }
 
 
-def _contact(contact: "ContactEstimate") -> dict[str, Any]:
-    region = contact.region(_SHARE, _CELL)
+def _contact(contact: "ContactEstimate", probability: float = 0.9, cell: float = 0.002) -> dict[str, Any]:
+    """Return a contact as JSON data.
+
+    Args:
+        contact: the estimate.
+        probability: of its region.
+        cell: m, least width of its cells: a region of the default skin would have a thousand smaller ones.
+    """
+    region = contact.region(probability, cell)
     origin = region.cells.min(axis=0)
     place, spread = contact.place.round(5).tolist(), contact.place_deviation.round(5).tolist()
     return {
@@ -154,13 +150,17 @@ class Mechanics:
     noise: "Noise"
 
     @classmethod
-    def of(cls, device: "AbstractSimulated | None", calibrated: bool) -> "Mechanics":
+    def of(
+        cls, device: "AbstractSimulated | None", calibrated: bool, gain: float = 0.02, placed: float = 0.001
+    ) -> "Mechanics":
         """Return the mechanics of a run's skin.
 
         Args:
             device: that simulates the skin; None: it has no mechanics.
-            calibrated: the gains of the watched device are known to 2 %; otherwise they vary as those of
-                the training do.
+            calibrated: the gains of the watched device are known; otherwise they vary as those of the
+                training do.
+            gain: standard deviation of the gains of a calibrated device.
+            placed: m, standard deviation of the positions of sensors, as made by hand.
 
         Raises:
             InputError: there are no mechanics, or readings of contacts do not add up.
@@ -173,10 +173,10 @@ class Mechanics:
         if getattr(device.model, "reading", None) == "equation10":
             raise InputError(f"readings of equation 10 do not add up: {advice}")
         settings = device.imperfection
-        noise = max(float(np.mean(settings.noise)), _QUIET)
-        gain = _CALIBRATED if calibrated else float(np.mean(settings.gain_spread))
+        noise = max(float(np.mean(settings.noise)), QUIET)
+        gain = gain if calibrated else float(np.mean(settings.gain_spread))
         offset = 0.0 if settings.tare else settings.offset
-        nominal = Noise(noise, gain=gain, offset=offset, position=_PLACED)
+        nominal = Noise(noise, gain=gain, offset=offset, position=placed)
         return cls(device.simulator, device.body, device.sensors, nominal)
 
     def posterior(self) -> "Posterior":
@@ -221,28 +221,24 @@ class MeanReadings(NamedTuple):
     host: float
 
 
-def average_frames(
-    frames: Sequence[Frame],
+def average_readings(
+    stream: Sequence[NewtonFrame],
     conversion: UnitConversion,
     masked: Sequence[int],
     baseline: np.ndarray,
     whole: bool,
 ) -> MeanReadings:
-    """Return the readings of frames, the latest one last.
+    """Return the mean of readings, the latest last.
 
     Args:
-        frames: as the device sent them.
-        conversion: of their values to N.
+        stream: of a moment.
+        conversion: of the values to N.
         masked: sensors without a valid reading.
         baseline: (S,), N, what the untouched skin reads by now.
         whole: the device sends whole numbers.
     """
-    newtons, valid = conversion(
-        np.stack([frame.values for frame in frames]), np.stack([frame.valid for frame in frames])
-    )
-    marks = [frame.saturated for frame in frames if frame.saturated is not None]
-    saturated = np.any(marks, axis=0) if marks else np.zeros(newtons.shape[1], dtype=bool)
-    works = np.logical_and.reduce(valid)
+    newtons, frame = np.stack([readings.newtons for readings in stream]), stream[-1].frame
+    works = np.logical_and.reduce([readings.usable for readings in stream])
     works[list(masked)] = False
     # The zero is that of largest values of intervals, which noise raises above the mean.
     rest = baseline if conversion.rest is None else baseline + conversion.rest
@@ -250,12 +246,12 @@ def average_frames(
     return MeanReadings(
         newtons.mean(axis=0, dtype=float) - rest,
         works,
-        saturated & works,
+        np.any([readings.saturated for readings in stream], axis=0) & works,
         None if noise is None else float(np.sqrt(np.mean(noise**2))),
-        len(frames),
+        len(stream),
         float(np.median(np.abs(conversion.scale))) if whole else 0.0,
-        frames[-1].t,
-        frames[-1].t_host,
+        frame.t,
+        frame.t_host,
     )
 
 
@@ -272,9 +268,9 @@ def estimate_contacts(posterior: "Posterior", nominal: "Noise", readings: MeanRe
     frame, offset = (nominal.frame, nominal.offset) if readings.noise is None else (readings.noise, rounding)
     limits = readings.values[readings.saturated]
     # A sensor at its limit says that it would read more: than the least of them, if there are several.
-    clip = max(float(limits.min()), _QUIET) if len(limits) else np.inf
+    clip = max(float(limits.min()), QUIET) if len(limits) else np.inf
     posterior.noise = replace(
-        nominal, frame=max(frame, rounding, _QUIET), frames=readings.frames, offset=offset, clip=clip
+        nominal, frame=max(frame, rounding, QUIET), frames=readings.frames, offset=offset, clip=clip
     )
     estimate = posterior.estimate(readings.values, readings.valid, readings.saturated)
     assert not isinstance(estimate, list)
@@ -293,7 +289,7 @@ def serve() -> None:
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     if hasattr(os, "nice"):
-        os.nice(_NICE)
+        os.nice(5)  # below what shows verdicts
     answers = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # what a library prints is not an answer
     with suppress(EOFError, OSError, pickle.UnpicklingError):  # the command has ended
@@ -327,11 +323,16 @@ class LiveContacts:
 
     Args:
         reason: why nothing is known before :meth:`start`.
+        stale: s after its readings from which an estimate is unknown.
+        span: s of which the readings are averaged.
     """
 
-    def __init__(self, reason: str = "this view estimates none") -> None:
+    def __init__(
+        self, reason: str = "this view estimates none", stale: float = 0.5, span: float = 0.1
+    ) -> None:
+        self.stale, self.span = stale, span
         self._lock, self._wake, self._closed = Lock(), Event(), False
-        self._frames: deque[Frame] = deque(maxlen=_MOST)
+        self._recent: deque[NewtonFrame] = deque(maxlen=1000)
         self._newest: MeanReadings | None = None
         self._process: subprocess.Popen[bytes] | None = None
         self._thread: Thread | None = None
@@ -381,35 +382,38 @@ class LiveContacts:
 
     def look(
         self,
-        frames: Sequence[Frame],
+        stream: Sequence[NewtonFrame],
         conversion: UnitConversion,
         verdicts: Sequence[Verdict],
         baseline: np.ndarray,
     ) -> None:
-        """Take new frames; leave their readings for the process if there is a verdict. It returns at once.
+        """Take new readings; leave their mean for the process if there is a verdict. It returns at once.
 
         Args:
-            frames: as the device sent them.
-            conversion: of their values to N.
+            stream: the readings.
+            conversion: of the values to N.
             verdicts: on them.
             baseline: (S,), N, what the untouched skin reads by now.
         """
-        if self._process is None:
+        if self._process is None or not stream:
             return
-        self._frames.extend(frames)
-        last = self._frames[-1]
-        while self._frames[0].segment != last.segment or not 0 <= last.t - self._frames[0].t < SPAN - 1e-6:
-            self._frames.popleft()
+        self._recent.extend(stream)
+        last = stream[-1].frame
+        while not self._together(self._recent[0].frame, last):
+            self._recent.popleft()
         if verdicts:
             masked = verdicts[-1].masked
-            self._newest = average_frames(self._frames, conversion, masked, baseline, self._whole())
+            self._newest = average_readings(self._recent, conversion, masked, baseline, self._whole())
             self._wake.set()
 
-    def state(self) -> dict[str, Any]:
-        """Return what is known now, as JSON data."""
+    def _together(self, first: Frame, last: Frame) -> bool:
+        return first.segment == last.segment and 0 <= last.t - first.t < self.span - 1e-6
+
+    def state(self, now: float) -> dict[str, Any]:
+        """Return what is known at ``now``, s, on the host's monotonic clock, as JSON data."""
         with self._lock:
             latest, host = self._latest, self._host
-        return latest if monotonic() - host <= STALE else unknown_contacts("no estimate for half a second")
+        return latest if now - host <= self.stale else unknown_contacts("no estimate for half a second")
 
     def _run(self, mechanics: Mechanics) -> None:
         """Pass the newest readings to the process, and keep its answers."""

@@ -1,17 +1,17 @@
-"""Classify a stream of frames, without input or output: verdicts, their debouncing, and the engine."""
+"""Classify a stream of readings, without input or output: verdicts, their debouncing, and the engine."""
 
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from math import ceil, floor, inf
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from annotated_types import Ge, Gt, Le, Lt
 from pydantic import NonNegativeFloat, PositiveFloat
 
 from skin.core.settings import checked
-from skin.device.resampling import Frame, Resampled, StreamClock, Window
+from skin.device.resampling import Frame, Window
 from skin.evaluation.decisions import (
     DECISIONS,
     DRIFT,
@@ -22,7 +22,7 @@ from skin.evaluation.decisions import (
 )
 from skin.live.verdict import LASTING, Note, Verdict, order_notes
 from skin.touch.labels import RELEASE, Task
-from skin.wire.channels import EXPECTED, FROZEN, UnitConversion, fails_in_contact
+from skin.wire.channels import NewtonFrame, Reason, fails_in_contact
 
 
 @checked("live.patience")
@@ -79,10 +79,9 @@ class Debounce:
 Classify = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """Readings (B, T, S), float32, N, and valid (B, T, S), bool, of windows -> probabilities (B, L)."""
 
-_DISTINCT = 10  # different frames of a block that is repeated
-_GAP = 0.5  # s without a frame after which the history of the window is lost
-_CHANGING = 0.3  # fraction of changes at the tare from which a channel must change within FROZEN
-_ROUNDING = 1e-6  # s
+_GAP = (
+    0.5  # s without a frame after which the history of the window is lost: longer than any burst of a bridge
+)
 
 
 @checked("detection")
@@ -106,24 +105,6 @@ class Detection:
     longest: float = 2.0
 
 
-@dataclass(frozen=True)
-class EngineSettings:
-    """What an :class:`Engine` is built from: its arguments."""
-
-    classify: Classify
-    task: Task
-    sensors: int
-    frames: int
-    rate: float
-    detection: Detection
-    patience: DebounceSettings
-    presses: np.ndarray | None = None
-
-    def build(self) -> "Engine":
-        """Return a new engine."""
-        return Engine(**{entry.name: getattr(self, entry.name) for entry in fields(self)})
-
-
 class _Decision(NamedTuple):
     """A window that is to be classified.
 
@@ -143,6 +124,7 @@ class _Decision(NamedTuple):
     last: bool
 
 
+@dataclass(eq=False)
 class Engine:
     """Decides on the window of a stream twenty times per second of device time, or at every slower frame.
 
@@ -165,39 +147,45 @@ class Engine:
             one rises by the threshold, the place is unknown. None: each sensor feels what is on itself.
 
     Attributes:
+        window: of the latest readings, N.
         alarm: the latest verdict was dangerous, and the contact has not ended.
     """
 
-    def __init__(
-        self,
-        classify: Classify,
-        task: Task,
-        sensors: int,
-        frames: int,
-        rate: float,
-        detection: Detection,
-        patience: DebounceSettings | None = None,
-        presses: np.ndarray | None = None,
-    ) -> None:
-        self.window = Window(frames, rate, sensors)
-        self.task = task
-        self._classify, self._detection = classify, detection
-        self._patience = patience or DebounceSettings()
-        shares = (
-            None
-            if presses is None
-            else presses / np.maximum(np.diagonal(presses), 1e-9)[:, None] - np.eye(sensors)
-        )
-        self._contact = ContactDetector(sensors, rate, detection.threshold, detection.drift, shares)
-        self._held = held_frames(detection.longest, rate, frames)
-        self._shown = longest_shown(self._held, ceil(RELEASE * rate - 1e-9), frames)
-        self._above = 0.5 if self._patience.above is None else self._patience.above
-        self._responds = np.eye(sensors, dtype=bool) if presses is None else presses >= detection.threshold
-        self._clock, self._freshness, self._losses = StreamClock(), _Freshness(sensors), _Losses()
-        self._latest: tuple[Frame, float, float] | None = None  # with its time, and that since the one before
+    classify: Classify
+    task: Task
+    sensors: int
+    frames: int
+    rate: float
+    detection: Detection
+    patience: DebounceSettings = field(default_factory=DebounceSettings)
+    presses: np.ndarray | None = None
+
+    def __post_init__(self) -> None:
+        self.window = Window(self.frames, self.rate, self.sensors)
+        threshold, drift = self.detection.threshold, self.detection.drift
+        self._contact = ContactDetector(self.sensors, self.rate, threshold, drift, self.shares)
+        self._held = held_frames(self.detection.longest, self.rate, self.frames)
+        self._shown = longest_shown(self._held, ceil(RELEASE * self.rate - 1e-9), self.frames)
+        self._above = 0.5 if self.patience.above is None else self.patience.above
+        itself = np.eye(self.sensors, dtype=bool)
+        self._responds = itself if self.presses is None else self.presses >= threshold
+        self._losses = _Losses()
+        self._latest: tuple[NewtonFrame, float] | None = None  # with the time since those before
         self._tick = -1
         self._decided = True
         self.reset()
+
+    def build(self) -> "Engine":
+        """Return a new engine with the same settings."""
+        return replace(self)
+
+    @property
+    def shares(self) -> np.ndarray | None:
+        """(S, S), readings of other sensors under a touch, relative to that of the sensor; None: unknown."""
+        if self.presses is None:
+            return None
+        own = np.maximum(np.diagonal(self.presses), 1e-9)
+        return np.asarray(self.presses / own[:, None] - np.eye(self.sensors))
 
     @property
     def contact(self) -> bool:
@@ -209,89 +197,101 @@ class Engine:
         """Readings (S,), N, of the untouched skin by now."""
         return self._contact.baseline
 
-    @property
-    def frozen(self) -> "Frozen":
-        """Why the device cannot be working; empty if it may be."""
-        return self._freshness.frozen
-
-    def reset(self, raised: np.ndarray | None = None) -> None:
-        """Reset alarm and contact, after a tare of the untouched skin.
+    def reset(self, raised: np.ndarray | None = None, noise: np.ndarray | None = None) -> None:
+        """Forget readings, alarm and contact, after a tare of the untouched skin.
 
         Args:
             raised: (S,), N, baseline of the tare above the rest that is stored for the device: something may
                 have touched it. None: no rest is stored.
+            noise: (S,), N, standard deviation of the readings of the untouched skin; None: as before.
         """
-        raised = np.zeros(self.window.sensors) if raised is None else raised
-        self._contact.reset(raised >= self._detection.threshold)
-        shape = self.window.frames, self.window.sensors
+        raised = np.zeros(self.sensors) if raised is None else raised
+        self._contact.reset(raised >= self.detection.threshold)
+        self._contact.noise = self._contact.noise if noise is None else noise
+        self.window.clear()
+        shape = self.frames, self.sensors
         self._idle = np.zeros(shape, dtype=np.float32), np.ones(shape, dtype=bool)
         self.alarm, self._peak_probability = False, 0.0
-        slow = self._patience.label, self._patience.label
+        slow = self.patience.label, self.patience.label
         self._touch = Debounce(*slow)
         self._labels = {name: Debounce(*slow) for name in self.task.gated}
-        self._labels |= {"dangerous": Debounce(self._patience.alarm, self._patience.calm)}
-        self._agreeing, self._doubts = dict[str, float](), dict[str, Note]()
+        self._labels |= {"dangerous": Debounce(self.patience.alarm, self.patience.calm)}
+        self._agreeing, self._lasting = dict[str, float](), dict[str, Note]()
 
-    def push(self, frames: Sequence[Frame], conversion: UnitConversion | None) -> list[Verdict]:
-        """Return the verdicts that are due with these frames, the latest one last.
+    def remember(self, stream: Sequence[NewtonFrame]) -> None:
+        """Take readings on which nothing is decided: those before the first tare."""
+        for readings in stream:
+            self._add(readings)
+
+    def push(self, stream: Sequence[NewtonFrame]) -> list[Verdict]:
+        """Return the verdicts that are due with these readings, the latest one last.
 
         Args:
-            frames: as the device sent them, in their order.
-            conversion: of their values to N; None: not known yet, so that nothing can be decided.
+            stream: readings in their order.
 
         Raises:
             InputError: the stream is slower than the model's rate.
         """
-        decisions = [decision for frame in frames for decision in self._add(frame, conversion)]
+        decisions = [decision for readings in stream for decision in self._take(readings)]
         if not decisions:
             return []
-        readings, valid = (
+        windows = (
             np.stack([getattr(decision, name) for decision in decisions]) for name in ("readings", "valid")
         )
-        probabilities = np.asarray(self._classify(readings, valid), dtype=float)
+        probabilities = np.asarray(self.classify(*windows), dtype=float)
         return [self._conclude(*pair) for pair in zip(decisions, probabilities.tolist(), strict=True)]
 
-    def _add(self, frame: Frame, conversion: UnitConversion | None) -> Iterator[_Decision]:
-        """Add a frame to the window; yield the decisions that are due."""
-        time = self._clock(frame)
-        pause = 0.0 if self._latest is None else time - self._latest[1]
-        if self._interrupted(frame, time):
+    def _take(self, readings: NewtonFrame) -> Iterator[_Decision]:
+        """Add readings to the window; yield the decisions that are due."""
+        if self._interrupted(readings):
             # What came last before the interruption would be forgotten undecided.
-            yield from self._decide(conversion, last=True)
+            yield from self._decide(last=True)
+        if self._add(readings):
+            yield from self._decide()
+
+    def _interrupted(self, readings: NewtonFrame) -> bool:
+        if self._latest is None:
+            return False
+        latest, pause = self._latest[0], readings.t - self._latest[0].t
+        return readings.frame.segment != latest.frame.segment or (
+            pause > _GAP and pause > 3 * self.window.period
+        )
+
+    def _add(self, readings: NewtonFrame) -> bool:
+        """Add readings to the window; return whether a decision is due."""
+        frame, t = readings.frame, readings.t
+        if self._interrupted(readings):
             self.window.clear()
             if frame.after in ("reset", "reconnect"):
                 self._contact.restart()
-        self._latest, self._decided = (frame, time, pause), False
-        self.window.add(frame._replace(t=time, segment=0))
-        self._freshness.add(frame, time, conversion)
-        self._losses.add(frame.lost + (not frame.valid.all()), time, self.contact)
-        tick = floor((time + _ROUNDING) * DECISIONS)
-        if tick != self._tick:
-            self._tick = tick
-            yield from self._decide(conversion)
+        self._latest = readings, 0.0 if self._latest is None else t - self._latest[0].t
+        self._decided = False
+        # What is frozen now is left out of this whole window, and of no later one. An interval with a
+        # reading that no skin can have is unknown: the force may be beyond the range.
+        sent = readings._replace(mask=readings.mask & ~(Reason.FROZEN | Reason.IMPLAUSIBLE))
+        newtons = np.where(readings.mask & Reason.IMPLAUSIBLE, np.inf, readings.newtons)
+        self.window.add(Frame(None, t, t, newtons, sent.usable, 0, frame.lost, frame.after, sent.saturated))
+        self._losses.add(frame.lost + (not frame.valid.all()), t, self.contact)
+        tick, self._tick = self._tick, floor((t + 1e-6) * DECISIONS)  # a rounding of the clock
+        return tick != self._tick
 
-    def _interrupted(self, frame: Frame, time: float) -> bool:
-        if self._latest is None:
-            return False
-        latest, before, _ = self._latest
-        pause = time - before
-        return frame.segment != latest.segment or (pause > _GAP and pause > 3 * self.window.period)
-
-    def _decide(self, conversion: UnitConversion | None, last: bool = False) -> Iterator[_Decision]:
-        """Yield the decision on the window that ends with the latest frame; none without a conversion."""
+    def _decide(self, last: bool = False) -> Iterator[_Decision]:
+        """Yield the decision on the window that ends with the latest readings."""
         seen = self.window.read(partial=True)
-        if self._decided or conversion is None or seen is None or self._latest is None:
+        if self._decided or seen is None or self._latest is None:
             return
         self._decided = True
-        frame, time, pause = self._latest
+        (t, _, mask, frame), pause = self._latest
         # A tap may come and go; but a device of the rate of a slow model may lose two frames, too.
-        pause = pause if pause > max(_GAP / 2, 2.5 / self.window.rate) else 0.0
-        readings, valid, below = self._read_window(seen, conversion, time)
+        pause = pause if pause > max(_GAP / 2, 2.5 / self.rate) else 0.0
+        readings, valid = seen.values.astype(np.float32), seen.valid & (mask & Reason.FROZEN == 0)
+        below = self._contact.falls(readings, valid)
+        self._contact.update(readings, valid, t)
         risen = bool(self._contact.rises(readings, valid).any())
         readings, valid = self._fill_window(readings, valid & ~below & ~self._contact.lost, seen.before)
         if not self.contact and not risen:
             self._idle = readings, valid
-        lasted = None if self._contact.since is None else time - self._contact.since
+        lasted = None if self._contact.since is None else t - self._contact.since
         responding = self._responds[:, valid[-1] & ~self._contact.void]
         unknown = np.asarray(~responding.any(axis=1) | (pause > 0))
         draft = Verdict(
@@ -303,19 +303,10 @@ class Engine:
             unknown=_numbers(unknown),
             notes=self._find_notes(unknown, below[-1], pause),
         )
-        yield _Decision(draft, time, *self._cut_window(readings, valid, lasted or 0.0), risen, last)
-
-    def _read_window(
-        self, seen: Resampled, conversion: UnitConversion, time: float
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Update the contact; return readings, N, valid, and which of them are below rest, each (T, S)."""
-        readings, valid = conversion(seen.values, seen.valid)
-        if conversion.noise is not None:
-            self._contact.noise = conversion.noise
-        valid = valid & ~self._freshness.stuck
-        below = self._contact.falls(readings, valid)
-        self._contact.update(readings, valid, time)
-        return readings, valid, below
+        if (lasted or 0.0) * self.rate > self._shown:
+            idle, idle_valid = self._idle
+            readings, valid = (as_press(idle, readings, self._held), as_press(idle_valid, valid, self._held))
+        yield _Decision(draft, t, readings, valid, risen, last)
 
     def _fill_window(
         self, readings: np.ndarray, valid: np.ndarray, before: int
@@ -342,19 +333,10 @@ class Engine:
         notes += [Note("unreadable")] * self._losses.excessive + [Note("pause", seconds=pause)] * (pause > 0)
         return tuple(notes)
 
-    def _cut_window(
-        self, readings: np.ndarray, valid: np.ndarray, lasted: float
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the window (T, S) as the model sees it, during a contact of ``lasted`` s."""
-        if lasted * self.window.rate <= self._shown:
-            return readings, valid
-        idle, idle_valid = self._idle
-        return as_press(idle, readings, self._held), as_press(idle_valid, valid, self._held)
-
     def _conclude(self, decision: _Decision, probabilities: Sequence[float]) -> Verdict:
         """Return the verdict on a decision, given the probabilities of its window, one per label."""
         chances = dict(zip(self.task.names, probabilities, strict=True))
-        learned = self._detection.learned and chances[self.task.gate or ""] > 0.5
+        learned = self.detection.learned and chances[self.task.gate or ""] > 0.5
         period = max(self.window.period, 1 / DECISIONS)
         self._update_alarm(decision, chances, learned, period)
         touching = decision.draft.contact is not None or decision.risen or learned
@@ -395,9 +377,9 @@ class Engine:
         self, present: Sequence[Note], chances: dict[str, float], touched: bool
     ) -> tuple[Note, ...]:
         """Return the notes on a decision, those of the touch so far, and on its danger."""
-        notes = self._doubts | {note.code: note for note in present}
-        # What makes a touch doubtful holds until it ends.
-        self._doubts = {code: note for code, note in notes.items() if code in LASTING and touched}
+        notes = self._lasting | {note.code: note for note in present}
+        # What makes a touch uncertain holds until it ends.
+        self._lasting = {code: note for code, note in notes.items() if code in LASTING and touched}
         if 0.5 < chances.get("dangerous", 0.0) <= self._above and touched and not self.alarm:
             notes["near_threshold"] = Note("near_threshold")
         return order_notes(notes.values())
@@ -450,60 +432,3 @@ class _Losses:
             failed = self._touched[1] + sum(before for _, before in self._recent)
             frames = self._touched[0] + len(self._recent) + failed
             self.excessive |= fails_in_contact(failed, frames, self._rest[1], self._rest.sum())
-
-
-Frozen = Literal["", "still", "repeated"]
-"""Why readings count as frozen: they do not; none has changed; a block of frames is sent again and again."""
-
-
-class _Freshness:
-    """Finds readings that do not change, though they did while the baseline was taken.
-
-    Attributes:
-        frozen: none of the readings has changed for :data:`FROZEN` s, or frames repeat those before.
-        stuck: (S,), bool, sensors whose readings have not changed for so long, unless they are at a limit.
-    """
-
-    def __init__(self, sensors: int) -> None:
-        self.frozen: Frozen = ""
-        self.stuck = np.zeros(sensors, dtype=bool)
-        self._values: np.ndarray | None = None
-        self._changed_at, self._unchanged, self._time, self._clock = np.zeros(sensors), 0, 0.0, 0.0
-        self._rows, self._equal = np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
-
-    def add(self, frame: Frame, time: float, conversion: UnitConversion | None) -> None:
-        """Compare a frame with the one before; nothing is known of a time without frames."""
-        self._clock, self._time = self._clock + min(time - self._time, _GAP), time
-        if self._values is None or frame.after not in ("", "gap"):
-            changed = np.ones(len(frame.values), dtype=bool)
-        else:
-            changed = frame.values != self._values
-        self._changed_at[changed] = self._clock
-        self._unchanged = 0 if changed.any() else self._unchanged + 1
-        self._values = frame.values
-        if conversion is None or conversion.changing is None:
-            return
-        silent = self._clock - self._changed_at >= FROZEN - _ROUNDING
-        limited = np.zeros_like(silent) if frame.saturated is None else frame.saturated
-        self.stuck = silent & (conversion.changing >= _CHANGING) & ~limited
-        # Noise alone would have changed some reading so many times.
-        still = silent.all() and self._unchanged * conversion.changing.sum() >= EXPECTED
-        self.frozen = "still" if still else "repeated" if self._repeats(frame, conversion.equal) else ""
-
-    def _repeats(self, frame: Frame, equal: np.ndarray) -> bool:
-        """Return whether the latest frames are, one after the other, those before them.
-
-        Args:
-            frame: the latest.
-            equal: (L,), probability that a frame at rest equals that 1, 2, ... frames before.
-        """
-        if len(equal) != len(self._rows):
-            self._rows, self._equal = (np.zeros(len(equal), dtype=np.int64) for _ in range(2))
-        row = hash(frame.values.tobytes())
-        self._equal = np.where(self._rows == row, self._equal + 1, 0)
-        self._rows = np.concatenate([[row], self._rows[:-1]])
-        likely = -self._equal * np.log(equal) < EXPECTED
-        if likely.all():
-            return False
-        # Sensors at their limit, all but one, may repeat a few values.
-        return len(np.unique(self._rows[: self._equal[~likely].max()])) >= _DISTINCT

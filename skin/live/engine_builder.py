@@ -3,7 +3,7 @@
 torch is not imported.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from functools import partial
@@ -20,28 +20,16 @@ from skin.errors import InputError
 from skin.evaluation.alarm import choose_alarm_threshold
 from skin.evaluation.decisions import DRIFT, least_visible
 from skin.live.contacts import Mechanics
-from skin.live.engine import DebounceSettings, Detection, EngineSettings
+from skin.live.engine import DebounceSettings, Detection, Engine
 from skin.live.verdict import Note, sensor_list
 from skin.runs.configuration import Config
 from skin.runs.model import Model, OnnxModel
-from skin.wire.channels import RawRange, UnitConversion, unit_conversion
-from skin.wire.reader import PortSettings, SkinDisconnected, SkinTimeout
+from skin.wire.channels import NewtonFrame, RawRange, UnitConversion, unit_conversion
+from skin.wire.reader import Port, SkinDisconnected, SkinTimeout
 from skin.wire.skin import SerialSource, Skin, Source
 
 STRENGTH = 1.5
 """Pressure of the touches as a multiple of the limit of ``dangerous``."""
-
-_WEAK = 1.2  # the same of weaker ones: a network is surer of strong touches than of those that a limit hides
-_LEAST = 0.5  # of the presses that must raise the alarm with nominal settings
-_SHARE = 0.9  # of what the model finds with nominal settings that the settings in use must find
-_MASKED = 0.25  # fraction of the sensors that may be without a valid reading
-_RATE = 20.0  # Hz of the simulated frames: a decision at each
-_REST, _HOLD, _FALL = 0.4, 0.4, 0.2  # s
-_FAST, _SLOW = 0.2, 4.0  # s in which the force rises; the slow one shows a baseline that follows touches
-_SLOWLY = 5  # sensors that are pressed slowly, too
-_PLAUSIBLE = 1.0  # N, largest contact threshold that counts as nominal
-_PIECE = 6  # frames that are judged at once
-_APART = 1000.0  # s between two touches: each begins with an untouched skin
 _OVERRIDE = "live.selftest=false skips this test"
 
 
@@ -51,13 +39,26 @@ class SelfTest:
 
     Attributes:
         presses: (S, S), N, true readings of a press at the limit of ``dangerous`` on each sensor.
-        used: settings of the alarm in use.
-        nominal: those that the model brings.
+        used: engine with the settings in use.
+        nominal: engine with those that the model brings.
+        weak: as ``STRENGTH``, of weaker presses: a network is surer of strong touches than of those that a
+            limit hides.
+        least: fraction of the presses that must raise the alarm with nominal settings.
+        found: fraction of what the model finds with nominal settings that the settings in use must find.
+        masked: largest fraction of the sensors without a valid reading.
+        slowly: sensors that are pressed slowly, too.
+        plausible: N, largest contact threshold that counts as nominal: a damaged model file cannot raise it.
     """
 
     presses: np.ndarray
-    used: EngineSettings
-    nominal: EngineSettings
+    used: Engine
+    nominal: Engine
+    weak: float = 1.2
+    least: float = 0.5
+    found: float = 0.9
+    masked: float = 0.25
+    slowly: int = 5
+    plausible: float = 1.0
 
     def run(self, conversion: UnitConversion, device: RawRange, say: Callable[[str], None]) -> None:
         """Run the test and report it.
@@ -73,129 +74,124 @@ class SelfTest:
                 hides weaker ones.
         """
         unit = unit_conversion(len(self.presses), None, 1.0, None, None)
-        expected = self.find(self._plausible, unit, RawRange())
+        expected = self.find(self._nominal, unit, RawRange())
         raised = self.find(self.used, conversion, device)
         # A place without a valid sensor is shown as unknown, which hides nothing, unless there are many.
         valid = ~conversion.broken[self._sensors]
         missed = np.unique(self._sensors[expected & ~raised & valid])
-        text = f"self-test: {raised.sum()} of {len(raised)} dangerous presses raise the alarm, "
-        text += f"{expected.sum()} with nominal settings"
+        text = f"self-test: {raised.sum()} of {len(raised)} dangerous presses raise the alarm"
+        nominally = f"{text}, {expected.sum()} with nominal settings"
         if not raised.all():
-            text += f"; not on {sensor_list(np.unique(self._sensors[~raised]).tolist())}"
+            nominally += f"; not on {sensor_list(np.unique(self._sensors[~raised]).tolist())}"
         untested = "only its range tests the scale" if device.known else "so its scale is not checked"
-        declared = "" if device.known else "the device declares no range, "
-        say(f"{text}; {declared}{untested}")
-        few = raised[valid].sum() < _SHARE * expected[valid].sum()
-        if expected.mean() < _LEAST or len(missed) or few or conversion.broken.mean() > _MASKED:
-            raise InputError(self._refusal(raised, expected, missed, conversion, device))
+        say(f"{nominally}; {'' if device.known else 'the device declares no range, '}{untested}")
+        text += f", not {expected.sum()}"
+        text += f"; {sensor_list(missed.tolist())} cannot raise it" * bool(len(missed))
+        if expected.mean() < self.least:
+            raise InputError(
+                f"{text}, even with nominal settings: train another run, or a longer one; {_OVERRIDE}"
+            )
+        few = raised[valid].sum() < self.found * expected[valid].sum()
+        if len(missed) or few or conversion.broken.mean() > self.masked:
+            raise InputError(f"{text}: {self._suspect(conversion)} is most likely wrong; {_OVERRIDE}")
         self._check_threshold(unit)
 
     def _check_threshold(self, unit: UnitConversion) -> None:
         """Raise InputError if a threshold above the nominal one hides weak touches, which it alone could."""
-        above = [settings.patience.above or 0.5 for settings in (self.used, self.nominal)]
+        above = [engine.patience.above or 0.5 for engine in (self.used, self.nominal)]
         if above[0] <= above[1]:
             return
-        used, nominal = (
-            self.find(
-                replace(self._plausible, patience=replace(self.nominal.patience, above=value)),
-                unit,
-                RawRange(),
-                _WEAK,
-            ).sum()
-            for value in above
-        )
-        if used < _SHARE * nominal:
+        patience = (replace(self.nominal.patience, above=value) for value in above)
+        engines = (replace(self._nominal, patience=each) for each in patience)
+        used, nominal = (self.find(engine, unit, RawRange(), self.weak).sum() for engine in engines)
+        if used < self.found * nominal:
             raise InputError(
-                f"self-test: {used} of {len(self._sensors)} presses at {_WEAK:g} times the limit raise the "
-                f"alarm, {nominal} with nominal settings: live.patience.above={above[0]:g} is most likely "
-                f"wrong; {_OVERRIDE}"
+                f"self-test: {used} of {len(self._sensors)} presses at {self.weak:g} times the limit raise "
+                f"the alarm, {nominal} with nominal settings: live.patience.above={above[0]:g} is most "
+                f"likely wrong; {_OVERRIDE}"
             )
 
     @property
     def _sensors(self) -> np.ndarray:
         """The sensor of each press, (P,)."""
-        slow = np.unique(np.linspace(0, len(self.presses) - 1, _SLOWLY).round().astype(int))
+        slow = np.unique(np.linspace(0, len(self.presses) - 1, self.slowly).round().astype(int))
         return np.concatenate([np.arange(len(self.presses)), slow])
 
     @property
-    def _plausible(self) -> EngineSettings:
-        """Nominal settings, with a contact threshold that a damaged model file cannot raise."""
+    def _nominal(self) -> Engine:
+        """An engine with nominal settings and a plausible contact threshold."""
         detection = self.nominal.detection
-        threshold = min(detection.threshold, _PLAUSIBLE)
+        threshold = min(detection.threshold, self.plausible)
         return replace(self.nominal, detection=replace(detection, threshold=threshold))
 
     def find(
         self,
-        settings: EngineSettings,
+        engine: Engine,
         conversion: UnitConversion,
         device: RawRange,
         strength: float = STRENGTH,
     ) -> np.ndarray:
         """Return which presses raise the alarm, (P,), bool: a fast one on each sensor, and some slow ones."""
-        engine, raised = settings.build(), list[bool]()
-        # Without noise: the frozen frames of a test are no fault of the device.
-        conversion = replace(conversion, changing=None)
+        engine, raised = engine.build(), list[bool]()
         for number, sensor in enumerate(self._sensors):
-            engine.reset()
-            rise = _FAST if number < len(self.presses) else _SLOW
-            frames = list(_frames(number, rise, strength * self.presses[sensor], conversion, device))
-            settling = round(_REST * _RATE)
-            engine.push(frames[:settling], None)  # nothing to decide yet
-            pieces = (frames[first : first + _PIECE] for first in range(settling, len(frames), _PIECE))
-            # The frames behind the alarm are left out.
-            raised.append(
-                any(verdict.dangerous for piece in pieces for verdict in engine.push(piece, conversion))
-            )
+            engine.reset(noise=conversion.noise)
+            press = strength * self.presses[sensor]
+            rest, stream = _press(number, number >= len(self.presses), press, conversion, device)
+            engine.remember(stream[:rest])  # nothing to decide yet
+            # Judged six at once; those behind the alarm are left out.
+            pieces = (stream[first : first + 6] for first in range(rest, len(stream), 6))
+            raised.append(any(verdict.dangerous for piece in pieces for verdict in engine.push(piece)))
         return np.array(raised)
 
-    def _refusal(
-        self,
-        raised: np.ndarray,
-        expected: np.ndarray,
-        missed: np.ndarray,
-        conversion: UnitConversion,
-        device: RawRange,
-    ) -> str:
-        """Return why the settings in use are refused, with those that are not nominal, or the device."""
-        found = f"{raised.sum()} of {len(raised)}"
-        text = f"self-test: {found} dangerous presses raise the alarm, not {expected.sum()}"
-        if len(missed):
-            text += f"; {sensor_list(missed.tolist())} cannot raise it"
-        if expected.mean() < _LEAST:
-            return f"{text}, even with nominal settings: train another run, or a longer one; {_OVERRIDE}"
-        if conversion.broken.mean() > _MASKED:
-            suspect = (
+    def _suspect(self, conversion: UnitConversion) -> str:
+        """Return what hides presses: the mask, or settings in use that are not nominal, or the device's."""
+        if conversion.broken.mean() > self.masked:
+            return (
                 f"{conversion.broken.sum()} of {len(self.presses)} sensors have no valid reading (at most a "
                 "quarter may): they are dead, or the mask of broken sensors (device.calibration, or a tare "
                 "at the limit)"
             )
-        else:
-            repaired = self.find(self._plausible, conversion, device)
-            hidden = np.isin(self._sensors, missed) & expected & ~repaired
-            enough = not hidden.any() and repaired.sum() >= _SHARE * expected.sum()
-            suspect = self._differing if enough else ""
-        suspect = suspect or "device.limits, device.scale or device.calibration"
-        return f"{text}: {suspect} is most likely wrong; {_OVERRIDE}"
-
-    @property
-    def _differing(self) -> str:
-        """The settings in use that are not nominal, in words."""
-        used, nominal = self.used, self._plausible
-        threshold = used.detection.threshold != nominal.detection.threshold
+        used, nominal = self.used, self._nominal
         differing = {
-            "the contact threshold of the model or live.touch": threshold,
+            "the contact threshold of the model or live.touch": used.detection.threshold
+            != nominal.detection.threshold,
             "live.drift": used.detection.drift != nominal.detection.drift,
             "live.patience": used.patience != nominal.patience,
         }
-        return " or ".join(name for name, differs in differing.items() if differs)
+        named = " or ".join(name for name, differs in differing.items() if differs)
+        return named or "device.limits, device.scale or device.calibration"
 
 
-def _frames(
-    number: int, rise: float, press: np.ndarray, conversion: UnitConversion, device: RawRange
-) -> Iterator[Frame]:
-    """Yield the frames of a press (S,), N, as the device would send them."""
-    corners = np.cumsum([_REST, rise, _HOLD, _FALL])
-    time = np.arange(0.0, corners[-1], 1 / _RATE)
+def _press(
+    number: int,
+    slow: bool,
+    press: np.ndarray,
+    conversion: UnitConversion,
+    device: RawRange,
+    rate: float = 20.0,
+    spans: tuple[float, ...] = (0.4, 0.2, 0.4, 0.2),
+    slowly: float = 4.0,
+    apart: float = 1000.0,
+) -> tuple[int, list[NewtonFrame]]:
+    """Return the readings of a press, as they come from the device.
+
+    Args:
+        number: of the press.
+        slow: whether its force rises slowly, which shows a baseline that follows touches.
+        press: (S,), N.
+        conversion: of the device's values to N.
+        device: values that it can send.
+        rate: of the frames, Hz: a decision at each.
+        spans: s of rest, rise, hold and fall.
+        slowly: s of a slow rise.
+        apart: s between two presses: each begins with an untouched skin.
+
+    Returns:
+        Number of readings at rest before the press, and all readings.
+    """
+    rest, rise, hold, fall = spans
+    corners = np.cumsum([rest, slowly if slow else rise, hold, fall])
+    time = np.arange(0.0, corners[-1], 1 / rate)
     load = np.interp(time, corners, [0, 1, 1, 0])
     with np.errstate(all="ignore"):  # any scale is tried
         values = np.nan_to_num(conversion.raw(load[:, None] * press))
@@ -205,10 +201,11 @@ def _frames(
     low, high = (
         np.inf * sign if limit is None else limit for sign, limit in zip((-1, 1), device.limits, strict=True)
     )
-    polarity = np.sign(conversion.scale)
-    for t, row in zip((time + _APART * number).tolist(), values, strict=True):
-        saturated = (row <= low) | (row >= high)
-        yield Frame(None, t, t, row, np.isfinite(row), number, 0, "", saturated, polarity)
+    frames = (
+        Frame(None, t, t, row, np.isfinite(row), number, 0, "", (row <= low) | (row >= high))
+        for t, row in zip((time + apart * number).tolist(), values, strict=True)
+    )
+    return round(rest * rate), [conversion.convert(frame) for frame in frames]
 
 
 # The settings of ``skin live``.
@@ -251,31 +248,21 @@ class LiveSettings:
         return configured(cls, {**live, "patience": patience}, "live")
 
 
-USUAL_RATE = 100.0
-"""Hz: of a device whose rate is not known yet, for the choice of a threshold."""
-
-_PATIENCE = 3.0  # s
-_ENOUGH = 20  # frames that show the rate
-_SHOWN = 0.2  # s from which the rate of arrivals shows
-_BURSTS = 5.0  # times the rate that frames in bursts may seem to arrive with; a unit is wrong by 1000
-_ALL = 10**6  # frames, more than any queue holds
-
-
 @dataclass(frozen=True)
-class Watched:
-    """The settings of an engine and what it is fed with.
+class LiveSession:
+    """An engine and what it is fed with.
 
     Attributes:
         model: that predicts.
         source: open.
-        settings: of the engine, in use.
-        nominal: those that the model brings.
+        engine: with the settings in use.
+        nominal: with those that the model brings.
     """
 
     model: Model
     source: Source
-    settings: EngineSettings
-    nominal: EngineSettings
+    engine: Engine
+    nominal: Engine
 
     def check(
         self,
@@ -299,29 +286,28 @@ class Watched:
         Raises:
             InputError: the settings in use hide dangerous touches.
         """
-        sensors = len(self.model.positions)
         found = verify_source(self.source, conversion, self.model.positions, self.model.size)
         if found.text:
             say(found.text)
         if found.state == "unverified":
             add_note(Note("unverified", detail=found.text))
-        rest = found.check.rest if found.check else self.source.calibrated_rest
-        raised = None
-        if rest is not None and conversion.rest is not None:
-            raised = conversion.rest - conversion.newtons(np.asarray(rest))
+        stored, raised = found.check.rest if found.check else self.source.calibrated_rest, None
+        if stored is not None and conversion.rest is not None:
+            raised = conversion.rest - conversion.newtons(np.asarray(stored))
+        dead, presses = len(self.model.positions), self.nominal.presses
         if not test:
             say("no self-test: live.selftest=false")
-        elif self.nominal.presses is None or not self.model.alarms:
+        elif presses is None or not self.model.alarms:
             say("no self-test: this run brings no alarm or no simulated skin")
         else:
-            selftest = SelfTest(self.nominal.presses, self.settings, self.nominal)
+            selftest = SelfTest(presses, self.engine, self.nominal)
             selftest.run(conversion, self.source.raw_range, say)
-            sensors = int(_MASKED * sensors)
-        if self.nominal.presses is not None and conversion.noise is not None:
-            felt = self.nominal.presses >= least_visible(conversion.noise, self.settings.detection.threshold)
-            if alone := np.flatnonzero(felt.sum(axis=1) < 2).tolist():
+            dead = int(selftest.masked * dead)
+        if presses is not None and conversion.noise is not None:
+            visible = presses >= least_visible(conversion.noise, self.engine.detection.threshold)
+            if alone := np.flatnonzero(visible.sum(axis=1) < 2).tolist():
                 say(f"no neighbour would show that the wire of {sensor_list(alone)} breaks to its rest value")
-        return sensors, raised
+        return dead, raised
 
 
 @dataclass(frozen=True)
@@ -342,14 +328,34 @@ class LiveSetup:
     begin: Callable[[], Source]
     mechanics: Callable[[], Mechanics]
 
-    def watch(self, live: LiveSettings, say: Callable[[str], None]) -> Watched:
-        """Choose the threshold, which may take seconds, and return what is fed to the engine.
+    def watch(self, live: LiveSettings, say: Callable[[str], None]) -> LiveSession:
+        """Choose the threshold, which may take seconds, and return the engine with its source.
+
+        Args:
+            live: settings of the live view.
+            say: called with each message for the user.
 
         Raises:
             InputError: no contact threshold is known, or no threshold raises an alarm as seldom as wanted.
         """
-        settings = used_and_nominal(self.model, self.port, live, say)
-        return Watched(self.model, self.port or self.begin(), *settings)
+        model, given, usual, conditions = self.model, live.patience.above, None, None
+        if given is None and model.alarms:
+            rate = model.rate if self.port is None else measured_rate(self.port.skin)
+            conditions = model.live_conditions(rate, live.patience.alarm, self.port is None)
+        if given is not None or model.alarms:
+            point = choose_alarm_threshold(model.alarm, conditions, given, say=say)
+            # A threshold of the command line is tested against the usual one.
+            usual = model.threshold if point is None or given is not None else point.announced(say)
+        if conditions is not None and self.port is not None:
+            # Frames that waited meanwhile would delay the verdicts about those of now.
+            with suppress(SkinTimeout, SkinDisconnected):
+                self.port.skin.read(10**6, 0.0)  # more than any queue holds
+        nominal = engine_settings(model, DebounceSettings(above=usual))
+        patience = replace(live.patience, above=usual if given is None else given)
+        engine = engine_settings(model, patience, live.touch, live.drift)
+        source = self.port or self.begin()
+        source.tare.glitches.shares = engine.shares
+        return LiveSession(model, source, engine, nominal)
 
 
 def watch_exported(
@@ -372,7 +378,7 @@ def watch_exported(
             "run itself for a recording or the simulator"
         )
     model = OnnxModel(path)
-    source = SerialSource(PortSettings.select(device), len(model.positions), model.rate).open_source()
+    source = SerialSource(Port.select(device), len(model.positions), model.rate).open_source()
     opened.enter_context(source.skin)
     say(f"loaded {model.title} from {path}, exported by version {model.metadata.version}")
     return LiveSetup(model, source.name, source, lambda: source, _refuse_contacts)
@@ -414,8 +420,8 @@ def watch_run(
 
     torch.set_num_threads(config.tracking.threads or 1)
     run = find_run(config.tracking, name, config.trust)
-    watched = run.configured(overrides)
-    device = build_device(watched)
+    configured = run.configured(overrides)
+    device = build_device(configured)
     # A port is opened first: that it is missing must not take as long to say as a run takes to load.
     port = open_source(device) if device.real else None
     if port is not None:
@@ -427,7 +433,7 @@ def watch_run(
         say(advice)
     # Without a simulator nothing could tune a contact threshold.
     touch = None if "simulator" in run.stored.device else live.touch
-    model = load_model(run, trained, watched, touch=touch, alarm=False)
+    model = load_model(run, trained, configured, touch=touch, alarm=False)
     mechanics = partial(Mechanics.of, model.device.reference, bool(config.device.get("calibration")))
 
     def begin() -> Source:
@@ -443,8 +449,8 @@ def engine_settings(
     patience: DebounceSettings,
     touch: float | None = None,
     drift: float = 600 * DRIFT,
-) -> EngineSettings:
-    """Return the settings of the engine of a model.
+) -> Engine:
+    """Return an engine for a model.
 
     Args:
         model: that predicts.
@@ -462,7 +468,7 @@ def engine_settings(
             "give a run of those"
         )
     contact = model.contact if touch is None else touch
-    return EngineSettings(
+    return Engine(
         model.probabilities,
         model.task,
         len(model.positions),
@@ -474,52 +480,36 @@ def engine_settings(
     )
 
 
-def used_and_nominal(
-    model: Model, port: Source | None, live: LiveSettings, say: Callable[[str], None]
-) -> tuple[EngineSettings, EngineSettings]:
-    """Return the settings of an engine: those of a live view, and those that the model brings.
-
-    Args:
-        model: that predicts.
-        port: open source of a skin at a port, whose frames are discarded that wait while a threshold is
-            chosen; None: the skin is simulated or recorded.
-        live: settings of the live view.
-        say: called with each message for the user.
-
-    Raises:
-        InputError: no contact threshold is known, or no threshold raises an alarm as seldom as wanted.
-    """
-    given, usual, conditions = live.patience.above, None, None
-    if given is None and model.alarms:
-        rate = model.rate if port is None else measured_rate(port.skin)
-        conditions = model.live_conditions(rate, live.patience.alarm, port is None)
-    if given is not None or model.alarms:
-        point = choose_alarm_threshold(model.alarm, conditions, given, say=say)
-        # A threshold of the command line is tested against the usual one.
-        usual = model.threshold if point is None or given is not None else point.announced(say)
-    if conditions is not None and port is not None:
-        # Frames that waited meanwhile would delay the verdicts about those of now.
-        with suppress(SkinTimeout, SkinDisconnected):
-            port.skin.read(_ALL, 0.0)
-    nominal = engine_settings(model, DebounceSettings(above=usual))
-    used = engine_settings(model, nominal.patience, live.touch, live.drift)
-    above = usual if given is None else given
-    return replace(used, patience=replace(live.patience, above=above)), nominal
-
-
-def measured_rate(skin: Skin) -> float:
+def measured_rate(
+    skin: Skin,
+    patience: float = 3.0,
+    enough: int = 20,
+    shown: float = 0.2,
+    bursts: float = 5.0,
+    usual: float = 100.0,
+    clock: Callable[[], float] = monotonic,
+) -> float:
     """Return the rate of a device, Hz: measured, else that of its header, else the usual one.
 
-    Waits some seconds for its first frames, which are discarded, and until they arrive at the rate of the
-    device's clock: its unit may have to be inferred.
+    Waits for its first frames, which are discarded, and until they arrive at the rate of the device's clock:
+    its unit may have to be inferred.
+
+    Args:
+        skin: open.
+        patience: s to wait.
+        enough: frames that show the rate.
+        shown: s from which the rate of arrivals shows.
+        bursts: times the rate that frames in bursts may seem to arrive with; a unit is wrong by 1000.
+        usual: Hz, of a device whose rate is not known.
+        clock: gives the host's monotonic time, s.
     """
-    begin, before = monotonic(), skin.stats.frames
-    while (passed := monotonic() - begin) < _PATIENCE:
+    begin, before = clock(), skin.stats.frames
+    while (passed := clock() - begin) < patience:
         with suppress(SkinTimeout):
-            skin.read(1, _PATIENCE / 10)
+            skin.read(1, patience / 10)
         stats = skin.stats
-        arrived = (stats.frames - before) / max(passed, _SHOWN)
-        if stats.frames >= _ENOUGH and arrived / _BURSTS < stats.rate_hz < arrived * _BURSTS:
+        arrived = (stats.frames - before) / max(passed, shown)
+        if stats.frames >= enough and arrived / bursts < stats.rate_hz < arrived * bursts:
             break
     declared = skin.header.rate if skin.header is not None else None
-    return skin.stats.rate_hz or declared or USUAL_RATE
+    return skin.stats.rate_hz or declared or usual

@@ -4,41 +4,48 @@ import logging
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from math import inf
-from threading import Event, Lock, RLock, Thread
+from threading import Event, RLock, Thread
 from time import monotonic
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
 from skin.device.resampling import Frame
 from skin.errors import InputError
 from skin.live.contacts import LiveContacts, unknown_contacts
-from skin.live.engine import Engine, Frozen
+from skin.live.engine import Engine
 from skin.live.verdict import Note, Verdict, order_notes, sensor_list, summarize_notes
-from skin.wire.channels import Tare, UnitConversion
+from skin.wire.channels import NewtonFrame, UnitConversion
 from skin.wire.reader import SkinDisconnected, SkinTimeout
 from skin.wire.skin import Skin
+from skin.wire.tare import Frozen, Tare
 
 _log = logging.getLogger(__name__)
 
-Told = tuple[Verdict | None, str, bool]
-"""What is said of the skin: the present verdict, else None; why there is none; and the alarm."""
 
-Observer = Callable[[Verdict | None, str, bool], None]
-"""Takes what is said of the skin; it must return at once."""
+class Assessment(NamedTuple):
+    """What is known of the skin at a moment.
+
+    Attributes:
+        verdict: the present one; None if there is none.
+        reason: why there is none, in words.
+        alarm: including one that continues without a verdict.
+    """
+
+    verdict: Verdict | None
+    reason: str
+    alarm: bool
+
+
+Observer = Callable[[Assessment, float], None]
+"""Takes an assessment and its time, s; it must return at once."""
 
 TareRequest = Literal["", "tare", "forced"]
 """A request for a new baseline: none, from the next quiet stretch, or from the next frames."""
 
-_KEPT = 8192  # frames that are kept for slow views
 _ONSET = 10  # frames of a touch before its contact is decided
-_AGE = 0.5  # s after which a decision is old where the next is not overdue
-_TOGETHER = 0.02  # s: decisions of one delivery
-_USUAL = 5.0  # s over which the usual interval between decisions is taken
-_OFTEN = 0.1  # s between two looks at the age of a verdict
-_CONFIRM = 60.0  # s after a refusal in which a tare may be forced
 Refusal = Literal["", "touched", "unforced"]
 REFUSALS: dict[Refusal, str] = {
     "": "",
@@ -91,8 +98,8 @@ class DisplayState:
         valid: (S,), bool, of the latest frame.
         saturated: (S,), bool, since the last call: the force is at least the value.
         verdict: the latest one; None if there is none now.
-        alarm: the latest verdict was dangerous, and the contact has not ended as far as known.
         line: text with rate, lost frames and latency.
+        alarm: the latest verdict was dangerous, and the contact has not ended as far as known.
         peak: (S,), N, the largest of each sensor in the touch that the verdict is about; 0 without touch.
         notes: on what may be wrong, the gravest first.
         contacts: what is known of them, as in :func:`skin.live.contacts.contact_message`.
@@ -122,116 +129,121 @@ class DisplayState:
 
     @property
     def map(self) -> np.ndarray:
-        """Forces (S,), N, at the time of the verdict."""
+        """Readings (S,), N, at the time of the verdict."""
         return self.peak if self.held else self.values
 
 
+@dataclass(eq=False)
 class Display:
-    """The latest frames, verdict and status, shared by one writing thread and any number of views.
+    """The latest readings, verdict and status, shared by one writing thread and any number of views.
 
-    A verdict that is older than half a second and the usual interval between decisions, or than
-    :data:`STALE`, counts as none, whatever the reason. An alarm is shown for ``calm`` s at least, even if it
-    was raised for frames that came late.
+    A verdict that is older than ``age`` and the usual interval between decisions, or than :data:`STALE`,
+    counts as none, whatever the reason. An alarm is shown for ``calm`` s at least, even if it was raised for
+    frames that came late.
 
     Args:
         info: constant information.
         contacts: tells what is known of them.
         calm: s.
+        age: s after which a decision is old where the next is not overdue.
+        together: s, decisions of one delivery.
+        usual: s over which the usual interval between decisions is taken.
+        confirm: s after a refusal in which a tare may be forced.
+        kept: frames that are kept for slow views.
 
     Attributes:
-        info: as given.
         notes: on the whole session.
-        contacts: the latest estimate of them.
         closed: event, set at the end.
-        observers: called with each verdict, in the thread that classifies.
-        listeners: called with the name of each event of the operator, such as ``tare``.
+        observers: called with each assessment, in the thread that classifies.
+        listeners: called with the name of each event of the operator, such as ``tare``, and its time, s.
     """
 
-    def __init__(self, info: DisplayInfo, contacts: LiveContacts | None = None, calm: float = 2.0) -> None:
-        self.info, self.closed, self.contacts = info, Event(), contacts or LiveContacts()
+    info: DisplayInfo
+    contacts: LiveContacts = field(default_factory=LiveContacts)
+    calm: float = 2.0
+    age: float = 0.5
+    together: float = 0.02
+    usual: float = 5.0
+    confirm: float = 60.0
+    kept: int = 8192
+
+    def __post_init__(self) -> None:
+        self.closed = Event()
         self.notes: tuple[Note, ...] = ()
         self.observers: list[Observer] = []
-        self.listeners: list[Callable[[str], None]] = []
-        self._lock, self._telling = RLock(), Lock()
-        sensors = len(info.positions)
+        self.listeners: list[Callable[[str, float], None]] = []
+        self._lock = RLock()
+        sensors = len(self.info.positions)
         first = np.zeros(sensors), np.zeros(sensors, dtype=bool)
-        self._frames: deque[tuple[np.ndarray, np.ndarray]] = deque([first], maxlen=_KEPT)
-        self._valid, self._alarm = np.ones(sensors, dtype=bool), False
-        self._peak, self._contact = np.zeros(sensors), False
-        self._number = 0
-        self._verdict: Verdict | None = None
-        self._calm, self._alarm_at, self._decided = calm, -inf, deque([-inf])
-        self._told: Told | None = None
-        self._trouble, self._line = "waiting for the first frame", ""
+        self._frames: deque[tuple[np.ndarray, np.ndarray]] = deque([first], maxlen=self.kept)
+        self._valid, self._peak, self._contact = np.ones(sensors, dtype=bool), np.zeros(sensors), False
+        self._number, self._line = 0, ""
+        self._latest = Assessment(None, "waiting for the first frame", False)
+        self._alarm_at, self._decided = -inf, deque([-inf])
+        self._published: Assessment | None = None
         self._request: TareRequest = ""
         self._refusal: Refusal = ""
         self._refused_at = -inf
 
-    def add_frame(self, frame: Frame, conversion: UnitConversion) -> None:
-        """Add a frame as sent, with the conversion of its values to N."""
-        values, valid = conversion(frame.values, frame.valid)
-        saturated = np.zeros_like(valid) if frame.saturated is None else frame.saturated & valid
+    def add(self, readings: NewtonFrame) -> None:
+        """Add a frame in newtons."""
+        values, valid = readings.newtons, readings.usable
         with self._lock:
             self._number += 1
-            self._frames.append((values, saturated))
+            self._frames.append((values, readings.saturated))
             self._valid = valid
-            self._peak = np.maximum(self._peak, np.where(valid, values, 0.0))
+            self._peak = np.maximum(self._peak, values)
 
-    def set_verdict(
-        self, verdict: Verdict | None, trouble: str = "", alarm: bool = False, now: float | None = None
-    ) -> None:
+    def set_verdict(self, verdict: Verdict | None, now: float, reason: str = "", alarm: bool = False) -> None:
         """Set the verdict; or None with the reason and whether an alarm continues.
 
         Args:
             verdict: made at ``now``.
-            trouble: why there is none.
+            now: s, the host's monotonic clock.
+            reason: why there is none.
             alarm: whether one continues without a verdict.
-            now: s, the host's monotonic clock; None: that of the call.
         """
-        now = monotonic() if now is None else now
         with self._lock:
-            self._verdict, self._trouble = verdict, trouble
             if verdict is not None:
-                if now - self._decided[-1] < _TOGETHER:
+                alarm = verdict.dangerous
+                if now - self._decided[-1] < self.together:
                     self._decided.pop()
                 self._decided.append(now)
-                while now - self._decided[0] > _USUAL:
+                while now - self._decided[0] > self.usual:
                     self._decided.popleft()
-            alarm = alarm if verdict is None else verdict.dangerous
-            self._alarm_at = now if alarm and not self._alarm else self._alarm_at
-            self._alarm = alarm
+            self._alarm_at = now if alarm and not self._latest.alarm else self._alarm_at
+            self._latest = Assessment(verdict, reason, alarm)
             contact = verdict is not None and verdict.contact is not None
             touched = contact or (verdict is not None and verdict.touched)
-            if not self._alarm and (not touched or (contact and not self._contact)):
+            if not alarm and (not touched or (contact and not self._contact)):
                 # A new touch; its first frames came before the decision.
                 recent = [values for values, _ in list(self._frames)[-_ONSET:]]
                 self._peak = np.max(recent, axis=0) if contact else np.zeros_like(self._peak)
             self._contact = contact
-        self._tell(now)
+            self._publish(now)
 
     def refresh(self, now: float) -> None:
-        """Tell the observers if the latest verdict has become too old, or a late alarm ends."""
-        if self.told(now) != self._told:
-            self._tell(now)
-
-    def _tell(self, now: float) -> None:
-        with self._telling:
-            self._told = self.told(now)
-            for observer in self.observers:
-                observer(*self._told)
-
-    def told(self, now: float | None = None) -> Told:
-        """Return what is said of the skin at ``now``, s, on the host's monotonic clock; None: of the call."""
-        now = monotonic() if now is None else now
+        """Inform the observers if the latest verdict has become too old, or a late alarm ends."""
         with self._lock:
-            alarm = self._alarm or now - self._alarm_at < self._calm
+            if self.assess(now) != self._published:
+                self._publish(now)
+
+    def _publish(self, now: float) -> None:
+        self._published = self.assess(now)
+        for observer in self.observers:
+            observer(self._published, now)
+
+    def assess(self, now: float) -> Assessment:
+        """Return what is known of the skin at ``now``, s, on the host's monotonic clock."""
+        with self._lock:
+            verdict, reason, alarm = self._latest
+            alarm = alarm or now - self._alarm_at < self.calm
             # A single pause is not usual.
             gaps = sorted(np.diff(self._decided))
             usual = gaps[-2] if len(gaps) > 2 else 0.0
-            if self._verdict is None or now - self._decided[-1] > min(_AGE + usual, STALE):
-                return None, self._trouble or LATE, alarm
-            late = alarm and not self._verdict.dangerous
-            return self._verdict.in_alarm if late else self._verdict, "", alarm
+            if verdict is None or now - self._decided[-1] > min(self.age + usual, STALE):
+                return Assessment(None, reason or LATE, alarm)
+            return Assessment(verdict.in_alarm if alarm and not verdict.dangerous else verdict, "", alarm)
 
     def add_note(self, note: Note) -> None:
         """Add a note on the whole session."""
@@ -243,24 +255,23 @@ class Display:
         with self._lock:
             self._line = line
 
-    def request_tare(self, force: bool = False) -> str:
-        """Request a new baseline; return why it is refused, or an empty text.
+    def request_tare(self, now: float, force: bool = False) -> str:
+        """Request a new baseline at ``now``, s; return why it is refused, or an empty text.
 
         It is refused while something touches the skin. Within a minute after that it can be forced once, by
         a second and explicit confirmation of the operator; :meth:`state` says so as long.
         """
         with self._lock:
-            touched = self._alarm or (self._verdict is not None and self._verdict.contact is not None)
-            forced = force and self._refusal == "touched" and monotonic() - self._refused_at <= _CONFIRM
-            refused = not forced and (touched or force)
-            self._refusal = "" if not refused else "touched" if touched else "unforced"
-            if refused:
-                event, self._refused_at = "tare_refused", monotonic()
+            forced = force and self._refusal == "touched" and now - self._refused_at <= self.confirm
+            touched = self._latest.alarm or self._contact
+            self._refusal = "" if forced else "touched" if touched else "unforced" if force else ""
+            if self._refusal:
+                event, self._refused_at = "tare_refused", now
             else:
                 event, self._request = ("tare_forced", "forced") if forced else ("tare", "tare")
         _log.warning("%s", REFUSALS[self._refusal] or _TARES[event])
         for listener in self.listeners:
-            listener(event)
+            listener(event, now)
         return REFUSALS[self._refusal]
 
     def take_tare(self) -> TareRequest:
@@ -269,46 +280,44 @@ class Display:
             request, self._request = self._request, ""
         return request
 
-    def state(self, since: int | None = None, now: float | None = None) -> DisplayState:
-        """Return the state at ``now``, s.
+    def state(self, now: float, since: int | None = None) -> DisplayState:
+        """Return the state.
 
         Args:
+            now: s, the host's monotonic clock.
             since: the values are the largest after so many frames; None: those of the latest frame.
-            now: s, the host's monotonic clock; None: that of the call.
         """
-        now = monotonic() if now is None else now
         with self._lock:
-            verdict, trouble, alarm = self.told(now)
+            assessment = self.assess(now)
             fresh = 1 if since is None else min(max(1, self._number - since), len(self._frames))
             latest = [self._frames[-1 - back] for back in range(fresh)]
-            refusal = REFUSALS[self._refusal] if now - self._refused_at <= _CONFIRM else ""
+            refusal = REFUSALS[self._refusal] if now - self._refused_at <= self.confirm else ""
             line = ", ".join(filter(None, (refusal, self._line)))
             peak, number, valid = self._peak, self._number, self._valid
         values, saturated = (np.max(part, axis=0) for part in zip(*latest, strict=True))
         readings = np.where(valid, values, 0.0), valid, saturated & valid
-        return DisplayState(number, *readings, verdict, line, alarm, peak, *self.describe(verdict, trouble))
+        notes = self.describe(assessment, now)
+        return DisplayState(number, *readings, assessment.verdict, line, assessment.alarm, peak, *notes)
 
-    def describe(self, verdict: Verdict | None, trouble: str) -> tuple[tuple[Note, ...], dict[str, Any]]:
-        """Return what belongs to a verdict, or to its absence: the notes, the gravest first, and contacts."""
-        if verdict is None:
-            return order_notes((Note("stale", detail=trouble), *self.notes)), unknown_contacts(trouble)
-        return order_notes((*verdict.notes, *self.notes)), self.contacts.state()
-
-
-_PATIENCE = 0.3  # s for which one read waits
-_PROVED = 10.0  # s after the self-test in which sensors may prove dead
-_AT_ONCE = 1024  # frames
-_STATUS = 0.5  # s between two updates of the status
-_ENOUGH = 10  # frames for each one of the model: with n, a tap of one frame reads 1/n too low at worst
-_DELAYS = 2000  # verdicts for the percentile of the delay
+    def describe(self, assessment: Assessment, now: float) -> tuple[tuple[Note, ...], dict[str, Any]]:
+        """Return what belongs to an assessment: the notes, the gravest first, and contacts."""
+        if assessment.verdict is None:
+            notes = (Note("stale", detail=assessment.reason), *self.notes)
+            return order_notes(notes), unknown_contacts(assessment.reason)
+        return order_notes((*assessment.verdict.notes, *self.notes)), self.contacts.state(now)
 
 
 @contextmanager
-def watch_age(display: Display) -> Iterator[None]:
-    """Tell the observers of a display while the block runs when its verdict becomes too old."""
+def watch_age(display: Display, interval: float = 0.1) -> Iterator[None]:
+    """Inform the observers of a display while the block runs when its verdict becomes too old.
+
+    Args:
+        display: to be watched.
+        interval: s between two looks.
+    """
 
     def watch() -> None:
-        while not display.closed.wait(_OFTEN):
+        while not display.closed.wait(interval):
             display.refresh(monotonic())
 
     thread = Thread(target=watch, name="skin-age", daemon=True)
@@ -320,6 +329,11 @@ def watch_age(display: Display) -> Iterator[None]:
         thread.join()
 
 
+Verify = Callable[[UnitConversion], tuple[int, np.ndarray | None]]
+"""Tests a conversion before the first decision. Returns the largest number of sensors that may prove dead
+soon after, and the baseline above the stored rest of the device, (S,), N, or None; or raises InputError."""
+
+
 class LiveLoop:
     """Classifies the frames of a skin until the recording ends, the time is over, a view closes, or Ctrl-C.
 
@@ -328,12 +342,16 @@ class LiveLoop:
 
     Args:
         skin: open.
-        tare: gives the conversion of values to N.
+        tare: converts frames to N.
         engine: gives verdicts.
         display: shows them.
-        before: called once with the conversion, before the first decision; returns the largest number of
-            sensors that may prove dead soon after, and the baseline above the stored rest of the device,
-            (S,), N, or None. It may raise InputError.
+        verify: called once, before the first decision; None: nothing is tested.
+        clock: gives the host's monotonic time, s.
+        wait: s that one read waits for a frame.
+        at_once: frames that are taken together.
+        status: s between two updates of the status.
+        proved: s after the test in which sensors may prove dead.
+        enough: frames for each one of the model: with n, a tap of one frame reads 1/n too low at worst.
 
     Attributes:
         verdicts: number of verdicts so far.
@@ -345,13 +363,20 @@ class LiveLoop:
         tare: Tare,
         engine: Engine,
         display: Display,
-        before: Callable[[UnitConversion], tuple[int, np.ndarray | None]] | None = None,
+        verify: Verify | None = None,
+        clock: Callable[[], float] = monotonic,
+        wait: float = 0.3,
+        at_once: int = 1024,
+        status: float = 0.5,
+        proved: float = 10.0,
+        enough: float = 10.0,
     ) -> None:
         self._skin, self._tare, self._engine, self._display = skin, tare, engine, display
-        self._before, self._heard_at = before, monotonic()
-        self._most_dead, self._tested_at = inf, 0.0
-        self._delays: deque[float] = deque(maxlen=_DELAYS)
-        self._updated_at = -np.inf
+        self._verify, self._clock, self._read_wait, self._at_once = verify, clock, wait, at_once
+        self._status, self._proved, self._enough = status, proved, enough
+        self._received_at, self._most_dead, self._tested_at = clock(), inf, inf
+        self._delays: deque[float] = deque(maxlen=2000)  # verdicts for the percentile of the delay
+        self._updated_at = -inf
         self.verdicts = 0
 
     def run(self, seconds: float | None = None) -> None:
@@ -364,21 +389,21 @@ class LiveLoop:
             InputError: nothing can be read, the stream is too slow, its scale is unknown, or the self-test
                 failed.
         """
-        until = np.inf if seconds is None else monotonic() + seconds
-        while monotonic() < until and not self._display.closed.is_set():
+        until = inf if seconds is None else self._clock() + seconds
+        while self._clock() < until and not self._display.closed.is_set():
             try:
-                frames = self._skin.read(1, _PATIENCE)
+                frames = self._skin.read(1, self._read_wait)
             except SkinTimeout as silent:
                 self._wait(str(silent).split(": ", 1)[-1])
             except SkinDisconnected:
                 return
             else:
-                self.take(frames + self._waiting(), monotonic())
-            self.update_status(monotonic())
+                self.take(frames + self._waiting(), self._clock())
+            self.update_status(self._clock())
 
     def update_status(self, now: float) -> None:
         """Show the state of the stream, if it was not shown within half a second before ``now``, s."""
-        if now - self._updated_at >= _STATUS:
+        if now - self._updated_at >= self._status:
             self._updated_at = now
             self._display.set_status(self.line)
             if not self._skin.stats.clock_trusted:
@@ -386,58 +411,70 @@ class LiveLoop:
 
     def _wait(self, reason: str) -> None:
         """Show why no frames come, once they are overdue: those of a bridge come in bursts."""
-        if monotonic() - self._heard_at >= STALE or self._skin.away:
-            self._display.set_verdict(None, reason, self._engine.alarm)
+        now = self._clock()
+        if now - self._received_at >= STALE or self._skin.away:
+            self._display.set_verdict(None, now, reason, self._engine.alarm)
 
     def _waiting(self) -> list[Frame]:
         """Return the other frames that have arrived."""
         try:
-            return self._skin.read(_AT_ONCE, 0.0)
+            return self._skin.read(self._at_once, 0.0)
         except (SkinTimeout, SkinDisconnected) as few:
             return few.frames
 
     def take(self, frames: list[Frame], now: float) -> None:
         """Take frames that have arrived at ``now``, s, and show what follows from them."""
-        self._heard_at = now
+        self._received_at = now
         if request := self._display.take_tare():
             self._tare.restart(force=request == "forced")
-        taken = self._tare.count
-        for frame in frames:
-            self._tare.add(frame, self._engine.contact or self._engine.alarm)
-        conversion = self._tare.conversion
-        if conversion is None:
-            self._engine.push(frames, None)
-            self._display.set_verdict(None, self._tare.status, self._engine.alarm, now)
+        stream = self._convert(frames, now)
+        if self._tare.conversion is None:
+            self._display.set_verdict(None, now, self._tare.status, self._engine.alarm)
             return
-        if self._tare.count > taken:
-            self._engine.reset()
-        self._test(conversion, now)
-        for frame in frames:
-            self._display.add_frame(frame, conversion)
-        verdicts = self._engine.push(frames, conversion)
-        if self._engine.frozen:
-            reason = FROZEN_READINGS[self._engine.frozen]
-            self._display.set_verdict(None, reason, self._engine.alarm, now)
+        self._count_dead(now)
+        for readings in stream:
+            self._display.add(readings)
+        verdicts = self._engine.push(stream)
+        if frozen := self._tare.freshness.frozen:
+            self._display.set_verdict(None, now, FROZEN_READINGS[frozen], self._engine.alarm)
             return
         for verdict in verdicts:
             self.verdicts += 1
             if now - verdict.t_host < STALE:
-                self._display.set_verdict(verdict, now=now)
+                self._display.set_verdict(verdict, now)
             else:
-                self._display.set_verdict(None, OLD_READINGS, verdict.dangerous, now)
+                self._display.set_verdict(None, now, OLD_READINGS, verdict.dangerous)
         if verdicts:
-            self._delays.append(monotonic() - verdicts[-1].t_host)
+            self._delays.append(self._clock() - verdicts[-1].t_host)
         # After the verdict is shown: it waits for nothing.
-        self._display.contacts.look(frames, conversion, verdicts, self._engine.baseline)
+        self._display.contacts.look(stream, self._tare.conversion, verdicts, self._engine.baseline)
 
-    def _test(self, conversion: UnitConversion, now: float) -> None:
-        """Test the alarm before the first decision; refuse a skin of which much proves dead soon after."""
-        if self._before is not None:
-            (self._most_dead, raised), self._before = self._before(conversion), None
-            self._engine.reset(raised)
+    def _convert(self, frames: list[Frame], now: float) -> list[NewtonFrame]:
+        """Return frames in newtons; those before a new baseline are left out."""
+        stream = list[NewtonFrame]()
+        for frame in frames:
+            before, count = self._tare.conversion, self._tare.count
+            readings = self._tare.add(frame, self._engine.contact or self._engine.alarm)
+            if readings is not None and (before is None or self._tare.count > count):
+                self._begin(now)
+                stream.clear()
+            stream += [] if readings is None else [readings]
+        return stream
+
+    def _begin(self, now: float) -> None:
+        """Begin anew with another conversion; test it if it is the first."""
+        assert self._tare.conversion is not None
+        raised = None
+        if self._verify is not None:
+            (self._most_dead, raised), self._verify = self._verify(self._tare.conversion), None
             self._tested_at = now
+        self._engine.reset(raised, self._tare.conversion.noise)
+        self._engine.remember(self._tare.take_earlier())
+
+    def _count_dead(self, now: float) -> None:
+        """Refuse a skin of which much proves dead soon after the test."""
         dead = [number for number, state in enumerate(self._skin.channels) if state == "dead"]
-        if len(dead) > self._most_dead and now - self._tested_at < _PROVED:
+        if len(dead) > self._most_dead and now - self._tested_at < self._proved:
             raise InputError(
                 f"self-test: {sensor_list(dead)} have never changed and are dead, more than "
                 f"{self._most_dead} of {len(self._skin.channels)}: check their wires; live.selftest=false "
@@ -447,7 +484,7 @@ class LiveLoop:
     @property
     def line(self) -> str:
         """Text with rate, lost frames, broken sensors and delay."""
-        stats, enough = self._skin.stats, _ENOUGH * self._engine.window.rate
+        stats, enough = self._skin.stats, self._enough * self._engine.rate
         slow = f" (short taps read low below {enough:g} Hz)" * (0 < stats.rate_hz < 0.95 * enough)
         counts = stats.list_counts(
             bad_frames="bad", lost="lost", dropped="dropped", resets="restarts", reconnects="reconnected"

@@ -5,8 +5,8 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from datetime import datetime, timedelta
-from functools import partial
 from threading import Thread
+from time import monotonic
 
 from rich.console import Console, Group, RenderableType
 from rich.live import Live
@@ -19,9 +19,6 @@ from skin.live.loop import Display, DisplayState
 from skin.live.verdicts import write_changes
 from skin.wire.segmentation import typed_lines
 
-_HERTZ = 8
-_BAR = 20  # characters
-_SHORT, _LONG = 3.0, 60.0  # s of contact after which it is shown, and after which it may be drift
 _KEYS = "t and Enter: a new tare, nothing may touch the skin; Ctrl-C ends"
 
 
@@ -32,8 +29,8 @@ def show_in_terminal(display: Display, console: Console) -> Iterator[None]:
         # In the background the program reads no keys; it must not be stopped.
         signal.signal(signal.SIGTTIN, signal.SIG_IGN)
     Thread(target=_read_keys, args=(display,), name="skin-keys", daemon=True).start()
-    render = partial(screen, display)
-    live = Live(get_renderable=render, console=console, refresh_per_second=_HERTZ, transient=True)
+    render = lambda: screen(display, monotonic())  # noqa: E731
+    live = Live(get_renderable=render, console=console, refresh_per_second=8, transient=True)
     closing = lambda _: display.closed.set()  # noqa: E731
     with live if console.is_terminal else write_changes(display, console.file, closing, reasons=True):
         try:
@@ -47,12 +44,12 @@ def _read_keys(display: Display) -> None:
     with suppress(OSError, ValueError):  # no input, or a closed one
         for text in typed_lines(sys.stdin.fileno()):
             if (word := text.strip().lower()) in ("t", "force"):
-                display.request_tare(force=word == "force")
+                display.request_tare(monotonic(), force=word == "force")
 
 
-def screen(display: Display) -> RenderableType:
-    """Return the verdict and the contacts, with the status of the stream below."""
-    info, state = display.info, display.state()
+def screen(display: Display, now: float) -> RenderableType:
+    """Return the verdict and the contacts at ``now``, s, with the status of the stream below."""
+    info, state = display.info, display.state(now)
     contacts = Text("\n".join(contact_text_lines(state.contacts)))
     border = "bold red" if state.alarm else "dim"
     shown = Group(_verdict(state), Text(), contacts)
@@ -60,7 +57,8 @@ def screen(display: Display) -> RenderableType:
     return Group(panel, Text(state.line or " ", style="dim"), Text(_KEYS, style="dim"))
 
 
-def _verdict(state: DisplayState) -> RenderableType:
+def _verdict(state: DisplayState, width: int = 20) -> RenderableType:
+    """Return the verdict, with bars of ``width`` characters."""
     verdict, alarm = state.verdict, Text("DANGEROUS", "bold white on red")
     if verdict is None or not verdict.touched:
         shown = "unknown" if verdict is None else verdict.state
@@ -75,19 +73,20 @@ def _verdict(state: DisplayState) -> RenderableType:
     notes += ["frames are missing"] * verdict.gap
     bars = Table.grid(padding=(0, 1))
     for word, chance in verdict.words():
-        filled = round(_BAR * chance)
-        bars.add_row(word, "█" * filled + "░" * (_BAR - filled), f"{100 * chance:.0f} %")
+        filled = round(width * chance)
+        bars.add_row(word, "█" * filled + "░" * (width - filled), f"{100 * chance:.0f} %")
     return Group(head, Text(), bars, Text("\n".join(filter(None, notes)), "yellow"))
 
 
-def contact_text(contact: float | None) -> str:
+def contact_text(contact: float | None, short: float = 3.0, long: float = 60.0) -> str:
     """Return a text with the time since which something touches the skin; empty without contact.
 
     Args:
         contact: duration of the contact, s; None without contact.
+        short, long: s of contact from which it is shown, and from which it may be drift.
     """
-    if contact is None or contact < _SHORT:
+    if contact is None or contact < short:
         return ""
     began = datetime.now() - timedelta(seconds=contact)
-    hint = "; if nothing touches the skin, take a new tare" if contact >= _LONG else ""
+    hint = "; if nothing touches the skin, take a new tare" if contact >= long else ""
     return f"contact since {began:%H:%M:%S} ({contact:.0f} s){hint}"

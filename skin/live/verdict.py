@@ -8,7 +8,6 @@ from typing import Any, Literal, NamedTuple
 from skin.touch.labels import OPPOSITE
 
 State = Literal["touch", "no touch", "unknown"]
-_NAMED = 3  # sensors
 
 NOTES = {
     "stale": "{text}",
@@ -29,10 +28,10 @@ LASTING = frozenset(("over_range", "unreadable", "lost_wire"))
 """Notes with which no touch is safe, until it ends."""
 
 
-def sensor_list(sensors: Sequence[int]) -> str:
-    """Return the numbers of sensors in words."""
-    omitted = f" and {len(sensors) - _NAMED} more" if len(sensors) > _NAMED else ""
-    numbers = ", ".join(map(str, sensors[:_NAMED]))
+def sensor_list(sensors: Sequence[int], most: int = 3) -> str:
+    """Return the numbers of sensors in words, at most so many."""
+    omitted = f" and {len(sensors) - most} more" if len(sensors) > most else ""
+    numbers = ", ".join(map(str, sensors[:most]))
     return f"sensor{'s' * (len(sensors) > 1)} {numbers}{omitted}"
 
 
@@ -118,8 +117,8 @@ class Verdict:
     @property
     def danger(self) -> bool | None:
         """Whether the touch is dangerous; None where that can be neither said nor excluded."""
-        doubtful = self.unknown or any(note.code in {*LASTING, "near_threshold"} for note in self.notes)
-        return True if self.dangerous else None if doubtful else False
+        uncertain = self.unknown or any(note.code in {*LASTING, "near_threshold"} for note in self.notes)
+        return True if self.dangerous else None if uncertain else False
 
     @property
     def known(self) -> dict[str, bool | None]:

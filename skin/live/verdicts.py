@@ -13,27 +13,29 @@ from time import monotonic
 from typing import IO, Any
 
 from skin.core.files import json_line, unwritable
-from skin.live.loop import Display, Told
-from skin.live.verdict import Note, Verdict, summarize_notes
+from skin.live.loop import Assessment, Display
+from skin.live.verdict import Note, summarize_notes
 
 SCHEMA = 1
 """Version of the messages. A field may be added without a new version; a reader ignores unknown ones."""
 
 
 def verdict_message(
-    verdict: Verdict | None, alarm: bool, notes: Sequence[Note], contacts: dict[str, Any]
+    assessment: Assessment, notes: Sequence[Note], contacts: dict[str, Any], now: float
 ) -> dict[str, Any]:
-    """Return a verdict, or the reason why there is none, as JSON data.
+    """Return what is known of the skin as JSON data.
 
     Args:
-        verdict: the present one; None if there is none.
-        alarm: including one that continues without a verdict.
+        assessment: the present one.
         notes: on the verdict or its absence, the gravest first.
         contacts: what is known of them.
+        now: s, the host's monotonic clock.
 
     Returns:
         The fields of ``docs/export.md`` but ``number`` and ``event``.
     """
+    verdict, _, alarm = assessment
+    moment = datetime.now(UTC) - timedelta(seconds=0.0 if verdict is None else now - verdict.t_host)
     shared = {
         "schema": SCHEMA,
         "stale": verdict is None,
@@ -42,7 +44,7 @@ def verdict_message(
         "alarm": alarm,
         "dangerous": True if alarm else None if verdict is None else verdict.danger,
         "notes": [note.message for note in notes],
-        "time": _utc(0.0 if verdict is None else monotonic() - verdict.t_host),
+        "time": moment.isoformat(timespec="milliseconds").replace("+00:00", "Z"),
         "contacts": contacts,
     }
     if verdict is None:
@@ -63,35 +65,32 @@ def verdict_message(
     }
 
 
-def _utc(ago: float) -> str:
-    """Return the time some seconds ago, ISO 8601 in UTC."""
-    moment = datetime.now(UTC) - timedelta(seconds=ago)
-    return moment.isoformat(timespec="milliseconds").replace("+00:00", "Z")
-
-
-HEARTBEAT = 0.5  # s without a line after which the state is repeated
-_WAITING = 256  # lines for a slow reader; then the oldest is dropped
-_ENDING = 1.0  # s in which a slow reader may take the last lines
+HEARTBEAT = 0.5
+"""s without a line after which the state is repeated."""
 
 
 class LineQueue:
-    """Writes lines in a thread of its own, flushed one by one: a slow reader or disk delays no verdict.
+    """Writes numbered JSON lines in a thread of its own, flushed one by one: a slow reader delays no verdict.
 
     Args:
         file: open for writing.
         failed: called with the error when the file cannot be written any more, as its reader is gone.
-        idle: makes a line of its number when there was none for ``HEARTBEAT`` s; None: there is no such line.
+        idle: called when there was no line for ``HEARTBEAT`` s, to add one; None: there is none.
+        waiting: lines for a slow reader; then the oldest is dropped.
+        ending: s in which a slow reader may take the last lines.
     """
 
     def __init__(
         self,
         file: IO[str],
         failed: Callable[[Exception], object],
-        idle: Callable[[int], str] | None = None,
+        idle: Callable[[], None] | None = None,
+        waiting: int = 256,
+        ending: float = 1.0,
     ) -> None:
-        self._file, self._failed, self._idle = file, failed, idle
+        self._file, self._failed, self._idle, self._ending = file, failed, idle, ending
         self._changed, self._over, self._number = Condition(), False, 0
-        self._waiting: deque[str] = deque(maxlen=_WAITING)
+        self._waiting: deque[str] = deque(maxlen=waiting)
         self._thread = Thread(target=self._run, name="skin-lines", daemon=True)
 
     def __enter__(self) -> "LineQueue":
@@ -103,13 +102,13 @@ class LineQueue:
         with self._changed:
             self._over = True
             self._changed.notify()
-        self._thread.join(_ENDING)
+        self._thread.join(self._ending)
 
-    def add(self, line: Callable[[int], str]) -> None:
-        """Add the line that a function makes of its number, from 1 up; return at once."""
+    def add(self, message: dict[str, Any]) -> None:
+        """Add a line with its number, from 1 up; return at once."""
         with self._changed:
             self._number += 1
-            self._waiting.append(line(self._number))
+            self._waiting.append(json_line({"number": self._number, **message}))
             self._changed.notify()
 
     def _run(self) -> None:
@@ -122,17 +121,16 @@ class LineQueue:
 
     def _next(self) -> str:
         """Return the next line; empty at the end."""
-        with self._changed:
-            wait = None if self._idle is None else HEARTBEAT
-            if not self._changed.wait_for(lambda: self._waiting or self._over, wait) and self._idle:
-                self.add(self._idle)
-            return self._waiting.popleft() if self._waiting else ""
+        wait = None if self._idle is None else HEARTBEAT
+        while True:
+            with self._changed:
+                if self._changed.wait_for(lambda: self._waiting or self._over, wait) or self._idle is None:
+                    return self._waiting.popleft() if self._waiting else ""
+            self._idle()  # without the lock: the display may just be adding a line
 
 
-def _line(display: Display, told: Told, event: str, number: int) -> str:
-    verdict, reason, alarm = told
-    message = verdict_message(verdict, alarm, *display.describe(verdict, reason))
-    return json_line({"number": number, "event": event, **message})
+def _message(display: Display, assessment: Assessment, event: str, now: float) -> dict[str, Any]:
+    return {"event": event, **verdict_message(assessment, *display.describe(assessment, now), now)}
 
 
 @contextmanager
@@ -146,19 +144,21 @@ def write_verdicts(display: Display, file: IO[str]) -> Iterator[None]:
         display: its ``closed`` is set when the reader closes the file.
         file: of a pipe or standard output.
     """
-    latest = display.told()
+    latest = display.assess(monotonic())
 
-    def observe(*told: *Told) -> None:
+    def observe(assessment: Assessment, now: float, event: str = "") -> None:
         nonlocal latest
-        before, latest = latest, told
-        if told[0] is not None or told != before:
-            lines.add(partial(_line, display, told, "change" if told[0] is None else "verdict"))
+        before, latest = latest, assessment
+        if assessment.verdict is None and assessment != before:
+            event = "change"
+        elif assessment.verdict is not None:
+            event = event or "verdict"
+        if event:
+            lines.add(_message(display, assessment, event, now))
 
-    def repeat(number: int) -> str:
-        nonlocal latest
-        before, latest = latest, display.told()  # the age is judged here, too
-        event = "change" if latest[0] is None and latest != before else "heartbeat"
-        return _line(display, latest, event, number)
+    def repeat() -> None:
+        now = monotonic()
+        observe(display.assess(now), now, "heartbeat")  # the age is judged here, too
 
     with LineQueue(file, lambda _: display.closed.set(), repeat) as lines:
         display.observers.append(observe)
@@ -191,31 +191,30 @@ def write_changes(
         failed: called with the error when the file cannot be written any more; the live view continues.
         reasons: write a line with the event ``change``, too, when there is another reason for no verdict.
     """
-    states, latest = (True, False, False), display.told()
+    states, latest = (True, False, False), display.assess(monotonic())
 
-    def observe(verdict: Verdict | None, reason: str, alarm: bool) -> None:
+    def observe(assessment: Assessment, now: float) -> None:
         nonlocal states, latest
-        before, former_reason = states, latest[1]
+        before, former, latest, verdict = states, latest.reason, assessment, assessment.verdict
         # Places stay as they were while nothing is known of the skin.
-        states = verdict is None, alarm, before[2] if verdict is None else bool(verdict.unknown)
-        latest = verdict, reason, alarm
-        for events, former, state in zip(_EVENTS, before, states, strict=True):
-            if state != former:
-                write(events[not state])
-        if reasons and states == before and reason != former_reason:
-            write("change")
+        states = verdict is None, assessment.alarm, before[2] if verdict is None else bool(verdict.unknown)
+        for events, previous, state in zip(_EVENTS, before, states, strict=True):
+            if state != previous:
+                write(events[not state], now)
+        if reasons and states == before and assessment.reason != former:
+            write("change", now)
 
-    def write(event: str) -> None:
-        lines.add(partial(_line, display, latest, event))
+    def write(event: str, now: float) -> None:
+        lines.add(_message(display, latest, event, now))
 
     with LineQueue(file, failed) as lines:
-        write("started")
+        write("started", monotonic())
         display.observers.append(observe)
         display.listeners.append(write)
         try:
             yield
         finally:
-            write("ended")
+            write("ended", monotonic())
 
 
 @contextmanager

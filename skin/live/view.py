@@ -7,6 +7,7 @@ from contextlib import ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
 from threading import Thread
+from time import monotonic
 
 from rich.console import Console
 
@@ -94,7 +95,7 @@ def show(
             watched = setup.watch(live, _say)
             if live.verdicts is None:
                 opened.enter_context(show_in_terminal(display, Console()))
-            source, engine = watched.source, watched.settings.build()
+            source, engine = watched.source, watched.engine
             check = partial(watched.check, live.selftest, _say, display.add_note)
             loop = LiveLoop(source.skin, source.tare, engine, display, check)
             opened.callback(lambda: _say(f"{loop.verdicts} verdicts, {loop.line}"))
@@ -120,7 +121,7 @@ def _open_views(setup: LiveSetup, live: LiveSettings, web: bool, opened: ExitSta
     span = model.window / model.rate
     info = DisplayInfo(model.title, setup.name, model.positions, model.size, live.top, span)
     display = Display(info, contacts, live.patience.calm)
-    display.set_verdict(None, "the threshold of the alarm is being chosen")
+    display.set_verdict(None, monotonic(), "the threshold of the alarm is being chosen")
     if live.log is not None:
         opened.enter_context(log_alarms(display, Path(live.log).expanduser()))
     if live.verdicts is not None:

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import uvicorn
-from scipy.spatial import ConvexHull, Delaunay
+from scipy.interpolate import RBFInterpolator
 from starlette.applications import Starlette
 from starlette.middleware import Middleware
 from starlette.middleware.trustedhost import TrustedHostMiddleware
@@ -22,25 +22,22 @@ from starlette.routing import Route
 
 from skin.core.files import json_line
 from skin.errors import InputError
-from skin.learning.representation import centres, weights
+from skin.learning.representation import centres
 from skin.live.contacts import contact_text_lines
-from skin.live.loop import Display, DisplayState
+from skin.live.loop import Assessment, Display, DisplayState
 from skin.live.terminal import contact_text
 from skin.live.verdicts import verdict_message
 
-HERTZ = 33  # pictures per second: 30, with a margin for a busy machine
-_PIXELS = 64
+HERTZ = 33
+"""Pictures per second: 30, with a margin for a busy machine."""
 _HOST = "127.0.0.1"
 _PAGE = Path(__file__).with_name("page.html")
-_FEWEST = 3
-_INWARDS = 1e-6
 
 
 class SkinPicture:
-    """Interpolates readings between the sensors, for display only.
+    """Interpolates readings between the sensors, for display only: radial functions, linear in the distance.
 
-    Linear inside the sensors' hull, as ``representation=interp`` does; outside, as at the nearest point of
-    the hull, so that there is no edge. Nearest neighbour if there is no triangle.
+    Each sensor shows its own reading, and there is no edge between the sensors or outside of them.
 
     Args:
         positions: (S, 3), m.
@@ -52,19 +49,8 @@ class SkinPicture:
     def __init__(self, positions: np.ndarray, size: tuple[float, float], pixels: int, top: float) -> None:
         self.pixels, self.top = pixels, top
         self._points, self._targets = np.asarray(positions, dtype=float)[:, :2], centres(size, pixels)
-        self._known = np.ones(len(self._points), dtype=bool)
-        self._matrix = self._weights()
-
-    def _weights(self) -> np.ndarray:
-        """Return the weights (P, S) of the known sensors."""
-        points = self._points[self._known]
-        matrix = np.zeros((len(self._targets), len(self._known)), np.float32)
-        if len(points) < _FEWEST or np.linalg.matrix_rank(points - points[0], tol=1e-6) < 2:
-            if len(points):
-                matrix[:, self._known] = weights(points, self._targets, "nearest")
-        else:
-            matrix[:, self._known] = weights(points, _inside(points, self._targets), "linear")
-        return matrix
+        self._known = np.zeros(len(self._points), dtype=bool)
+        self._matrix = np.zeros((pixels**2, len(self._points)), np.float32)
 
     def __call__(self, values: np.ndarray, valid: np.ndarray | None = None) -> np.ndarray:
         """Return the picture of readings (S,), N, as (pixels, pixels), uint8: 255 is ``top`` and above.
@@ -75,25 +61,13 @@ class SkinPicture:
         """
         valid = np.ones(len(values), dtype=bool) if valid is None else valid
         if not np.array_equal(valid, self._known):
-            self._known = valid.copy()
-            self._matrix = self._weights()
+            self._known, self._matrix = valid.copy(), np.zeros_like(self._matrix)
+            if valid.any():
+                points, own = self._points[valid], np.eye(int(valid.sum()))
+                radial = RBFInterpolator(points, own, kernel="linear", degree=0)
+                self._matrix[:, valid] = radial(self._targets)
         image = self._matrix @ values.astype(np.float32)
         return (255 * np.clip(image / self.top, 0, 1)).astype(np.uint8).reshape(self.pixels, self.pixels)
-
-
-def _inside(points: np.ndarray, targets: np.ndarray) -> np.ndarray:
-    """Return targets (P, 2), those outside of the hull of points (S, 2) moved to its nearest point."""
-    outside = Delaunay(points).find_simplex(targets) < 0
-    corners = points[ConvexHull(points).vertices]
-    along = np.roll(corners, -1, axis=0) - corners
-    share = ((targets[outside, None] - corners) * along).sum(axis=2) / (along**2).sum(axis=1)
-    feet = corners + share.clip(0, 1)[..., None] * along
-    nearest = ((feet - targets[outside, None]) ** 2).sum(axis=2).argmin(axis=1)
-    moved = targets.copy()
-    on_edge = feet[np.arange(len(feet)), nearest]
-    # A little inwards, so that rounding does not leave them outside.
-    moved[outside] = on_edge + _INWARDS * (corners.mean(axis=0) - on_edge)
-    return moved
 
 
 @contextmanager
@@ -126,14 +100,19 @@ def serve_page(display: Display, port: int) -> Iterator[str]:
         listening.close()
 
 
-def message(state: DisplayState, picture: SkinPicture) -> dict[str, Any]:
+def message(state: DisplayState, picture: SkinPicture, now: float) -> dict[str, Any]:
     """Return the data of each picture: the fields of a JSON line, and what the page draws.
 
     Forces are in N, the picture is base64 of uint8 row by row, the time ``sent`` in s.
+
+    Args:
+        state: of the display.
+        picture: interpolates the forces.
+        now: s, the host's monotonic clock.
     """
-    verdict = state.verdict
+    verdict, assessment = state.verdict, Assessment(state.verdict, "", state.alarm)
     return {
-        **verdict_message(verdict, state.alarm, state.notes, state.contacts),
+        **verdict_message(assessment, state.notes, state.contacts, now),
         "number": state.number,
         "sent": time(),
         "values": [round(value, 3) for value in state.values.tolist()],
@@ -150,15 +129,15 @@ def message(state: DisplayState, picture: SkinPicture) -> dict[str, Any]:
     }
 
 
-def _application(display: Display) -> Starlette:
+def _application(display: Display, pixels: int = 64) -> Starlette:
     info = display.info
-    picture = SkinPicture(info.positions, info.size, _PIXELS, info.top)
+    picture = SkinPicture(info.positions, info.size, pixels, info.top)
 
     async def page(request: Request) -> Response:
         return FileResponse(_PAGE, media_type="text/html", headers={"Cache-Control": "no-store"})
 
     async def skin(request: Request) -> Response:
-        geometry = {"positions": info.positions.tolist(), "size": list(info.size), "pixels": _PIXELS}
+        geometry = {"positions": info.positions.tolist(), "size": list(info.size), "pixels": pixels}
         named = {"title": info.title, "port": info.port, "top": info.top, "window": info.window}
         return JSONResponse(geometry | named)
 
@@ -169,7 +148,7 @@ def _application(display: Display) -> Starlette:
         # Another site's page can send a plain POST here, but not with a header of its own.
         if (order := request.headers.get("x-skin")) not in ("tare", "force"):
             return Response(status_code=403)
-        refused = display.request_tare(force=order == "force")
+        refused = display.request_tare(monotonic(), force=order == "force")
         return JSONResponse({"reason": refused}, status_code=409) if refused else Response(status_code=204)
 
     # Other host names are refused, so that pages of other sites cannot read the skin.
@@ -184,11 +163,13 @@ def _application(display: Display) -> Starlette:
 
 
 async def _events(display: Display, picture: SkinPicture) -> AsyncIterator[str]:
-    number, due = display.state().number, monotonic()  # of the first picture: the latest frame
+    due = monotonic()
+    number = display.state(due).number  # of the first picture: the latest frame
     while not display.closed.is_set():
-        state = display.state(number)
+        now = monotonic()
+        state = display.state(now, number)
         number = state.number
-        yield f"data: {json_line(message(state, picture))}\n\n"
+        yield f"data: {json_line(message(state, picture, now))}\n\n"
         # A picture that is a little late does not delay the next; those that are very late are left out.
         due = max(due + 1 / HERTZ, monotonic() - 1 / HERTZ)
         await asyncio.sleep(max(0.0, due - monotonic()))

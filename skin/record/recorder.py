@@ -351,7 +351,7 @@ def _about(device: Serial, header: Header | None) -> dict[str, Any]:
         "rate": device.model_rate,
         "window": device.window,
         "labels": device.labels,
-        "calibration": device.calibration,
+        "calibration": device.port.calibration,
     } | ({"channels": channels} if channels else {})
 
 

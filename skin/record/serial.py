@@ -2,16 +2,17 @@
 
 import sys
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import chain
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
-from pydantic import PositiveFloat
+from pydantic import PositiveFloat, PositiveInt
 
 from skin.body.base import AbstractBody
 from skin.body.layout import AbstractLayout
+from skin.core.settings import check_settings, configured
 from skin.device.base import AbstractDevice, Blank, Split
 from skin.device.resampling import Frame, Window
 from skin.device.touches import Recording, Touches, join_contacts
@@ -19,7 +20,7 @@ from skin.errors import InputError
 from skin.touch.labels import TOUCH, TOUCH_OR_NOT
 from skin.touch.paths import TouchSettings, model_window
 from skin.wire.channels import UnitConversion
-from skin.wire.reader import PortSettings, SkinDisconnected, SkinTimeout
+from skin.wire.reader import Port, SkinDisconnected, SkinTimeout
 from skin.wire.segmentation import (
     AbstractSegmenter,
     AnnouncedSegmenter,
@@ -57,12 +58,7 @@ def require_port(device: AbstractDevice) -> "Serial":
     return device
 
 
-_LABELS = ("announced", "prompted", "none")
-_FELT = 5.0  # standard deviations of a frame above rest
-
-
-@dataclass(kw_only=True, eq=False)
-class Serial(PortSettings, AbstractDevice):
+class Serial(AbstractDevice):
     """Yields gestures on a real or emulated skin; its only split is ``test``.
 
     Readings are in N above the baseline, which is taken from resampled values, because the maximum of noise
@@ -71,7 +67,6 @@ class Serial(PortSettings, AbstractDevice):
     Args:
         body: the sheet of the model.
         layout: positions of its sensors; the device must send as many values.
-        port, baudrate, tare, ...: as in :class:`skin.wire.reader.PortSettings`.
         labels: ``announced``, ``prompted`` or ``none``.
         gestures: number of gestures.
         seed: of the order of prompts.
@@ -79,36 +74,43 @@ class Serial(PortSettings, AbstractDevice):
             noise, also the force above which a prompted gesture is detected.
         touch: rate and window of the model (``conf/touch``).
         stream: add the label ``touch``.
+        timeout, port, baudrate, tare, ...: as in :class:`skin.wire.reader.Port`.
+
+    Attributes:
+        port: its settings.
+        wire: the skin at this port.
 
     Raises:
         InputError: invalid settings, or a device that does not match the model.
     """
 
     real = True
-    body: AbstractBody
-    layout: AbstractLayout
-    timeout: PositiveFloat = 10.0
-    labels: str = "announced"
-    gestures: int = 16
-    seed: int = 0
-    trigger: float = 0.3
-    touch: Mapping[str, Any] | TouchSettings | None = None
-    stream: bool = False
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.labels not in _LABELS:
-            raise InputError(f"device.labels must be one of {', '.join(_LABELS)}, got {self.labels}")
-        if self.gestures < 1:
-            raise InputError(f"device.gestures={self.gestures} must be 1 or more")
-        if self.labels == "none" and self.stream:
+    def __init__(
+        self,
+        body: AbstractBody,
+        layout: AbstractLayout,
+        labels: Literal["announced", "prompted", "none"] = "announced",
+        gestures: PositiveInt = 16,
+        seed: int = 0,
+        trigger: float = 0.3,
+        touch: Mapping[str, Any] | TouchSettings | None = None,
+        stream: bool = False,
+        timeout: PositiveFloat = 10.0,
+        **port: Any,
+    ) -> None:
+        chosen = {"labels": labels, "gestures": gestures, "timeout": timeout}
+        check_settings(Serial, chosen, "device")
+        self.port = configured(Port, port | {"timeout": timeout}, "device")
+        self.body, self.labels, self.gestures, self.seed, self.trigger = body, labels, gestures, seed, trigger
+        if labels == "none" and stream:
             raise InputError("labels=none finds windows with a touch: give a run trained without data.stream")
-        self.window, self.model_rate = model_window(self.touch)
-        self.task, self.size = TOUCH_OR_NOT if self.stream else TOUCH, self.body.size
-        self.sensors = self.layout.sensors(self.body)
+        self.window, self.model_rate = model_window(touch)
+        self.task, self.size = TOUCH_OR_NOT if stream else TOUCH, body.size
+        self.sensors = layout.sensors(body)
         self._positions = torch.from_numpy(self.sensors.positions).float()
         self._recording: Recording | None = None
-        self.wire = SerialSource(self, len(self.sensors), self.model_rate, self.body.layers)
+        self.wire = SerialSource(self.port, len(self.sensors), self.model_rate, body.layers)
 
     def touches(self, split: Split, epoch: int = 0) -> Touches:
         """Return the gestures, read at the first call; labels are None if unknown."""
@@ -162,18 +164,19 @@ class Serial(PortSettings, AbstractDevice):
         left = (
             (number, labels) for number, labels in planned if number < self.gestures and number not in done
         )
-        least = self._least_felt(conversion, first)
+        least = self._least_response(conversion, first)
         return PromptedSegmenter(
             window, left, _print, lambda seen: bool((conversion(seen.values, seen.valid)[0] > least).any())
         )
 
-    def _least_felt(self, conversion: UnitConversion, first: Sequence[Frame]) -> np.ndarray | float:
+    def _least_response(self, conversion: UnitConversion, first: Sequence[Frame]) -> np.ndarray | float:
         """Return the reading of each sensor (S,), N, that neither its noise nor a count explains."""
         if conversion.noise is None or conversion.rest is None:
             return self.trigger
         whole = all((frame.values % 1 == 0).all() for frame in first)
+        # Five standard deviations of a frame: one in three million is more.
         return np.maximum(
-            _FELT * conversion.noise + conversion.rest,
+            5 * conversion.noise + conversion.rest,
             whole * np.minimum(np.abs(conversion.scale), self.trigger),
         )
 

@@ -1,27 +1,41 @@
-"""What the values of channels mean: their state, their conversion to newtons, and their baseline."""
+"""What the values of channels mean: their state, and their conversion to newtons."""
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from math import inf
-from typing import Literal, get_args
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from scipy.special import betainc
 
 from skin.device.calibration import Calibration
 from skin.device.curves import Curves
-from skin.device.resampling import Frame, StreamClock, Window
+from skin.device.resampling import Frame
 from skin.errors import InputError
 from skin.wire.protocol import Header
 
-ChannelState = Literal["ok", "saturated", "stuck", "dead", "impossible"]
 Limits = tuple[float | None, float | None]
 
-_SILENT = 5.0  # s without any change
-_LIVELY = 1.0  # s within which most channels change, if their noise can be seen at all
-_BELOW = 0.01  # fraction of the range below 0 that an offset explains
-_FAR = 20  # smallest steps of a channel: more than its noise ranges over
+
+class Reason:  # plain numbers: an enumeration would cost a tenth of the time of a frame
+    """Why a reading cannot be used, or only as a lower bound: bits of a mask."""
+
+    SATURATED = 1
+    """At the limit of the channel: the force is at least the reading, which is usable."""
+    MISSING = 2
+    """The device sent no number, or an error value."""
+    IMPOSSIBLE = 4
+    """The converter cannot give the value."""
+    DEAD = 8
+    """The channel has never changed."""
+    STUCK = 16
+    """It does not change while most others do."""
+    UNKNOWN = 32
+    """It has no baseline, or is broken according to the calibration."""
+    FROZEN = 64
+    """It does not change, though it did while the baseline was taken."""
+    IMPLAUSIBLE = 128
+    """No skin can have the reading."""
 
 
 @dataclass(frozen=True)
@@ -48,48 +62,62 @@ class RawRange:
 class ChannelHealth:
     """Checks channels frame by frame.
 
-    A value at a limit is saturated and valid: the force is at least that. A channel that does not change for
+    A value at a limit is saturated and usable: the force is at least that. A channel that does not change for
     five seconds while most others do is stuck, or dead if it has never changed. A channel that has never
     changed is also dead if another has had noise of more than one count for five seconds. Neither state is
-    detected if the noise of the untouched skin is below one count. A single change makes the channel valid
+    detected if the noise of the untouched skin is below one count. A single change makes the channel usable
     again. A channel that stays at the largest value it has ever sent, far above its smallest, is saturated at
     an unknown limit rather than stuck, because a held press must not be masked.
 
-    A value that the converter cannot give is invalid at once.
+    A value that the converter cannot give is unusable at once.
 
     Args:
         limits: smallest and largest value of a channel; None where an untouched channel may have this value,
             such as 0 of a resistor that conducts only under load.
+        silent: s without any change after which a channel is stuck.
+        active: s within which most channels change, if their noise can be seen at all.
+        far: smallest steps of a channel: more than its noise ranges over.
+        below: fraction of the range below 0 that an offset explains.
 
     Attributes:
         limits: as given; a new value applies from the next frame on.
         largest: largest count of the converter, whose smallest is 0; infinite: unknown.
+        mask: (S,), int, of :class:`Reason`, of the last frame; empty before the first.
     """
 
-    def __init__(self, limits: Limits = (None, None)) -> None:
+    def __init__(
+        self,
+        limits: Limits = (None, None),
+        silent: float = 5.0,
+        active: float = 1.0,
+        far: float = 20.0,
+        below: float = 0.01,
+    ) -> None:
         self.limits, self.largest = limits, inf
+        self._silent, self._active, self._far, self._below = silent, active, far, below
         self._last: np.ndarray | None = None
-        self._begin_time, self._faults = True, (np.zeros(0, dtype=bool),) * 4
+        self._begins, self.mask = True, np.zeros(0, dtype=int)
 
     def restart(self) -> None:
         """Reset the times after a restart of the device; the known range of each channel is kept."""
-        self._begin_time = True
+        self._begins = True
 
-    def check(self, values: np.ndarray, t: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return which values (S,) are valid and which are saturated, (S,), bool each.
+    def check(self, values: np.ndarray, t: float, limited: np.ndarray | None = None) -> np.ndarray:
+        """Return the mask of a frame, (S,), int, of :class:`Reason`.
 
         Args:
-            values: as sent.
+            values: (S,), as sent.
             t: s, rising.
+            limited: (S,), bool, channels that are known to be at a limit; None: none is.
         """
         if self._last is None or len(values) != len(self._last):
-            self._last, self._begin_time = values, True
+            self._last, self._begins = values, True
             self._least, self._most = np.array(values, dtype=float), np.array(values, dtype=float)
             self._smallest = np.full(len(values), np.inf)
             self._ever = np.zeros(len(values), dtype=bool)
-        if self._begin_time:
-            self._changed_at, self._noisy_since, self._coarse_at = np.full((3, len(values)), t)
-            self._lively_since, self._begin_time = t, False
+        if self._begins:
+            self._changed_at, self._noisy_since, self._large_step_at = np.full((3, len(values)), t)
+            self._active_since, self._begins = t, False
         step, self._last = np.abs(values - self._last), values
         changed = step > 0
         self._changed_at[changed] = t
@@ -97,33 +125,59 @@ class ChannelHealth:
         self._smallest = np.minimum(self._smallest, np.where(changed, step, np.inf))
         np.minimum(self._least, values, out=self._least)
         np.maximum(self._most, values, out=self._most)
-        silent = t - self._changed_at
-        if 2 * np.count_nonzero(silent < _LIVELY) <= len(values):
-            self._lively_since = t
+        unchanged = t - self._changed_at
+        if 2 * np.count_nonzero(unchanged < self._active) <= len(values):
+            self._active_since = t
         # Noise below half a step changes only values near an edge; a double step is more than that.
-        self._coarse_at[step > 1.5 * self._smallest.min()] = t
-        self._noisy_since[t - self._coarse_at >= _LIVELY] = t
-        dull = (silent >= _SILENT) & (
-            (t - self._lively_since >= _SILENT) | (~self._ever & (t - self._noisy_since.min() >= _SILENT))
-        )
+        self._large_step_at[step > 1.5 * self._smallest.min()] = t
+        self._noisy_since[t - self._large_step_at >= self._active] = t
+        others_change = t - self._active_since >= self._silent
+        never = ~self._ever & (t - self._noisy_since.min() >= self._silent)
+        inactive = (unchanged >= self._silent) & (others_change | never)
         low, high = self.limits
-        at_limit = (values >= (np.inf if high is None else high)) | (
-            values <= (-np.inf if low is None else low)
+        low, high = -inf if low is None else low, inf if high is None else high
+        loaded = self._ever & (self._most - self._least >= self._far * self._smallest)
+        saturated = (values >= high) | (values <= low) | (inactive & loaded & (values >= self._most))
+        saturated = saturated if limited is None else saturated | limited
+        impossible = (values > self.largest) | (values < -self._below * self.largest)
+        self.mask = np.where(
+            impossible,
+            Reason.IMPOSSIBLE,
+            saturated * Reason.SATURATED
+            + (inactive & ~saturated) * np.where(self._ever, Reason.STUCK, Reason.DEAD),
         )
-        loaded = self._ever & (self._most - self._least >= _FAR * self._smallest)
-        impossible = (values > self.largest) | (values < -_BELOW * self.largest)
-        saturated = at_limit | (dull & loaded & (values >= self._most))
-        dull, saturated = dull & ~saturated, saturated & ~impossible
-        self._faults = impossible, dull & ~self._ever, dull, saturated
-        return ~dull & ~impossible, saturated
+        return self.mask
 
-    def states(self) -> tuple[ChannelState, ...]:
+    def states(self) -> tuple[str, ...]:
         """Return the state of each channel at the last frame; empty before the first."""
-        worst = np.select(self._faults, [4, 3, 2, 1], 0)
-        return tuple(get_args(ChannelState)[number] for number in worst)
+        names = {bit: name.lower() for name, bit in vars(Reason).items()} | {0: "ok"}
+        return tuple(map(names.__getitem__, self.mask.tolist()))
 
 
-_LARGEST = 1e9  # N: more would overflow in a network or in JSON
+class NewtonFrame(NamedTuple):
+    """A frame in newtons, made once.
+
+    Attributes:
+        t: s, time of the stream, which goes on over restarts of the device.
+        newtons: (S,), float32; 0 where there is no usable value.
+        mask: (S,), int, of :class:`Reason`.
+        frame: as the device sent it.
+    """
+
+    t: float
+    newtons: np.ndarray
+    mask: np.ndarray
+    frame: Frame
+
+    @property
+    def usable(self) -> np.ndarray:
+        """(S,), bool, readings that are forces or lower bounds of forces."""
+        return np.asarray(self.mask <= Reason.SATURATED)
+
+    @property
+    def saturated(self) -> np.ndarray:
+        """(S,), bool, usable readings that are lower bounds."""
+        return np.asarray(self.mask == Reason.SATURATED)
 
 
 @dataclass(frozen=True)
@@ -141,6 +195,7 @@ class UnitConversion:
         curves: of the sensors, for gain 1; None: all are linear.
         rest: (S,), N, mean of the frames of the untouched skin: below 0, because the zero is that of the
             largest values of intervals; None: unknown.
+        largest: N; more would overflow in a network or in JSON, and no skin has it.
     """
 
     scale: np.ndarray
@@ -151,16 +206,29 @@ class UnitConversion:
     equal: np.ndarray = field(default_factory=lambda: np.zeros(0))
     curves: Curves | None = None
     rest: np.ndarray | None = None
+    largest: ClassVar[float] = 1e9
 
     def __call__(self, values: np.ndarray, valid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return readings (..., S), N, 0 where invalid, and a mask of the valid ones, (..., S), bool.
-
-        A reading that no skin can have is invalid.
-        """
+        """Return readings (..., S), N, float32, 0 where invalid, and a mask of the valid ones, (..., S)."""
         with np.errstate(over="ignore", invalid="ignore"):
             newtons = self.newtons(values)
-            valid = valid & ~self.broken & (np.abs(newtons) <= _LARGEST)
+            valid = valid & ~self.broken & (np.abs(newtons) <= self.largest)
         return np.where(valid, newtons, 0.0).astype(np.float32), valid
+
+    def convert(self, frame: Frame, t: float | None = None, mask: np.ndarray | int = 0) -> NewtonFrame:
+        """Return a frame in newtons.
+
+        Args:
+            frame: as the device sent it.
+            t: s, time of the stream; None: that of the frame.
+            mask: (S,), int, what else makes its readings unusable.
+        """
+        newtons, valid = self(frame.values, frame.valid)
+        sent = ~frame.valid * Reason.MISSING if frame.mask is None else frame.mask
+        limited = 0 if frame.saturated is None else frame.saturated * Reason.SATURATED
+        refused = (frame.valid & ~valid) * np.where(self.broken, Reason.UNKNOWN, Reason.IMPLAUSIBLE)
+        mask = sent | limited | refused | mask
+        return NewtonFrame(frame.t if t is None else t, newtons, np.asarray(mask), frame)
 
     def newtons(self, values: np.ndarray) -> np.ndarray:
         """Return values (..., S) in N, whatever they are."""
@@ -169,8 +237,8 @@ class UnitConversion:
 
     def raw(self, newtons: np.ndarray) -> np.ndarray:
         """Return the values (..., S) that the device sends at readings in N."""
-        bent = newtons if self.curves is None else self.curves.bend(newtons)
-        return bent / self.scale + self.zero
+        linear = newtons if self.curves is None else self.curves.bend(newtons)
+        return linear / self.scale + self.zero
 
 
 def unit_conversion(
@@ -253,268 +321,27 @@ def check_sensitivity(conversion: UnitConversion, declared: float | None) -> Non
         )
 
 
-FEWEST = 10
-"""Frames that a baseline needs."""
-
-# As multiples of the noise and of the smallest step seen.
-_MOVED = 8.0, 3.0  # within the frames
-_SHIFTED = 20.0, 10.0  # against the old baseline, because offsets drift
-_SMOOTH = 0.5  # von Neumann ratio of successive differences to variance: 2 for noise, near 0 for a touch
-
-
-def take_baseline(
-    values: np.ndarray,
-    valid: np.ndarray,
-    before: np.ndarray | None = None,
-    touch: float = 0.0,
-    force: bool = False,
-) -> np.ndarray:
-    """Return the median of each channel over frames without touch, (S,).
-
-    A touch is detected as a change, within the frames or against the previous baseline. A constant load
-    cannot be distinguished from an offset.
-
-    Args:
-        values: (F, S).
-        valid: (F, S); channels without a valid value are not checked.
-        before: the previous baseline, (S,), or None.
-        touch: smallest shift of the baseline that counts as a touch, however small the noise.
-        force: do not check for a touch.
-
-    Raises:
-        InputError: too few frames.
-        SkinTouched: the skin was touched.
-    """
-    if len(values) < FEWEST:
-        raise InputError(f"a baseline needs {FEWEST} frames, got {len(values)}: give more seconds")
-    baseline = np.asarray(np.median(values, axis=0))
-    if force:
-        return baseline
-    checked = np.asarray(valid.any(axis=0))
-    steps = np.abs(np.diff(values, axis=0))
-    # From differences: a touch that lasts half of the time would otherwise count as noise.
-    noise = 1.4826 * np.median(steps, axis=0) / np.sqrt(2)
-    smallest = np.where(steps > 0, steps, np.inf).min(axis=0)
-    smallest[np.isinf(smallest)] = 0.0
-    moved = np.abs(values - baseline).max(axis=0)
-    # A stroke changes by as much as noise does, but in a consistent direction.
-    smooth = (steps**2).mean(axis=0) < _SMOOTH * values.var(axis=0)
-    noise = np.where(smooth, 0.0, noise)
-    _refuse_touch("moved by", moved, np.maximum(_MOVED[0] * noise, _MOVED[1] * smallest), checked)
-    if before is not None:
-        limit = np.maximum(np.maximum(_SHIFTED[0] * noise, _SHIFTED[1] * smallest), touch)
-        _refuse_touch("differs from its old baseline by", np.abs(baseline - before), limit, checked)
-    return baseline
-
-
-def _refuse_touch(what: str, change: np.ndarray, limit: np.ndarray, checked: np.ndarray) -> None:
-    beyond = np.where(checked, change - limit, -np.inf)
-    channel = int(beyond.argmax())
-    if beyond[channel] > 0:
-        raise SkinTouched(
-            f"the skin is touched: channel {channel} {what} {change[channel]:.4g}, noise explains "
-            f"{limit[channel]:.4g}; let go and tare again, or tare(force=True) if nothing touches it"
-        )
-
-
-MakeConversion = Callable[[np.ndarray | None, Header | None], UnitConversion]
-"""Returns the conversion for a baseline (S,), or None, and a header, or None; InputError if the scale is
-unknown."""
-
-HEADER = 6.0
-"""s within which a device must send its header: many repeat it every five."""
-_OFTEN = 0.2  # s between two attempts to take a baseline
-PATIENCE = 60.0  # s for which a touch may delay the baseline
-_UNTOUCHED = "taking the baseline: do not touch the skin"
-_AT_LIMIT = 0.5  # fraction of the time at its limit from which a channel cannot be tared
-FROZEN = 5.0
-"""s without a change after which readings are frozen."""
-_LAGS = 1000  # frames of the longest block that is recognised when it is sent again and again
-EXPECTED = 20
-"""Changes of any channel that noise would have caused in that time: without one, readings are frozen."""
-
-
-class Tare:
-    """Takes the baseline from the first quiet stretch of a stream, and again on request.
-
-    The baseline is that of values resampled to the model's rate: the maximum of noise is not 0. It is kept
-    over restarts of the device, because the restart may have happened under a touch. A channel at its limit
-    cannot be tared: it keeps its previous baseline, or is invalid without one.
-
-    Args:
-        conversion: makes the conversion of values to N.
-        seconds: s without touch from which the baseline is taken; 0: no baseline.
-        rate: of the model, Hz.
-        header: returns the header of the device, None until it has sent one.
-
-    Attributes:
-        conversion: of values to N; None until unit and baseline are known.
-        status: message about what the tare is waiting for; empty if nothing.
-        warning: message about what the latest baseline lacks; empty if nothing.
-        count: number of baselines taken.
-    """
-
-    def __init__(
-        self,
-        conversion: MakeConversion,
-        seconds: float,
-        rate: float,
-        header: Callable[[], Header | None] = lambda: None,
-    ) -> None:
-        self._conversion, self._header = conversion, header
-        self._seconds, self._rate = seconds, rate
-        self.conversion: UnitConversion | None = None
-        self.status, self.warning = "waiting for the first frame", ""
-        self.count = 0
-        self._clock, self._quiet = StreamClock(), list[Frame]()
-        self._first: float | None = None
-        self._tried = -inf
-        self._deadline: float | None = None
-        self._forced = False
-
-    def restart(self, force: bool = False) -> None:
-        """Take a new baseline from the next quiet stretch, during which nothing may touch the skin.
-
-        After a minute without a quiet stretch the old baseline stays.
-
-        Args:
-            force: take it from the next frames, even if the skin seems touched.
-        """
-        if self._seconds and self.conversion is not None:
-            self._quiet.clear()
-            self._tried, self._deadline, self._forced = -inf, inf, force
-            self.status = _UNTOUCHED
-
-    def add(self, frame: Frame, touched: bool = False) -> None:
-        """Add a frame.
-
-        Args:
-            frame: as the device sent it.
-            touched: something touches the skin, so that a new baseline must wait unless it is forced.
-
-        Raises:
-            InputError: the scale is unknown, or the tare is too short.
-        """
-        if self.conversion is not None and self._deadline is None:
-            return
-        if self._deadline is not None:
-            self._deadline = min(self._deadline, frame.t_host + PATIENCE)
-            if frame.t_host > self._deadline:
-                self._deadline, self.status = None, ""
-                return
-        self._first = frame.t_host if self._first is None else self._first
-        header = self._header()
-        try:
-            plain = self._conversion(None, header)
-        except InputError:
-            # The header may arrive a little late.
-            if header is not None or frame.t_host - self._first > HEADER:
-                raise
-            self.status = "waiting for the header of the device"
-            return
-        if not self._seconds:
-            self.conversion, self.status = plain, ""
-        elif touched and not self._forced:
-            self._quiet.clear()
-            self.status = "the new baseline waits: something touches the skin"
-        else:
-            self._collect(frame)
-
-    def _collect(self, frame: Frame) -> None:
-        """Take the baseline from the latest frames if they are long enough and quiet."""
-        time = self._clock(frame)
-        # One segment: a device that restarts often would otherwise never get a baseline.
-        self._quiet.append(frame._replace(t=time, segment=0))
-        while time - self._quiet[0].t > 1.5 * self._seconds:
-            self._quiet.pop(0)
-        if time - self._quiet[0].t < self._seconds:
-            self.status = _UNTOUCHED
-        elif time - self._tried >= _OFTEN:
-            self._tried = time
-            self._try_baseline()
-
-    def _try_baseline(self) -> None:
-        intervals = int(self._seconds * self._rate + 1e-6)
-        window = Window(max(1, intervals), self._rate, len(self._quiet[-1].values))
-        for frame in self._quiet:
-            window.add(frame)
-        seen = window.read()
-        if seen is None:
-            return
-        # Intervals in which all frames were lost have no baseline.
-        complete = seen.valid.any(axis=1)
-        if complete.sum() < FEWEST <= intervals:
-            self.status = "taking the baseline: waiting for more frames"
-            return
-        values, valid = seen.values[complete], seen.valid[complete]
-        try:
-            baseline = take_baseline(values, valid, force=self._forced)
-        except SkinTouched as touched:
-            self.status = f"no baseline yet: {str(touched).split(';')[0]}"
-            return
-        limited = (seen.saturated[complete].mean(axis=0) >= _AT_LIMIT) | ~valid.any(axis=0)
-        self._take(baseline, limited)
-
-    def _take(self, baseline: np.ndarray, limited: np.ndarray) -> None:
-        """Use a baseline (S,) of all channels but those that are ``limited``, (S,), bool."""
-        fresh, before = self._conversion(baseline, self._header()), self.conversion
-        untared = limited & ~fresh.broken
-        if before is not None:
-            retained = untared & ~before.broken
-            fresh = replace(fresh, zero=np.where(retained, before.zero, fresh.zero))
-            untared &= ~retained
-        fresh = replace(fresh, broken=fresh.broken | untared)
-        if fresh.broken.all():
-            self.status = f"no baseline: {_channels(limited)} at the limit or without a value"
-            return
-        frames = np.stack([frame.values for frame in self._quiet])
-        steps = np.diff(frames, axis=0)
-        newtons = fresh.newtons(frames)
-        noise, rest = np.diff(newtons, axis=0).std(axis=0) / np.sqrt(2), newtons.mean(axis=0)
-        changing = (steps != 0).mean(axis=0)
-        self.conversion = replace(
-            fresh, noise=noise, changing=changing, rest=rest, equal=_repeat_probability(frames)
-        )
-        lacks = (
-            [f"{_channels(untared)} at the limit or without a value: no baseline"] if untared.any() else []
-        )
-        passed = self._quiet[-1].t - self._quiet[0].t
-        if changing.sum() * (len(self._quiet) - 1) * FROZEN / passed < EXPECTED:
-            lacks.append(f"this device shows no noise: readings that freeze for {FROZEN:g} s cannot be seen")
-        self.warning = "; ".join(lacks)
-        self.count, self.status, self._deadline, self._forced = self.count + 1, "", None, False
-        self._quiet.clear()
-
-
-_FRAMES, _FEW = 100, 3  # minimum number of frames at rest and of failures
-_TIMES, _ACCIDENT = 2.0, 1e-4  # times the failures at rest; least probability of an accident
-
-
-def fails_in_contact(failed: int, frames: int, failed_at_rest: int, frames_at_rest: int) -> bool:
-    """Return whether more frames fail in a contact than by accident, given those at rest.
+def fails_in_contact(
+    failed: int,
+    frames: int,
+    failed_at_rest: int,
+    frames_at_rest: int,
+    *,
+    enough: tuple[int, int] = (3, 100),
+    times: float = 2.0,
+    chance: float = 1e-4,
+) -> bool:
+    """Return whether so many frames fail in a contact that it is no accident, given those at rest.
 
     Values beyond the range may make frames, or values in them, unreadable.
+
+    Args:
+        failed, frames: in contact.
+        failed_at_rest, frames_at_rest: the same at rest.
+        enough: failures in contact, and frames at rest, of which less tell nothing.
+        times: frames may fail so many times as often as at rest.
+        chance: greatest probability of so many failures or more that is no accident.
     """
-    usual = min(_TIMES * (failed_at_rest + 1) / (frames_at_rest + _FRAMES), 1.0)
-    # The probability of so many or more.
-    known = frames_at_rest >= _FRAMES and failed >= _FEW
-    return bool(known and betainc(failed, frames - failed + 1, usual) < _ACCIDENT)
-
-
-def _repeat_probability(frames: np.ndarray) -> np.ndarray:
-    """Return the probability (L,) that one of the frames (F, S) equals that 1, 2, ... frames before."""
-    rows = np.array([hash(frame.tobytes()) for frame in frames])
-    lags = range(1, min(len(rows) // 2, _LAGS) + 1)
-    return np.array([((rows[lag:] == rows[:-lag]).sum() + 1) / (len(rows) - lag + 2) for lag in lags])
-
-
-def _channels(which: np.ndarray) -> str:
-    """Return the numbers of channels in words."""
-    numbers = np.flatnonzero(which)
-    if len(numbers) == len(which):
-        return "all channels"
-    return ("channel " if len(numbers) == 1 else "channels ") + ", ".join(map(str, numbers))
-
-
-class SkinTouched(InputError):  # noqa: N818
-    """No baseline can be taken, because something touches the skin."""
+    usual = min(times * (failed_at_rest + 1) / (frames_at_rest + enough[1]), 1.0)
+    known = failed >= enough[0] and frames_at_rest >= enough[1]
+    return bool(known and betainc(failed, frames - failed + 1, usual) < chance)

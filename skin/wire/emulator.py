@@ -36,9 +36,6 @@ from skin.wire.protocol import (
 )
 from skin.wire.segmentation import label_text
 
-_BATCH = 16  # every combination of the labels once
-_EDGE = 0.25  # of a frame, in which force rises and falls
-
 
 @dataclass(frozen=True)
 class Gesture:
@@ -102,7 +99,7 @@ def gestures_with_labels(device: AbstractSimulated, labels: np.ndarray, seed: in
 
 def _batch(device: AbstractSimulated, seed: int, number: int) -> list[Gesture]:
     draw = generator(Stream.TEST, 2, seed, number)
-    return _draw_gestures(device, device.sampler.balanced(_BATCH, draw), draw)
+    return _draw_gestures(device, device.sampler.balanced(16, draw), draw)  # every combination of labels
 
 
 @torch.no_grad()
@@ -117,32 +114,28 @@ def _draw_gestures(device: AbstractSimulated, labels: np.ndarray, draw: np.rando
     ]
 
 
-def upsample(force: np.ndarray, model_rate: float, rate: float) -> np.ndarray:
+def upsample(force: np.ndarray, model_rate: float, rate: float, ramp: float = 0.25) -> np.ndarray:
     """Upsample true readings to the rate of a device; return (F, S), N.
 
-    A frame of the model is held for its interval, with ramps of a quarter of the interval towards smaller
-    neighbours. The maximum over the interval is the frame itself, so resampling restores the original frames
-    and no touch becomes longer.
+    A frame of the model is held for its interval, with ramps towards smaller neighbours. The maximum over the
+    interval is the frame itself, so resampling restores the original frames and no touch becomes longer.
 
     Args:
         force: (T, S), N.
         model_rate: of ``force``, Hz.
         rate: of the device, Hz.
+        ramp: fraction of the interval in which force rises, and falls.
     """
     frames = round(len(force) * rate / model_rate)
     place = (np.arange(frames) + 0.5) * model_rate / rate
     now = np.minimum(place.astype(int), len(force) - 1)
-    share = (place - now)[:, None]
+    fraction = (place - now)[:, None]
     padded = np.concatenate([np.zeros_like(force[:1]), force, np.zeros_like(force[:1])])
     level = padded[now + 1]
     before, after = np.minimum(padded[now], level), np.minimum(padded[now + 2], level)
-    rising = before + (level - before) * np.clip(share / _EDGE, 0, 1)
-    falling = after + (level - after) * np.clip((1 - share) / _EDGE, 0, 1)
-    return np.where(share < 0.5, rising, falling)
-
-
-_PATIENCE = 1.0  # s that a reader may be late before bytes are lost, as in a device without flow control
-_PAUSE = 0.002  # s until a full buffer is tried again
+    rising = before + (level - before) * np.clip(fraction / ramp, 0, 1)
+    falling = after + (level - after) * np.clip((1 - fraction) / ramp, 0, 1)
+    return np.where(fraction < 0.5, rising, falling)
 
 
 class AbstractPort(ABC):
@@ -174,9 +167,9 @@ class AbstractPort(ABC):
     def _send(self, data: bytes) -> int:
         """Write part of ``data`` without waiting and return its length; the lock is held."""
 
-    def write(self, data: bytes) -> None:
-        """Write; bytes that are not read within a second are lost."""
-        deadline = monotonic() + _PATIENCE
+    def write(self, data: bytes, patience: float = 1.0) -> None:
+        """Write; bytes that are not read within ``patience`` s are lost, as without flow control."""
+        deadline = monotonic() + patience
         while data and monotonic() < deadline:
             with self._lock:
                 if not self.connected():
@@ -188,7 +181,7 @@ class AbstractPort(ABC):
                     pass
                 except OSError:
                     return
-            sleep(_PAUSE)
+            sleep(0.002)  # until a full buffer is tried again
 
 
 def open_port(port: str, link: str | None) -> AbstractPort:
@@ -296,10 +289,9 @@ class _Tcp(AbstractPort):
 
     def unplug(self) -> None:
         with self._lock:
-            if self._client is not None:
-                self._client.close()
-                self._client = None
-            self._server.close()
+            for end in filter(None, (self._client, self._server)):
+                end.close()
+            self._client = None
 
     @staticmethod
     def _left(client: socket.socket) -> bool:
@@ -320,7 +312,7 @@ BANNER = b"\x00\xff\x00ets Jul 29 2019 12:21:46\r\nrst:0x1 (POWERON_RESET),boot:
 KINDS = ("silence", "reset", "unplug")
 """Faults that occur at a moment."""
 
-Share = Annotated[float, Ge(0), Le(1)]
+Fraction = Annotated[float, Ge(0), Le(1)]
 Often = NonNegativeFloat | Sequence[NonNegativeFloat]
 
 
@@ -344,8 +336,8 @@ class Faults:
         since: s.
     """
 
-    flipped_bits: Share = 0.0
-    lost_bytes: Share = 0.0
+    flipped_bits: Fraction = 0.0
+    lost_bytes: Fraction = 0.0
     banner: bool = False
     silence: Often = 0.0
     reset: Often = 0.0
@@ -379,10 +371,6 @@ class Faults:
         bits ^= generator.random(len(bits)) < self.flipped_bits
         arrived = np.packbits(bits)
         return arrived[generator.random(len(arrived)) >= self.lost_bytes].tobytes()
-
-
-_HEADER = 1.0  # s from one header to the next
-_LOOK = 0.05  # s between two checks for a reader
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -452,7 +440,7 @@ class Emulator:
 
     def run(self, seconds: float | None = None, count: int | None = None) -> None:
         """Send until ``count`` gestures or ``seconds`` of device time are over, or until :meth:`stop`."""
-        while not self.port.connected() and not self._over.wait(_LOOK):
+        while not self.port.connected() and not self._over.wait(0.05):
             pass
         end = None if seconds is None else round(seconds * self.settings.rate)
         self._start = monotonic()
@@ -500,7 +488,7 @@ class Emulator:
             for kind in KINDS:
                 if faults[kind][place]:
                     getattr(self, f"_{kind}")()
-            if self._number % max(1, round(_HEADER * rate)) == 0:
+            if self._number % max(1, round(rate)) == 0:  # each second
                 self._header()
             self._frame(self._broken(row))
             self._number += 1

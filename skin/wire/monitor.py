@@ -12,17 +12,19 @@ from skin.device.resampling import Frame
 from skin.wire.channels import fails_in_contact
 from skin.wire.skin import Skin
 
-_KEPT = 10_000  # frames for the statistics of channels
-_FAR, _NEAR = 10.0, 0.5  # times the noise; s: a touch
-_SPREAD = 1.4826  # median absolute deviation -> standard deviation of normal noise
-
 
 class PortMonitor:
-    """Collects statistics of an open skin."""
+    """Collects statistics of an open skin.
 
-    def __init__(self, skin: Skin) -> None:
-        self._skin = skin
-        self._frames: deque[Frame] = deque(maxlen=_KEPT)
+    Args:
+        skin: open.
+        kept: frames for the statistics of channels.
+        far, near: times the noise, and s, that make a touch.
+    """
+
+    def __init__(self, skin: Skin, kept: int = 10_000, far: float = 10.0, near: float = 0.5) -> None:
+        self._skin, self._far, self._near = skin, far, near
+        self._frames: deque[Frame] = deque(maxlen=kept)
 
     def lines(self, seconds: float | None) -> Iterator[str]:
         """Yield a line each second, and the last one after ``seconds`` s; None: without end."""
@@ -59,11 +61,11 @@ class PortMonitor:
         # Of a channel that is never valid, the values that it repeats.
         rows = [row[mask] if mask.any() else row for row, mask in zip(values.T, valid.T, strict=True)]
         lines = [f"header: {self._skin.header or 'none'}", "channel     least    median   largest     noise"]
-        for channel, (row, state, share) in enumerate(zip(rows, states, valid.mean(axis=0), strict=True)):
+        for channel, (row, state, fraction) in enumerate(zip(rows, states, valid.mean(axis=0), strict=True)):
             middle = np.median(row)
-            noise = _SPREAD * np.median(np.abs(row - middle))
-            text = state if share == 1 else f"{state}, invalid in {1 - share:.0%}"
-            if share == 0 and state == "ok":
+            noise = 1.4826 * np.median(np.abs(row - middle))  # as of a normal distribution
+            text = state if fraction == 1 else f"{state}, invalid in {1 - fraction:.0%}"
+            if fraction == 0 and state == "ok":
                 text = "no value"
             elif _fails_under_touch(~valid[:, channel], touched):
                 text += ", more often in contact than at rest: beyond its range?"
@@ -78,8 +80,8 @@ class PortMonitor:
     def _find_contact(self, values: np.ndarray, valid: np.ndarray) -> np.ndarray:
         """Return the frames (F,), bool, within half a second of which a channel is far from its median."""
         away, noise = np.abs(values - np.median(values, axis=0)), np.abs(np.diff(values, axis=0)).mean(axis=0)
-        touched = ((away > _FAR * noise) & valid).any(axis=1)
-        near = 2 * round(_NEAR * self._skin.stats.rate_hz) + 1
+        touched = ((away > self._far * noise) & valid).any(axis=1)
+        near = 2 * round(self._near * self._skin.stats.rate_hz) + 1
         return np.asarray(maximum_filter1d(touched, near))
 
 

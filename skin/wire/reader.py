@@ -1,4 +1,4 @@
-"""Read a port: its settings, streams of bytes, feeds of frames, and the thread that fills a queue."""
+"""Read a port: its settings, streams of bytes, and feeds of frames."""
 
 import errno
 import logging
@@ -6,23 +6,26 @@ import os
 import socket
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
-from dataclasses import dataclass, fields, replace
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field, fields, replace
 from itertools import count
 from math import inf
-from time import monotonic, sleep
+from time import sleep
 from typing import TYPE_CHECKING, Annotated, Any, Protocol
 from urllib.parse import urlsplit
 
 from pydantic import AfterValidator, NonNegativeFloat, PositiveFloat, PositiveInt
 
-from skin.core.settings import RISING, check_settings
+from skin.core.settings import RISING, checked
 from skin.device.resampling import After, Frame
 from skin.errors import InputError
 from skin.wire.adapter import Adapter, read_adapter
-from skin.wire.channels import ChannelHealth, ChannelState, Limits
+from skin.wire.channels import ChannelHealth, Limits, Reason
 from skin.wire.decoder import Decoder
 from skin.wire.protocol import Format
+
+if TYPE_CHECKING:
+    from skin.device.touches import Touches
 
 _log = logging.getLogger(__name__)
 
@@ -34,13 +37,15 @@ def _check_order(limits: Limits) -> Limits:
     return limits
 
 
-@dataclass(kw_only=True, eq=False)
-class PortSettings:
+@checked("device")
+@dataclass(frozen=True, kw_only=True)
+class Port:
     """Where a skin is and how to read it.
 
     Args:
         port: ``/dev/ttyACM0``, ``COM3`` or ``socket://host:number``.
         baudrate: bits per second, for serial ports.
+        format: of our protocol.
         adapter: describes what the board sends: an option of ``conf/adapter/``, a YAML file, or the settings
             of :class:`skin.wire.adapter.Adapter`.
         limits: smallest and largest value of a channel, as in
@@ -57,6 +62,9 @@ class PortSettings:
         calibration: calibration file.
         sensitivity: N per unit of a sensor by its data sheet; the conversion to N must agree with it.
 
+    Attributes:
+        frames: the adapter, read.
+
     Raises:
         InputError: a setting is invalid.
     """
@@ -69,24 +77,20 @@ class PortSettings:
     timeout: PositiveFloat = 6.0
     backoff: Annotated[tuple[PositiveFloat, PositiveFloat], RISING] = (1.0, 10.0)
     silence: NonNegativeFloat | None = 5.0
-    tare: float = 2.0
+    tare: NonNegativeFloat = 2.0
     scale: float | None = None
     calibration: str | None = None
     sensitivity: PositiveFloat | None = None
+    frames: Adapter = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        # To open the port shows whether it is one.
-        settings = {entry.name: getattr(self, entry.name) for entry in fields(PortSettings)[1:]}
-        changed = {name: value for name, value in settings.items() if value != getattr(PortSettings, name)}
-        check_settings(PortSettings, changed, "device")
-        if self.tare < 0:
-            raise InputError(f"device.tare is s without touch and must be 0 or more, got {self.tare}")
-        self.frames = read_adapter(self.adapter)
-        if self.frames.kind == "protocol" and self.frames.format == "auto":
-            self.frames = replace(self.frames, format=self.format)
+        frames = read_adapter(self.adapter)
+        if frames.kind == "protocol" and frames.format == "auto":
+            frames = replace(frames, format=self.format)
+        object.__setattr__(self, "frames", frames)
 
     @classmethod
-    def select(cls, device: Mapping[str, Any]) -> "PortSettings":
+    def select(cls, device: Mapping[str, Any]) -> "Port":
         """Return those of the settings of ``device=serial`` that describe the port."""
         return cls(**{entry.name: device[entry.name] for entry in fields(cls) if entry.name in device})
 
@@ -111,17 +115,7 @@ class SkinDisconnected(_TooFewFramesError, ConnectionError):  # noqa: N818
     """The skin was unplugged, or a recording has ended."""
 
 
-if TYPE_CHECKING:
-    from skin.device.touches import Touches
-
-try:
-    import termios
-except ImportError:  # Windows
-    _Gone: type[Exception] = OSError
-else:
-    _Gone = termios.error
-
-_WAIT = 0.1  # s
+_WAIT = 0.1  # s that one read waits for bytes
 _CONNECT = 5.0  # s
 # A reader does not notice that the other side lost its power; by default the system checks after two hours.
 _KEEPALIVE = {"TCP_KEEPIDLE": 10, "TCP_KEEPINTVL": 5, "TCP_KEEPCNT": 3}  # s, s, attempts
@@ -171,6 +165,15 @@ def check_port(port: str) -> None:
         raise InputError(f"no port {port}: {_existing()}")
 
 
+@contextmanager
+def _os_error() -> Iterator[None]:
+    """Raise OSError for any error: pyserial lets ``termios.error`` through, which is none."""
+    try:
+        yield
+    except Exception as error:
+        raise OSError(str(error)) from error
+
+
 class _Serial:
     def __init__(self, port: str, baudrate: int) -> None:
         import serial
@@ -178,20 +181,16 @@ class _Serial:
         try:
             # Exclusive, or two readers would get half the bytes each.
             self._port = serial.Serial(port, baudrate, timeout=_WAIT, write_timeout=_CONNECT, exclusive=True)
-        except (OSError, _Gone, ValueError, OverflowError) as error:
+        except Exception as error:
             raise _refused(port, baudrate, error) from error
 
     def read(self) -> bytes:
-        try:
+        with _os_error():
             return self._port.read(max(1, min(self._port.in_waiting, _MOST)))
-        except (OSError, _Gone) as error:
-            raise OSError(str(error)) from error
 
     def write(self, data: bytes) -> None:
-        try:
+        with _os_error():
             self._port.write(data)
-        except (OSError, _Gone) as error:
-            raise OSError(str(error)) from error
 
     def close(self) -> None:
         self._port.close()
@@ -199,9 +198,8 @@ class _Serial:
 
 class _Socket:
     def __init__(self, port: str) -> None:
-        host, number = _address(port)
         try:
-            self._socket = socket.create_connection((host, number), timeout=_CONNECT)
+            self._socket = socket.create_connection(_address(port), timeout=_CONNECT)
         except OSError as error:
             raise InputError(f"cannot reach {port}: {error}; does anything listen there?") from error
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
@@ -230,31 +228,37 @@ class _Socket:
 
 def _address(port: str) -> tuple[str, int]:
     """Return host and number of ``socket://host:number``."""
-    try:
+    with suppress(ValueError):
         address = urlsplit(port)
-        host, number = address.hostname, address.port
-    except ValueError:
-        host = number = None
-    if not host or not number:
-        raise InputError(f"{port} is not an address: give device.port=socket://HOST:NUMBER")
-    return host, number
+        if address.hostname and address.port:
+            return address.hostname, address.port
+    raise InputError(f"{port} is not an address: give device.port=socket://HOST:NUMBER")
 
 
 def _refused(port: str, baudrate: int, error: Exception) -> InputError:
-    number, text = getattr(error, "errno", None), str(error)
-    if number in (errno.ENOENT, errno.ENODEV, errno.ENXIO) or "FileNotFoundError" in text:
-        return InputError(f"no port {port}: {_existing()}")
-    # Windows reports "access is denied" for a port in use.
-    if number in (errno.EBUSY, errno.EAGAIN, errno.EWOULDBLOCK) or "PermissionError" in text:
-        return InputError(f"{port} is in use: close the serial monitor or any other program that reads it")
-    if number in (errno.EACCES, errno.EPERM):
-        return InputError(
+    """Return why a serial port cannot be opened; Windows reports "access is denied" for a port in use."""
+    number, text, existing = getattr(error, "errno", None), str(error), _existing()
+    reasons = (
+        ((errno.ENOENT, errno.ENODEV, errno.ENXIO), "FileNotFoundError", f"no port {port}: {existing}"),
+        (
+            (errno.EBUSY, errno.EAGAIN, errno.EWOULDBLOCK),
+            "PermissionError",
+            f"{port} is in use: close the serial monitor or any other program that reads it",
+        ),
+        (
+            (errno.EACCES, errno.EPERM),
+            "may not be opened",
             f"{port} may not be opened: add your user to dialout with "
-            "sudo usermod -a -G dialout $USER, and log in again"
-        )
-    if number in (errno.ENOTTY, errno.EINVAL, errno.EISDIR) or "configure port" in text:
-        return InputError(f"{port} is not a serial port: {_existing()}")
-    return InputError(f"cannot open {port} with device.baudrate={baudrate}: {text}")
+            "sudo usermod -a -G dialout $USER, and log in again",
+        ),
+        (
+            (errno.ENOTTY, errno.EINVAL, errno.EISDIR),
+            "configure port",
+            f"{port} is not a serial port: {existing}",
+        ),
+        ((number,), "", f"cannot open {port} with device.baudrate={baudrate}: {text}"),
+    )
+    return InputError(next(why for numbers, words, why in reasons if number in numbers or words in text))
 
 
 def _existing() -> str:
@@ -266,74 +270,24 @@ def _existing() -> str:
     )
 
 
-_AT_ONCE = 256  # frames, where time does not matter
 _WEAK = {
     "none": "no checksum: a wrong value passes in 29 % of flipped bits and 76 % of lost bytes",
     "xor": "a weak checksum (*HH): 2 % of double flipped bits and 6 % of double lost bytes pass",
 }
 
 
-_AGAIN = 1.0  # s between two attempts to start a board, which may take seconds to boot
-_UNPOLLED = 0.25  # s without an answer after which a board is polled again
-
-
-class Prompter:
-    """Sends a board what it waits for: a start string, a string for each frame, and a stop string.
-
-    Args:
-        adapter: with the strings.
-        stream: to the board.
-    """
-
-    def __init__(self, adapter: Adapter, stream: ByteStream) -> None:
-        self._stream = stream
-        self._start, self._poll, self._stop = (
-            (text or "").encode() for text in (adapter.start, adapter.poll, adapter.stop)
-        )
-        self._asked_at = self._polled_at = -inf
-        self._attempts, self._started, self._answered = 0, False, True
-
-    def ask(self, now: float) -> None:
-        """Send what is due at ``now``, s."""
-        if self._start and not self._started and now - self._asked_at >= _AGAIN:
-            self._stream.write(self._start)
-            self._asked_at = now
-            self._attempts += 1
-        if self._poll and (self._answered or now - self._polled_at >= _UNPOLLED):
-            self._stream.write(self._poll)
-            self._polled_at, self._answered = now, False
-            self._attempts += not self._start
-
-    def answer(self, received: bool, frames: bool) -> None:
-        """Note whether bytes and frames arrived; before the first frame any bytes answer a poll."""
-        self._started |= frames
-        self._answered |= frames or (received and not self._started)
-
-    @property
-    def unanswered(self) -> str:
-        """What was sent without any frame in return, in words; empty if nothing."""
-        if self._started or not self._attempts:
-            return ""
-        name, text = ("start", self._start) if self._start else ("poll", self._poll)
-        return (
-            f"the {name} string {text.decode()!r} of the adapter was sent {self._attempts} times without an "
-            "answer"
-        )
-
-    def stop(self) -> None:
-        """Send the stop string."""
-        if self._stop:
-            self._stream.write(self._stop)
-
-
 class WireFeed:
     """Frames decoded from bytes, with checked channels; logs bad frames once a second.
+
+    It sends the strings of the adapter: to start the board, for each frame, and to stop it.
 
     Args:
         opener: opens the stream of bytes.
         decoder: turns them into frames.
         limits: smallest and largest value of a channel.
         silence: s without a byte after which the stream counts as gone.
+        again: s between two attempts to start a board, which may take seconds to boot.
+        unanswered: s without an answer after which a board is polled again.
 
     Attributes:
         patient: the feed can wait, so no frame needs to be dropped.
@@ -342,11 +296,17 @@ class WireFeed:
     patient = False
 
     def __init__(
-        self, opener: Callable[[], ByteStream], decoder: Decoder, limits: Limits | None, silence: float = inf
+        self,
+        opener: Callable[[], ByteStream],
+        decoder: Decoder,
+        limits: Limits | None = None,
+        silence: float = inf,
+        again: float = 1.0,
+        unanswered: float = 0.25,
     ) -> None:
         self._opener, self._decoder, self._limits, self._silence = opener, decoder, limits, silence
+        self._again, self._unanswered = again, unanswered
         self._health = ChannelHealth(limits or (None, None))
-        self._stream = opener()
         self._begin()
 
     def open(self) -> None:
@@ -354,40 +314,41 @@ class WireFeed:
 
         The known ranges of channels are kept: a cable may be unplugged under a press that saturates channels.
         """
-        self._stream = self._opener()
+        self._begin()
         self._decoder.restart()
         self._health.restart()
-        self._begin()
 
     def _begin(self) -> None:
-        self._warned = False
-        self._prompter = Prompter(self._decoder.adapter, self._stream)
-        self._reported = Counter(self._decoder.stats.bad)
-        self._reported_at = self._heard_at = monotonic()
-        self._clock_told = ""
+        self._stream = self._opener()
+        adapter = self._decoder.adapter
+        self._start, self._poll, self._stop = (
+            (text or "").encode() for text in (adapter.start, adapter.poll, adapter.stop)
+        )
+        self._asked_at = self._polled_at = -inf
+        self._attempts, self._started, self._answered, self._warned = 0, False, True, False
+        self._received_at = self._reported_at = inf
+        self._reported, self._logged_clock = Counter(self._decoder.stats.bad), ""
 
-    def poll(self) -> list[Frame]:
+    def poll(self, clock: Callable[[], float]) -> list[Frame]:
         """Return the frames received since the last call.
+
+        Args:
+            clock: gives the host's monotonic time, s.
 
         Raises:
             InputError: no format is detected, or another device is connected.
             OSError: the stream is closed, or silent for too long.
         """
-        self._prompter.ask(monotonic())
-        data, now = self._stream.read(), monotonic()
-        if data:
-            self._heard_at = now
-        elif now - self._heard_at >= self._silence:
+        self._ask(clock())
+        data, now = self._stream.read(), clock()
+        if data or now < self._received_at:
+            self._received_at = now
+        elif now - self._received_at >= self._silence:
             raise TimeoutError(f"nothing received for {self._silence:g} s")
         frames = self.decode(data, now) if data else []
-        self._prompter.answer(bool(data), bool(frames))
-        stats = self._decoder.stats
-        if now - self._reported_at >= 1:
-            fresh, self._reported, self._reported_at = stats.bad - self._reported, Counter(stats.bad), now
-            if fresh:
-                reasons = ", ".join(f"{count} {reason}" for reason, count in fresh.most_common())
-                trouble = f"; {stats.trouble}" if stats.trouble else ""
-                _log.warning("%d bad frames (%s)%s", fresh.total(), reasons, trouble)
+        # Before the first frame any bytes answer a poll.
+        self._answered |= bool(frames) or (bool(data) and not self._started)
+        self._started |= bool(frames)
         return frames
 
     def decode(self, data: bytes, now: float) -> list[Frame]:
@@ -401,43 +362,71 @@ class WireFeed:
             raise error
         if frames:
             self._prepare()
+        self._report(now)
         return [self._judge(frame) for frame in frames]
 
-    def states(self) -> tuple[ChannelState, ...]:
-        """Return the state of each channel."""
+    @property
+    def states(self) -> tuple[str, ...]:
+        """State of each channel: ``ok``, or a :class:`skin.wire.channels.Reason`."""
         return self._health.states()
 
     @property
     def unanswered(self) -> str:
-        """Text sent to the board without an answer; empty if it answered or nothing was sent."""
-        return self._prompter.unanswered
+        """What was sent to the board without any frame in return, in words; empty if nothing."""
+        if self._started or not self._attempts:
+            return ""
+        name, text = ("start", self._start) if self._start else ("poll", self._poll)
+        sent = f"the {name} string {text.decode()!r} of the adapter was sent"
+        return f"{sent} {self._attempts} times without an answer"
 
     def close(self) -> None:
         """Tell the board to stop, and close the port."""
         with suppress(OSError):
-            self._prompter.stop()
+            if self._stop:
+                self._stream.write(self._stop)
         self._stream.close()
+
+    def _ask(self, now: float) -> None:
+        """Send what is due at ``now``, s."""
+        if self._start and not self._started and now - self._asked_at >= self._again:
+            self._stream.write(self._start)
+            self._asked_at = now
+            self._attempts += 1
+        if self._poll and (self._answered or now - self._polled_at >= self._unanswered):
+            self._stream.write(self._poll)
+            self._polled_at, self._answered = now, False
+            self._attempts += not self._start
 
     def _prepare(self) -> None:
         """Warn once of a weak checksum; set limits from the header as soon as it arrives."""
-        check, header, clock = self._decoder.stats.check, self._decoder.header, self._decoder.stats.clock
-        if clock != self._clock_told:
-            (_log.info if self._decoder.stats.clock_trusted else _log.warning)("%s", clock)
-            self._clock_told = clock
-        if not self._warned and check in _WEAK:
-            _log.warning("frames carry %s; let the firmware send *HHHH", _WEAK[check])
+        stats, header = self._decoder.stats, self._decoder.header
+        if stats.clock != self._logged_clock:
+            (_log.info if stats.clock_trusted else _log.warning)("%s", stats.clock)
+            self._logged_clock = stats.clock
+        if not self._warned and stats.check in _WEAK:
+            _log.warning("frames carry %s; let the firmware send *HHHH", _WEAK[stats.check])
         self._warned = True
         if header is not None and header.bits:
             self._health.largest = 2**header.bits - 1
             self._health.limits = self._limits or (None, self._health.largest)
 
+    def _report(self, now: float) -> None:
+        """Log the bad frames of the last second."""
+        self._reported_at = min(self._reported_at, now)
+        if now - self._reported_at < 1:
+            return
+        stats = self._decoder.stats
+        fresh, self._reported, self._reported_at = stats.bad - self._reported, Counter(stats.bad), now
+        if fresh:
+            reasons = ", ".join(f"{number} {reason}" for reason, number in fresh.most_common())
+            trouble = f"; {stats.trouble}" if stats.trouble else ""
+            _log.warning("%d bad frames (%s)%s", fresh.total(), reasons, trouble)
+
     def _judge(self, frame: Frame) -> Frame:
         if frame.after not in ("", "gap"):
             self._health.restart()
-        valid, saturated = self._health.check(frame.values, frame.t)
-        if frame.saturated is not None:
-            saturated = saturated | frame.saturated
-        return frame._replace(valid=valid & frame.valid, saturated=saturated & frame.valid)
+        mask = self._health.check(frame.values, frame.t, frame.saturated) | ~frame.valid * Reason.MISSING
+        return frame._replace(valid=mask <= Reason.SATURATED, saturated=mask == Reason.SATURATED, mask=mask)
 
 
 class PlaybackFeed:
@@ -446,10 +435,14 @@ class PlaybackFeed:
     Args:
         strips: touches in N, all with one rate; a window should not span two of them.
         realtime: False: as fast as they are read.
+        at_once: frames, where time does not matter.
     """
 
-    def __init__(self, strips: "Iterable[Touches]", realtime: bool = True) -> None:
-        self.patient, self._start = not realtime, monotonic()
+    states: tuple[str, ...] = ()  # the frames of a file already have masks of valid values
+    unanswered = ""
+
+    def __init__(self, strips: "Iterable[Touches]", realtime: bool = True, at_once: int = 256) -> None:
+        self.patient, self._at_once, self._start = not realtime, at_once, inf
         self._frames = self._play(strips)
         self._next = next(self._frames, None)
 
@@ -464,24 +457,28 @@ class PlaybackFeed:
                 for values, valid, limited in zip(*touch, strict=True):
                     seq = next(number)
                     t = seq / strip.rate
-                    yield Frame(seq, t, self._start + t, values, valid, segment, 0, after, limited)
+                    yield Frame(seq, t, t, values, valid, segment, 0, after, limited)
                     after = ""
 
-    def poll(self) -> list[Frame]:
-        """Return the frames that are due."""
+    def poll(self, clock: Callable[[], float]) -> list[Frame]:
+        """Return the frames that are due.
+
+        Args:
+            clock: gives the host's monotonic time, s.
+
+        Raises:
+            EOFError: the recording has ended.
+        """
         if self._next is None:
             raise EOFError("the recording has ended")
+        self._start = min(self._start, clock())
         if not self.patient:
-            sleep(min(_WAIT, max(0.0, self._next.t_host - monotonic())))
-        frames, now = list[Frame](), monotonic()
-        while self._next and len(frames) < _AT_ONCE and (self.patient or self._next.t_host <= now):
-            frames.append(self._next)
+            sleep(min(_WAIT, max(0.0, self._start + self._next.t - clock())))
+        frames, due = list[Frame](), inf if self.patient else clock() - self._start
+        while self._next and len(frames) < self._at_once and self._next.t <= due:
+            frames.append(self._next._replace(t_host=self._start + self._next.t))
             self._next = next(self._frames, None)
         return frames
-
-    def states(self) -> tuple[ChannelState, ...]:
-        """Return nothing: the frames of a file already have masks of valid values."""
-        return ()
 
     def open(self) -> None:
         """Do nothing: memory is never disconnected."""

@@ -19,15 +19,10 @@ from skin.wire.contact_lines import ContactLine, join_contact_lines, parse_conta
 from skin.wire.protocol import Announcement, parse_announcement
 from skin.wire.reader import ByteStream
 
-_LONGEST = 4096  # bytes
-_KEPT = 64  # announcements that are kept unread
-
-
 Labels = Mapping[str, int]
 
-_LATE = 0.25  # fraction of an announced window that may be missed at its beginning
 _INTERRUPTED = "the gesture was interrupted: the skin was unplugged or restarted"
-_UNFELT = "no touch was detected, so the gesture is asked for again: all working sensors read noise"
+_NO_RESPONSE = "no touch was detected, so the gesture is asked for again: all working sensors read noise"
 
 
 @dataclass
@@ -84,16 +79,18 @@ class AnnouncementListener:
 
     Args:
         opener: opens the stream of bytes.
+        longest: bytes of a line.
+        kept: announcements that are kept unread.
 
     Attributes:
         announcements: announcements that have not been read yet.
         contacts: lines of contacts that have not been read yet.
     """
 
-    def __init__(self, opener: Callable[[], ByteStream]) -> None:
-        self._opener = opener
-        self.announcements: deque[Announcement] = deque(maxlen=_KEPT)
-        self.contacts: deque[ContactLine] = deque(maxlen=_KEPT * _LONGEST)
+    def __init__(self, opener: Callable[[], ByteStream], longest: int = 4096, kept: int = 64) -> None:
+        self._opener, self._longest = opener, longest
+        self.announcements: deque[Announcement] = deque(maxlen=kept)
+        self.contacts: deque[ContactLine] = deque(maxlen=kept * longest)
 
     def __call__(self) -> ByteStream:
         """Open the stream; called again after each disconnection."""
@@ -106,7 +103,7 @@ class AnnouncementListener:
         """Return the received bytes."""
         data = self._stream.read()
         *lines, self._rest = (self._rest + data).split(b"\n")
-        self._rest = self._rest[-_LONGEST:]
+        self._rest = self._rest[-self._longest :]
         self.announcements.extend(filter(None, map(parse_announcement, lines)))
         self.contacts.extend(filter(None, map(parse_contact_line, lines)))
         return data
@@ -173,14 +170,18 @@ class AnnouncedSegmenter(AbstractSegmenter):
         window: as in :class:`AbstractSegmenter`.
         listener: collects the announcements.
         task: the required labels; ``touch`` is always 1.
+        late: fraction of a window that may be missed at its beginning.
 
     Raises:
         InputError: a frame without a number, or an announcement without a required label.
     """
 
-    def __init__(self, window: Window, listener: AnnouncementListener, task: Task) -> None:
+    def __init__(
+        self, window: Window, listener: AnnouncementListener, task: Task, late: float = 0.25
+    ) -> None:
         super().__init__(window)
-        self._announcements, self._task, self._contacts = listener.announcements, task, listener.contacts
+        self._announcements, self._task, self._late = listener.announcements, task, late
+        self._contacts = listener.contacts
 
     def _begin(self, frame: Frame) -> RecordedGesture | None:
         if frame.seq is None:
@@ -191,7 +192,7 @@ class AnnouncedSegmenter(AbstractSegmenter):
                 return None
             self._announcements.popleft()
             # Most of a gesture that began long before the port was opened is missing.
-            if frame.seq <= announced.seq + _LATE * announced.frames:
+            if frame.seq <= announced.seq + self._late * announced.frames:
                 late = frame.seq - announced.seq
                 begin = frame.t - late * self._length / announced.frames
                 labels = {"touch": 1} | dict(announced.labels)
@@ -224,7 +225,7 @@ class PromptedSegmenter(AbstractSegmenter):
         window: as in :class:`AbstractSegmenter`.
         plan: (number, labels) of the gestures.
         notify: called with each message for the user.
-        felt: returns whether the skin has detected a touch in a window.
+        responded: returns whether the skin has detected a touch in a window.
         lines: typed lines; None: standard input. Lines typed before a prompt count, unless they come from a
             keyboard.
     """
@@ -234,11 +235,11 @@ class PromptedSegmenter(AbstractSegmenter):
         window: Window,
         plan: Iterator[tuple[int, Labels]],
         notify: Callable[[str], None],
-        felt: Callable[[Resampled], bool],
+        responded: Callable[[Resampled], bool],
         lines: Iterator[str] | None = None,
     ) -> None:
         super().__init__(window)
-        self._wanted, self._notify, self._felt = plan, notify, felt
+        self._wanted, self._notify, self._responded = plan, notify, responded
         self._typed: SimpleQueue[str] = SimpleQueue()
         self._asked: tuple[int, Labels] | None = None
         self._hasty = lines is None and sys.stdin.isatty()
@@ -256,10 +257,10 @@ class PromptedSegmenter(AbstractSegmenter):
         done = super().add(frame)
         if done is not None and done.labels is not None:
             done.broken = done.resampled is None or (
-                done.labels.get("touch") != 0 and not self._felt(done.resampled)
+                done.labels.get("touch") != 0 and not self._responded(done.resampled)
             )
             if done.broken:
-                self._notify(_INTERRUPTED if done.resampled is None else _UNFELT)
+                self._notify(_INTERRUPTED if done.resampled is None else _NO_RESPONSE)
                 self._ask((done.number, done.labels))
         elif self.gesture is None and self._asked is None and not self.over:
             # A frame after a gesture, so that the message about that is printed first.

@@ -19,31 +19,20 @@ import numpy as np
 from skin.device.calibration import read_calibration
 from skin.device.resampling import Frame, check_rate
 from skin.errors import InputError
-from skin.wire.channels import (
-    HEADER,
-    PATIENCE,
-    ChannelState,
-    Limits,
-    RawRange,
-    SkinTouched,
-    Tare,
-    UnitConversion,
-    check_sensitivity,
-    take_baseline,
-    unit_conversion,
-)
+from skin.wire.channels import RawRange, UnitConversion, check_sensitivity, unit_conversion
 from skin.wire.decoder import Decoder, Stats
 from skin.wire.protocol import Header
 from skin.wire.reader import (
     ByteStream,
     PlaybackFeed,
-    PortSettings,
+    Port,
     SkinDisconnected,
     SkinTimeout,
     WireFeed,
     open_stream,
 )
 from skin.wire.segmentation import AnnouncementListener
+from skin.wire.tare import HEADER, PATIENCE, SkinTouched, Tare, take_baseline
 
 if TYPE_CHECKING:
     from skin.body.base import Layer
@@ -52,9 +41,6 @@ if TYPE_CHECKING:
 
 
 _log = logging.getLogger(__name__)
-_PAUSE = 0.002  # s between two reads of the port: fewer and larger pieces cost a tenth of the time
-_RATE = 256  # frames over which the rate is taken
-_WAKE = 0.2  # s: longer waits for a lock would block Ctrl-C on Windows
 
 
 class Skin:
@@ -66,10 +52,13 @@ class Skin:
     Args:
         feed: open.
         decoder: of the feed; None: it needs none.
-        settings: timeout and backoff.
+        port: with timeout and backoff.
         baseline: from an earlier tare.
         queue: largest number of frames in the queue.
         reconnect: try to open the feed again after a disconnection.
+        clock: gives the host's monotonic time, s.
+        pause: s between two reads of the port: fewer and larger pieces cost a tenth of the time.
+        wake: s; longer waits for a lock would block Ctrl-C on Windows.
 
     Attributes:
         baseline: (S,), values of the untouched skin, in the device's unit; None before the first tare.
@@ -80,19 +69,22 @@ class Skin:
         self,
         feed: WireFeed | PlaybackFeed,
         decoder: Decoder | None,
-        settings: PortSettings,
+        port: Port,
         baseline: np.ndarray | None,
         queue: int,
         reconnect: bool = False,
+        clock: Callable[[], float] = monotonic,
+        pause: float = 0.002,
+        wake: float = 0.2,
     ) -> None:
-        self._feed, self._decoder = feed, decoder
+        self._feed, self._decoder, self._clock, self._pause, self._wake = feed, decoder, clock, pause, wake
         self._stats = Stats() if decoder is None else decoder.stats
-        self._timeout, self._backoff, self._wait = settings.timeout, settings.backoff, settings.backoff[0]
+        self._timeout, self._backoff, self._wait = port.timeout, port.backoff, port.backoff[0]
         self.baseline = baseline
         self._most, self._reconnect, self.away = queue, reconnect, False
         self._error: Exception | None = None  # why the thread ended; EOFError at the end of a recording
         self._frames: deque[Frame] = deque()
-        self._times: deque[float] = deque(maxlen=_RATE)
+        self._times: deque[float] = deque(maxlen=256)  # over which the rate is taken
         self._stop, self._fresh = Event(), Condition()
         self._thread = Thread(target=self._run, name="skin-reader", daemon=True)
         self._thread.start()
@@ -120,14 +112,16 @@ class Skin:
             SkinDisconnected: it was unplugged, and ``reconnect`` is not set.
         """
         while True:
-            back = self._stats.reconnects
-            frame = next(self._take(1, self._timeout), None)
-            if frame is not None:
-                yield frame
-            elif isinstance(self._error, EOFError):
-                return
-            elif self._error is not None or (not self.away and self._stats.reconnects == back):
-                self._explain(1, self._timeout, [])
+            reconnects = self._stats.reconnects
+            try:
+                yield from self.read(1)
+            except SkinTimeout:
+                if not self.away and self._stats.reconnects == reconnects:
+                    raise
+            except SkinDisconnected:
+                if isinstance(self._error, EOFError):
+                    return
+                raise
 
     def read(self, count: int, timeout: float | None = None) -> list[Frame]:
         """Return exactly ``count`` frames.
@@ -142,9 +136,17 @@ class Skin:
             InputError: nothing can be read: another format, baud rate or number of sensors.
         """
         timeout = self._timeout if timeout is None else timeout
-        frames = list(self._take(count, timeout))
-        if len(frames) < count:
-            self._explain(count, timeout, frames)
+        deadline, frames = self._clock() + timeout, list[Frame]()
+        while len(frames) < count:
+            with self._fresh:
+                while not self._frames:
+                    left = deadline - self._clock()
+                    if self._error is not None or left <= 0:
+                        raise self._explain(count, timeout, frames)
+                    self._fresh.wait(min(left, self._wake))
+                frames.append(self._frames.popleft())
+                self._fresh.notify_all()
+            self._stats.frames += self._decoder is None
         return frames
 
     def tare(self, seconds: float = 1.0, force: bool = False, touch: float | None = None) -> np.ndarray:
@@ -160,11 +162,9 @@ class Skin:
             InputError: the skin is touched or was restarted meanwhile, or too few frames arrived; the old
                 baseline is kept.
         """
-        frames, start = list[Frame](), monotonic()
+        frames, start = list[Frame](), self._clock()
         while not frames or frames[-1].t_host < start + seconds:
-            frame = self.read(1)[0]
-            if frame.t_host >= start:
-                frames.append(frame)
+            frames += [frame for frame in self.read(1) if frame.t_host >= start]
         if len({frame.segment for frame in frames}) > 1:
             raise InputError("the skin was restarted meanwhile: tare again; the old baseline is kept")
         if touch is None:
@@ -179,9 +179,9 @@ class Skin:
         return self._decoder.header if self._decoder else None
 
     @property
-    def channels(self) -> tuple[ChannelState, ...]:
+    def channels(self) -> tuple[str, ...]:
         """State of each channel at the last frame; empty if channels are not checked."""
-        return self._feed.states()
+        return self._feed.states
 
     @property
     def stats(self) -> Stats:
@@ -193,70 +193,53 @@ class Skin:
             rate = (len(times) - 1) / passed if passed > 0 else 0.0
         return replace(self._stats, bad=Counter(self._stats.bad), rate_hz=rate)
 
-    def _explain(self, count: int, timeout: float, frames: list[Frame]) -> None:
-        """Raise the error that explains why ``count`` frames are not available."""
+    def _explain(self, count: int, timeout: float, frames: list[Frame]) -> Exception:
+        """Return the error that explains why ``count`` frames are not available."""
         error, stats = self._error, self._stats
         if isinstance(error, SkinDisconnected | EOFError):
-            raise SkinDisconnected(str(error), frames) from error
+            return SkinDisconnected(str(error), frames)
         if error is not None:
-            raise error
-        message = f"{len(frames)} of {count} frames arrived within {timeout:g} s"
+            return error
+        foreign = self._decoder is not None and self._decoder.adapter.kind != "protocol"
         if self.away:
-            raise SkinTimeout(f"{message}: the skin is unplugged; trying again", frames)
-        if isinstance(self._feed, WireFeed) and (unanswered := self._feed.unanswered):
-            raise SkinTimeout(f"{message}: {unanswered}", frames)
-        if not stats.bytes and not stats.frames:
-            raise SkinTimeout(f"{message}: port open, nothing received; is the device sending?", frames)
-        if not stats.frames and self._decoder is not None and self._decoder.adapter.kind != "protocol":
-            raise SkinTimeout(f"{message}: {self._decoder.explain()}", frames)
-        if not stats.frames:
-            reason = stats.trouble or "no format shows yet; wrong baud rate?"
-            raise SkinTimeout(f"{message}: {stats.bytes} bytes but no frame: {reason}", frames)
-        raise SkinTimeout(f"{message}: {stats.trouble or 'the device stopped sending'}", frames)
-
-    def _take(self, count: int, timeout: float) -> Iterator[Frame]:
-        """Yield frames as they arrive: ``count``, or fewer if ``timeout`` s pass or the thread ends."""
-        deadline = monotonic() + timeout
-        for _ in range(count):
-            with self._fresh:
-                while not self._frames:
-                    left = deadline - monotonic()
-                    if self._error is not None or left <= 0:
-                        return
-                    self._fresh.wait(min(left, _WAKE))
-                frame = self._frames.popleft()
-                self._fresh.notify_all()
-            self._stats.frames += self._decoder is None
-            yield frame
+            reason = "the skin is unplugged; trying again"
+        elif self._feed.unanswered:
+            reason = self._feed.unanswered
+        elif stats.frames:
+            reason = stats.trouble or "the device stopped sending"
+        elif not stats.bytes:
+            reason = "port open, nothing received; is the device sending?"
+        elif self._decoder is not None and foreign:
+            reason = str(self._decoder.explain())
+        else:
+            trouble = stats.trouble or "no format shows yet; wrong baud rate?"
+            reason = f"{stats.bytes} bytes but no frame: {trouble}"
+        return SkinTimeout(f"{len(frames)} of {count} frames arrived within {timeout:g} s: {reason}", frames)
 
     def _run(self) -> None:
         try:
             while not self._stop.is_set():
-                self._step()
+                try:
+                    frames = self._feed.poll(self._clock)
+                except OSError as error:
+                    self._reopen(error)
+                    continue
+                if frames:
+                    self._wait = self._backoff[0]
+                    self._push(frames)
+                    self._stop.wait(0 if self._feed.patient else self._pause)
         except Exception as error:
             with self._fresh:
                 self._error = error
                 self._fresh.notify_all()
 
-    def _step(self) -> None:
-        try:
-            frames = self._feed.poll()
-        except OSError as error:
-            with suppress(OSError):
-                self._feed.close()
-            if not self._reconnect:
-                raise SkinDisconnected(f"the skin was unplugged: {error}") from error
-            _log.warning("the skin was unplugged (%s); trying again", error)
-            self._reopen()
-            return
-        if frames:
-            self._wait = self._backoff[0]
-            self._push(frames)
-            if not self._feed.patient:
-                self._stop.wait(_PAUSE)
-
-    def _reopen(self) -> None:
+    def _reopen(self, error: OSError) -> None:
         """Open the feed again; the wait between two attempts doubles until frames arrive."""
+        with suppress(OSError):
+            self._feed.close()
+        if not self._reconnect:
+            raise SkinDisconnected(f"the skin was unplugged: {error}") from error
+        _log.warning("the skin was unplugged (%s); trying again", error)
         self.away = True
         while self.away and not self._stop.wait(self._wait):
             self._wait = min(2 * self._wait, self._backoff[1])
@@ -272,7 +255,7 @@ class Skin:
                     self._times.clear()
                 self._times.append(frame.t)
                 while self._feed.patient and len(self._frames) >= self._most and not self._stop.is_set():
-                    self._fresh.wait(_WAKE)
+                    self._fresh.wait(self._wake)
                 self._frames.append(frame)
                 if len(self._frames) > self._most:
                     dropped = self._frames.popleft()
@@ -282,7 +265,7 @@ class Skin:
 
 
 def open_skin(
-    port: str | PortSettings,
+    port: str | Port,
     layout: Sized | None = None,
     *,
     opener: Callable[[], ByteStream] | None = None,
@@ -309,14 +292,14 @@ def open_skin(
         queue: number of frames that are buffered.
         reconnect: wait for an unplugged skin; its next frame has ``after="reconnect"``.
         realtime: False plays a recording or the simulator as fast as frames are read.
-        settings: baudrate, adapter, limits, timeout, backoff and silence, as in :class:`PortSettings`.
+        settings: baudrate, adapter, limits, timeout, backoff and silence, as in :class:`Port`.
 
     Raises:
         InputError: there is nothing at ``port``, it may not be opened or is in use, or a setting is wrong.
     """
     if unused := sorted({"tare", "scale", "calibration"} & settings.keys()):
         raise InputError(f"open_skin gives values as the device sends them: leave out {unused[0]}")
-    about = port if isinstance(port, PortSettings) else PortSettings(port=port, **settings)
+    about = port if isinstance(port, Port) else Port(port=port, **settings)
     if not (isinstance(queue, int) and queue > 0):
         raise InputError(f"queue={queue} must be a whole number above 0: leave it out for 4096")
     address, sensors = str(about.port), None if layout is None else len(layout)
@@ -343,7 +326,7 @@ def play(
     baseline: np.ndarray | None = None,
     queue: int = 4096,
     realtime: bool = True,
-    settings: PortSettings | None = None,
+    settings: Port | None = None,
 ) -> Skin:
     """Return touches in N, all with one rate, as the frames of an open skin.
 
@@ -352,7 +335,7 @@ def play(
         baseline, queue, realtime: as in :func:`open_skin`.
         settings: with the timeout.
     """
-    return Skin(PlaybackFeed(strips, realtime), None, settings or PortSettings(), baseline, queue)
+    return Skin(PlaybackFeed(strips, realtime), None, settings or Port(), baseline, queue)
 
 
 def _read_touches(path: str, sensors: int | None) -> "Touches":
@@ -370,9 +353,6 @@ def _read_touches(path: str, sensors: int | None) -> "Touches":
     return touches
 
 
-_LEAST = 1.0  # s over which the rate is measured
-
-
 @dataclass(frozen=True)
 class Source:
     """An open stream of frames and its tare.
@@ -380,25 +360,24 @@ class Source:
     Attributes:
         name: shown in the live view.
         skin: open.
-        tare: gives the conversion of values to N.
-        limits: smallest and largest value of a channel, as given by the user.
+        tare: converts frames to N.
         port: that the frames come from; None: a recording or the simulator.
     """
 
     name: str
     skin: Skin
     tare: Tare
-    limits: Limits | None = None
     port: "SerialSource | None" = None
 
     @property
     def raw_range(self) -> RawRange:
         """The values that the device can send, as far as it declares them."""
-        header, limits = self.skin.header, self.limits or (None, None)
+        header, limits = self.skin.header, self.port.settings.limits if self.port else None
         if header is not None and header.bits:
             largest = 2.0**header.bits - 1
-            return RawRange(0.0, largest, header.unit != "N", self.limits or (None, largest))
-        return RawRange(limits[0], limits[1], False, limits)
+            return RawRange(0.0, largest, header.unit != "N", limits or (None, largest))
+        limits = limits or (None, None)
+        return RawRange(*limits, limits=limits)
 
     @property
     def calibrated_rest(self) -> np.ndarray | None:
@@ -425,16 +404,13 @@ class SerialSource:
         layers: of the body; empty: unknown.
 
     Raises:
-        InputError: an invalid setting, a calibration of another number of sensors, or a conversion that
-            contradicts ``device.sensitivity``.
+        InputError: a calibration of another number of sensors, or a conversion that contradicts
+            ``device.sensitivity``.
     """
 
-    def __init__(
-        self, settings: PortSettings, sensors: int, rate: float, layers: "Sequence[Layer]" = ()
-    ) -> None:
+    def __init__(self, settings: Port, sensors: int, rate: float, layers: "Sequence[Layer]" = ()) -> None:
         self.settings, self._sensors, self._rate, self.layers = settings, sensors, rate, layers
-        path = settings.calibration
-        self._calibration = None if path is None else read_calibration(path)
+        self._calibration = None if settings.calibration is None else read_calibration(settings.calibration)
         if settings.scale is not None or self._calibration is not None:
             self.convert(None, None)
 
@@ -448,15 +424,13 @@ class SerialSource:
         """1 or -1 per sensor, -1 where the value falls with force; empty: 1 for all."""
         if self._calibration is not None:
             return self._calibration.polarity
-        scale = self.settings.scale
-        return [-1] * self._sensors if scale is not None and scale < 0 else ()
+        return [-1] * self._sensors if (self.settings.scale or 0) < 0 else ()
 
     def open(self, reconnect: bool = False) -> tuple[Skin, AnnouncementListener]:
         """Open the port and collect its announcements; ``reconnect`` waits for an unplugged skin."""
-        port = self.settings.port
-        if port is None:
+        if self.settings.port is None:
             raise InputError("device=serial needs a port, device.port=/dev/ttyACM0; skin emulate makes one")
-        listener = AnnouncementListener(partial(open_stream, port, self.settings.baudrate))
+        listener = AnnouncementListener(partial(open_stream, self.settings.port, self.settings.baudrate))
         skin = open_skin(
             self.settings,
             range(self._sensors),
@@ -470,7 +444,7 @@ class SerialSource:
     def open_source(self) -> Source:
         """Open the port as a stream of frames; wait for an unplugged skin."""
         skin, _ = self.open(reconnect=True)
-        return Source(str(self.settings.port), skin, self.tare(skin), self.settings.limits, self)
+        return Source(str(self.settings.port), skin, self.tare(skin), self)
 
     def tare(self, skin: Skin) -> Tare:
         """Return the tare of an open skin."""
@@ -495,11 +469,8 @@ class SerialSource:
         """
         try:
             frames, conversion = warm_up(skin, self.tare(skin), self._rate, self.settings.tare, notify)
-            while (
-                skin.header is None
-                and self.settings.frames.kind == "protocol"  # other formats have no header
-                and frames[-1].t_host - frames[0].t_host < HEADER
-            ):
+            known = self.settings.frames.kind != "protocol"  # other formats have no header
+            while skin.header is None and not known and frames[-1].t_host - frames[0].t_host < HEADER:
                 frames += skin.read(1)
             return frames, conversion
         except (SkinTimeout, SkinDisconnected) as error:
@@ -507,7 +478,7 @@ class SerialSource:
 
 
 def warm_up(
-    skin: Skin, tare: Tare, rate: float, seconds: float, notify: Callable[[str], None]
+    skin: Skin, tare: Tare, rate: float, seconds: float, notify: Callable[[str], None], least: float = 1.0
 ) -> tuple[list[Frame], UnitConversion]:
     """Read frames until rate and conversion are known; return all frames read, and the conversion.
 
@@ -517,13 +488,14 @@ def warm_up(
         rate: of the model, Hz: a slower device is refused.
         seconds: of the tare.
         notify: called with each message for the user.
+        least: s over which the rate is measured.
 
     Raises:
         InputError: the device is too slow, or the scale is unknown.
         SkinTouched: the skin was still touched after a minute.
     """
     notify("reading the untouched skin: keep off" if seconds else "reading the rate")
-    frames, least, measured = list[Frame](), max(seconds, _LEAST), False
+    frames, least, measured = list[Frame](), max(seconds, least), False
     while True:
         frames += skin.read(1)
         if frames[-1].segment != frames[0].segment:
@@ -534,11 +506,10 @@ def warm_up(
             continue
         if not measured:
             # By the device's clock, with lost frames.
-            count = len(frames) - 1 + sum(frame.lost for frame in frames[1:])
-            check_rate(count / passed, rate)
+            check_rate((len(frames) - 1 + sum(frame.lost for frame in frames[1:])) / passed, rate)
         if tare.conversion is not None:
             return frames, tare.conversion
-        if not measured and tare.status.startswith("no baseline"):
+        if not measured and tare.state in ("touched", "limited"):
             notify("the skin is touched: let go")
         measured = True
         if passed > least + PATIENCE:

@@ -19,7 +19,7 @@ from skin.device.resampling import Frame
 from skin.errors import InputError
 from skin.wire.channels import UnitConversion
 from skin.wire.protocol import Header
-from skin.wire.reader import PortSettings
+from skin.wire.reader import Port
 from skin.wire.skin import SerialSource, Source
 
 SENSORS, RATE, HOLD, GAP = 9, 25.0, 11.0, 2.5
@@ -95,7 +95,7 @@ def data(monkeypatch, tmp_path):
 
 
 def verify(name="arm-L", scale=0.02, positions=POSITIONS, layers=LAYERS, **settings):
-    port = SerialSource(PortSettings(port="/dev/x", scale=scale, **settings), SENSORS, 10.0, layers)
+    port = SerialSource(Port(port="/dev/x", scale=scale, **settings), SENSORS, 10.0, layers)
     source = Source("x", Opened(name), None, port=port)
     conversion = port.convert(None, source.skin.header)
     return verify_source(source, conversion, positions, SIZE), (port, source.skin.header, conversion)
@@ -164,4 +164,4 @@ def test_emulated_devices_and_recordings_are_exempt(data):
 def test_a_declared_sensitivity_verifies_the_scale_or_refuses_it(data):
     assert verify(sensitivity=0.024)[0].state == "declared"
     with pytest.raises(InputError, match=r"by 0\.002 N per unit, device\.sensitivity=0\.02 says otherwise"):
-        SerialSource(PortSettings(port="/dev/x", scale=0.002, sensitivity=0.02), SENSORS, 10.0)
+        SerialSource(Port(port="/dev/x", scale=0.002, sensitivity=0.02), SENSORS, 10.0)

@@ -272,7 +272,7 @@ def engine_windows(drawn, readings, valid, ends, rate):
     # The first decision comes at a tick of the engine.
     times = 100.0 + (np.arange(len(readings)) - ends[0]) / rate
     frames = [Frame(n, t, t, row, valid) for n, (t, row) in enumerate(zip(times, readings, strict=True))]
-    verdicts = engine.push(frames, conversion)
+    verdicts = engine.push([conversion.convert(frame) for frame in frames])
     place = {round(verdict.t * rate): number for number, verdict in enumerate(verdicts)}
     chosen = [place[round(times[end] * rate)] for end in ends]
     return np.stack([windows[n] for n in chosen]), [verdicts[n].contact is not None for n in chosen]

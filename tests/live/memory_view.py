@@ -5,10 +5,10 @@ from types import SimpleNamespace
 import numpy as np
 
 from skin.live.loop import Display, DisplayInfo, LiveLoop
-from skin.wire.channels import Tare
 from skin.wire.decoder import Decoder
-from skin.wire.reader import PortSettings, WireFeed
+from skin.wire.reader import Port, WireFeed
 from skin.wire.skin import SerialSource
+from skin.wire.tare import Tare
 
 LOOK = 0.05  # s between two looks at the display
 
@@ -30,31 +30,32 @@ class MemoryView:
 
     Args:
         stream: (s of the host's clock, bytes that arrive then).
-        settings: of the engine.
-        before: called with the conversion before the first decision.
+        engine: with its settings.
+        verify: called with the conversion before the first decision.
         port: settings of the port.
 
     Attributes:
         looks: what the display shows, every ``LOOK`` s.
-        said: (s, verdict or None, reason, alarm) of everything that the observers are told.
+        said: (s, verdict or None, reason, alarm) of all assessments for observers.
     """
 
-    def __init__(self, stream, settings, before=None, **port):
-        self.looks, self.said, self.now = [], [], 0.0
-        port = PortSettings(**port)
-        source = SerialSource(port, settings.sensors, settings.rate)
-        decoder = Decoder(settings.sensors, adapter=port.frames, polarity=source.polarity)
+    def __init__(self, stream, engine, verify=None, **port):
+        self.looks, self.said = [], []
+        port = Port(**port)
+        source = SerialSource(port, engine.sensors, engine.rate)
+        decoder = Decoder(engine.sensors, adapter=port.frames, polarity=source.polarity)
         feed = WireFeed(SimpleNamespace, decoder, port.limits)  # opens a stream that nobody reads
         skin = SimpleNamespace(stats=decoder.stats)
-        tare = Tare(source.convert, 2.0, settings.rate, lambda: decoder.header)
-        places = np.zeros((settings.sensors, 3))
+        tare = Tare(source.convert, 2.0, engine.rate, lambda: decoder.header)
+        tare.glitches.shares = engine.shares
+        places = np.zeros((engine.sensors, 3))
         self.display = Display(DisplayInfo("memory", "memory", places, (0.1, 0.1), 4.0))
-        self.display.observers.append(lambda *told: self.said.append((self.now, *told)))
-        self.loop = LiveLoop(skin, tare, settings.build(), self.display, before)
+        self.display.observers.append(lambda assessment, now: self.said.append((now, *assessment)))
+        self.loop = LiveLoop(skin, tare, engine.build(), self.display, verify)
         for arrival, data in stream:
             self.look(arrival)
-            frames, self.now = feed.decode(data, arrival), arrival
-            skin.channels = feed.states()
+            frames = feed.decode(data, arrival)
+            skin.channels = feed.states
             if frames:
                 self.loop.take(frames, arrival)
             self.loop.update_status(arrival)
@@ -64,7 +65,7 @@ class MemoryView:
         while len(self.looks) * LOOK <= end:
             t = len(self.looks) * LOOK
             self.display.refresh(t)
-            self.looks.append(Look(t, self.display.state(now=t)))
+            self.looks.append(Look(t, self.display.state(t)))
 
     def states(self, begin, end):
         """Return the states that were shown between two times, s."""
@@ -75,7 +76,7 @@ class MemoryView:
         return {code for look in self.looks if begin < look.t < end for code in look.notes}
 
     def first(self, after):
-        """Return when the first alarm was told, s."""
+        """Return when the first alarm was shown, s."""
         return next((t for t, _, _, alarm in self.said if alarm and t >= after), np.inf)
 
     def kept(self, begin, end):

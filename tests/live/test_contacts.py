@@ -22,12 +22,10 @@ from skin.inference.candidates import disc_readings
 from skin.inference.noise import Noise
 from skin.live.contacts import (
     PREPARING,
-    SPAN,
-    STALE,
     LiveContacts,
     MeanReadings,
     Mechanics,
-    average_frames,
+    average_readings,
     contact_message,
     contact_text_lines,
     estimate_contacts,
@@ -87,17 +85,15 @@ def started():
 def running():
     """Return contacts whose process is ready; it takes seconds to begin."""
     with started() as contacts:
-        assert contacts.state()["reason"] == PREPARING
+        assert contacts.state(monotonic())["reason"] == PREPARING
         yield contacts
 
 
-def frames(values, count=10, end=1.0, **changes):
-    """Return the frames of 0.1 s that end now."""
-    times = end - SPAN + (np.arange(count) + 1) * SPAN / count
-    valid = np.ones(SENSORS, dtype=bool)
-    return [
-        Frame(None, t, monotonic(), np.asarray(values, dtype=float), valid)._replace(**changes) for t in times
-    ]
+def frames(values, count=10, end=1.0, conversion=CONVERSION, **changes):
+    """Return the readings of 0.1 s that end now."""
+    times = end - 0.1 + (np.arange(count) + 1) * 0.1 / count
+    frame = Frame(None, 0.0, monotonic(), np.asarray(values, dtype=float), np.ones(SENSORS, dtype=bool))
+    return [conversion.convert(frame._replace(t=t, **changes)) for t in times]
 
 
 def moment(values, **changes):
@@ -110,7 +106,7 @@ def moment(values, **changes):
 def state_of(contacts, wanted, values):
     """Offer the same readings until the state is another one, and return it."""
     deadline = monotonic() + PATIENCE
-    while (state := contacts.state())["state"] != wanted:
+    while (state := contacts.state(monotonic()))["state"] != wanted:
         assert monotonic() < deadline, state
         contacts.look(frames(values, end=monotonic()), CONVERSION, [TOUCHED], np.zeros(SENSORS))
         sleep(0.02)
@@ -233,15 +229,16 @@ def test_readings_are_means_above_the_rest_of_the_sensors_that_work():
     values = np.arange(SENSORS, dtype=float)
     noise, rest, baseline = np.full(SENSORS, 0.2), np.full(SENSORS, -0.3), np.full(SENSORS, 0.1)
     conversion = replace(CONVERSION, scale=np.full(SENSORS, 0.5), noise=noise, rest=rest)
-    sent = frames(values, saturated=np.arange(SENSORS) == 8)
-    sent[3] = sent[3]._replace(values=values + 10, valid=np.arange(SENSORS) != 7)
-    readings = average_frames(sent, conversion, (2,), baseline, True)
+    sent = frames(values, conversion=conversion, saturated=np.arange(SENSORS) == 8)
+    other = sent[3].frame._replace(values=values + 10, valid=np.arange(SENSORS) != 7)
+    sent[3] = conversion.convert(other)
+    readings = average_readings(sent, conversion, (2,), baseline, True)
     assert readings.values[[0, 8]] == pytest.approx([0.5 + 0.2, 4 + 0.5 + 0.2])
     assert np.flatnonzero(~readings.valid).tolist() == [2, 7]
     assert np.flatnonzero(readings.saturated).tolist() == [8]
     assert (readings.frames, readings.step) == (10, 0.5)
     assert readings.noise == pytest.approx(0.2)
-    assert average_frames(sent, CONVERSION, (), baseline, False).noise is None
+    assert average_readings(sent, CONVERSION, (), baseline, False).noise is None
 
 
 def test_the_process_estimates_what_is_left_for_it(running, posterior, felt):
@@ -249,13 +246,13 @@ def test_the_process_estimates_what_is_left_for_it(running, posterior, felt):
     running._newest = moment(felt, time=-1.0)
     running._wake.set()
     deadline = monotonic() + PATIENCE
-    while (state := running.state())["device_time"] != -1.0:
+    while (state := running.state(monotonic()))["device_time"] != -1.0:
         assert monotonic() < deadline
         sleep(0.001)
     # The same bits as in this process, with whatever frame before.
     assert state == estimate_contacts(posterior, NOISE, moment(felt, time=-1.0))
-    sleep(1.5 * STALE)
-    assert running.state()["state"] == "unknown"
+    sleep(1.5 * running.stale)
+    assert running.state(monotonic())["state"] == "unknown"
     assert state_of(running, "no contact", np.zeros(SENSORS))["number"] == 0
 
 
@@ -270,7 +267,7 @@ def test_looking_never_waits_and_only_the_newest_counts(running, felt):
         longest = max(longest, monotonic() - began)
         sleep(0.005)
     assert longest < 5  # waiting for the stopped process would never end
-    assert running.state()["state"] == "unknown"
+    assert running.state(monotonic())["state"] == "unknown"
     os.kill(running._process.pid, signal.SIGCONT)
     deadline, times = monotonic() + PATIENCE, set()
     while not any(t > 1e6 + 0.05 * 198.5 for t in times):
@@ -286,11 +283,11 @@ def test_a_process_that_dies_is_said_and_stops_nothing(felt):
         state_of(contacts, "contacts", felt)
         os.kill(contacts._process.pid, signal.SIGKILL)
         deadline = monotonic() + PATIENCE
-        while "has ended" not in contacts.state()["reason"]:
+        while "has ended" not in contacts.state(monotonic())["reason"]:
             assert monotonic() < deadline
             contacts.look(frames(felt, end=monotonic()), CONVERSION, [TOUCHED], np.zeros(SENSORS))
             sleep(0.01)
-        assert contacts.state()["state"] == "unknown"
+        assert contacts.state(monotonic())["state"] == "unknown"
 
 
 @pytest.mark.parametrize(
@@ -344,7 +341,7 @@ def test_verdicts_are_the_same_to_the_bit_with_contacts(running, felt):
     load = np.interp(np.arange(600) / 100, [1, 2, 4, 5], [0, 1, 1, 0])[:, None] * felt
     valid = np.ones(SENSORS, dtype=bool)
     stream = [
-        Frame(None, number / 100, 0.0, row, valid)
+        CONVERSION.convert(Frame(None, number / 100, 0.0, row, valid))
         for number, row in enumerate(load + rng.normal(scale=0.02, size=load.shape))
     ]
 
@@ -354,7 +351,7 @@ def test_verdicts_are_the_same_to_the_bit_with_contacts(running, felt):
     def watch(contacts):
         engine, verdicts = Engine(classify, TOUCH, SENSORS, 30, 10.0, Detection(0.3)), []
         for first in range(0, len(stream), 5):
-            verdicts += (fresh := engine.push(stream[first : first + 5], CONVERSION))
+            verdicts += (fresh := engine.push(stream[first : first + 5]))
             contacts.look(stream[first : first + 5], CONVERSION, fresh, engine.baseline)
         return verdicts
 

@@ -13,6 +13,7 @@ from skin.live.engine import Debounce, DebounceSettings, Detection, Engine
 from skin.runs.torch_model import window_classifier
 from skin.touch.labels import TOUCH, Task
 from skin.wire.channels import UnitConversion
+from skin.wire.tare import Tare
 
 PLAIN_PARTS = np.ones(4), np.zeros(4), np.zeros(4, bool)
 PLAIN = UnitConversion(*PLAIN_PARTS)
@@ -36,13 +37,29 @@ def frame(t, values, segment=0, valid=None, **more):
     return Frame(None, t, t, values, np.ones(len(values), bool) if valid is None else valid, segment, **more)
 
 
-def engine(window=5, rate=10.0, sensors=4, task=TOUCH, threshold=0.5, longest=2.0, presses=None, **patience):
+def engine(
+    window=5, rate=10.0, task=TOUCH, threshold=0.5, longest=2.0, presses=None, conversion=PLAIN, **patience
+):
+    """Return an engine of four sensors, with a model and with what converts its frames."""
     detection = Detection(threshold, learned=task.gate is not None, longest=longest)
     loud = Loud()
-    classify = window_classifier(loud, torch.zeros(sensors, 3), rate)
-    subject = Engine(classify, task, sensors, window, rate, detection, DebounceSettings(**patience), presses)
-    subject.loud = loud
+    classify = window_classifier(loud, torch.zeros(4, 3), rate)
+    subject = Engine(classify, task, 4, window, rate, detection, DebounceSettings(**patience), presses)
+    subject.loud, subject.tare = loud, Tare(lambda baseline, header: conversion, 0.0, rate)
+    subject.reset(noise=conversion.noise)
     return subject
+
+
+def rested(**settings):
+    """Return an engine that has seen rest for 0.6 s."""
+    subject = engine(**settings)
+    play(subject, np.zeros((60, 4)))
+    return subject
+
+
+def push(subject, frames):
+    """Push frames as the device sends them, and return the verdicts."""
+    return subject.push([subject.tare.add(one) for one in frames])
 
 
 def play(engine, values, rate=100.0, start=0.0, segment=0, burst=1):
@@ -52,7 +69,7 @@ def play(engine, values, rate=100.0, start=0.0, segment=0, burst=1):
         for number, row in enumerate(np.asarray(values, dtype=float))
     ]
     bursts = (frames[first : first + burst] for first in range(0, len(frames), burst))
-    return [verdict for some in bursts for verdict in engine.push(some, PLAIN)]
+    return [verdict for some in bursts for verdict in push(engine, some)]
 
 
 def test_each_frame_repeated_gives_what_the_window_itself_gives():
@@ -112,8 +129,7 @@ def test_without_touch_nothing_is_said():
 
 
 def test_words_carry_the_probability_of_what_is_said():
-    subject = engine()
-    play(subject, np.zeros((60, 4)))
+    subject = rested()
     verdict = play(subject, np.full((40, 4), 1.0), start=0.6)[-1]
     chance = verdict.chances["big"]
     assert 0.5 < chance < 1
@@ -155,10 +171,10 @@ def test_masked_sensors_and_gaps_are_told():
     subject = engine()
     valid = np.array([True, False, True, True])
     frames = [frame(number / 100, np.full(4, 3.0), valid=valid) for number in range(60)]
-    verdict = subject.push(frames, PLAIN)[-1]
+    verdict = push(subject, frames)[-1]
     assert verdict.masked == verdict.unknown == (1,)
     assert not verdict.gap
-    (verdict,) = subject.push([frame(0.65, np.zeros(4), lost=5, after="gap")], PLAIN)
+    (verdict,) = push(subject, [frame(0.65, np.zeros(4), lost=5, after="gap")])
     assert verdict.gap
 
 
@@ -167,15 +183,14 @@ def test_a_place_is_known_where_another_sensor_responds():
     presses[1, 2], presses[3, 2] = 0.6, 0.4
     subject = engine(presses=presses)
     frames = [frame(n / 100, np.zeros(4), valid=np.array([True, False, True, False])) for n in range(60)]
-    verdict = subject.push(frames, PLAIN)[-1]
+    verdict = push(subject, frames)[-1]
     assert (verdict.masked, verdict.unknown, verdict.state) == ((1, 3), (3,), "unknown")
     assert [(note.code, note.sensors) for note in verdict.notes] == [("masked", (3,))]
 
 
 @pytest.mark.parametrize("force", [0.0, 5.0])
 def test_an_alarm_outlives_a_restart_of_the_device_until_the_contact_ends(force):
-    subject = engine()
-    play(subject, np.zeros((60, 4)))
+    subject = rested()
     assert play(subject, np.full((60, 4), 5.0), start=0.6)[-1].dangerous
     said = play(subject, np.full((300, 4), force), start=1.2, segment=1)
     assert said[0].dangerous
@@ -199,19 +214,19 @@ def test_a_press_is_found_at_once_after_each_restart(rate, away):
 @pytest.mark.parametrize("rate", [2, 3])
 def test_a_stream_that_becomes_slow_is_unknown_as_taps_fall_between_its_frames(rate):
     subject = engine()
-    said = subject.push([frame(n / 100, np.zeros(4)) for n in range(500)], PLAIN)
+    said = push(subject, [frame(n / 100, np.zeros(4)) for n in range(500)])
     assert {verdict.state for verdict in said} == {"no touch"}
-    slow = subject.push([frame(5 + n / rate, np.zeros(4), lost=40, after="gap") for n in range(9)], PLAIN)
+    slow = push(subject, [frame(5 + n / rate, np.zeros(4), lost=40, after="gap") for n in range(9)])
     assert {verdict.state for verdict in slow[1:]} == {"unknown"}
     assert f"no frame for {1 / rate:.2f} s" in slow[-1].notes[0].text
     end = 5 + 8 / rate
-    fast = subject.push([frame(end + n / 4.1, np.zeros(4)) for n in range(1, 9)], PLAIN)
+    fast = push(subject, [frame(end + n / 4.1, np.zeros(4)) for n in range(1, 9)])
     assert {verdict.state for verdict in fast} == {"no touch"}
 
 
 def test_a_fast_model_is_not_blind_after_each_lost_frame():
     subject = engine(rate=100.0)
-    said = subject.push([frame(n / 100, np.zeros(4)) for n in range(500) if n % 20 > 4], PLAIN)
+    said = push(subject, [frame(n / 100, np.zeros(4)) for n in range(500) if n % 20 > 4])
     assert len(said) > 50
     assert {verdict.state for verdict in said} == {"no touch"}
 
@@ -236,21 +251,21 @@ def test_frozen_readings_are_seen_where_noise_was():
     noise = np.random.default_rng(0).normal(scale=0.05, size=(300, 4))
     for changing, frozen in ((np.full(4, 0.9), True), (np.zeros(4), False)):
         conversion = UnitConversion(*PLAIN_PARTS, noise=np.full(4, 0.05), changing=changing)
-        subject = engine()
-        subject.push([frame(n / 100, row) for n, row in enumerate(noise)], conversion)
-        subject.push([frame(3 + n / 100, noise[-1]) for n in range(480)], conversion)
-        assert not subject.frozen
-        subject.push([frame(7.8 + n / 100, noise[-1]) for n in range(30)], conversion)
-        assert subject.frozen == ("still" if frozen else "")
-        subject.push([frame(8.1, noise[0])], conversion)
-        assert not subject.frozen
+        subject = engine(conversion=conversion)
+        push(subject, [frame(n / 100, row) for n, row in enumerate(noise)])
+        push(subject, [frame(3 + n / 100, noise[-1]) for n in range(480)])
+        assert not subject.tare.freshness.frozen
+        push(subject, [frame(7.8 + n / 100, noise[-1]) for n in range(30)])
+        assert subject.tare.freshness.frozen == ("still" if frozen else "")
+        push(subject, [frame(8.1, noise[0])])
+        assert not subject.tare.freshness.frozen
 
 
 def test_a_channel_that_stops_changing_leaves_its_place_unknown():
     noise = np.random.default_rng(0).normal(scale=0.05, size=(900, 4))
     noise[300:, 2] = noise[300, 2]
     conversion = UnitConversion(*PLAIN_PARTS, noise=np.full(4, 0.05), changing=np.full(4, 0.9))
-    said = engine().push([frame(n / 100, row) for n, row in enumerate(noise)], conversion)
+    said = push(engine(conversion=conversion), [frame(n / 100, row) for n, row in enumerate(noise)])
     assert [verdict.unknown for verdict in said if verdict.t < 7.9] == [()] * sum(v.t < 7.9 for v in said)
     assert said[-1].unknown == (2,)
 
@@ -258,10 +273,10 @@ def test_a_channel_that_stops_changing_leaves_its_place_unknown():
 def test_a_value_that_is_the_same_behind_a_silence_is_not_stuck():
     noise = np.random.default_rng(0).normal(scale=0.05, size=(300, 4))
     conversion = UnitConversion(*PLAIN_PARTS, noise=np.full(4, 0.05), changing=np.full(4, 0.9))
-    subject = engine()
-    subject.push([frame(n / 100, row) for n, row in enumerate(noise)], conversion)
+    subject = engine(conversion=conversion)
+    push(subject, [frame(n / 100, row) for n, row in enumerate(noise)])
     behind = np.array([noise[-1, 0], noise[-1, 1], 0.01, 0.01])
-    said = subject.push([frame(12 + n / 100, behind, after="gap" * (n == 0)) for n in range(30)], conversion)
+    said = push(subject, [frame(12 + n / 100, behind, after="gap" * (n == 0)) for n in range(30)])
     # The last decision before the silence, and the first behind it.
     paused = [any(note.code == "pause" and note.seconds > 8 for note in verdict.notes) for verdict in said]
     assert paused[:3] == [False, True, False]
@@ -270,8 +285,9 @@ def test_a_value_that_is_the_same_behind_a_silence_is_not_stuck():
 
 def test_a_safe_touch_beside_a_dead_sensor_may_hide_a_dangerous_one():
     """What presses on the dead sensor cannot be felt: its neighbours read a part of the force."""
-    said = engine(threshold=0.3).push(
-        [frame(n / 100, np.full(4, 0.4), valid=np.arange(4) != 2) for n in range(100)], PLAIN
+    said = push(
+        engine(threshold=0.3),
+        [frame(n / 100, np.full(4, 0.4), valid=np.arange(4) != 2) for n in range(100)],
     )
     last = said[-1]
     assert (last.state, last.dangerous, last.unknown) == ("touch", False, (2,))
@@ -293,7 +309,7 @@ def test_a_broken_wire_does_not_end_an_alarm(broken):
         frame(n / 100, row, valid=np.array([True, broken is not None or not 400 <= n < 1000, True, True]))
         for n, row in enumerate(values)
     ]
-    said = subject.push(frames, PLAIN)
+    said = push(subject, frames)
     alarms = [(verdict.t, verdict.dangerous) for verdict in said]
     assert all(on for t, on in alarms if 2.1 < t < 10.9)
     assert not any(on for t, on in alarms if t < 2 or 13.5 < t < 15)
@@ -306,15 +322,14 @@ def test_a_broken_wire_does_not_end_an_alarm(broken):
 def test_values_that_fall_with_force_are_told():
     values = np.zeros((300, 4))
     values[200:, :2] = -4.0
-    verdict = engine().push([frame(n / 100, row) for n, row in enumerate(values)], PLAIN)[-1]
+    verdict = push(engine(), [frame(n / 100, row) for n, row in enumerate(values)])[-1]
     assert verdict.state == "unknown"
     assert [(note.code, note.sensors) for note in verdict.notes] == [("below", (0, 1)), ("void", (0, 1))]
     assert "device.scale" in verdict.notes[0].text
 
 
 def test_a_word_does_not_stand_beside_the_probability_of_its_opposite():
-    subject = engine(label=0.5)
-    play(subject, np.zeros((60, 4)))
+    subject = rested(label=0.5)
     play(subject, np.full((100, 4), 1.0), start=0.6)
     said = play(subject, np.full((30, 4), 0.6), start=1.6)
     for verdict in said:
@@ -322,16 +337,14 @@ def test_a_word_does_not_stand_beside_the_probability_of_its_opposite():
 
 
 def test_an_answer_that_is_no_number_raises_the_alarm():
-    subject = engine()
-    play(subject, np.zeros((60, 4)))
+    subject = rested()
     subject.loud.probabilities = lambda touches: torch.full((1, 4), torch.nan)
     assert not play(subject, np.zeros((10, 4)), start=0.6)[-1].dangerous
     assert play(subject, np.full((10, 4), 1.0), start=0.7)[-1].dangerous
 
 
 def test_an_alarm_stays_while_the_model_changes_its_mind():
-    subject = engine()
-    play(subject, np.zeros((60, 4)))
+    subject = rested()
     play(subject, np.full((10, 4), 5.0), start=0.6)
     subject.loud.probabilities = lambda touches: torch.zeros(1, 4)
     held = play(subject, np.full((500, 4), 1.0), start=0.7)
@@ -341,12 +354,11 @@ def test_an_alarm_stays_while_the_model_changes_its_mind():
 
 
 def test_a_new_tare_takes_the_alarm_back():
-    subject = engine()
-    play(subject, np.zeros((60, 4)))
+    subject = rested()
     assert play(subject, np.full((100, 4), 5.0), start=0.6)[-1].dangerous
     subject.reset()
     tared = UnitConversion(np.ones(4), np.full(4, 5.0), np.zeros(4, bool))
-    (verdict,) = subject.push([frame(1.66, np.full(4, 5.0))], tared)
+    (verdict,) = subject.push([tared.convert(frame(1.66, np.full(4, 5.0)))])
     assert (verdict.dangerous, verdict.contact) == (False, None)
 
 

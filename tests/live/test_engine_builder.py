@@ -22,8 +22,8 @@ from skin.live.engine import DebounceSettings
 from skin.live.engine_builder import LiveSettings, measured_rate, watch_exported
 from skin.runs.onnx_writer import write_model
 from skin.wire.protocol import Header, encode_header, encode_line
-from skin.wire.reader import PortSettings
-from skin.wire.skin import SerialSource
+from skin.wire.skin import open_skin
+from tests.wire.memory import Sent
 
 pytest.importorskip("onnxruntime")
 RATE = 100.0  # Hz, of the device
@@ -151,21 +151,16 @@ def test_the_settings_of_the_file_and_of_the_command(with_thresholds, skin):
 def test_the_rate_of_a_device_is_that_of_its_arrivals_until_its_clock_is_known(at_once):
     """A clock in ms without a header counts as one in us at first: 100 Hz would be 100,000 Hz."""
 
-    def serve():
-        peer, begin = server.accept()[0], monotonic()
-        with peer, suppress(OSError):  # the reader has ended
-            for number in range(10**6):
-                peer.sendall(
-                    f"{number},{1000 + 10 * number},{','.join(['100', '101', '99'] * 3)}\r\n".encode()
-                )
-                if (number + 1) % at_once == 0:
-                    sleep(max(0.0, begin + (number + 1) / RATE - monotonic()))
+    class Board(Sent):
+        def read(self):
+            sleep(at_once / RATE)
+            first, self.number = self.number, self.number + at_once
+            rows = (f"{n},{1000 + 10 * n},{'100,101,99,' * 2}99\r\n" for n in range(first, self.number))
+            return "".join(rows).encode()
 
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        Thread(target=serve, daemon=True).start()
-        settings = PortSettings(port=f"socket://127.0.0.1:{server.getsockname()[1]}")
-        with SerialSource(settings, 9, 10.0).open_source().skin as skin:
-            assert measured_rate(skin) == pytest.approx(RATE, rel=0.3)
+    Board.number = 0
+    with open_skin("memory", range(7), opener=Board) as skin:
+        assert measured_rate(skin) == pytest.approx(RATE, rel=0.3)
 
 
 def test_no_frame_that_waited_while_the_threshold_was_chosen_is_judged(model, skin):
@@ -183,7 +178,7 @@ def test_the_command_replaces_settings_of_the_file(model, skin):
     with ExitStack() as opened:
         watched = watch_exported(str(model), {"port": skin}, said.append, opened).watch(other, said.append)
     assert said[-1] == "alarm above 0.75"
-    assert (watched.settings.detection.threshold, watched.nominal.detection.threshold) == (0.5, 0.3)
+    assert (watched.engine.detection.threshold, watched.nominal.detection.threshold) == (0.5, 0.3)
 
 
 @pytest.mark.slow("starts a process that imports anew")

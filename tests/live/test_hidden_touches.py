@@ -110,10 +110,10 @@ def test_a_tare_under_a_load():
 
 
 def test_a_baseline_above_the_stored_rest_is_void_at_once():
-    """As `before` finds it: nothing is shown as no touch, and the next tare counts."""
+    """As `verify` finds it: nothing is shown as no touch, and the next tare counts."""
     raised = np.where(np.arange(SENSORS) == 4, 6.0, 0.01)
     values = force(12, (0, 12, 4, 6.0), (8, 9, 2, 6.0))
-    seen = MemoryView(arriving(lines(values)), settings(), before=lambda conversion: (2, raised))
+    seen = MemoryView(arriving(lines(values)), settings(), verify=lambda conversion: (2, raised))
     assert seen.hidden(3, 12) == 0
     assert seen.notes(3, 7) >= {"void"}
     assert 8 <= seen.first(7) <= 8.5
@@ -139,12 +139,16 @@ def over_word(row):
     return ",".join("OL" if value > 3 else f"{value:.3f}" for value in row)
 
 
+def over_number(row):
+    return ",".join("3e38" if value > 3 else f"{value:.3f}" for value in row)
+
+
 def hexadecimal(row):
     """Write counts that have letters under a press alone: the whole line is unreadable."""
     return " ".join(f"{0x200 + (int(value / SCALE) if value > 0.3 else 5):03X}" for value in row)
 
 
-@pytest.mark.parametrize("write", [over_range, over_word, hexadecimal])
+@pytest.mark.parametrize("write", [over_range, over_word, over_number, hexadecimal])
 @pytest.mark.parametrize("length", [0.3, 4.0])
 def test_values_that_are_lost_under_a_press(write, length):
     presses = [(8 + 6 * n, 8 + 6 * n + length, 2 * n, 6.0) for n in range(3)]
@@ -203,6 +207,39 @@ def test_a_finger_that_slides_or_lifts_breaks_no_wire():
     assert seen.states(18, 24) == {"no touch"}
 
 
+def glitching(values, error=65535, share=0.0):
+    """Return the view of counts of which channel 2 is an error for one frame, every 1.7 s."""
+    rows = np.apply_along_axis(counted, 1, values)
+    rows[::170, 2] = error
+    stream = [(",".join(map(str, row)) + "\n").encode() for row in rows.tolist()]
+    return MemoryView(arriving(stream), overlapping(share) if share else settings(), scale=SCALE)
+
+
+def test_an_error_value_that_recurs_is_no_touch_where_others_would_feel_one():
+    """It neither keeps the baseline from being taken nor raises an alarm; presses do."""
+    values = force(20, (14, 15, 2, 6.0), (14, 15, 1, 1.2), (14, 15, 3, 1.2))
+    seen = glitching(values, share=0.2)
+    assert seen.states(9, 13.9) == {"no touch"}
+    assert 14 <= seen.first(5) <= 14.5
+    assert not seen.kept(5, 13.9)
+
+
+def test_an_error_value_counts_as_a_touch_where_nothing_contradicts_it():
+    """No sensor overlaps with it, so a tap to the end of the range would look the same."""
+    assert glitching(force(12)).states(3, 12) == {"unknown"}  # the skin seems touched: no baseline
+
+
+@pytest.mark.parametrize("frames", [1, 2])
+def test_taps_to_the_end_of_the_range_are_no_error_values(frames):
+    """Each tap ends at the same value of an undeclared range, and the neighbours feel it."""
+    taps = [(6 + 2.5 * n, 6 + 2.5 * n + frames / RATE) for n in range(6)]
+    touches = [(*tap, sensor, part) for tap in taps for sensor, part in ((4, 9.0), (3, 1.8), (5, 1.8))]
+    values = np.minimum(force(24, *touches), 8.0)
+    seen = MemoryView(arriving(lines(values)), overlapping(0.2))
+    for begin, _ in taps:
+        assert begin <= seen.first(begin - 0.01) <= begin + 0.5
+
+
 def test_a_block_that_is_sent_again_and_again():
     """The device, or a bridge, is stuck: what was read in half a second comes ever again."""
     values = force(20, (12, 15, 4, 6.0))
@@ -222,24 +259,15 @@ def test_few_values_that_alternate_are_no_block():
     assert 12 <= seen.first(11) <= 12.5
 
 
-class Sure:
-    """A touch is dangerous with a probability of .98 above 4 N."""
-
-    def probabilities(self, touches):
-        from torch import where
-
-        danger = where(touches.readings.flatten(1).amax(1) > 4, 0.98, 0.02)
-        return danger[:, None].repeat(1, 4)
+def sure(readings, valid):
+    """Return probabilities: a touch is dangerous with .98 above 4 N."""
+    danger = np.where(readings.max(axis=(1, 2)) > 4, 0.98, 0.02)
+    return np.repeat(danger[:, None], 4, axis=1)
 
 
 @pytest.mark.parametrize(("above", "danger"), [(0.99, {None}), (0.9, {True})])
 def test_probably_dangerous_is_not_safe(above, danger):
-    from torch import zeros
-
-    from skin.runs.torch_model import window_classifier
-
-    classify = window_classifier(Sure(), zeros(SENSORS, 3), 10.0)
-    strict = replace(settings(), classify=classify, patience=DebounceSettings(above=above))
+    strict = replace(settings(), classify=sure, patience=DebounceSettings(above=above))
     seen = MemoryView(arriving(lines(force(12, (6, 8, 4, 6.0)))), strict)
     during = [look for look in seen.looks if 6.6 < look.t < 8]
     assert {look.danger for look in during} == danger

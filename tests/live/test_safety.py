@@ -1,25 +1,22 @@
 """Streams of boards that restart, freeze, break or come in bursts: no dangerous touch is hidden or late."""
 
-import socket
-from contextlib import nullcontext, suppress
+from contextlib import nullcontext
 from dataclasses import replace
-from threading import Event, Thread
-from time import monotonic, sleep
 
 import numpy as np
 import pytest
-import torch
 
 from skin.errors import InputError
-from skin.live.engine import DebounceSettings, Detection, EngineSettings
+from skin.live.engine import DebounceSettings, Detection, Engine
 from skin.live.engine_builder import SelfTest
 from skin.live.loop import STALE, Display, DisplayInfo, LiveLoop
-from skin.runs.torch_model import window_classifier
 from skin.touch.labels import TOUCH
 from skin.wire.channels import RawRange, UnitConversion
+from skin.wire.decoder import Decoder
 from skin.wire.protocol import Header, encode_header, encode_line
-from skin.wire.reader import PortSettings
+from skin.wire.reader import Port, SkinDisconnected, SkinTimeout
 from skin.wire.skin import SerialSource
+from skin.wire.tare import Tare
 from tests.live.memory_view import MemoryView
 
 RATE, SENSORS = 100, 9
@@ -28,19 +25,14 @@ COUNTS = encode_header(Header(n=SENSORS, rate=RATE, unit="adc", bits=10))
 SCALE = 0.02  # N per count
 
 
-class Loud:
-    """A touch is dangerous where a reading exceeds 4 N."""
-
-    def probabilities(self, touches):
-        danger = (touches.readings.flatten(1).amax(1) > 4).float()
-        return torch.stack([danger] * 4, dim=1)
+def loud(readings, valid):
+    """Return probabilities: a touch is dangerous where a reading exceeds 4 N."""
+    return np.repeat((readings.max(axis=(1, 2)) > 4)[:, None], 4, axis=1).astype(float)
 
 
-def settings(**changes):
-    classify = window_classifier(Loud(), torch.zeros(SENSORS, 3), 10.0)
-    shape = SENSORS, 30, 10.0
+def settings():
     presses = 5.0 * np.eye(SENSORS)
-    return EngineSettings(classify, TOUCH, *shape, Detection(0.3), DebounceSettings(), presses)
+    return Engine(loud, TOUCH, SENSORS, 30, 10.0, Detection(0.3), DebounceSettings(), presses)
 
 
 def force(seconds, *touches):
@@ -73,37 +65,30 @@ def arriving(stream, each=1):
             waiting = b""
 
 
-def watch(stream, each=1, before=None, **port):
+def watch(stream, each=1, verify=None, **port):
     """Return the live view of the bytes of frames."""
-    return MemoryView(arriving(stream, each), settings(), before, **port)
+    return MemoryView(arriving(stream, each), settings(), verify, **port)
 
 
-def served(stream):
-    """Return what the observers of a live view of a socket are told, as (verdict, reason, alarm)."""
-    told, opened = [], Event()
-    server = socket.create_server(("127.0.0.1", 0))
+class Paced:
+    """A skin whose clock goes on while it is read."""
 
-    def serve():
-        client, _ = server.accept()
-        opened.wait(20)
-        begin = monotonic()
-        with client, suppress(ConnectionError):  # the live view may end first
-            for now, data in arriving(stream):
-                sleep(max(0.0, begin + now - monotonic()))
-                client.sendall(data)
+    away, channels = False, ()
 
-    thread = Thread(target=serve, daemon=True)
-    thread.start()
-    port = f"socket://127.0.0.1:{server.getsockname()[1]}"
-    source = SerialSource(PortSettings(port=port, timeout=10.0), SENSORS, 10.0)
-    skin, _ = source.open()
-    opened.set()
-    display = Display(DisplayInfo("loud", port, np.zeros((SENSORS, 3)), (0.1, 0.1), 4.0))
-    display.observers.append(lambda *state: told.append(state))
-    with skin, server:
-        LiveLoop(skin, source.tare(skin), settings().build(), display).run()
-        thread.join(20)
-    return told
+    def __init__(self, stream):
+        self.now, self._stream, self.decoder = 0.0, list(arriving(stream)), Decoder(SENSORS)
+        self.stats = self.decoder.stats
+
+    def read(self, count, timeout):
+        end = self.now + timeout
+        while self._stream and self._stream[0][0] <= end:
+            self.now, data = self._stream.pop(0)
+            if frames := self.decoder.feed(data, self.now):
+                return frames
+        if not self._stream:
+            raise SkinDisconnected("the stream has ended")
+        self.now = end
+        raise SkinTimeout("0 of 1 frames arrived within 0.3 s: the device stopped sending")
 
 
 LATE = 0.02  # s: a frame, and the interval between decisions is in the limits
@@ -180,10 +165,16 @@ def test_bursts_without_a_clock_are_decided_like_single_frames():
 
 
 def test_silence_is_unknown_after_a_second_and_a_half():
-    told = served([*lines(force(4)), 3.0, *lines(force(1))])
-    silent = [verdict for verdict, reason, _ in told if "stopped sending" in reason]
-    assert silent
-    assert all(verdict is None for verdict in silent)
+    """In the loop as it runs; frames stop at 4 s."""
+    skin, said = Paced([*lines(force(4)), 3.0, *lines(force(1))]), []
+    tare = Tare(SerialSource(Port(), SENSORS, 10.0).convert, 2.0, 10.0, lambda: skin.decoder.header)
+    display = Display(DisplayInfo("loud", "memory", np.zeros((SENSORS, 3)), (0.1, 0.1), 4.0))
+    display.observers.append(lambda assessment, now: said.append((now, assessment)))
+    LiveLoop(skin, tare, settings(), display, clock=lambda: skin.now).run()
+    silent = [(now, one.verdict) for now, one in said if "stopped sending" in one.reason]
+    assert {verdict for _, verdict in silent} == {None}
+    assert 5.5 <= silent[0][0] <= 5.9
+    assert silent[-1][0] > 6.5
 
 
 def test_what_came_before_a_silence_is_no_verdict_of_now():
@@ -224,117 +215,89 @@ def test_sensors_that_prove_dead_after_the_self_test_are_counted(dead):
     values[:, :dead] = 0.0
     refused = pytest.raises(InputError, match=r"sensors 0, 1, 2 .* dead, more than 2 of 9.*selftest=false")
     with refused if dead > 2 else nullcontext():
-        watch(lines(values), before=lambda conversion: (2, None))
+        watch(lines(values), verify=lambda conversion: (2, None))
 
 
 def test_sensors_that_break_later_end_no_live_view():
     values = force(15)
     values[700:, :6] = values[700, :6]
-    seen = watch(lines(values), before=lambda conversion: (2, None))
+    seen = watch(lines(values), verify=lambda conversion: (2, None))
     assert seen.states(13, 15) == {"unknown"}
 
 
-class TestSelfTest:
-    """The settings of a live view against simulated presses."""
-
-    COUNTED = RawRange(0.0, 1023.0, True, (None, 1023.0))
-
-    def run(self, used=None, conversion=None, device=COUNTED, nominal=None):
-        nominal = nominal or settings()
-        conversion = conversion or UnitConversion(
-            np.full(SENSORS, SCALE), np.full(SENSORS, 200.0), np.zeros(SENSORS, bool)
-        )
-        said = []
-        SelfTest(4.0 * np.eye(SENSORS), used or nominal, nominal).run(conversion, device, said.append)
-        return said
-
-    def test_nominal_settings_pass(self):
-        assert self.run() == [
-            "self-test: 14 of 14 dangerous presses raise the alarm, 14 with nominal settings; only its range "
-            "tests the scale"
-        ]
-        assert "its scale is not checked" in self.run(device=RawRange())[0]
-
-    @pytest.mark.parametrize(
-        ("change", "named"),
-        [
-            (lambda s: replace_detection(s, threshold=1000.0), "live.touch"),
-            (lambda s: replace_detection(s, drift=1e9 / 600), "live.drift"),
-            (lambda s: replace_patience(s, above=0.9999999), None),
-        ],
-    )
-    def test_settings_that_blind_are_named(self, change, named):
-        used = change(settings())
-        if named is None:
-            self.run(used)
-        else:
-            with pytest.raises(InputError, match=rf"{named} is most likely wrong.*live\.selftest=false"):
-                self.run(used)
-
-    def test_a_threshold_that_only_strong_touches_exceed_is_named(self):
-        """A network is nearly certain of touches far above the limit, and less so of those just above it."""
-
-        class Soft(Loud):
-            def probabilities(self, touches):
-                danger = torch.sigmoid(8 * (touches.readings.flatten(1).amax(1) - 4))
-                return torch.stack([danger] * 4, dim=1)
-
-        classify = window_classifier(Soft(), torch.zeros(SENSORS, 3), 10.0)
-        nominal = replace(settings(), classify=classify)
-        for above in (0.1, 0.99):
-            self.run(replace_patience(nominal, above=above), nominal=nominal)
-        with pytest.raises(InputError, match=r"0 of 14 .* 14 with .* live\.patience\.above=0\.9999 is most"):
-            self.run(replace_patience(nominal, above=0.9999), nominal=nominal)
-
-    def test_a_model_that_finds_less_than_half_of_the_presses_is_refused(self):
-        felt = np.where(np.arange(SENSORS) < SENSORS // 3, 4.0, 1e-3)
-        conversion = UnitConversion(np.full(SENSORS, SCALE), np.full(SENSORS, 200.0), np.zeros(SENSORS, bool))
-        test = SelfTest(np.diag(felt), settings(), settings())
-        with pytest.raises(InputError, match="even with nominal settings: train another run"):
-            test.run(conversion, self.COUNTED, print)
-
-    @pytest.mark.parametrize("scale", [1e-9, 1e-300, 1e9, 0.02 / 1e6])
-    def test_a_scale_that_blinds_is_named(self, scale, monkeypatch):
-        monkeypatch.setattr("skin.live.engine_builder._SLOWLY", 1)  # slow presses take most of the time
-        conversion = UnitConversion(np.full(SENSORS, scale), np.full(SENSORS, 200.0), np.zeros(SENSORS, bool))
-        with pytest.raises(InputError, match=r"device\.scale or device\.calibration is most likely"):
-            self.run(conversion=conversion)
-
-    def test_one_sensor_that_can_never_alarm_is_named(self):
-        scale = np.full(SENSORS, SCALE)
-        scale[3] = 1e-9
-        conversion = UnitConversion(scale, np.full(SENSORS, 200.0), np.zeros(SENSORS, bool))
-        with pytest.raises(InputError, match="sensor 3 cannot raise it"):
-            self.run(conversion=conversion)
-
-    def test_masked_sensors_are_counted(self):
-        broken = np.arange(SENSORS) < 3
-        conversion = UnitConversion(np.full(SENSORS, SCALE), np.full(SENSORS, 200.0), broken)
-        with pytest.raises(InputError, match=r"9 of 14 .* the mask of broken sensors"):
-            self.run(conversion=conversion)
-
-    def test_sensors_that_are_really_dead_are_counted(self):
-        conversion = UnitConversion(np.full(SENSORS, SCALE), np.full(SENSORS, 200.0), np.arange(SENSORS) < 3)
-        with pytest.raises(
-            InputError, match=r"3 of 9 sensors have no valid reading .*: they are dead, or the"
-        ):
-            self.run(conversion=conversion)
-
-    def test_one_dead_sensor_of_nine_is_no_reason_to_stop(self):
-        """Its place is shown as unknown."""
-        broken = np.arange(SENSORS) == 4
-        conversion = UnitConversion(np.full(SENSORS, SCALE), np.full(SENSORS, 200.0), broken)
-        assert "not on sensor 4" in self.run(conversion=conversion)[0]
-
-    def test_a_model_that_finds_nothing_is_refused(self):
-        nominal = replace_detection(settings(), threshold=1e308)
-        with pytest.raises(InputError, match="the contact threshold of the model"):
-            self.run(nominal=nominal)
+COUNTED = RawRange(0.0, 1023.0, True, (None, 1023.0))
+RESTS = np.full(SENSORS, 200.0)
 
 
-def replace_detection(of, **changes):
-    return replace(of, detection=replace(of.detection, **changes))
+def conversion(scale=SCALE, broken=0):
+    """Return a conversion of counts whose first sensors are broken."""
+    return UnitConversion(np.broadcast_to(scale, SENSORS), RESTS, np.arange(SENSORS) < broken)
 
 
-def replace_patience(of, **changes):
-    return replace(of, patience=replace(of.patience, **changes))
+def selftest(used=None, converted=None, device=COUNTED, nominal=None, presses=None, **limits):
+    """Run the settings of a live view against simulated presses; return what is reported."""
+    nominal, said = nominal or settings(), []
+    presses = 4.0 * np.eye(SENSORS) if presses is None else presses
+    test = SelfTest(presses, used or nominal, nominal, **limits)
+    test.run(converted or conversion(), device, said.append)
+    return said
+
+
+def detecting(**changes):
+    return replace(settings(), detection=replace(settings().detection, **changes))
+
+
+def patient(engine=None, **changes):
+    engine = engine or settings()
+    return replace(engine, patience=replace(engine.patience, **changes))
+
+
+def test_nominal_settings_pass():
+    assert selftest() == [
+        "self-test: 14 of 14 dangerous presses raise the alarm, 14 with nominal settings; only its range "
+        "tests the scale"
+    ]
+    assert "its scale is not checked" in selftest(device=RawRange())[0]
+    selftest(patient(above=0.9999999))
+    # Its place is shown as unknown.
+    one = UnitConversion(np.full(SENSORS, SCALE), RESTS, np.arange(SENSORS) == 4)
+    assert "not on sensor 4" in selftest(converted=one)[0]
+
+
+DEVICE = r"device\.limits, device\.scale or device\.calibration is most likely"
+FEW = np.diag(np.where(np.arange(SENSORS) < SENSORS // 3, 4.0, 1e-3))
+ONE = np.where(np.arange(SENSORS) == 3, 1e-9, SCALE)
+
+
+@pytest.mark.parametrize(
+    ("changes", "named"),
+    [
+        ({"used": detecting(threshold=1000.0)}, r"live\.touch is most likely wrong.*live\.selftest=false"),
+        ({"used": detecting(drift=1e9 / 600)}, r"live\.drift is most likely wrong.*live\.selftest=false"),
+        ({"presses": FEW}, "even with nominal settings: train another run"),
+        *(({"converted": conversion(scale), "slowly": 1}, DEVICE) for scale in (1e-9, 1e-300, 1e9, 2e-8)),
+        ({"converted": conversion(ONE)}, "sensor 3 cannot raise it"),
+        (
+            {"converted": conversion(broken=3)},
+            r"9 of 14 .* 3 of 9 sensors have no valid reading .*: they are dead, or the mask of broken",
+        ),
+        ({"nominal": detecting(threshold=1e308)}, "the contact threshold of the model"),
+    ],
+)
+def test_what_blinds_is_refused_and_named(changes, named):
+    with pytest.raises(InputError, match=named):
+        selftest(**changes)
+
+
+def soft(readings, valid):
+    """As a network, which is nearly certain of strong touches, and less so of those just above the limit."""
+    danger = 1 / (1 + np.exp(-8 * (readings.max(axis=(1, 2)) - 4.0)))
+    return np.repeat(danger[:, None], 4, axis=1)
+
+
+def test_a_threshold_that_only_strong_touches_exceed_is_named():
+    nominal = replace(settings(), classify=soft)
+    for above in (0.1, 0.99):
+        selftest(patient(nominal, above=above), nominal=nominal)
+    with pytest.raises(InputError, match=r"0 of 14 .* 14 with .* live\.patience\.above=0\.9999 is most"):
+        selftest(patient(nominal, above=0.9999), nominal=nominal)

@@ -1,7 +1,6 @@
 """The live view and a recording of the same stream give the same answers, bit for bit."""
 
-import socket
-from threading import Event, Thread
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,6 +17,7 @@ from skin.runs.build import build_data, build_device, build_learner
 from skin.runs.torch_model import window_classifier
 from skin.touch.labels import TOUCH
 from skin.wire.clocks import ClockWatch
+from skin.wire.decoder import Decoder
 from skin.wire.protocol import (
     Announcement,
     Header,
@@ -27,6 +27,9 @@ from skin.wire.protocol import (
     encode_header,
     encode_line,
 )
+from skin.wire.reader import WireFeed
+from skin.wire.tare import Tare
+from tests.wire.memory import Sent
 
 SHEET = Sheet((0.16, 0.16), (32, 32), [{"material": "EcoFlex 00-30", "thickness": 0.005}])
 LAYOUT = Grid(2, 3)
@@ -68,27 +71,6 @@ def pieces(late=0):
             yield number, data
 
 
-class Listener:
-    """A socket that a skin is read from; sends a piece, and the next one when it is let."""
-
-    def __init__(self, stream, wait):
-        self.server = socket.create_server(("127.0.0.1", 0))
-        self.port = f"socket://127.0.0.1:{self.server.getsockname()[1]}"
-        self.thread = Thread(target=self._run, args=(stream, wait), daemon=True)
-        self.thread.start()
-
-    def _run(self, stream, wait):
-        client, _ = self.server.accept()
-        with client:
-            for number, data in stream:
-                client.sendall(data)
-                wait(number)
-
-    def close(self):
-        self.thread.join(20)
-        self.server.close()
-
-
 class Asked:
     """A learner that keeps what it was asked."""
 
@@ -110,72 +92,58 @@ def learner(configured):
     return found
 
 
-def serial(port, **settings):
-    limits = [None, LIMIT]
-    return Serial(
-        body=SHEET, layout=LAYOUT, port=port, gestures=GESTURES, scale=SCALE, limits=limits, **settings
-    )
+def serial(**settings):
+    settings = {"limits": [None, LIMIT], "gestures": GESTURES} | settings
+    return Serial(body=SHEET, layout=LAYOUT, port="memory", scale=SCALE, timeout=5.0, **settings)
 
 
-def watched(learner, device):
-    """Run the live view on a device until its peer leaves; return time -> (window, verdict)."""
-    skin, _ = device.wire.open()
-    positions = torch.from_numpy(device.sensors.positions).float()
-    asked, found = Asked(learner), {}
-    engine = Engine(
-        window_classifier(asked, positions, 10.0), TOUCH, len(positions), 30, 10.0, Detection(0.3)
-    )
-    info = DisplayInfo("rules", str(device.port), positions.numpy(), device.size, 4.0)
-    return skin, engine, asked, info, found
+@pytest.fixture
+def sent(monkeypatch):
+    """Return a function that lets ports read pieces (number, bytes)."""
+
+    def send(stream):
+        pieces = [data for _, data in stream]
+        monkeypatch.setattr("skin.wire.skin.open_stream", lambda *port: Sent(*pieces))
+
+    monkeypatch.setattr(ClockWatch, "_SPAN", np.inf)  # the stream comes as fast as it is read
+    return send
 
 
 def live(learner, stream):
-    """Return what the live view said at each frame, by its number."""
-    turn = Event()
-
-    def wait(number):
-        assert turn.wait(20), "the live view fell silent"
-        turn.clear()
-
-    listener = Listener(stream, wait)
-    device = serial(listener.port)
-    skin, engine, asked, info, found = watched(learner, device)
+    """Return the window and the verdict of the live view at each frame, by its number."""
+    device, asked, found = serial(), Asked(learner), {}
+    positions = torch.from_numpy(device.sensors.positions).float()
+    engine = Engine(window_classifier(asked, positions, 10.0), TOUCH, 6, 30, 10.0, Detection(0.3))
 
     class Taking(Display):
-        def set_verdict(self, verdict, trouble="", alarm=False, now=None):
-            super().set_verdict(verdict, trouble, alarm, now)
+        def set_verdict(self, verdict, *others):
+            super().set_verdict(verdict, *others)
             if verdict is not None:
                 found[round(verdict.t * RATE)] = asked.windows[-1], verdict
 
-    class Turning(LiveLoop):
-        def take(self, frames, now):
-            super().take(frames, now)
-            turn.set()
-
-        def _wait(self, reason):
-            super()._wait(reason)
-            turn.set()
-
-    with skin:
-        Turning(skin, device.wire.tare(skin), engine, Taking(info)).run()
-    listener.close()
+    decoder = Decoder(6)
+    feed = WireFeed(lambda: None, decoder, (None, LIMIT))
+    skin = SimpleNamespace(stats=decoder.stats, header=None, channels=())
+    display = Taking(DisplayInfo("rules", "memory", positions.numpy(), device.size, 4.0))
+    loop = LiveLoop(skin, Tare(device.wire.convert, 2.0, 10.0), engine, display)
+    for number, data in stream:
+        if frames := feed.decode(data, number / RATE):
+            loop.take(frames, number / RATE)
     return found
 
 
-def recorded(learner, stream, path):
-    """Return the recording of the same stream, and what the learner says of it."""
-    listener = Listener(stream, lambda number: None)
-    device = serial(listener.port, timeout=5.0)
+def recorded(learner, path):
+    """Return the recording of the stream that is sent, and what the learner says of it."""
+    device = serial()
     record_session(device, path, None, False, lambda text: None)
-    listener.close()
     touches = read_recording(convert_session(device, path)[0]).touches
     return touches, learner.probabilities(touches)
 
 
-def test_live_and_recorded_are_the_same_to_the_last_bit(learner, tmp_path, monkeypatch):
-    monkeypatch.setattr(ClockWatch, "_SPAN", np.inf)  # the stream comes as fast as it is read
+def test_live_and_recorded_are_the_same_to_the_last_bit(learner, tmp_path, sent):
     said = live(learner, pieces())
-    touches, chances = recorded(learner, pieces(), tmp_path / "s.csv")
+    sent(pieces())
+    touches, chances = recorded(learner, tmp_path / "s.csv")
     assert len(touches) == GESTURES
     for gesture in range(GESTURES):
         last = IDLE + gesture * (LENGTH + 30) + LENGTH - 1
@@ -192,19 +160,19 @@ def test_live_and_recorded_are_the_same_to_the_last_bit(learner, tmp_path, monke
         assert gesture == 0 or not touches.valid[gesture, :, DEAD].any()
 
 
-def test_the_header_counts_whenever_it_comes(tmp_path):
+@pytest.mark.parametrize("binary", [False, True])
+def test_the_header_counts_whenever_it_comes_and_given_limits_win_over_it(sent, binary):
     """At most 1023: with the header after frame 5 as with the header before frame 0."""
-    found = []
-    for late in (0, 5, 40):
-        listener = Listener(_adc(late), lambda number: None)
-        device = Serial(body=SHEET, layout=LAYOUT, port=listener.port, scale=SCALE, gestures=1, timeout=5.0)
-        with device.wire.open()[0] as skin:
+    for late, limits, expected in ((0, None, 30), (5, None, 30), (40, None, 30), (3, [None, 2000.0], 0)):
+        sent(_adc(late, binary))
+        with serial(limits=limits, gestures=1).wire.open()[0] as skin:
             frames = skin.read(200, 10)
-        listener.close()
-        found.append([frame.saturated.tolist() for frame in frames[50:]])
+            assert (skin.header.bits, skin.stats.bad_frames) == (10, 0)
+        assert np.array([frame.saturated for frame in frames[50:]]).sum(axis=0).tolist() == [
+            *(0, 0, expected),
+            *(0, 0, 0),
+        ]
         assert all(frame.valid.all() for frame in frames)
-    assert found[0] == found[1] == found[2]
-    assert np.array(found[0])[:, 2].sum() == 30
 
 
 def _adc(late, binary=False):
@@ -218,16 +186,3 @@ def _adc(late, binary=False):
             yield number, header + encode_frame(row, number, number * 20_000)
         else:
             yield number, header + encode_line(row.tolist(), number, number * 20_000)
-
-
-def test_given_limits_win_over_the_header_and_binary_streams_carry_one():
-    for limits, count in ((None, 30), ([None, 2000.0], 0)):
-        listener = Listener(_adc(3, binary=True), lambda number: None)
-        settings = {"scale": SCALE, "gestures": 1, "timeout": 5.0, "limits": limits}
-        device = Serial(body=SHEET, layout=LAYOUT, port=listener.port, **settings)
-        with device.wire.open()[0] as skin:
-            frames = skin.read(200, 10)
-            assert skin.header.bits == 10
-            assert skin.stats.bad_frames == 0
-        listener.close()
-        assert sum(frame.saturated[2] for frame in frames) == count

@@ -1,4 +1,4 @@
-"""JSON lines: what they say, who gets them, and what happens to a reader that is gone."""
+"""JSON lines and the log of alarms: what they say, who gets them, and a reader that is gone."""
 
 import importlib.util
 import json
@@ -6,21 +6,30 @@ import os
 import subprocess
 import sys
 from contextlib import contextmanager, suppress
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
 from time import monotonic, sleep
 from types import ModuleType
 
 import numpy as np
+import pytest
 
 from skin.core.files import ROOT
+from skin.errors import InputError
 from skin.live.loop import Display, DisplayInfo, watch_age
 from skin.live.verdict import Verdict
-from skin.live.verdicts import HEARTBEAT, write_verdicts
+from skin.live.verdicts import HEARTBEAT, LineQueue, log_alarms, write_verdicts
 
 PATIENCE = 60  # s
 
 
-def display():
-    return Display(DisplayInfo("run", "port", np.zeros((4, 3)), (0.1, 0.1), 4.0))
+def display(calm=2.0):
+    return Display(DisplayInfo("run", "port", np.zeros((4, 3)), (0.1, 0.1), 4.0), calm=calm)
+
+
+def logged(dangerous):
+    return replace(verdict(dangerous), chances={"dangerous": 0.9}, labels={"dangerous": dangerous}, masked=())
 
 
 def verdict(dangerous=False, chance=0.25):
@@ -60,7 +69,7 @@ def wait_for(take, accepted):
 def test_a_verdict_is_a_line():
     shown = display()
     with connected(shown) as take:
-        shown.set_verdict(verdict(dangerous=True, chance=float("nan")))
+        shown.set_verdict(verdict(dangerous=True, chance=float("nan")), monotonic())
         found = wait_for(take, lambda message: message["event"] == "verdict")
     assert found["schema"] == 1
     assert (found["alarm"], found["stale"], found["touched"], found["reason"]) == (True, False, True, "")
@@ -74,7 +83,7 @@ def test_a_verdict_that_is_too_old_is_stale_and_keeps_its_alarm():
     """Also where the engine hangs, which would tell nothing itself."""
     shown = display()
     with watch_age(shown), connected(shown) as take:
-        shown.set_verdict(verdict(dangerous=True))
+        shown.set_verdict(verdict(dangerous=True), monotonic())
         began = monotonic()
         fresh = wait_for(take, lambda message: message["event"] == "verdict")
         old = wait_for(take, lambda message: message["stale"])
@@ -92,7 +101,7 @@ def test_a_verdict_that_is_too_old_is_stale_and_keeps_its_alarm():
 
 def test_the_first_line_tells_what_is_waited_for():
     shown = display()
-    shown.set_verdict(None, "the threshold of the alarm is being chosen")
+    shown.set_verdict(None, monotonic(), "the threshold of the alarm is being chosen")
     with connected(shown) as take:
         message = take()
     assert (message["event"], message["stale"], message["state"]) == ("heartbeat", True, "unknown")
@@ -103,7 +112,7 @@ def test_a_reason_is_sent_once_and_then_with_each_heartbeat():
     shown = display()
     with connected(shown) as take:
         for _ in range(3):
-            shown.set_verdict(None, "unplugged", True)
+            shown.set_verdict(None, monotonic(), "unplugged", True)
         events = [take() for _ in range(3)]
     assert [one["event"] for one in events if one["reason"] == "unplugged"] == [
         "change",
@@ -118,7 +127,7 @@ def test_each_line_is_there_at_once():
     shown = display()
     with connected(shown) as take:
         for chance in (0.25, 0.5, 0.75):
-            shown.set_verdict(verdict(chance=chance))
+            shown.set_verdict(verdict(chance=chance), monotonic())
             found = wait_for(take, lambda message: message["event"] == "verdict")
             assert found["probabilities"]["big"] == chance
 
@@ -128,7 +137,7 @@ def test_a_reader_that_is_slow_delays_nothing_and_misses_the_oldest():
     with piped(shown) as lines:
         began = monotonic()
         for _ in range(5_000):
-            shown.set_verdict(verdict())
+            shown.set_verdict(verdict(), monotonic())
         assert monotonic() - began < PATIENCE
         numbers = [json.loads(lines.readline())["number"]]
         while numbers[-1] < 5_000:
@@ -151,8 +160,78 @@ def test_what_waits_is_written_before_the_end():
     with os.fdopen(reading, "rb") as lines:
         with os.fdopen(writing, "w", buffering=1) as file, write_verdicts(shown, file):
             for _ in range(20):
-                shown.set_verdict(verdict())
+                shown.set_verdict(verdict(), monotonic())
         assert [json.loads(line)["number"] for line in lines] == [*range(1, 21)]
+
+
+def test_each_change_is_a_line_with_its_time(tmp_path):
+    shown, path = display(0.0), tmp_path / "logs" / "alarms.jsonl"
+    before = datetime.now(UTC)
+    with log_alarms(shown, path):
+        shown.set_verdict(None, monotonic(), "filling the window: 20 %")
+        for dangerous in (False, True, True):
+            shown.set_verdict(logged(dangerous), monotonic())
+        shown.set_verdict(None, monotonic(), "unplugged", True)
+        shown.set_verdict(logged(True), monotonic())
+        shown.request_tare(monotonic())
+        shown.set_verdict(logged(False), monotonic())
+        shown.set_verdict(logged(True), monotonic())
+    shown.set_verdict(logged(True), monotonic())  # after the end
+    found = [json.loads(line) for line in path.read_text().splitlines()]
+    events = ["started", "resumed", "alarm", "stale", "resumed", "tare_refused", "cleared", "alarm", "ended"]
+    assert [one["event"] for one in found] == events
+    alarm, stale = found[2], found[3]
+    assert (alarm["probabilities"], alarm["contact"]) == ({"dangerous": 0.9}, 0.4)
+    assert (stale["reason"], stale["alarm"]) == ("unplugged", True)
+    for event in (found[5], found[8]):  # of an operator, or the end: while the alarm lasts
+        assert (event["alarm"], event["stale"], event["state"]) == (True, False, "touch")
+    times = [datetime.fromisoformat(one["time"]) for one in found]
+    slack = timedelta(milliseconds=2)
+    assert all(before - slack <= time <= datetime.now(UTC) + slack for time in times)
+    with log_alarms(shown, path):
+        pass
+    assert len(path.read_text().splitlines()) == len(found) + 2  # appended
+
+
+def test_a_folder_that_cannot_be_written_is_refused(tmp_path):
+    (tmp_path / "file").write_text("")
+    with (
+        pytest.raises(InputError, match=r"live\.log=FILE"),
+        log_alarms(display(0.0), tmp_path / "file" / "log"),
+    ):
+        pass
+
+
+def test_a_full_disk_ends_the_log_and_not_the_view():
+    class Full:
+        def write(self, text):
+            raise OSError("No space left on device")
+
+    errors = []
+    with LineQueue(Full(), errors.append) as lines:
+        for _ in range(3):
+            lines.add({"event": "alarm"})
+    assert [str(error) for error in errors] == ["No space left on device"]
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no such device")
+def test_a_full_disk_does_not_hide_how_the_view_ends(capsys):
+    """Closing the file raised an error of its own: SIGTERM ended with code 2."""
+    shown = display(0.0)
+    with pytest.raises(SystemExit, match="143"), log_alarms(shown, Path("/dev/full")):
+        raise SystemExit(143)
+    assert capsys.readouterr().err == "the alarm log ends here: [Errno 28] No space left on device\n"
+
+
+def test_the_log_is_valid_json_whatever_a_verdict_holds(tmp_path):
+    shown, path = display(0.0), tmp_path / "alarms.jsonl"
+    broken = Verdict(
+        float("inf"), monotonic(), {"a": float("nan")}, True, {"a": True}, True, False, (), 1e300
+    )
+    with log_alarms(shown, path):
+        shown.set_verdict(broken, monotonic())
+    messages = [json.loads(line, parse_constant=pytest.fail) for line in path.read_text().splitlines()]
+    assert {message.get("device_time") for message in messages} == {None}
 
 
 LIVE = """
@@ -169,7 +248,8 @@ with watch_age(shown), print_verdicts(shown):
     shown.closed.wait(1)
     for _ in range(40):
         chances = {"big": 0.3, "dangerous": 1.0}
-        shown.set_verdict(Verdict(1.5, monotonic(), chances, True, {"dangerous": True}, True, False, (), 0.4))
+        said = Verdict(1.5, monotonic(), chances, True, {"dangerous": True}, True, False, (), 0.4)
+        shown.set_verdict(said, monotonic())
         if shown.closed.wait(0.05):
             break
 print("ended", file=sys.stderr)

@@ -15,7 +15,6 @@ from time import monotonic, sleep
 import numpy as np
 import pytest
 from rich.console import Console
-from scipy.interpolate import LinearNDInterpolator
 
 from skin.device.resampling import Frame
 from skin.errors import InputError
@@ -39,15 +38,16 @@ def display():
     return Display(DisplayInfo("rules naive 0", "/dev/skin", PLACES, SIZE, 4.0))
 
 
-def frame(values, valid=None):
+def frame(values, valid=None, **more):
+    """Return a frame in newtons."""
     valid = np.ones(5, bool) if valid is None else valid
-    return Frame(None, 0.0, 0.0, np.asarray(values, float), valid)
+    return PLAIN.convert(Frame(None, 0.0, 0.0, np.asarray(values, float), valid, **more))
 
 
 def shown(subject):
     """Return the text in the terminal."""
     console = Console(width=120, record=True, force_terminal=True, file=StringIO())
-    console.print(terminal.screen(subject))
+    console.print(terminal.screen(subject, monotonic()))
     return console.export_text()
 
 
@@ -74,39 +74,26 @@ def posted(address, **headers):
 
 def test_no_peak_between_two_looks_is_missed():
     subject = display()
-    subject.add_frame(frame(np.zeros(5)), PLAIN)
-    seen = subject.state().number
+    subject.add(frame(np.zeros(5)))
+    seen = subject.state(monotonic()).number
     for height in (1, 7, 2):
-        subject.add_frame(frame(height * np.eye(5)[3]), PLAIN)
-    state = subject.state(seen)
+        subject.add(frame(height * np.eye(5)[3]))
+    state = subject.state(monotonic(), seen)
     assert state.values.tolist() == [0, 0, 0, 7, 0]
-    assert subject.state(state.number).values[3] == 2
+    assert subject.state(monotonic(), state.number).values[3] == 2
 
 
-def test_the_picture_interpolates_between_the_sensors():
-    values = np.array([1.0, 2.0, 0.5, 3.0, 1.5])
-    image = SkinPicture(PLACES, SIZE, 32, 4.0)(values)
-    row, column = 17, 15
-    place = (column + 0.5) / 32 * SIZE[0], (row + 0.5) / 32 * SIZE[1]
-    expected = LinearNDInterpolator(PLACES[:, :2], values)(*place)
-    assert image[row, column] == pytest.approx(255 * expected / 4, abs=1.01)
-    assert SkinPicture(PLACES[:1], SIZE, 8, 4.0)(values[:1]).tolist() == [[63] * 8] * 8
-
-
-def test_the_picture_has_no_edge_outside_the_sensors():
+def test_the_picture_shows_each_reading_and_no_edge_between_or_outside():
     values = np.array([0.0, 4.0, 1.0, 3.0, 2.0])
-    image = SkinPicture(PLACES, SIZE, 64, 4.0)(values).astype(int)
-    slopes = [
-        4 * abs(values[a] - values[b]) / np.linalg.norm(PLACES[a] - PLACES[b])
-        for a in range(5)
-        for b in range(a)
-    ]
-    pixel = max(SIZE) / 64
-    for axis in (0, 1):
-        assert np.abs(np.diff(image, axis=axis)).max() <= 255 / 4 * max(slopes) * pixel + 1
-    # Beyond a corner of the hull, as at the corner.
-    assert image[0, 0] == 0
-    assert abs(image[-1, -1] - 255 * 3 / 4) <= 1
+    picture = SkinPicture(PLACES, SIZE, 64, 4.0)
+    image = picture(values).astype(int)
+    for (x, y, _), value in zip(PLACES, values, strict=True):
+        row, column = int(64 * y / SIZE[1]), int(64 * x / SIZE[0])
+        assert image[row, column] == pytest.approx(255 * value / 4, abs=8)
+    assert image[32, 20] == pytest.approx(np.mean(image[[31, 33, 32, 32], [20, 20, 19, 21]]), abs=2)
+    # Half a picture from dark to bright is 8 a pixel.
+    assert max(np.abs(np.diff(image, axis=axis)).max() for axis in (0, 1)) <= 8
+    assert SkinPicture(PLACES[:1], SIZE, 8, 4.0)(values[1:2] / 4).tolist() == [[63] * 8] * 8
 
 
 def test_where_output_is_no_terminal_a_line_tells_each_change(tmp_path):
@@ -116,7 +103,7 @@ def test_where_output_is_no_terminal_a_line_tells_each_change(tmp_path):
         terminal.show_in_terminal(subject, Console(file=file, width=60)),
     ):
         for verdict in (None, None, PRESSED, PRESSED):
-            subject.set_verdict(verdict, "" if verdict else "taking the baseline: do not touch")
+            subject.set_verdict(verdict, monotonic(), "" if verdict else "taking the baseline: do not touch")
             sleep(0.2)
     said = [json.loads(line) for line in (tmp_path / "said").read_text().splitlines()]
     assert [line["event"] for line in said] == ["started", "change", "resumed", "alarm", "ended"]
@@ -129,9 +116,9 @@ def test_where_output_is_no_terminal_a_line_tells_each_change(tmp_path):
 
 def test_the_terminal_shows_the_alarm_and_the_probability():
     subject = display()
-    subject.set_verdict(replace(PRESSED, dangerous=False, contact=0.1))
-    subject.add_frame(frame([0, 0, 6.25, 0, 0]), PLAIN)
-    subject.set_verdict(PRESSED)
+    subject.set_verdict(replace(PRESSED, dangerous=False, contact=0.1), monotonic())
+    subject.add(frame([0, 0, 6.25, 0, 0]))
+    subject.set_verdict(PRESSED, monotonic())
     subject.set_status("99.9 Hz")
     text = shown(subject)
     assert "DANGEROUS" in text
@@ -143,14 +130,14 @@ def test_the_terminal_shows_the_alarm_and_the_probability():
 
 def test_the_page_gets_pictures_and_needs_nothing_from_elsewhere():
     subject = display()
-    subject.add_frame(frame([0, 0, 2.0, 0, 0], np.array([True, True, True, True, False])), PLAIN)
+    subject.add(frame([0, 0, 2.0, 0, 0], np.array([True, True, True, True, False])))
     with web.serve_page(subject, 0) as address:
         code, page = fetch(address)
         assert code == 200
         assert not re.search(r"(src|href)\s*=|https?://|@import|url\(", page)
         info = json.loads(fetch(f"{address}/skin.json")[1])
         assert info["positions"] == PLACES.tolist()
-        subject.set_verdict(PRESSED)
+        subject.set_verdict(PRESSED, monotonic())
         with urllib.request.urlopen(f"{address}/pictures", timeout=30) as answer:
             line = answer.readline().decode()
         picture = json.loads(line.removeprefix("data: "))
@@ -164,8 +151,8 @@ def test_the_page_gets_pictures_and_needs_nothing_from_elsewhere():
 @pytest.mark.parametrize("value", [1e300, -1e300, 1e10])
 def test_the_page_gets_valid_json_whatever_the_device_sends(value):
     subject = display()
-    subject.add_frame(frame([0, value, 2.0, 0, 0]), PLAIN)
-    subject.set_verdict(Verdict(0, 0, {"big": float("inf")}, True, {"big": True}, False, False))
+    subject.add(frame([0, value, 2.0, 0, 0]))
+    subject.set_verdict(Verdict(0, 0, {"big": float("inf")}, True, {"big": True}, False, False), monotonic())
     with web.serve_page(subject, 0) as address, urllib.request.urlopen(f"{address}/pictures") as answer:
         line = answer.readline().decode().removeprefix("data: ")
     picture = json.loads(line, parse_constant=pytest.fail)
@@ -176,8 +163,8 @@ def test_a_saturated_sensor_shows_its_limit_and_an_unknown_one_nothing():
     """A dark hole at the sensor that is pressed hardest would hide the press."""
     subject = display()
     valid, saturated = np.array([True, True, True, True, False]), np.array([False, False, True, False, False])
-    subject.add_frame(frame([1.0, 1.0, 4.0, 1.0, 9.0], valid)._replace(saturated=saturated), PLAIN)
-    state = subject.state()
+    subject.add(frame([1.0, 1.0, 4.0, 1.0, 9.0], valid, saturated=saturated))
+    state = subject.state(monotonic())
     assert state.values.tolist() == [1, 1, 4, 1, 0]
     assert state.saturated.tolist() == saturated.tolist()
     picture = SkinPicture(PLACES, SIZE, 64, 4.0)
@@ -187,18 +174,18 @@ def test_a_saturated_sensor_shows_its_limit_and_an_unknown_one_nothing():
     assert image[row, column] > 60
     row, column = (round(PLACES[2, axis] / SIZE[axis] * 64) for axis in (1, 0))
     assert image[row - 2 : row + 3, column - 2 : column + 3].max() > 235
-    sent = web.message(state, picture)
+    sent = web.message(state, picture, monotonic())
     assert (sent["saturated"][2], sent["valid"][4], sent["values"][2]) == (True, False, 4.0)
     assert picture(np.zeros(5), np.zeros(5, dtype=bool)).max() == 0
 
 
 def test_an_alarm_outlives_silence_in_every_view():
     subject = display()
-    subject.set_verdict(PRESSED)
-    subject.set_verdict(None, "the device has stopped sending", alarm=True)
-    state = subject.state()
+    subject.set_verdict(PRESSED, monotonic())
+    subject.set_verdict(None, monotonic(), "the device has stopped sending", alarm=True)
+    state = subject.state(monotonic())
     assert (state.verdict, state.alarm) == (None, True)
-    assert web.message(state, SkinPicture(PLACES, SIZE, 8, 4.0))["alarm"] is True
+    assert web.message(state, SkinPicture(PLACES, SIZE, 8, 4.0), monotonic())["alarm"] is True
     text = shown(subject)
     assert "DANGEROUS" in text
     assert "stopped sending" in text
@@ -232,9 +219,9 @@ def test_the_operator_types_t_for_a_tare(monkeypatch, tmp_path):
             assert subject.take_tare() == ""
             os.write(master, b"t\n")
             assert requested(subject) == "tare"
-            subject.set_verdict(PRESSED)
+            subject.set_verdict(PRESSED, monotonic())
             os.write(master, b"t\n")
-            until(lambda: "tare refused" in subject.state().line)
+            until(lambda: "tare refused" in subject.state(monotonic()).line)
             assert subject.take_tare() == ""
             os.write(master, b"force\n")
             assert requested(subject) == "forced"
@@ -257,82 +244,81 @@ def requested(subject):
 
 def test_a_tare_is_refused_under_a_touch_until_it_is_confirmed():
     subject, events = display(), []
-    subject.listeners.append(events.append)
-    assert subject.request_tare(force=True) != ""  # there is nothing to confirm
+    subject.listeners.append(lambda event, now: events.append(event))
+    assert subject.request_tare(monotonic(), force=True) != ""  # there is nothing to confirm
     for verdict in (PRESSED, replace(PRESSED, dangerous=False, contact=0.5)):
-        subject.set_verdict(verdict)
-        assert "something touches the skin" in subject.request_tare()
+        subject.set_verdict(verdict, monotonic())
+        assert "something touches the skin" in subject.request_tare(monotonic())
         assert subject.take_tare() == ""
-        assert subject.request_tare(force=True) == ""
+        assert subject.request_tare(monotonic(), force=True) == ""
         assert subject.take_tare() == "forced"
-    subject.set_verdict(None, "the device has stopped sending", alarm=True)
-    assert subject.request_tare() != ""
-    subject.set_verdict(replace(PRESSED, dangerous=False, touched=False))
-    assert subject.request_tare() == ""
+    subject.set_verdict(None, monotonic(), "the device has stopped sending", alarm=True)
+    assert subject.request_tare(monotonic()) != ""
+    subject.set_verdict(replace(PRESSED, dangerous=False, touched=False), monotonic())
+    assert subject.request_tare(monotonic()) == ""
     refused = "tare_refused"
     assert events == [refused, refused, "tare_forced", refused, "tare_forced", refused, "tare"]
 
 
-def test_a_refused_tare_is_said_while_it_may_be_forced(monkeypatch):
-    subject, now = display(), [100.0]
-    monkeypatch.setattr(loop, "monotonic", lambda: now[0])
+def test_a_refused_tare_is_said_while_it_may_be_forced():
+    subject, idle = display(), replace(PRESSED, touched=False, dangerous=False)
+    refused = loop.REFUSALS["touched"]
     subject.set_status("99.9 Hz")
-    subject.set_verdict(PRESSED)
-    assert subject.request_tare() == loop.REFUSALS["touched"]
-    assert subject.request_tare(force=True) == ""
-    assert subject.state().line == "99.9 Hz"  # it was forced
-    assert subject.request_tare(force=True) == loop.REFUSALS["touched"]  # a refusal is for one
-    now[0] += 59.0
-    assert subject.state().line == f"{loop.REFUSALS['touched']}, 99.9 Hz"
-    now[0] += 2.0
-    assert subject.state().line == "99.9 Hz"
-    subject.set_verdict(replace(PRESSED, touched=False, dangerous=False))
-    assert "nothing to force" in subject.request_tare(force=True)
-    assert subject.state().line == "there is nothing to force, 99.9 Hz"
-    now[0] += 61.0
-    assert subject.state().line == "99.9 Hz"
-    subject.set_verdict(PRESSED)
-    subject.request_tare()
-    subject.set_verdict(replace(PRESSED, touched=False, dangerous=False))
-    assert subject.request_tare() == ""
-    assert subject.state().line == "99.9 Hz"
+    subject.set_verdict(PRESSED, 100.0)
+    assert subject.request_tare(100.0) == refused
+    assert subject.request_tare(100.0, force=True) == ""
+    assert subject.state(100.0).line == "99.9 Hz"  # it was forced
+    assert subject.request_tare(100.0, force=True) == refused  # a refusal is for one
+    assert subject.state(159.0).line == f"{refused}, 99.9 Hz"
+    assert subject.state(161.0).line == "99.9 Hz"
+    subject.set_verdict(idle, 161.0)
+    assert "nothing to force" in subject.request_tare(161.0, force=True)
+    assert subject.state(161.0).line == "there is nothing to force, 99.9 Hz"
+    assert subject.state(222.0).line == "99.9 Hz"
+    subject.set_verdict(PRESSED, 222.0)
+    subject.request_tare(222.0)
+    subject.set_verdict(idle, 222.0)
+    assert subject.request_tare(222.0) == ""
+    assert subject.state(222.0).line == "99.9 Hz"
 
 
 def test_the_map_of_an_alarm_is_held_and_goes_with_the_touch():
     subject = display()
     idle = replace(PRESSED, touched=False, dangerous=False)
-    subject.set_verdict(idle)
-    subject.add_frame(frame([0, 0, 6.0, 0, 0]), PLAIN)
-    subject.set_verdict(replace(PRESSED, dangerous=False, contact=0.1))
-    state = subject.state()
+    subject.set_verdict(idle, monotonic())
+    subject.add(frame([0, 0, 6.0, 0, 0]))
+    subject.set_verdict(replace(PRESSED, dangerous=False, contact=0.1), monotonic())
+    state = subject.state(monotonic())
     assert (state.held, state.map[2]) == (False, 6.0)
-    subject.add_frame(frame([0, 0, 0.1, 0, 0]), PLAIN)
+    subject.add(frame([0, 0, 0.1, 0, 0]))
     for verdict in (PRESSED, replace(PRESSED, dangerous=False, contact=None)):
-        subject.set_verdict(verdict)
-        state = subject.state(state.number)
+        subject.set_verdict(verdict, monotonic())
+        state = subject.state(monotonic(), state.number)
         assert (state.held, state.map[2], state.values[2]) == (True, 6.0, 0.1)
     # The next touch follows before the prediction is over: its map is its own.
     for _ in range(20):
-        subject.add_frame(frame(np.zeros(5)), PLAIN)
-    subject.add_frame(frame([0, 1.0, 0, 0, 0]), PLAIN)
-    subject.set_verdict(replace(PRESSED, dangerous=False, contact=0.05))
-    assert subject.state().peak.tolist() == [0, 1, 0, 0, 0]
-    subject.set_verdict(idle)
-    assert subject.state().peak.max() == 0
+        subject.add(frame(np.zeros(5)))
+    subject.add(frame([0, 1.0, 0, 0, 0]))
+    subject.set_verdict(replace(PRESSED, dangerous=False, contact=0.05), monotonic())
+    assert subject.state(monotonic()).peak.tolist() == [0, 1, 0, 0, 0]
+    subject.set_verdict(idle, monotonic())
+    assert subject.state(monotonic()).peak.max() == 0
 
 
 def test_an_unknown_place_is_not_shown_as_no_touch():
     subject = display()
     masked = {"unknown": (2,), "masked": (2,), "notes": (Note("masked", (2,)), Note("pause", seconds=0.7))}
-    subject.set_verdict(replace(PRESSED, touched=False, labels={}, dangerous=False, **masked))
-    sent = web.message(subject.state(), SkinPicture(PLACES, SIZE, 8, 4.0))
+    subject.set_verdict(replace(PRESSED, touched=False, labels={}, dangerous=False, **masked), monotonic())
+    sent = web.message(subject.state(monotonic()), SkinPicture(PLACES, SIZE, 8, 4.0), monotonic())
     assert (sent["state"], sent["unknown"]) == ("unknown", [2])
     text = shown(subject)
     assert "no touch" not in text
     assert "near sensor 2 would stay undetected" in text
     assert "(and 1 more note)" in text
-    subject.set_verdict(None, "readings are frozen")
-    assert web.message(subject.state(), SkinPicture(PLACES, SIZE, 8, 4.0))["unknown"] == [0, 1, 2, 3, 4]
+    subject.set_verdict(None, monotonic(), "readings are frozen")
+    assert web.message(subject.state(monotonic()), SkinPicture(PLACES, SIZE, 8, 4.0), monotonic())[
+        "unknown"
+    ] == [0, 1, 2, 3, 4]
     assert "unknown: readings are frozen" in shown(subject)
 
 
@@ -378,9 +364,9 @@ def repeated(subject, verdict):
 
     def repeat():
         while not over.wait(0.1):
-            subject.set_verdict(verdict)
+            subject.set_verdict(verdict, monotonic())
 
-    subject.set_verdict(verdict)
+    subject.set_verdict(verdict, monotonic())
     thread = Thread(target=repeat)
     thread.start()
     yield
@@ -390,7 +376,7 @@ def repeated(subject, verdict):
 
 def test_the_page_draws_what_it_is_sent(browser):
     subject = display()
-    subject.add_frame(frame([0, 0, 2.0, 0, 0], np.array([True, True, True, True, False])), PLAIN)
+    subject.add(frame([0, 0, 2.0, 0, 0], np.array([True, True, True, True, False])))
     subject.set_status("99.9 Hz")
     with web.serve_page(subject, 0) as address, repeated(subject, PRESSED):
         browser.open(address)
@@ -413,8 +399,8 @@ ANNOUNCED = "return [...document.querySelectorAll('[role=alert]')].map(one => on
 
 def test_the_page_announces_an_alarm_and_its_end_once(browser):
     subject = display()
-    subject.add_frame(frame([0, 0, 2.0, 0, 0]), PLAIN)
-    subject.set_verdict(None, "taking the baseline")
+    subject.add(frame([0, 0, 2.0, 0, 0]))
+    subject.set_verdict(None, monotonic(), "taking the baseline")
     with web.serve_page(subject, 0) as address:
         browser.open(address)
 
@@ -429,14 +415,14 @@ def test_the_page_announces_an_alarm_and_its_end_once(browser):
             "window.changes = 0; new MutationObserver(() => changes++)"
             ".observe(document.querySelector('[role=alert]'), {childList: true, characterData: true})"
         )
-        subject.set_verdict(PRESSED)
+        subject.set_verdict(PRESSED, monotonic())
         until(["Alarm: dangerous touch"])
-        subject.set_verdict(None, "the device has stopped sending", alarm=True)
+        subject.set_verdict(None, monotonic(), "the device has stopped sending", alarm=True)
         while "stopped sending" not in browser.run("return document.body.innerText"):
             sleep(0.1)
         assert browser.run("return changes") == 1
         assert browser.run("return document.getElementById('head').getAttribute('role')") == "status"
-        subject.set_verdict(None, "the device has stopped sending")
+        subject.set_verdict(None, monotonic(), "the device has stopped sending")
         until([""])
 
 
@@ -453,7 +439,7 @@ CROSSED = "latest && latest.values.length + ' of ' + skin.positions.length + ' o
 
 def test_the_page_goes_on_after_a_restart_with_more_sensors(browser):
     subject, now = display(), "performance.now() - drawn < 1000"
-    subject.add_frame(frame([0, 0, 2.0, 0, 0]), PLAIN)
+    subject.add(frame([0, 0, 2.0, 0, 0]))
     with web.serve_page(subject, 0) as address:
         browser.open(address)
         shows(browser, CROSSED, "5 of 5 on /dev/skin")
@@ -469,7 +455,7 @@ def test_the_page_goes_on_after_a_restart_with_more_sensors(browser):
 
 def test_the_map_of_a_program_that_has_ended_is_outdated(browser):
     subject = display()
-    subject.add_frame(frame([0, 0, 2.0, 0, 0]), PLAIN)
+    subject.add(frame([0, 0, 2.0, 0, 0]))
     subject.set_status("99.9 Hz")
     bright = "getComputedStyle($('map')).filter"
     with web.serve_page(subject, 0) as address:
@@ -478,7 +464,7 @@ def test_the_map_of_a_program_that_has_ended_is_outdated(browser):
             shows(browser, "$('time').textContent", "Map: now")
             assert browser.run(f"return {bright}") == "none"
         shows(browser, "$('head').textContent", "unknown: no decision for longer than usual")
-        subject.set_verdict(None, "the device has stopped sending")
+        subject.set_verdict(None, monotonic(), "the device has stopped sending")
         shows(browser, "$('time').textContent", "Map: last readings")
     shows(browser, "$('time').textContent", "Map: outdated, no answer from the program")
     assert "grayscale" in browser.run(f"return {bright}")
@@ -489,7 +475,7 @@ def test_the_map_of_a_program_that_has_ended_is_outdated(browser):
 def test_a_page_without_an_answer_says_unknown_and_keeps_the_alarm(browser, monkeypatch):
     """The program hangs, though its connection stays open."""
     subject, over = display(), Event()
-    subject.add_frame(frame([0, 0, 6.0, 0, 0]), PLAIN)
+    subject.add(frame([0, 0, 6.0, 0, 0]))
     with web.serve_page(subject, 0) as address:
         browser.open(address)
         with repeated(subject, PRESSED):
@@ -507,7 +493,7 @@ def test_a_page_without_an_answer_says_unknown_and_keeps_the_alarm(browser, monk
 
 def test_the_page_shows_the_gravest_note_and_no_probability_beside_an_alarm_of_late_frames(browser):
     subject = display()
-    subject.add_frame(frame([0, 0, 6.0, 0, 0]), PLAIN)
+    subject.add(frame([0, 0, 6.0, 0, 0]))
     notes = (Note("over_range", (2,)), Note("masked", (4,)))
     safe = replace(PRESSED, dangerous=False, labels={"big": False, "dangerous": False}, notes=notes)
     with web.serve_page(subject, 0) as address:
@@ -517,6 +503,6 @@ def test_the_page_shows_the_gravest_note_and_no_probability_beside_an_alarm_of_l
             note = browser.run("return $('note').textContent")
             assert "no value of sensor 2 since the force rose" in note
             assert note.endswith("(and 1 more note)")
-            subject.set_verdict(PRESSED)
+            subject.set_verdict(PRESSED, monotonic())
             shows(browser, "document.body.dataset.state", "danger")
             assert "safe" not in browser.run("return $('bars').innerText")

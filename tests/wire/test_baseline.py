@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from skin.errors import InputError
-from skin.wire.channels import SkinTouched, take_baseline
+from skin.wire.tare import SkinTouched, take_baseline
 
 RNG = np.random.default_rng(3)
 VALID = np.ones((100, 6), dtype=bool)

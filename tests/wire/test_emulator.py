@@ -1,20 +1,99 @@
-"""An emulator that plays in a thread ends when it is told to, whatever it waits for."""
+"""The emulator: its gestures, its converter, its faults, and how it ends."""
 
 import socket
 import time
 from threading import Thread
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 
 from skin.body.base import Sheet
 from skin.body.layout import Grid
+from skin.core.settings import configured
+from skin.device.resampling import resample
 from skin.device.simulated import Simulated
+from skin.errors import InputError
 from skin.mechanics.simulator.naive import Naive
-from skin.wire.emulator import Emulator, EmulatorSettings, Faults, open_port
+from skin.wire.emulator import Converter, Emulator, EmulatorSettings, Faults, open_port, upsample
 
 SHEET = Sheet((0.16, 0.16), (16, 16), [{"material": "EcoFlex 00-30", "thickness": 0.005}])
+RATE = 10.0
+
+
+def drawn():
+    """Return readings of 30 frames in which touches last 1, 2 and 5 frames, of either sign."""
+    force = np.zeros((30, 3))
+    force[4] = [3.0, 1.0, -0.2]
+    force[10:12] = [[2.0, 0.5, -0.1], [1.0, 2.5, -0.4]]
+    force[20:25] = np.arange(1.0, 6.0)[:, None] * [1.0, 0.3, -0.05]
+    return force
+
+
+@pytest.mark.parametrize("rate", [10.0, 20.0, 50.0, 100.0, 1000.0])
+def test_the_maximum_over_each_interval_is_the_frame(rate):
+    force = drawn()
+    felt = upsample(force, RATE, rate)
+    time = np.arange(len(felt)) / rate
+    known = np.ones_like(felt, dtype=bool)
+    back = resample(time, felt, known, ~known, 3.0 - 0.5 / rate, 1 / RATE, 30)
+    assert back.valid.all()
+    assert back.values == pytest.approx(force, abs=1e-12)
+
+
+def test_force_rises_and_falls_without_a_jump():
+    felt = upsample(drawn(), RATE, 1000.0)
+    # A quarter of a frame has 25 samples: no step is larger than a 25th of the largest change between frames.
+    assert np.abs(np.diff(felt, axis=0)).max() <= 5.0 / 25 + 1e-9
+
+
+def test_counts_are_those_of_a_converter():
+    converter = Converter(10, clip=10.0)
+    assert converter.scale == pytest.approx(20 / 512)
+    said = converter(np.array([0.0, converter.scale, -100.0, 100.0]))
+    assert said.tolist() == [512, 513, 0, 1023]
+    assert Converter(None, 10.0)(np.array([0.25])).tolist() == [0.25]
+
+
+def test_no_fault_changes_nothing():
+    data = bytes(range(256))
+    assert Faults().damaged(data, np.random.default_rng(0)) == data
+
+
+def test_bits_and_bytes_at_their_rates():
+    data, draw = bytes(100_000), np.random.default_rng(1)
+    arrived = Faults(flipped_bits=0.01, lost_bytes=0.1).damaged(data, draw)
+    # Five standard deviations of either count.
+    assert len(arrived) == pytest.approx(90_000, abs=5 * np.sqrt(9000))
+    flipped = np.unpackbits(np.frombuffer(arrived, np.uint8)).sum()
+    assert flipped == pytest.approx(0.01 * 8 * len(arrived), abs=5 * np.sqrt(7200))
+
+
+def test_a_rate_is_per_minute_and_a_list_is_moments():
+    draw = np.random.default_rng(2)
+    happened = Faults(reset=6.0).happen("reset", 0, 600_000, 100.0, draw).sum()
+    assert happened == pytest.approx(600, abs=5 * np.sqrt(600))
+    listed = Faults(reset=[1.5, 3]).happen("reset", 100, 300, 100.0, draw)
+    assert np.flatnonzero(listed).tolist() == [50, 200]
+
+
+@pytest.mark.parametrize(
+    ("given", "reason"),
+    [
+        ({"flip": 1}, "faults has no setting flip"),
+        ({"flipped_bits": 2}, "flipped_bits"),
+        ({"reset": -1}, "reset"),
+    ],
+)
+def test_what_cannot_be_is_refused(given, reason):
+    with pytest.raises(InputError, match=reason):
+        configured(Faults, given, "faults")
+
+
+def test_a_channel_that_is_not_there():
+    with pytest.raises(InputError, match="no channel 4"):
+        Faults(dead=[4]).fits(4)
 
 
 @pytest.mark.parametrize("waits_for", ["a reader", "the next frame", "its power"])

@@ -7,15 +7,19 @@ import socket
 import subprocess
 import sys
 from itertools import islice
+from threading import Event
 from time import monotonic, sleep
 
 import numpy as np
 import pytest
 
 from skin.errors import InputError
+from skin.wire.channels import Reason
+from skin.wire.decoder import Decoder
 from skin.wire.protocol import Header, encode_frame, encode_header, encode_line
-from skin.wire.reader import SkinDisconnected, SkinTimeout, open_stream
+from skin.wire.reader import SkinDisconnected, SkinTimeout, WireFeed
 from skin.wire.skin import open_skin
+from tests.wire.memory import Sent, opened
 
 LAYOUT = range(4)
 PATIENT = 60.0  # s: machines are busy at times
@@ -70,22 +74,38 @@ def test_frames_of_a_socket_and_its_end():
         assert numbers(caught.value.frames) == [50, 51]
 
 
-def test_iterating(plug):
-    with open_skin(plug.port, timeout=PATIENT) as skin:
-        plug.send(encode_header(Header(n=4, id="arm-L")), lines(*range(5)))
+def test_iterating():
+    with opened(encode_header(Header(n=4, id="arm-L")), lines(*range(5))) as skin:
         assert (numbers(islice(skin, 5)), skin.header.id) == ([0, 1, 2, 3, 4], "arm-L")
 
 
-def test_what_comes_when_a_port_is_opened_is_skipped_and_counted(plug):
-    with open_skin(plug.port, LAYOUT) as skin:
-        plug.send(b"\x00\xff503,50", b"4*1F\nets Jun  8 2016\r\nrst:0x1 (POWERON)\r\n\xff\xfe\x00\n")
-        plug.send(lines(*range(5)))
-        assert numbers(skin.read(5, timeout=PATIENT)) == [0, 1, 2, 3, 4]
-        assert (skin.stats.skipped, skin.stats.bad_frames) == (4, 0)
+BAUD = b"\x00\xff503,50", b"4*1F\nets Jun  8 2016\r\nrst:0x1 (POWERON)\r\n\xff\xfe\x00\n"
 
 
 @pytest.mark.parametrize(
-    ("spoilt", "reason"),
+    ("pieces", "found", "counts"),
+    [
+        ((*BAUD, lines(*range(5))), [(n, 0, "", 0) for n in range(5)], {"skipped": 4, "bad_frames": 0}),
+        ((lines(0, 1, 2, 3, 7, 8),), [(3, 0, "", 0), (7, 3, "gap", 0), (8, 0, "", 0)], {"lost": 3}),
+        (
+            (lines(700, 701, 702), b"booted\n", lines(0, 1)),
+            [(702, 0, "", 0), (0, 0, "reset", 1), (1, 0, "", 1)],
+            {"resets": 1},
+        ),
+    ],
+)
+def test_frames_are_placed_and_counted(pieces, found, counts):
+    """What comes when a port is opened is skipped; a gap is flagged, not filled; a restart is a segment."""
+    with opened(*pieces) as skin:
+        frames = skin.read(sum(piece.count(b"*") for piece in pieces) - (BAUD[1] in pieces), timeout=PATIENT)
+        stats = skin.stats
+    said = [(frame.seq, frame.lost, frame.after, frame.segment) for frame in frames]
+    assert said[-len(found) :] == found
+    assert {name: getattr(stats, name) for name in counts} == counts
+
+
+@pytest.mark.parametrize(
+    ("damaged", "reason"),
     [
         (b"5,50000,1,2,3\n", "fields"),
         (b"5,50000,one,two,three,4\n", "number"),
@@ -94,102 +114,73 @@ def test_what_comes_when_a_port_is_opened_is_skipped_and_counted(plug):
         (b"9" * 70_000 + b"\n", "long"),
     ],
 )
-def test_a_bad_line_costs_itself_only(plug, spoilt, reason):
+def test_a_bad_line_costs_itself_only(damaged, reason):
     # Where every line has a checksum, one without is bad for that.
     check = "crc16" if reason == "checksum" else "none"
-    with open_skin(plug.port, LAYOUT) as skin:
-        plug.send(lines(*range(5), check=check), spoilt, lines(6, 7, check=check))
+    with opened(lines(*range(5), check=check), damaged, lines(6, 7, check=check)) as skin:
         frames = skin.read(7 if check == "crc16" else 6, timeout=PATIENT)
         assert (numbers(frames[-3:]), frames[-2].lost) == ([4, 6, 7], 1)
         assert (skin.stats.bad, skin.stats.resyncs) == ({reason: 1}, 1)
 
 
-def test_bad_lines_are_told_once_a_second_with_their_reason(plug, caplog):
+def test_bad_lines_are_logged_once_a_second_with_their_reason(caplog):
     caplog.set_level(logging.WARNING, "skin.wire")
-    with open_skin(plug.port, LAYOUT) as skin:
-        start = monotonic()
-        plug.send(lines(*range(5)))
-        number = 5
-        while not any("bad frames" in entry.message for entry in caplog.records):
-            plug.send(line(number).replace(b"501", b"502") + line(number + 1))
-            number += 2
-            sleep(0.02)
-        skin.read(5)
-        passed = monotonic() - start
-    told = [entry.message for entry in caplog.records if "bad frames" in entry.message]
-    assert 1 <= len(told) <= 1 + passed
-    assert "checksum" in told[0]
+    feed = WireFeed(Sent, Decoder(4))
+    feed.decode(lines(*range(5)), 0.0)
+    for number in range(5, 305, 2):
+        feed.decode(line(number).replace(b"501", b"502") + line(number + 1), number / 100)
+    logged = [entry.message for entry in caplog.records if "bad frames" in entry.message]
+    assert len(logged) == 3
+    assert logged[1].startswith("51 bad frames (51 checksum)")
 
 
 @pytest.mark.parametrize(("check", "said"), [("none", "29 %"), ("xor", "weak checksum"), ("crc16", "")])
-def test_what_protects_the_frames_is_said_once(plug, caplog, check, said):
-    with open_skin(plug.port, LAYOUT) as skin:
-        plug.send(lines(*range(9), check=check))
-        skin.read(8, timeout=PATIENT)
-        assert skin.stats.check == check
+def test_what_protects_the_frames_is_said_once(caplog, check, said):
+    feed = WireFeed(Sent, Decoder(4))
+    for number in range(9):
+        feed.decode(line(number, check=check), number / 100)
     assert [said in entry.message for entry in caplog.records] == [True] * bool(said)
 
 
-def test_more_than_half_bad_asks_for_baud_rate_and_format(plug):
-    with open_skin(plug.port, LAYOUT) as skin:
-        plug.send(lines(*range(5)))
-        skin.read(5, timeout=PATIENT)
-        deadline = monotonic() + PATIENT
-        while not skin.stats.trouble and monotonic() < deadline:
-            plug.send(b"\xfa\x92\x00\n\x81\x82\n")
-            sleep(0.05)
-        with pytest.raises(SkinTimeout, match="wrong baud rate or format"):
-            skin.read(1, timeout=0.1)
+NOISE = np.random.default_rng(0).bytes(6000)
+SIXTEEN = b"".join(line(number, [1] * 16) for number in range(200))
 
 
 @pytest.mark.parametrize(
     ("sent", "reason"),
     [
-        (b"".join(line(number, [1] * 16) for number in range(200)), "16 values per frame, the layout has 4"),
-        (np.random.default_rng(0).bytes(6000), r"begin with ([0-9a-f]{2} ){63}[0-9a-f]{2}: is the baud rate"),
+        (SIXTEEN, "16 values per frame, the layout has 4"),
+        (NOISE, r"begin with ([0-9a-f]{2} ){63}[0-9a-f]{2}: is the baud rate"),
     ],
 )
-def test_what_cannot_be_read_is_refused(plug, sent, reason):
-    with open_skin(plug.port, LAYOUT) as skin:
-        plug.send(sent)
-        with pytest.raises(InputError, match=reason):
-            skin.read(1, timeout=PATIENT)
+def test_what_cannot_be_read_is_refused(sent, reason):
+    with opened(sent) as skin, pytest.raises(InputError, match=reason):
+        skin.read(1, timeout=PATIENT)
 
 
-def test_a_gap_is_flagged_and_not_filled(plug):
-    with open_skin(plug.port, LAYOUT) as skin:
-        plug.send(lines(0, 1, 2, 3, 7, 8))
-        frames = skin.read(6, timeout=PATIENT)
-    told = [(frame.seq, frame.lost, frame.after) for frame in frames[3:]]
-    assert told == [(3, 0, ""), (7, 3, "gap"), (8, 0, "")]
-    assert {frame.segment for frame in frames} == {0}
-
-
-def test_a_device_that_starts_anew_is_a_new_segment(plug):
-    with open_skin(plug.port, LAYOUT) as skin:
-        plug.send(lines(700, 701, 702), b"booted\n", lines(0, 1))
-        frames = skin.read(5, timeout=PATIENT)
-        assert skin.stats.resets == 1
-    assert [(frame.segment, frame.after) for frame in frames] == [(0, "")] * 3 + [(1, "reset"), (1, "")]
-
-
-def test_silence_is_told_apart_from_nonsense_and_carries_what_came(plug):
-    with open_skin(plug.port, LAYOUT, timeout=0.1) as skin:
-        with pytest.raises(SkinTimeout, match="port open, nothing received"):
-            skin.read(1)
-        with pytest.raises(SkinTimeout, match="port open, nothing received"):
+@pytest.mark.parametrize(
+    ("pieces", "reason", "arrived"),
+    [
+        ([], "port open, nothing received", []),
+        ([b"hello\n"], "6 bytes but no frame", []),
+        ([lines(0, 1, 2)], r"3 of 100 frames arrived within 0.3 s: .* stopped sending", [0, 1, 2]),
+    ],
+)
+def test_silence_is_told_apart_from_nonsense_and_carries_what_came(pieces, reason, arrived):
+    with opened(*pieces, timeout=0.3) as skin:
+        with pytest.raises(SkinTimeout, match=reason) as caught:
+            skin.read(100)
+        assert numbers(caught.value.frames) == arrived
+        with pytest.raises(SkinTimeout):
             next(iter(skin))
-        plug.send(b"hello\n")
-        wait_for(lambda: skin.stats.bytes)
-        with pytest.raises(SkinTimeout, match="6 bytes but no frame"):
-            skin.read(1)
-        plug.send(lines(0, 1, 2))
-        wait_for(lambda: skin.stats.frames == 3)
-        with pytest.raises(
-            SkinTimeout, match=r"3 of 100 frames arrived within 0.2 s: .* stopped sending"
-        ) as caught:
-            skin.read(100, timeout=0.2)
-        assert numbers(caught.value.frames) == [0, 1, 2]
+
+
+def test_more_than_half_bad_asks_for_baud_rate_and_format():
+    decoder = Decoder(4)
+    decoder.feed(lines(*range(5)), 0.0)
+    for number in range(1, 50):
+        decoder.feed(b"\xfa\x92\x00\n\x81\x82\n", 0.05 * number)
+    assert "wrong baud rate or format" in decoder.stats.trouble
 
 
 def test_unplugging_is_an_error_after_what_came_before(plug):
@@ -203,48 +194,38 @@ def test_unplugging_is_an_error_after_what_came_before(plug):
             next(iter(skin))
 
 
-def test_two_hundred_times_unplugged_and_plugged_in_again(new_plug):
-    def opener():
-        cable = new_plug()
-        stream = open_stream(cable.port, 115200)
-        cable.send(b"77,5", b"\n", lines(*range(4)))
-        cables.append(cable)
-        return stream
-
-    cables = []
-    with open_skin("cable", LAYOUT, opener=opener, reconnect=True, backoff=(0.001, 0.01)) as skin:
-        frames = skin.read(4, timeout=PATIENT)
-        for _ in range(200):
-            cables[-1].unplug()
-            frames += skin.read(4, timeout=PATIENT)
+def test_two_hundred_times_unplugged_and_plugged_in_again():
+    streams = iter([Sent(b"77,5", b"\n", lines(*range(4))) for _ in range(200)])
+    last = Sent(b"77,5", b"\n", lines(*range(4)), end=False)
+    opener, settings = lambda: next(streams, last), {"reconnect": True, "backoff": (0.001, 0.01)}
+    with open_skin("cable", LAYOUT, opener=opener, **settings) as skin:
+        frames = skin.read(804, timeout=PATIENT)
         assert (skin.stats.reconnects, skin.stats.frames, skin.stats.dropped) == (200, 804, 0)
     assert [frame.after for frame in frames] == ["", "", "", ""] + ["reconnect", "", "", ""] * 200
     assert [frame.segment for frame in frames[::4]] == list(range(201))
 
 
-def test_while_it_is_away_it_is_tried_again_and_said(plug, new_plug):
-    ports = [plug.port]
-    with open_skin(
-        "x", LAYOUT, opener=lambda: open_stream(ports[-1], 115200), reconnect=True, backoff=(0.01, 0.02)
-    ) as skin:
-        plug.send(lines(0, 1, 2))
+def test_while_it_is_away_it_is_tried_again_and_said():
+    other = b"".join(line(number, [5, 6, 7]) for number in range(300))
+    streams, back = [Sent(lines(0, 1, 2))], Event()
+
+    def opener():
+        if not streams and not back.is_set():
+            raise InputError("no port")
+        return streams.pop() if streams else Sent(other, end=False)
+
+    with open_skin("x", LAYOUT, opener=opener, reconnect=True, backoff=(0.01, 0.02)) as skin:
         skin.read(3, timeout=PATIENT)
-        ports.append("/dev/nothing")
-        plug.unplug()
         wait_for(lambda: skin.away)
         with pytest.raises(SkinTimeout, match="unplugged; trying again"):
             skin.read(1, timeout=0.1)
-        other = new_plug()
-        ports.append(other.port)
-        wait_for(lambda: skin.stats.reconnects)
-        other.send(b"".join(line(number, [5, 6, 7]) for number in range(300)))
+        back.set()
         with pytest.raises(InputError, match="sends 3 values per frame, the layout has 4"):
             skin.read(1, timeout=PATIENT)
 
 
-def test_who_is_late_loses_the_oldest_frames_and_is_told(plug):
-    with open_skin(plug.port, LAYOUT, queue=10) as skin:
-        plug.send(lines(*range(100)))
+def test_who_is_late_loses_the_oldest_frames_and_is_informed():
+    with opened(lines(*range(100)), queue=10) as skin:
         # A frame counts when it is decoded, before it waits to be read.
         wait_for(lambda: skin.stats.dropped == 90)
         frames = skin.read(10)
@@ -302,20 +283,20 @@ def test_a_setting_that_cannot_be_used_is_refused(plug, setting, named):
         open_skin(plug.port, **setting)
 
 
-def test_channels_that_mean_nothing_are_masked_and_named(plug):
+def test_channels_that_mean_nothing_are_masked_and_named():
     rng = np.random.default_rng(0)
     values = rng.integers(400, 600, (800, 6))
     values[:, 1] = 0  # never a change
     values[200:, 2] = 444  # none any more
     values[-1, 3] = 1023
-    with open_skin(plug.port, range(6)) as skin:
-        plug.send(encode_header(Header(n=6, bits=10)))
-        plug.send(*(line(number, row.tolist()) for number, row in enumerate(values)))
+    data = b"".join(line(number, row.tolist()) for number, row in enumerate(values))
+    with opened(encode_header(Header(n=6, bits=10)), data, layout=6) as skin:
         frames = skin.read(800, timeout=PATIENT)
         assert skin.channels == ("ok", "dead", "stuck", "saturated", "ok", "ok")
     assert frames[100].valid.all()
     assert frames[-1].valid.tolist() == [True, False, False, True, True, True]
     assert frames[-1].saturated.tolist() == [False, False, False, True, False, False]
+    assert frames[-1].mask.tolist() == [0, Reason.DEAD, Reason.STUCK, Reason.SATURATED, 0, 0]
 
 
 def test_tare_and_a_touch(plug):
@@ -335,7 +316,7 @@ def test_tare_and_a_touch(plug):
         assert skin.tare(0.5, force=True)[2] == pytest.approx(800, abs=1.01)
 
 
-def test_tare_while_the_device_starts_anew_is_refused(plug):
+def test_tare_while_the_device_restarts_is_refused(plug):
     with open_skin(plug.port, LAYOUT, timeout=PATIENT) as skin:
         with plug.sending(lambda number: [500] * 4, restart=20), pytest.raises(InputError, match="restarted"):
             skin.tare(0.5)

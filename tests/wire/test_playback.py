@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from skin.device.files import write_recording
+from skin.device.resampling import Frame
 from skin.errors import InputError
 from skin.runs.build import build_device
 from skin.wire.reader import SkinDisconnected
-from skin.wire.skin import open_skin
+from skin.wire.skin import Source, open_skin
 
 
 @pytest.fixture(scope="module")
@@ -57,3 +58,12 @@ def test_the_simulator_is_played(device):
         frames = skin.read(6001, timeout=60)
     assert np.stack([frame.values for frame in frames[:6000]]) == pytest.approx(strip)
     assert (frames[5999].after, frames[6000].after, frames[6000].segment) == ("", "cut", 1)
+
+
+def test_values_in_newtons_stay_what_they_are():
+    values, valid = np.array([0.5, -1.0, 7.0]), np.array([True, True, False])
+    source = Source.in_newtons("recording", None, 3)
+    source.tare.add(Frame(0, 0.0, 0.0, values, valid))
+    said, known = source.tare.conversion(values, valid)
+    assert said.tolist() == [0.5, -1.0, 0.0]
+    assert known.tolist() == valid.tolist()

@@ -10,11 +10,13 @@ from skin.device.calibration import Calibration, read_calibration, write_calibra
 from skin.device.imperfection import Imperfection
 from skin.device.resampling import Frame, Window
 from skin.errors import InputError
-from skin.wire.channels import Tare, unit_conversion
+from skin.wire.channels import unit_conversion
 from skin.wire.decoder import Decoder
 from skin.wire.protocol import Header, encode_header, encode_line
-from skin.wire.reader import PortSettings
-from skin.wire.skin import SerialSource, open_skin
+from skin.wire.reader import Port
+from skin.wire.skin import SerialSource
+from skin.wire.tare import Tare
+from tests.wire.memory import opened
 
 FALLING = Calibration(
     {"gain": [2.0, 0.5, 1.0], "offset": [0.1, -0.2, 0.0], "clip": [10.0, 10.0, 10.0]},
@@ -80,12 +82,12 @@ def test_a_scale_may_be_negative_but_not_beside_a_calibration_and_not_0():
     conversion = unit_conversion(2, np.array([900.0, 900.0]), -0.02, None, None)
     readings, _ = conversion(np.array([900.0, 400.0]), np.ones(2, dtype=bool))
     np.testing.assert_allclose(readings, [0, 10], atol=1e-6)
-    assert SerialSource(PortSettings(scale=-0.02), 2, 10.0).polarity == [-1, -1]
+    assert SerialSource(Port(scale=-0.02), 2, 10.0).polarity == [-1, -1]
     with pytest.raises(InputError, match=r"must not be 0.*device.scale=-0.039 if values fall"):
-        SerialSource(PortSettings(scale=0.0), 2, 10.0)
+        SerialSource(Port(scale=0.0), 2, 10.0)
     for scale in (float("nan"), float("inf")):
         with pytest.raises(InputError, match=r"device.scale=(nan|inf) must be a finite number"):
-            PortSettings(scale=scale)
+            Port(scale=scale)
     with pytest.raises(InputError, match="above 0 beside a calibration"):
         unit_conversion(3, None, -0.02, FALLING, None)
 
@@ -115,26 +117,11 @@ def test_frames_come_in_the_order_of_the_layout():
     assert plain.feed(b"".join(encode_line([1, 2, 3], n, 1000 * n) for n in range(4)))[0].polarity is None
 
 
-class Sent:
-    """A stream of bytes that were sent before it was opened."""
-
-    def __init__(self, data):
-        self._data = [data]
-
-    def read(self):
-        if not self._data:
-            raise OSError("end")
-        return self._data.pop()
-
-    def close(self):
-        pass
-
-
 def test_both_ends_of_the_converter_saturate_a_channel_whose_values_fall():
     rows = [[500 + n % 2, 500 + n % 2] for n in range(10)] + [[0, 0], [1023, 1023], [1, 1022]]
     data = encode_header(Header(n=2, bits=10))
     data += b"".join(encode_line(row, n, 1000 * n) for n, row in enumerate(rows))
-    with open_skin("", range(2), opener=lambda: Sent(data), polarity=[1, -1]) as skin:
+    with opened(data, layout=2, polarity=[1, -1]) as skin:
         frames = skin.read(len(rows), timeout=20)
     assert [frame.saturated.tolist() for frame in frames[-3:]] == [
         [False, True],
@@ -145,7 +132,7 @@ def test_both_ends_of_the_converter_saturate_a_channel_whose_values_fall():
 
 
 def test_a_press_on_a_falling_channel_reads_its_peak_after_a_tare():
-    source = SerialSource(PortSettings(scale=-0.02, tare=1.0), 1, 10.0)
+    source = SerialSource(Port(scale=-0.02, tare=1.0), 1, 10.0)
     rng, rows = np.random.default_rng(0), []
     for number in range(200):
         force = 5.0 if 150 <= number < 155 else 0.0

@@ -107,8 +107,12 @@ def test_writing_while_it_is_unplugged_and_plugged_in(plugged):
     assert not writing.is_alive()
 
 
-def test_a_link_leads_to_it_and_is_followed_again(tmp_path):
-    link = tmp_path / "skin"
+@pytest.fixture
+def link(tmp_path):
+    return tmp_path / "skin"
+
+
+def test_a_link_leads_to_it_and_is_followed_again(link):
     port = open_port("pty", str(link))
     first = os.readlink(link)
     assert port.address == str(link)
@@ -120,13 +124,11 @@ def test_a_link_leads_to_it_and_is_followed_again(tmp_path):
     port.unplug()
 
 
-def test_a_link_in_use_is_left_alone(tmp_path):
-    link = tmp_path / "skin"
+def test_a_link_in_use_is_left_alone(link):
     first = open_port("pty", str(link))
     target = os.readlink(link)
-    with pytest.raises(
-        InputError, match=rf"link=\S+ leads to {target}, which is in use: end .* another name"
-    ):
+    used = rf"link=\S+ leads to {target}, which is in use: end .* another name"
+    with pytest.raises(InputError, match=used):
         open_port("pty", str(link))
     assert os.readlink(link) == target
     first.unplug()
@@ -139,8 +141,7 @@ def test_a_link_in_use_is_left_alone(tmp_path):
     assert not link.is_symlink()
 
 
-def test_a_link_that_leads_nowhere_is_taken_over_and_another_ones_is_not_removed(tmp_path):
-    link = tmp_path / "skin"
+def test_a_link_that_leads_nowhere_is_taken_over_and_another_ones_is_not_removed(link):
     link.symlink_to("/dev/pts/nothing")
     port = open_port("pty", str(link))
     assert link.exists()
@@ -150,15 +151,14 @@ def test_a_link_that_leads_nowhere_is_taken_over_and_another_ones_is_not_removed
     assert os.readlink(link) == "/dev/pts/other"
 
 
+def test_a_file_is_not_replaced_by_a_link(link):
+    link.write_text("keep")
+    with pytest.raises(InputError, match="would replace"):
+        open_port("pty", str(link))
+    assert link.read_text() == "keep"
+
+
 @pytest.mark.parametrize("name", ["usb", "tcp:", "tcp:70000", "tcp:x"])
 def test_other_ports_are_refused(name):
     with pytest.raises(InputError, match="pty or tcp"):
         open_port(name, None)
-
-
-def test_a_file_is_not_replaced_by_a_link(tmp_path):
-    path = tmp_path / "notes"
-    path.write_text("keep")
-    with pytest.raises(InputError, match="would replace"):
-        open_port("pty", str(path))
-    assert path.read_text() == "keep"

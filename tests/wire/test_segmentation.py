@@ -43,53 +43,44 @@ def shown(segmenter, sequence):
     return [gesture for frame in sequence if (gesture := segmenter.add(frame))]
 
 
+def announced(sequence, *said, seconds=0.3, task=TOUCH):
+    """Return the gestures of a stream with announcements."""
+    return shown(AnnouncedSegmenter(window(seconds), announcements(*said), task), sequence)
+
+
 def test_an_announced_gesture_is_its_frames():
-    segmenter = AnnouncedSegmenter(window(0.3), announcements(Announcement(0, 10, 30, LABELS)), TOUCH)
-    (gesture,) = shown(segmenter, frames(range(60)))
+    (gesture,) = announced(frames(range(60)), Announcement(0, 10, 30, LABELS))
     assert [frame.seq for frame in gesture.frames] == list(range(10, 40))
     assert (gesture.labels, gesture.lost, gesture.broken) == (LABELS, 0, False)
 
 
 def test_a_window_keeps_its_place_where_its_first_frames_are_lost():
-    segmenter = AnnouncedSegmenter(window(0.3), announcements(Announcement(0, 10, 30, LABELS)), TOUCH)
-    (gesture,) = shown(segmenter, frames([*range(10), *range(14, 60)]))
+    (gesture,) = announced(frames([*range(10), *range(14, 60)]), Announcement(0, 10, 30, LABELS))
     assert gesture.begin == pytest.approx(0.1)
     assert (gesture.frames[0].seq, gesture.frames[-1].seq, gesture.lost) == (14, 39, 4)
 
 
-def test_a_gesture_that_was_half_over_is_none():
-    segmenter = AnnouncedSegmenter(
-        window(0.3), announcements(Announcement(0, 0, 30, LABELS), Announcement(1, 30, 30, LABELS)), TOUCH
-    )
-    assert [gesture.number for gesture in shown(segmenter, frames(range(15, 70)))] == [1]
-
-
-def test_windows_that_touch_each_other_are_two():
-    segmenter = AnnouncedSegmenter(
-        window(0.1), announcements(Announcement(0, 0, 10, LABELS), Announcement(1, 10, 10, LABELS)), TOUCH
-    )
-    assert [gesture.number for gesture in shown(segmenter, frames(range(25)))] == [0, 1]
+@pytest.mark.parametrize(
+    ("sent", "length", "numbers"),
+    [(range(15, 70), 30, [1]), (range(25), 10, [0, 1])],  # half over at the beginning; one after the other
+)
+def test_windows_that_touch_each_other_are_two(sent, length, numbers):
+    said = Announcement(0, 0, length, LABELS), Announcement(1, length, length, LABELS)
+    gestures = announced(frames(sent), *said, seconds=length / 100)
+    assert [gesture.number for gesture in gestures] == numbers
 
 
 def test_a_restart_breaks_a_gesture_off():
-    segmenter = AnnouncedSegmenter(window(0.3), announcements(Announcement(0, 0, 30, LABELS)), TOUCH)
-    (gesture,) = shown(segmenter, frames(range(10)) + frames(range(5), segment=1))
+    sent = frames(range(10)) + frames(range(5), segment=1)
+    (gesture,) = announced(sent, Announcement(0, 0, 30, LABELS))
     assert gesture.broken
 
 
-def test_a_label_that_is_not_announced_is_missed():
+def test_a_label_that_is_not_announced_is_missed_and_a_touch_is_always_one():
     with pytest.raises(InputError, match="no press"):
-        shown(
-            AnnouncedSegmenter(
-                window(0.3), announcements(Announcement(0, 0, 30, {"big": 1, "dynamic": 1})), TOUCH
-            ),
-            frames(range(3)),
-        )
-
-
-def test_a_touch_is_always_a_touch():
-    segmenter = AnnouncedSegmenter(window(0.1), announcements(Announcement(0, 0, 10, LABELS)), TOUCH_OR_NOT)
-    (gesture,) = shown(segmenter, frames(range(20)))
+        announced(frames(range(3)), Announcement(0, 0, 30, {"big": 1, "dynamic": 1}))
+    said = Announcement(0, 0, 10, LABELS)
+    (gesture,) = announced(frames(range(20)), said, seconds=0.1, task=TOUCH_OR_NOT)
     assert gesture.labels["touch"] == 1
 
 

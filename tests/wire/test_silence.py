@@ -1,132 +1,125 @@
-"""A device that lost its power never says that it is gone: a socket without data is opened anew."""
+"""A device that lost its power never says that it is gone: a socket without data is opened again."""
 
 import logging
-import select
 import shutil
 import socket
 import subprocess
 import sys
-from itertools import islice
-from time import monotonic, sleep
+from itertools import count, islice
+from time import monotonic
 
+import numpy as np
 import pytest
 
 from skin.errors import InputError
+from skin.wire.decoder import Decoder
 from skin.wire.protocol import encode_line
-from skin.wire.reader import SkinTimeout
+from skin.wire.reader import WireFeed
 from skin.wire.skin import open_skin
+from tests.wire.memory import Sent
 
 LAYOUT = range(4)
 PATIENT = 60.0  # s: machines are busy at times
 HASTY = {"reconnect": True, "silence": 0.3, "backoff": (0.01, 0.04)}
+LINK = "socket://127.0.0.1:1"
 
 
 def lines(*numbers, values=(500, 501, 502, 503)):
     return b"".join(encode_line(values, number, number * 10_000) for number in numbers)
 
 
-@pytest.fixture
-def server():
-    """Return a listening socket that waits for PATIENT s at most."""
-    with socket.create_server(("127.0.0.1", 0)) as listening:
-        listening.settimeout(PATIENT)
-        yield listening
-
-
-def address(server):
-    return f"socket://127.0.0.1:{server.getsockname()[1]}"
-
-
-def test_a_peer_that_stops_sending_is_left_and_found_again(server, caplog):
+def test_a_peer_that_stops_sending_is_left_and_found_again(caplog):
+    """By a socket, whose connection stays open, as after a power cut in the middle of a frame."""
     caplog.set_level(logging.WARNING, "skin.wire")
-    with open_skin(address(server), LAYOUT, **HASTY) as skin:
-        first, _ = server.accept()
-        # In the middle of a frame; the connection stays open, as after a power cut.
-        first.sendall(lines(*range(5)) + b"5,50000,500,5")
-        second, _ = server.accept()
-        second.sendall(lines(*range(3)))
-        frames = skin.read(8, timeout=PATIENT)
-        assert skin.stats.reconnects == 1
-        assert skin.stats.bad_frames == 0
-        assert first.recv(1) == b""
-        first.close()
-        second.close()
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        server.settimeout(PATIENT)
+        address = f"socket://127.0.0.1:{server.getsockname()[1]}"
+        with open_skin(address, LAYOUT, **HASTY) as skin:
+            first, _ = server.accept()
+            first.sendall(lines(*range(5)) + b"5,50000,500,5")
+            second, _ = server.accept()
+            second.sendall(lines(*range(3)))
+            frames = skin.read(8, timeout=PATIENT)
+            assert (skin.stats.reconnects, skin.stats.bad_frames) == (1, 0)
+            assert first.recv(1) == b""
+            first.close()
+            second.close()
     assert [frame.seq for frame in frames] == [0, 1, 2, 3, 4, 0, 1, 2]
     assert [frame.after for frame in frames] == [""] * 5 + ["reconnect", "", ""]
     assert [frame.segment for frame in frames] == [0] * 5 + [1] * 3
     assert "unplugged (nothing received for 0.3 s)" in caplog.text
 
 
-def test_a_peer_that_accepts_and_never_sends_is_tried_less_and_less_often(server):
-    # Iterating does not give up although the timeout passes: the skin comes back again and again.
-    settings = HASTY | {"silence": 0.1, "backoff": (0.02, 10.0), "timeout": 0.3}
-    with open_skin(address(server), LAYOUT, **settings) as skin:
-        peers, times = [], []
-        for _ in range(6):
-            peers.append(server.accept()[0])
-            times.append(monotonic())
-        peers[-1].sendall(lines(*range(4)))
+def polled(pieces, silence, step=0.1):
+    """Poll a feed every ``step`` s; return its frames and when it was found silent."""
+    feed, times = WireFeed(lambda: Sent(*pieces, end=False, pause=0), Decoder(4), None, silence), count()
+    frames = []
+    for _ in range(len(pieces) + 20):
+        now = step * next(times)
+        try:
+            frames += feed.poll(lambda now=now: now)
+        except TimeoutError:
+            return frames, now
+    return frames, np.inf
+
+
+@pytest.mark.parametrize(
+    ("pieces", "silence", "found"),
+    [
+        ([lines(*range(3))], 0.5, 0.5),  # from the last byte on
+        ([], 0.5, 0.5),  # from the opening on
+        ([lines(0, 1, 2), b"", b"", b"", lines(3), b"", b"", b""], 0.5, 0.9),
+        ([piece for n in range(12) for piece in (lines(n), b"", b"", b"")], 0.5, np.inf),  # seldom
+        ([lines(*range(3))], np.inf, np.inf),
+    ],
+)
+def test_silence_counts_from_the_last_byte(pieces, silence, found):
+    frames, when = polled(pieces, silence)
+    last = max((n for n, piece in enumerate(pieces) if piece), default=0)
+    assert when == pytest.approx(found if len(pieces) < 40 else 0.1 * last + silence)
+    assert len(frames) == sum(piece.count(b"\n") for piece in pieces)
+
+
+@pytest.mark.parametrize(
+    ("address", "settings", "silence"),
+    [
+        (LINK, {}, 0.3),
+        (LINK, {"silence": 0}, np.inf),
+        (LINK, {"silence": None}, np.inf),
+        (LINK, {"reconnect": False}, np.inf),
+        ("/dev/ttyACM0", {}, np.inf),  # the system tells of a serial port that is gone
+    ],
+)
+def test_silence_is_borne_where_that_is_asked_for(address, settings, silence):
+    with open_skin(address, LAYOUT, opener=lambda: Sent(end=False), **HASTY | settings) as skin:
+        assert skin._feed._silence == silence
+
+
+def test_a_peer_that_accepts_and_never_sends_is_tried_less_and_less_often():
+    """Iterating does not give up although the timeout passes: the skin comes back again and again."""
+    streams, times = [Sent(end=False) for _ in range(5)] + [Sent(lines(*range(4)), end=False)], []
+
+    def opener():
+        times.append(monotonic())
+        return streams[len(times) - 1]
+
+    settings = HASTY | {"silence": 0.02, "backoff": (0.01, 10.0), "timeout": 0.1}
+    with open_skin(LINK, LAYOUT, opener=opener, **settings) as skin:
         assert [frame.seq for frame in islice(skin, 4)] == [0, 1, 2, 3]
-        for peer in peers:
-            peer.close()
-    # 0.1 s of silence, and 0.02, 0.04 ... 0.32 s between two attempts
-    assert times[-1] - times[-2] >= 0.4
-    assert skin.stats.reconnects == 5
+        assert skin.stats.reconnects == 5
+    assert all(stream.closed for stream in streams)
+    # 0.02 s of silence, and 0.01, 0.02 ... 0.16 s between two attempts
+    assert times[-1] - times[-2] >= 0.17
 
 
-@pytest.mark.parametrize("settings", [{"silence": 0}, {"silence": None}, {"reconnect": False}])
-def test_silence_is_borne_where_that_is_asked_for(server, settings):
-    with open_skin(address(server), LAYOUT, **HASTY | {"silence": 0.1} | settings) as skin:
-        peer, _ = server.accept()
-        with pytest.raises(SkinTimeout, match="nothing received"):
-            skin.read(1, timeout=0.4)
-        peer.sendall(lines(0, 1, 2))
-        assert len(skin.read(3, timeout=PATIENT)) == 3
-        assert skin.stats.reconnects == 0
-        peer.close()
-
-
-def test_a_silent_serial_port_is_left_open(plug):
-    with open_skin(plug.port, LAYOUT, **HASTY | {"silence": 0.1}) as skin:
-        plug.send(lines(0, 1, 2))
-        skin.read(3, timeout=PATIENT)
-        sleep(0.4)
-        plug.send(lines(3))
-        assert skin.read(1, timeout=PATIENT)[0].after == ""
-        assert skin.stats.reconnects == 0
-
-
-def test_who_sends_seldom_is_not_silent(server):
-    with open_skin(address(server), LAYOUT, **HASTY | {"silence": 0.6}) as skin:
-        peer, _ = server.accept()
-        for number in range(12):
-            peer.sendall(lines(number))
-            sleep(0.07)
-        assert [frame.after for frame in skin.read(12, timeout=PATIENT)] == [""] * 12
-        peer.close()
-
-
-def test_another_number_of_sensors_after_silence_is_refused(server):
-    with open_skin(address(server), LAYOUT, **HASTY | {"timeout": PATIENT}) as skin:
-        first, _ = server.accept()
-        first.sendall(lines(*range(3)))
-        second, _ = server.accept()
-        second.sendall(lines(*range(300), values=(5, 6, 7)))
-        with pytest.raises(InputError, match="sends 3 values per frame, the layout has 4"):
-            list(skin)
-        first.close()
-        second.close()
-
-
-def test_the_port_is_closed_while_a_peer_is_silent(server):
-    with open_skin(address(server), LAYOUT, **HASTY) as skin:
-        first, _ = server.accept()
-        second, _ = server.accept()
-    assert skin.stats.reconnects == 1
-    for peer in (first, second):
-        assert select.select([peer], [], [], PATIENT)[0]
-        assert peer.recv(1) == b""
-        peer.close()
+def test_another_number_of_sensors_after_silence_is_refused():
+    streams = iter((Sent(lines(*range(3)), end=False), Sent(lines(*range(300), values=(5, 6, 7)), end=False)))
+    settings = HASTY | {"silence": 0.02, "timeout": PATIENT}
+    with (
+        open_skin(LINK, LAYOUT, opener=lambda: next(streams), **settings) as skin,
+        pytest.raises(InputError, match="sends 3 values per frame, the layout has 4"),
+    ):
+        list(skin)
 
 
 @pytest.mark.parametrize("silence", [-1, float("nan"), float("inf")])

@@ -88,15 +88,17 @@ def build_frames(
         make_skin: returns the skin of the device, where a representation needs its geometry.
     """
     _check_options({"representation": representation})
-
-    def measure_geometry() -> "Tensor":
-        from skin.mechanics.geometry import sensor_geometry
-
-        skin = make_skin()
-        return sensor_geometry(skin.body, skin.sensors, skin.simulator(skin.body, skin.sensors))
-
-    geometry = measure_geometry if device.configured else None
+    # Not a local function: processes that train together pickle it.
+    geometry = partial(_measure_geometry, make_skin) if device.configured else None
     return TouchData(device, instantiate(representation), geometry=geometry)
+
+
+def _measure_geometry(make_skin: Callable[[], SkinModel]) -> "Tensor":
+    """Return what the sensors of a skin respond to, (S, G)."""
+    from skin.mechanics.geometry import sensor_geometry
+
+    skin = make_skin()
+    return sensor_geometry(skin.body, skin.sensors, skin.simulator(skin.body, skin.sensors))
 
 
 def build_data(config: Config, device: AbstractDevice) -> TouchData:

@@ -243,7 +243,21 @@ def answers(uri: str | None) -> bool:
 
 
 def check_server(uri: str | None) -> None:
-    """Raise InputError if the server of a tracking URI does not answer, before anything heavy is imported."""
+    """Check that the server of a tracking URI answers, before anything heavy is imported.
+
+    Raises:
+        InputError: it does not, or it is a database whose driver is not installed.
+    """
+    if uri is not None and uri.startswith(("mssql", "mysql", "postgresql")):
+        from sqlalchemy import exc, make_url  # only where a database is named
+
+        try:
+            make_url(uri).get_dialect().import_dbapi()
+        except (ImportError, exc.SQLAlchemyError) as error:
+            raise InputError(
+                f"tracking.uri={uri} needs a driver that is not installed ({one_line(error)}): install it, "
+                'or give postgresql+pg8000://... after pip install "tactile-skin[server]"'
+            ) from error
     if not answers(uri):
         raise InputError(
             f"the tracking server {uri} does not answer: start it, open the tunnel to it, or correct "

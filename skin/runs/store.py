@@ -109,12 +109,11 @@ class Store:
                 served = is_server(uri) and settings.artifacts is None
                 location = None if served else (artifacts / settings.experiment).resolve().as_uri()
                 identity = _experiment(client, settings.experiment, location)
-        except (ImportError, MlflowException, SQLAlchemyError, CommandError, sqlite3.Error, OSError) as error:
+        except (MlflowException, SQLAlchemyError, CommandError, sqlite3.Error, OSError) as error:
             reason = next(iter(str(error.__cause__ or error).splitlines()), type(error).__name__)
             raise InputError(
                 f"cannot use the runs in {uri}: {reason.replace(reveal_password(uri), uri)}: give another "
-                "place, as in tracking.uri=sqlite:////FOLDER/runs.db, or for postgresql+pg8000://... "
-                'pip install "tactile-skin[server]"'
+                "place, as in tracking.uri=sqlite:////FOLDER/runs.db"
             ) from error
         store = cls(client, uri, identity, artifacts.resolve() / "unfinished")
         for run in store.find("RUNNING"):

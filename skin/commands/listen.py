@@ -59,12 +59,20 @@ def main(config: Config, n: int | None, seconds: float | None, adapter: Any) -> 
 
 
 def _propose(settings: "PortSettings", seconds: float | None) -> None:
-    """Print an adapter that reads the board, as YAML to paste; what it makes of it goes to standard error."""
-    from skin.wire.proposal import listen_raw, propose
+    """Print an adapter that reads the board, as YAML to paste, with what it makes of it in comments."""
+    from time import monotonic
+
+    from skin.wire.proposal import propose
     from skin.wire.reader import open_stream
 
-    with closing(open_stream(str(settings.port), settings.baudrate)) as stream:
-        pieces = listen_raw(stream, _ENOUGH if seconds is None else min(seconds, _ENOUGH))
-    proposal = propose(pieces)
-    print(f"# {proposal.summary}", proposal.adapter.describe(), sep="\n")
+    listened = _ENOUGH if seconds is None else min(seconds, _ENOUGH)
+    pieces, begin = list[tuple[float, bytes]](), monotonic()
+    with closing(open_stream(str(settings.port), settings.baudrate)) as stream, suppress(OSError):
+        while (now := monotonic() - begin) < listened:
+            if data := stream.read():
+                pieces.append((now, data))
+    best, *others = propose(pieces, listened)
+    print(f"# {best.summary}", best.adapter.describe(), sep="\n")
+    for other in others:
+        print(f"# nearly as plausible: {other.summary}", *other.adapter.describe().splitlines(), sep="\n# ")
     print("save it, as board.yaml, and give device.adapter=board.yaml", file=sys.stderr)

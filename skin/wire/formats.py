@@ -1,18 +1,22 @@
 """Formats of frames: how bytes are cut into pieces, and what the fields of a piece are."""
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from math import isfinite, nan
+from math import inf, isfinite, nan
 from typing import ClassVar, NamedTuple, Protocol
 
 import numpy as np
 
 from skin.device.resampling import Check, FrameError
 from skin.errors import InputError
+from skin.wire.lines import NumberWords, Reader, SeparatedReader
 from skin.wire.protocol import (
+    INVALID,
+    OVER,
+    SEPARATORS,
     Format,
     Header,
     Line,
@@ -22,7 +26,6 @@ from skin.wire.protocol import (
     ends_with_separator,
     frames_ahead,
     parse_header,
-    parse_line,
 )
 
 
@@ -78,19 +81,29 @@ class Roles:
         contiguous = self.values == tuple(range(first, last))
         object.__setattr__(self, "_take", slice(first, last) if contiguous else list(self.values))
 
-    def frame(self, fields: Sequence[float] | np.ndarray, finite: bool) -> RawFrame:
-        """Return the frame of (``count``,) fields, NaN where there is no number.
+    def frame(self, line: Line) -> RawFrame:
+        """Return the frame of a line with ``count`` fields.
+
+        A word, or digits of another base, in place of a value costs only it; anything else may be a line that
+        is damaged.
 
         Raises:
-            FrameError: counter or time are no ``number``.
+            FrameError: counter or time are no ``number``, or a value is none.
         """
+        fields, finite = line.fields, line.finite
         seq = None if self.counter is None else fields[self.counter]
         ticks = None if self.time is None else float(fields[self.time])
-        if (seq is not None and (not 0 <= seq < np.inf or seq % 1)) or (
-            ticks is not None and not 0 <= ticks < np.inf
+        if (seq is not None and (not 0 <= seq < inf or seq % 1)) or (
+            ticks is not None and not 0 <= ticks < inf
         ):
             raise FrameError("number")
         values = np.array(fields, dtype=np.float64)[self._take]  # type: ignore[attr-defined]
+        if not finite:
+            strange = [word for place, word in line.strange.items() if place in self.values]
+            words_alone = all(word.isalpha() or not word.strip(b"0123456789abcdefABCDEF") for word in strange)
+            if strange and not (words_alone and 2 * np.isfinite(values).sum() > len(values)):
+                raise FrameError("number", word=strange[0].decode("ascii", "replace"))
+            finite = bool(np.isfinite(values).all())
         if self.invalid and not self.invalid.isdisjoint(values.tolist()):
             values[np.isin(values, list(self.invalid))] = nan
             finite = False
@@ -99,26 +112,107 @@ class Roles:
         return RawFrame(None if seq is None else int(seq), ticks, values, finite)
 
 
-@dataclass(frozen=True)
-class TextFormat:
-    """Lines, or other pieces of text with a delimiter.
+class Delimited:
+    """Cuts where a text stands: LF also stands for CRLF and LF CR.
 
-    Attributes:
-        roles: of the fields.
-        check: kind of checksum.
-        trailing: every line ends with a separator, so no line means an empty field by it.
-        parse: returns the fields of a line.
-        delimiter: between two frames; LF also stands for CRLF and LF CR.
-        padded: whether a line may lack its last field, where a separator ends it.
+    Args:
+        delimiter: the text.
     """
 
+    def __init__(self, delimiter: bytes) -> None:
+        self._delimiter = delimiter
+
+    def __call__(self, data: bytes) -> tuple[list[bytes], bytes]:
+        """Return the complete pieces, and what is left."""
+        *pieces, left = data.split(self._delimiter)
+        return pieces, left
+
+
+class FixedLength:
+    """Cuts frames of a fixed length, which only their own bytes delimit.
+
+    What must follow a frame is checked, too, because a lost byte would shift its values.
+
+    Args:
+        length: bytes of a frame.
+        pattern: regular expression of a frame.
+        follow: that of what must follow it; empty: nothing.
+        margin: bytes that ``follow`` takes.
+    """
+
+    def __init__(self, length: int, pattern: bytes, follow: bytes = b"", margin: int = 0) -> None:
+        self.length, self._margin = length, margin
+        self.frame = re.compile(pattern, re.DOTALL)
+        self._step = re.compile(pattern + b"(?=" + follow + b")", re.DOTALL)
+        self._both = re.compile(b"(?=" + pattern * 2 + b")", re.DOTALL)
+
+    def __call__(self, data: bytes) -> tuple[list[bytes], bytes]:
+        """Return the frames, the bytes between them as pieces of their own, and what is left."""
+        pieces, place = list[bytes](), 0
+        while len(data) - place >= self.length + self._margin:
+            if self._step.match(data, place):
+                end = place + self.length
+            else:
+                following = self._both.search(data, place + 1)
+                end = following.start() if following else len(data) - 2 * self.length + 1
+            if end <= place:
+                break
+            pieces.append(data[place:end])
+            place = end
+        return pieces, data[place:]
+
+
+_ANSI = re.compile(rb"\x1b\[[0-9;]*[A-Za-z]|\0")  # colours of a terminal, and the end of a string in C
+
+
+@dataclass(frozen=True)
+class Layout:
+    """A splitter and a reader: pieces and their fields.
+
+    Attributes:
+        split: cuts bytes into pieces.
+        reader: of the fields of a piece.
+        name: word for the user.
+        ignore: regular expression of the lines that are no frames.
+        plain: the lines are those of our protocol, in which no byte is left out.
+    """
+
+    split: Delimited | FixedLength
+    reader: Reader
+    name: str = "text"
+    ignore: re.Pattern[bytes] | None = None
+    plain: bool = False
+
+    def fields(self, piece: bytes) -> Line | bytes:
+        """Return the fields of a piece; the line where it is empty, ignored or a comment; else FrameError."""
+        if isinstance(self.split, FixedLength):
+            if not self.split.frame.fullmatch(piece):
+                raise FrameError("structure")
+            return self.reader(piece)
+        line = (piece if self.plain else _ANSI.sub(b"", piece)).strip(b"\r\n")
+        if not line or line.startswith(b"#") or (self.ignore is not None and self.ignore.fullmatch(line)):
+            return line
+        return self.reader(line)
+
+
+@dataclass(frozen=True)
+class FieldFormat:
+    """Frames of one piece each.
+
+    Attributes:
+        layout: of the pieces.
+        roles: of their fields.
+        check: kind of checksum.
+    """
+
+    layout: Layout
     roles: Roles
     check: Check = "none"
-    trailing: bool = False
-    parse: Callable[[bytes], Line] = parse_line
-    delimiter: bytes = b"\n"
-    padded: bool = True
-    name: str = "text"
+
+    @property
+    def name(self) -> str:
+        """Word for the user."""
+        return self.layout.name
 
     @property
     def sensors(self) -> int:
@@ -126,38 +220,24 @@ class TextFormat:
         return self.roles.sensors
 
     def split(self, data: bytes) -> tuple[list[bytes], bytes]:
-        """Return the complete lines, and what is left."""
-        *pieces, left = data.split(self.delimiter)
-        return pieces, left
+        """Return the complete pieces, and what is left."""
+        return self.layout.split(data)
 
     def fields(self, piece: bytes) -> Line | bytes:
-        """Return the fields of a line, or the line where it is empty or a comment; else raise FrameError."""
-        line = piece.strip(b"\r\n")
-        if not line or line.startswith(b"#"):
-            return line
-        read = self._parse(line)
+        """Return the fields of a piece, or the line where it is none; else raise FrameError."""
+        read = self.layout.fields(piece)
+        if isinstance(read, bytes):
+            return read
         if read.check != self.check:
             raise FrameError("checksum")
-        if (missing := self.roles.count - len(read.fields)) == 0:
-            return read
-        if missing != 1 or self.trailing or not self.padded or not ends_with_separator(line):
-            extra = self.roles.count - len(self.roles.values)
-            raise FrameError("fields", len(read.fields) - extra)
-        return Line([*read.fields, nan], read.check, False)
-
-    def _parse(self, line: bytes) -> Line:
-        """Return the fields of a line; a word in place of a value, such as for over-range, costs only it."""
-        try:
-            return self.parse(line)
-        except FrameError as bad:
-            if 2 * sum(map(isfinite, bad.numbers)) <= self.roles.count:
-                raise
-            return Line(bad.numbers, bad.check, False)
+        if len(read.fields) != self.roles.count:
+            raise FrameError("fields", len(read.fields) - self.roles.count + len(self.roles.values))
+        return read
 
     def read(self, piece: bytes) -> RawFrame | bytes:
-        """Return the frame in a line, or the line where it is empty or a comment; else raise FrameError."""
+        """Return the frame in a piece, or the line where it is none; else raise FrameError."""
         read = self.fields(piece)
-        return read if isinstance(read, bytes) else self.roles.frame(read.fields, read.finite)
+        return read if isinstance(read, bytes) else self.roles.frame(read)
 
 
 class RowsFormat:
@@ -174,30 +254,27 @@ class RowsFormat:
 
     name: ClassVar[str] = "rows"
 
-    def __init__(self, line: TextFormat, rows: int, index: int | None, first: int) -> None:
-        self._line, self.rows, self._index, self._first = line, rows, index, first
+    def __init__(self, line: FieldFormat, rows: int, index: int | None, first: int) -> None:
+        self.line, self.rows, self.index, self._first = line, rows, index, first
         self._partial: list[Line] = []
-        self._open, self._told = False, True
+        self._open, self._partial_reported = False, True
         self.sensors, self.check = rows * line.sensors, line.check
-
-    def split(self, data: bytes) -> tuple[list[bytes], bytes]:
-        """Return the complete lines, and what is left."""
-        return self._line.split(data)
+        self.split = line.split
 
     def read(self, piece: bytes) -> RawFrame | bytes:
         """Return the frame whose last row this line is; bytes within a frame; else raise FrameError."""
         try:
-            row = self._line.fields(piece)
+            row = self.line.fields(piece)
         except FrameError:
-            if self._index is not None:
+            if self.index is not None:
                 return self._break()
             row = b""
         if isinstance(row, bytes):
-            broken = self._index is None and not row.startswith(b"# skin") and self._begin()
+            broken = self.index is None and not row.startswith(b"# skin") and self._begin()
             return self._break() if broken else row
         broken = False
-        if self._index is not None:
-            number = row.fields[self._index]
+        if self.index is not None:
+            number = row.fields[self.index]
             if number == self._first:
                 broken = self._begin()
             elif number != self._first + len(self._partial):
@@ -209,82 +286,25 @@ class RowsFormat:
             raise FrameError("rows")
         if len(self._partial) < self.rows:
             return b""
-        self._open = self._told = False
-        return self._join()
+        frames, self._partial = [self.line.roles.frame(row) for row in self._partial], []
+        self._open = self._partial_reported = False
+        values = np.concatenate([frame.values for frame in frames])
+        return RawFrame(frames[0].seq, frames[0].ticks, values, all(frame.finite for frame in frames))
 
     def _begin(self) -> bool:
         """Begin a frame; return whether the one before it is incomplete."""
         broken = self._open and bool(self._partial)
-        self._partial, self._open, self._told = [], True, False
+        self._partial, self._open, self._partial_reported = [], True, False
         return broken
 
     def _break(self) -> bytes:
         """Skip the rows up to the next frame; the first of them counts as a bad frame."""
-        told, self._told = self._told, True
+        reported, self._partial_reported = self._partial_reported, True
         self._partial = []
-        self._open = self._open and self._index is None and not told
-        if told:
+        self._open = self._open and self.index is None and not reported
+        if reported:
             return b""
         raise FrameError("rows")
-
-    def _join(self) -> RawFrame:
-        frames = [self._line.roles.frame(row.fields, row.finite) for row in self._partial]
-        self._partial = []
-        values = np.concatenate([frame.values for frame in frames])
-        return RawFrame(frames[0].seq, frames[0].ticks, values, all(frame.finite for frame in frames))
-
-
-@dataclass(frozen=True)
-class FixedFormat:
-    """Frames of a fixed length, which only their own bytes delimit.
-
-    Attributes:
-        roles: of the fields.
-        parse: returns the fields of a frame.
-        length: bytes.
-        pattern: regular expression of a frame.
-        follow: that of what must follow it, because a lost byte would shift the values; empty: nothing.
-        margin: bytes that ``follow`` takes.
-    """
-
-    roles: Roles
-    parse: Callable[[bytes], Line]
-    length: int
-    pattern: re.Pattern[bytes]
-    follow: bytes = b""
-    margin: int = 0
-    name: str = "binary"
-    check: Check = "none"
-
-    @property
-    def sensors(self) -> int:
-        """S."""
-        return self.roles.sensors
-
-    def split(self, data: bytes) -> tuple[list[bytes], bytes]:
-        """Return the frames, the bytes between them as pieces of their own, and what is left."""
-        pieces, place = list[bytes](), 0
-        step = re.compile(self.pattern.pattern + b"(?=" + self.follow + b")", re.DOTALL)
-        both = re.compile(b"(?=" + self.pattern.pattern * 2 + b")", re.DOTALL)
-        while len(data) - place >= self.length + self.margin:
-            if step.match(data, place):
-                pieces.append(data[place : place + self.length])
-                place += self.length
-                continue
-            following = both.search(data, place + 1)
-            end = following.start() if following else len(data) - 2 * self.length + 1
-            if end <= place:
-                break
-            pieces.append(data[place:end])
-            place = end
-        return pieces, data[place:]
-
-    def read(self, piece: bytes) -> RawFrame | bytes:
-        """Return a frame; else raise FrameError."""
-        if not self.pattern.fullmatch(piece):
-            raise FrameError("structure")
-        read = self.parse(piece)
-        return self.roles.frame(read.fields, read.finite)
 
 
 @dataclass(frozen=True)
@@ -294,11 +314,7 @@ class BinaryFormat:
     sensors: int
     name: ClassVar[str] = "binary"
     check: ClassVar[Check] = "crc16"
-
-    def split(self, data: bytes) -> tuple[list[bytes], bytes]:
-        """Return what stands between zeros, and what is left."""
-        *pieces, left = data.split(b"\0")
-        return pieces, left
+    split: ClassVar[Delimited] = Delimited(b"\0")
 
     def read(self, piece: bytes) -> RawFrame | bytes:
         """Return the frame between two zeros, or the text of a comment; else raise FrameError."""
@@ -331,9 +347,9 @@ class DetectedFormat(NamedTuple):
     summary: str = ""
 
 
-_LINES, _FRAMES = 3, 2
-_LINES_UNKNOWN = 8  # three lines of noise may count upwards by chance, eight hardly
-_STEP = 1000  # frames that may be missing between two consecutive lines
+_WORDS = SeparatedReader(NumberWords(".", "", 10, INVALID, OVER), SEPARATORS)
+LINES = Layout(Delimited(b"\n"), _WORDS, plain=True)
+"""Lines of our protocol."""
 
 
 def protocol_roles(sensors: int, counted: bool) -> Roles:
@@ -343,13 +359,14 @@ def protocol_roles(sensors: int, counted: bool) -> Roles:
     return Roles(sensors + 2, tuple(range(2, sensors + 2)), 0, 1)
 
 
-def detect_format(data: bytes, sensors: int | None, format: Format) -> DetectedFormat:
+def detect_format(data: bytes, sensors: int | None, format: Format, frames: int = 2) -> DetectedFormat:
     """Return the format of the first bytes of a connection, in our protocol.
 
     Args:
         data: from the first byte on; an incomplete piece at the end is ignored.
         sensors: S, or None to detect it.
         format: only this format, or ``auto``.
+        frames: of one size with a correct CRC that show the binary format.
     """
     count_seen = None
     if format != "text":
@@ -358,7 +375,7 @@ def detect_format(data: bytes, sensors: int | None, format: Format) -> DetectedF
             with suppress(FrameError):
                 counts.append(len(decode_frame(piece).values))
         for count in counts:
-            if counts.count(count) >= _FRAMES and sensors in (None, count):
+            if counts.count(count) >= frames and sensors in (None, count):
                 return DetectedFormat(BinaryFormat(count))
             count_seen = count
     if format == "binary":
@@ -394,50 +411,43 @@ class SensorCountError(InputError):
         )
 
 
-def _parse_numbers(line: bytes) -> Line | None:
-    """Return a line if more than half of its fields are numbers; only such lines show a format."""
-    try:
-        read = parse_line(line.removesuffix(b"\r"))
-    except FrameError:
-        return None
-    return read if 2 * sum(map(isfinite, read.fields)) > len(read.fields) else None
-
-
-def _detect_text(data: bytes, sensors: int | None, count_seen: int | None) -> DetectedFormat:
+def _detect_text(
+    data: bytes, sensors: int | None, count_seen: int | None, few: int = 3, many: int = 8
+) -> DetectedFormat:
+    """Return the format of lines: ``few`` alike show one of S sensors; noise may count by chance, so ``many``
+    are needed where S is unknown."""
     header, run = None, list[Line]()
-    for piece in data.split(b"\n")[:-1]:
-        line = piece.removesuffix(b"\r")
-        if line.startswith(b"#"):
-            header = parse_header(line) or header
+    for piece in LINES.split(data)[0]:
+        try:
+            read = LINES.fields(piece)
+        except FrameError:
+            read = Line([])
+        if isinstance(read, bytes) and read:
+            header = parse_header(read) or header
             continue
-        if (read := _parse_numbers(line)) is None:
+        # Only lines of which more than half of the fields are numbers show a format.
+        if not read or read.strange or 2 * sum(map(isfinite, read.fields)) <= len(read.fields):
             run = []
             continue
         if run and (len(run[-1].fields), run[-1].check) != (len(read.fields), read.check):
             run = []
-        run = [*run[1 - _LINES_UNKNOWN :], read]
-        expected = sensors or (header.n if header else None)
-        if frame_format := _judge(run, expected, learn=sensors is None):
-            return DetectedFormat(replace(frame_format, trailing=ends_with_separator(line)), None, header)
-        if len(run) >= _LINES:
-            count_seen = len(read.fields) - 2 * _all_count(run[-_LINES:])
+        run = [*run[1 - many :], read]
+        if len(run) < few:
+            continue
+        count, expected, counted = (
+            len(read.fields),
+            sensors or (header.n if header else None),
+            _all_count(run[-few:]),
+        )
+        fits = count == expected or (counted and count - 2 == expected)
+        if not fits and sensors is None and len(run) == many:
+            expected, fits = count - 2 * _all_count(run), True
+        if fits and expected:
+            reader = replace(_WORDS, trailing=ends_with_separator(piece.strip(b"\r\n")))
+            roles = protocol_roles(expected, count != expected)
+            return DetectedFormat(FieldFormat(replace(LINES, reader=reader), roles, read.check), None, header)
+        count_seen = count - 2 * counted
     return DetectedFormat(None, count_seen, header)
-
-
-def _judge(run: Sequence[Line], sensors: int | None, learn: bool) -> TextFormat | None:
-    """Return the format of similar lines, or None if they do not determine it."""
-    if len(run) < _LINES:
-        return None
-    count, check = len(run[-1].fields), run[-1].check
-    counting = _all_count(run[-_LINES:])
-    if count == sensors:
-        return TextFormat(protocol_roles(count, False), check)
-    if sensors is not None and count == sensors + 2 and counting:
-        return TextFormat(protocol_roles(sensors, True), check)
-    if not learn or len(run) < _LINES_UNKNOWN:
-        return None
-    counting = _all_count(run)
-    return TextFormat(protocol_roles(count - 2 * counting, counting), check)
 
 
 def _all_count(run: Sequence[Line]) -> bool:
@@ -445,9 +455,10 @@ def _all_count(run: Sequence[Line]) -> bool:
     return len(run) > 1 and all(_counts(before.fields, line.fields) for before, line in pairwise(run))
 
 
-def _counts(before: Sequence[float], line: Sequence[float]) -> bool:
+def _counts(before: Sequence[float], line: Sequence[float], step: int = 1000) -> bool:
+    """Return whether a line follows another one, with fewer than ``step`` between them."""
     if len(line) < 3 or any(field < 0 or field % 1 for field in (before[0], line[0])):
         return False
     # A clock of whole seconds, or one that stands still, is one too: the decoder judges it.
     later = line[1] >= before[1] or line[1] < 2**31 < before[1]
-    return later and 0 < frames_ahead(int(before[0]), int(line[0])) <= _STEP
+    return later and 0 < frames_ahead(int(before[0]), int(line[0])) <= step

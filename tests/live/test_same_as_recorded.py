@@ -17,7 +17,7 @@ from skin.record.serial import Serial
 from skin.runs.build import build_data, build_device, build_learner
 from skin.runs.torch_model import window_classifier
 from skin.touch.labels import TOUCH
-from skin.wire.clocks import ClockWatch
+from skin.wire.clocks import FrameClock
 from skin.wire.protocol import (
     Announcement,
     Header,
@@ -173,7 +173,7 @@ def recorded(learner, stream, path):
 
 
 def test_live_and_recorded_are_the_same_to_the_last_bit(learner, tmp_path, monkeypatch):
-    monkeypatch.setattr(ClockWatch, "_SPAN", np.inf)  # the stream comes as fast as it is read
+    monkeypatch.setattr(FrameClock, "_SPAN", np.inf)  # the stream comes as fast as it is read
     said = live(learner, pieces())
     touches, chances = recorded(learner, pieces(), tmp_path / "s.csv")
     assert len(touches) == GESTURES

@@ -170,7 +170,7 @@ def check_frames(decoder, pieces, rows):
 def test_a_proposed_adapter_reads_what_was_sent(name):
     _, rows, period = STREAMS[name]
     pieces = sent(name)
-    proposal = propose(pieces)
+    proposal = propose(pieces)[0]
     assert proposal.sensors == rows.shape[1]
     # What a person pastes is what is read.
     import yaml
@@ -195,7 +195,7 @@ def test_bursts_are_read_with_the_time_between_their_frames(name, burst):
         (pieces[min(n + burst, len(pieces)) - 1][0], b"".join(data for _, data in pieces[n : n + burst]))
         for n in range(0, len(pieces), burst)
     ]
-    decoder = Decoder(adapter=propose(bursts).adapter)
+    decoder = Decoder(adapter=propose(bursts)[0].adapter)
     frames = check_frames(decoder, bursts, rows)
     steps = np.diff([frame.t for frame in frames])[len(frames) // 2 :]
     assert np.median(steps) == pytest.approx(period or 1 / RATE, rel=0.1)

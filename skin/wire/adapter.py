@@ -4,9 +4,9 @@ import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import groupby
-from math import inf, isfinite
+from math import isfinite
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -18,18 +18,17 @@ from skin.core.safe_loading import load_yaml
 from skin.core.settings import check_settings
 from skin.device.resampling import FrameError
 from skin.errors import InputError
-from skin.wire.columns import Columns, find_roles, resolve
+from skin.wire.columns import Columns, cycles, find_roles, resolve
 from skin.wire.formats import (
-    Delimited,
     DetectedFormat,
     FieldFormat,
-    FixedLength,
-    FrameFormat,
-    Layout,
+    Roles,
     RowsFormat,
     SensorCountError,
-    detect_format,
-    detection_error,
+    detect_binary,
+    fixed_length,
+    protocol_roles,
+    split_at,
 )
 from skin.wire.lines import (
     JsonReader,
@@ -42,16 +41,7 @@ from skin.wire.lines import (
     learn_keys,
     number_pattern,
 )
-from skin.wire.protocol import (
-    INVALID,
-    OVER,
-    SEPARATORS,
-    Format,
-    Header,
-    Line,
-    ends_with_separator,
-    parse_header,
-)
+from skin.wire.protocol import INVALID, OVER, SEPARATORS, Format, Line, parse_header
 
 _RUN = 12  # frames alike that show a format: that noise rises as often by chance is improbable
 
@@ -132,33 +122,37 @@ class Adapter:
     stop: str | None = None
 
     def __post_init__(self) -> None:
-        settings = {entry.name: getattr(self, entry.name) for entry in fields(self)}
-        check_settings(Adapter, {name: settings[name] for name in self._changed}, "device.adapter")
+        check_settings(Adapter, {name: getattr(self, name) for name in self._changed}, "device.adapter")
+        groups = {}
         for name in ("pattern", "number", "ignore"):
+            text = getattr(self, name)
             try:
-                re.compile(settings[name] or "")
+                groups[name] = re.compile(text or "").groupindex
             except re.error as error:
-                raise InputError(
-                    f"device.adapter.{name}={settings[name]} is no regular expression: {error}"
-                ) from error
-        if self.pattern and not re.compile(self.pattern).groupindex:
-            raise InputError("device.adapter.pattern needs a named group per field, as in (?P<values>.*)")
-        if self.decimal == "," and self.separator == ",":
-            raise InputError("device.adapter: the decimal sign cannot separate fields, too: set separator")
-        for name in ("start", "poll", "separator", "label"):
-            if settings[name] == "":
-                raise InputError(f"device.adapter.{name} is empty: leave it out")
-        if self.kind == "text" and self.end == "" and not self.length:
-            raise InputError("device.adapter: text without an end needs its length, as in length: 11")
-        if self.kind == "binary":
-            if not self.struct:
-                raise InputError(
-                    "device.adapter: binary frames need a struct, as in struct: {force: (16,)<u2}"
-                )
-            if not self._mark(self.head) + self._mark(self.tail):
-                raise InputError("device.adapter: binary frames need a head or a tail, as in head: aa 55")
-            if self._record.itemsize * max(1, self.repeat) > 2**15 or not self._record.itemsize:
-                raise InputError(f"device.adapter.struct has {self._record.itemsize} bytes: at most 32768")
+                raise InputError(f"device.adapter.{name}={text} is no regular expression: {error}") from error
+        binary = self.kind == "binary"
+        size = self._record.itemsize if self.struct else 1
+        empty = [name for name in ("start", "poll", "separator", "label") if getattr(self, name) == ""]
+        for wrong, message in (
+            (
+                self.pattern and not groups["pattern"],
+                ".pattern needs a named group per field, as in (?P<values>.*)",
+            ),
+            (self.decimal == self.separator, ": the decimal sign cannot separate fields, too: set separator"),
+            (empty, f".{' and '.join(empty)} is empty: leave it out"),
+            (
+                self.kind == "text" and self.end == "" and not self.length,
+                ": text without an end needs its length, as in length: 11",
+            ),
+            (binary and not self.struct, ": binary frames need a struct, as in struct: {force: (16,)<u2}"),
+            (
+                binary and not self._mark(self.head) + self._mark(self.tail),
+                ": binary frames need a head or a tail, as in head: aa 55",
+            ),
+            (not 0 < size * max(1, self.repeat) <= 2**15, f".struct has {size} bytes: at most 32768"),
+        ):
+            if wrong:
+                raise InputError(f"device.adapter{message}")
 
     @cached_property
     def _changed(self) -> list[str]:
@@ -224,7 +218,7 @@ class Adapter:
         return self.kind == "binary" or self.length is not None or self._delimiter(data) in data
 
     def _delimiter(self, data: bytes) -> bytes:
-        return self.end.encode() if self.end else b"\n" if b"\n" in data else b"\r"
+        return self.end.encode() if self.end else b"\n" if b"\n" in data or self.kind == "protocol" else b"\r"
 
     def detect(self, data: bytes, sensors: int | None) -> DetectedFormat:
         """Return the format of the first bytes of a connection.
@@ -233,26 +227,27 @@ class Adapter:
             data: from the first byte on; an incomplete piece at the end is ignored.
             sensors: S, or None to detect it.
         """
-        if self.kind == "protocol":
-            return detect_format(data, sensors, self.format)
-        seen = DetectedFormat()
+        protocol, seen = self.kind == "protocol", DetectedFormat()
+        if protocol and self.format != "text":
+            seen = detect_binary(data, sensors)
+        if seen.frame_format or (protocol and self.format == "binary"):
+            return seen
         for layout in self.layouts(data):
-            # The first line may be half of one.
-            pieces = layout.split(data)[0][layout.name != "binary" :]
+            # Without a checksum, the first line may be half of one.
+            pieces = layout.split(data)[0][layout.frame is None and not protocol :]
             rows = self.rows is not None or self.index is not None
             detected = (self._detect_rows if rows else self._detect_run)(layout, pieces, sensors)
             if detected.frame_format:
                 return detected
-            seen = seen if detected.count_seen is None else detected
+            seen = seen if detected.count_seen is None and not detected.header else detected
         return seen
 
-    def layouts(self, data: bytes) -> Iterator[Layout]:
+    def layouts(self, data: bytes) -> Iterator[FieldFormat]:
         """Yield how data may be cut and read; what the adapter leaves open follows from them."""
         ignore = None if self.ignore is None else re.compile(self.ignore.encode())
         if self.kind == "binary":
             yield from self._binary_layouts(data)
         elif self.length is not None:
-            reader = self._reader([data])
             mark = (
                 self.separator.encode()
                 if self.separator
@@ -260,63 +255,59 @@ class Adapter:
             )
             count = data[: self.length].count(mark) + 1
             width, odd = divmod(self.length - (count - 1) * len(mark), count)
-            if not odd and width > 0 and count > 1:
-                number = rb"[-+.\d ]{%d}" % width
-                pattern = re.escape(mark).join([number] * count)
-                if re.search(b"(?:" + pattern + b"){%d}" % _RUN, data):
-                    cut = FixedLength(self.length, pattern, number + re.escape(mark), width + len(mark))
-                    yield Layout(cut, reader, "text", ignore)
+            number = rb"[-+.\d ]{%d}" % width
+            pattern = re.escape(mark).join([number] * count)
+            if not odd and width > 0 and count > 1 and re.search(b"(?:" + pattern + b"){%d}" % _RUN, data):
+                split = fixed_length(self.length, pattern, number + re.escape(mark), width + len(mark))
+                yield FieldFormat(split, self._reader([data]), frame=re.compile(pattern))
         else:
-            split = Delimited(self._delimiter(data))
-            lines = [line for line in self._lines(data) if line and not line.startswith(b"#")]
-            if ignore is not None:
-                lines = [line for line in lines if not ignore.fullmatch(line)]
-            yield Layout(split, self._reader(lines), self.kind, ignore)
+            lines = [line for line in self._lines(data) if not (ignore and ignore.fullmatch(line))]
+            plain = self.kind == "protocol"
+            cut = partial(split_at, self._delimiter(data))
+            yield FieldFormat(cut, self._reader(lines), "text" if plain else self.kind, ignore, plain=plain)
+
+    def _binary_layouts(self, data: bytes, most_repeats: int = 256) -> Iterator[FieldFormat]:
+        head, tail = self._mark(self.head), self._mark(self.tail)
+        repeats = [self.repeat] if self.repeat else range(1, most_repeats)
+        for repeat in repeats if data.count(head or tail) >= _RUN else ():
+            size = repeat * self._record.itemsize
+            pattern = re.escape(head) + b".{%d}" % size + re.escape(tail)
+            if re.search(b"(?:" + pattern + b"){%d}" % _RUN, data, re.DOTALL):
+                follow = b"" if tail else head
+                split = fixed_length(len(head) + size + len(tail), pattern, re.escape(follow), len(follow))
+                reader, frame = self.struct_reader(repeat, len(head)), re.compile(pattern, re.DOTALL)
+                yield FieldFormat(split, reader, "binary", frame=frame)
+
+    def struct_reader(self, repeat: int, offset: int) -> StructReader:
+        """Return what reads ``struct``, ``repeat`` times from byte ``offset`` on."""
+        return StructReader(self._record, self._wide, repeat, offset)
 
     def _reader(self, lines: Sequence[bytes]) -> Reader:
         """Return what reads the fields of lines like these."""
         if self.kind == "json":
             reader = JsonReader(self._words)
             return replace(reader, keys=tuple(self.names) or learn_keys(reader.fields, lines))
-        marks: Sequence[bytes] = (
-            [self.separator.encode()] if self.separator and self.separator.strip() else []
-        )
+        marks = [self.separator.encode()] if self.separator and self.separator.strip() else []
         if self.separator is None:
             marks = [mark for mark in SEPARATORS if mark.decode() not in (self.decimal, self.thousands)]
-        split = SeparatedReader(self._words, marks, self.names)
+        bodies = [line.rpartition(b"*")[0 if b"*" in line else 2].rstrip(b" \r") for line in lines]
+        ends = sum(body.endswith(tuple(marks)) for body in bodies)
+        split = SeparatedReader(self._words, marks, self.names, 2 * ends > len(bodies))
         pattern = self.pattern or (label_pattern(self.label) if self.label else None)
         pattern = pattern or (number_pattern(self.number) if self.number else None)
         if pattern is None:
-            mark = marks[0] if self.separator and marks else None
-            ends = [line.rstrip(b" ").endswith(mark) if mark else ends_with_separator(line) for line in lines]
-            return replace(split, trailing=2 * sum(ends) > len(ends))
+            return split
         named = PatternReader(re.compile(pattern.encode()), split)
         groups = named.pattern.groupindex
         if "name" not in groups:
             return named
-        if "value" in groups and self.rows is None:
-            return replace(named, keys=tuple(self.names) or learn_keys(named.fields, lines))
-        return replace(named, keys=tuple(self.names))
+        learn = "value" in groups and self.rows is None and not self.names
+        return replace(named, keys=learn_keys(named.fields, lines) if learn else tuple(self.names))
 
     def _lines(self, data: bytes) -> list[bytes]:
-        """Return the complete lines; the first may be half of one."""
-        return [line.strip(b"\r\n") for line in data.split(self._delimiter(data))[:-1]][1:]
-
-    def _binary_layouts(self, data: bytes, most_repeats: int = 256) -> Iterator[Layout]:
-        head, tail = self._mark(self.head), self._mark(self.tail)
-        if data.count(head or tail) < _RUN:
-            return
-        for repeat in [self.repeat] if self.repeat else range(1, most_repeats):
-            size = repeat * self._record.itemsize
-            pattern = re.escape(head) + b".{%d}" % size + re.escape(tail)
-            if re.search(b"(?:" + pattern + b"){%d}" % _RUN, data, re.DOTALL):
-                follow, margin = (b"", 0) if tail else (re.escape(head), len(head))
-                split = FixedLength(len(head) + size + len(tail), pattern, follow, margin)
-                yield Layout(split, self.struct_reader(repeat, len(head)), "binary")
-
-    def struct_reader(self, repeat: int, offset: int) -> StructReader:
-        """Return what reads ``struct``, ``repeat`` times from byte ``offset`` on."""
-        return StructReader(self._record, self._wide, repeat, offset)
+        """Return the complete lines with fields; the first may be half of one."""
+        lines = [line.strip(b"\r\n") for line in data.split(self._delimiter(data))[:-1]][1:]
+        return [line for line in lines if line and not line.startswith(b"#")]
 
     def _columns(
         self, rows: Sequence[Line], reader: Reader, sensors: int | None, *index: int
@@ -339,53 +330,51 @@ class Adapter:
             invalid=self._numbers,
         )
 
-    def _detected(
-        self, layout: FrameFormat, columns: Columns, header: Header | None = None
+    def _detect_run(
+        self, layout: FieldFormat, pieces: Sequence[bytes], sensors: int | None
     ) -> DetectedFormat:
-        """Return a format with what its columns show of the clock."""
-        return DetectedFormat(layout, None, header, columns.unit, self.time_unit is not None, columns.summary)
-
-    def _detect_run(self, layout: Layout, pieces: Sequence[bytes], sensors: int | None) -> DetectedFormat:
         header, count_seen, run = None, None, list[Line]()
         for piece in pieces:
             read = _try(layout, piece)
-            if isinstance(read, bytes):
+            if isinstance(read, bytes) and (read or not layout.plain):
                 header = parse_header(read) or header
                 continue
-            if read is None or (
-                run and (len(run[-1].fields), run[-1].check) != (len(read.fields), read.check)
-            ):
+            if not isinstance(read, Line):
                 run = []
-            if read is None:
                 continue
+            if run and (len(run[-1].fields), run[-1].check) != (len(read.fields), read.check):
+                run = []
             run = [*run[1 - _RUN :], read]
-            columns = self._columns(run, layout.reader, sensors) if len(run) == _RUN else None
-            if isinstance(columns, int):
-                count_seen = columns
-            elif columns is not None:
-                return self._detected(FieldFormat(layout, columns.roles, read.check), columns, header)
+            found: Columns | Roles | int | None = None
+            if layout.plain:
+                found = protocol_roles(run[-8:], sensors, header and header.n)
+            elif len(run) == _RUN:
+                found = self._columns(run, layout.reader, sensors)
+            if isinstance(found, int):
+                count_seen = found
+            elif found is not None:
+                roles, unit, summary = found if isinstance(found, Columns) else (found, None, "")
+                detected = replace(layout, roles=roles, check=read.check)
+                return DetectedFormat(detected, None, header, unit, summary)
         return DetectedFormat(count_seen=count_seen, header=header)
 
-    def _detect_rows(self, layout: Layout, pieces: Sequence[bytes], sensors: int | None) -> DetectedFormat:
+    def _detect_rows(
+        self, layout: FieldFormat, pieces: Sequence[bytes], sensors: int | None
+    ) -> DetectedFormat:
         reads = [read if isinstance(read := _try(layout, piece), Line) else None for piece in pieces]
-        counts = Counter(len(read.fields) for read in reads if read)
-        if not counts:
-            return DetectedFormat()
-        width = counts.most_common(1)[0][0]
-        reads = [read if read and len(read.fields) == width else None for read in reads]
-        rows = [read for read in reads if read]
-        index, first = self._find_index(rows, layout.reader.names(width)), 0.0
+        width = Counter(len(read.fields) for read in reads if read).most_common(1)
+        rows = [read if read and len(read.fields) == width[0][0] else None for read in reads]
+        numbered, starts, first, count = [row for row in rows if row], list[Line](), 0.0, 0
+        index = self._find_index(numbered, layout.reader) if numbered else None
         if index is not None:
-            numbers = [row.fields[index] for row in rows if isfinite(row.fields[index])] or [inf]
-            first, count = min(numbers), (0 if inf in numbers else int(max(numbers) - min(numbers)) + 1)
-            starts = [row for row in rows if row.fields[index] == first]
+            numbers = [row.fields[index] for row in numbered if isfinite(row.fields[index])] or [0.0]
+            first, count = min(numbers), int(max(numbers) - min(numbers)) + 1
+            starts = [row for row in numbered if row.fields[index] == first]
         else:
-            blocks = [[read for read in block if read] for filled, block in groupby(reads, bool) if filled][
-                1:-1
-            ]
+            blocks = [[row for row in block if row] for filled, block in groupby(rows, bool) if filled][1:-1]
             count = Counter(map(len, blocks)).most_common(1)[0][0] if blocks else 0
             starts = [block[0] for block in blocks if len(block) == count]
-        if count < 1 or len(starts) < _RUN or self.rows not in (None, 0, count):
+        if len(starts) < _RUN or self.rows not in (None, 0, count):
             return DetectedFormat()
         columns = self._columns(starts, layout.reader, None, *([] if index is None else [index]))
         if columns is None or isinstance(columns, int):
@@ -393,43 +382,34 @@ class Adapter:
         total = count * columns.roles.sensors
         if sensors not in (None, total):
             return DetectedFormat(count_seen=total)
-        return self._detected(
-            RowsFormat(FieldFormat(layout, columns.roles), count, index, int(first)), columns
-        )
+        detected = RowsFormat(replace(layout, roles=columns.roles), count, index, first)
+        return DetectedFormat(detected, None, None, columns.unit, columns.summary)
 
-    def _find_index(self, rows: Sequence[Line], names: Sequence[str]) -> int | None:
+    def _find_index(self, rows: Sequence[Line], reader: Reader) -> int | None:
         """Return the field that numbers the rows; None if there is none."""
-        if self.index is not None:
-            return resolve([self.index], names, len(rows[0].fields))[0]
-        if "name" in names and self.names:
-            return list(names).index("name")
-        table = np.array([row.fields for row in rows])
-        for column in range(min(2, table.shape[1] - 1)):
-            numbers = table[:, column]
-            if not np.isfinite(numbers).all() or (numbers % 1).any():
-                continue
-            first, last, steps = numbers.min(), numbers.max(), np.diff(numbers)
-            again = (numbers[:-1] == last) & (numbers[1:] == first)
-            if last > first and 0 <= first <= 1 and np.mean((steps == 1) | again) > 0.9:
-                return column
-        return None
+        names, table = reader.names(len(rows[0].fields)), np.array([row.fields for row in rows])
+        if self.index is not None or ("name" in names and self.names):
+            return resolve(["name" if self.index is None else self.index], names, table.shape[1])[0]
+        leading = range(min(2, table.shape[1] - 1))
+        return next((column for column in leading if cycles(table[:, column])), None)
 
     def explain(self, data: bytes, count_seen: int | None, sensors: int | None) -> InputError:
         """Return the error for data in which no frame was found."""
-        if self.kind == "protocol":
-            return detection_error(data, count_seen, sensors)
         if count_seen is not None and sensors is not None:
             return SensorCountError(count_seen, sensors)
-        hint = "skin listen adapter=auto proposes an adapter"
-        if self.kind == "binary" or self.length is not None or len(lines := self._lines(data)) < 2:
+        hint, start = "skin listen adapter=auto proposes an adapter", data[:64]
+        sample = repr(start.decode("ascii", "replace")) if is_text(start) else start.hex(" ")
+        if self.kind == "protocol":
             return InputError(
-                f"the adapter reads no frame in {len(data)} bytes, which begin with {data[:64].hex(' ')}, as "
-                f"text {data[:40].decode('ascii', 'replace')!r}: {hint}"
+                f"no frame in {len(data)} bytes, which begin with {sample}: is the baud rate right, as in "
+                f"device.baudrate=115200? For another format, {hint}"
             )
-        layout, texts = (
-            next(self.layouts(data)),
-            [line for line in lines if line and not line.startswith(b"#")][-3:],
-        )
+        texts = [] if self.kind == "binary" or self.length is not None else self._lines(data)[-3:]
+        if not texts:
+            return InputError(
+                f"the adapter reads no frame in {len(data)} bytes, which begin with {sample}: {hint}"
+            )
+        layout = next(self.layouts(data))
         shown = "; ".join(
             f"{line[:80].decode('ascii', 'replace')!r} ({_why(layout, line)})" for line in texts
         )
@@ -468,16 +448,24 @@ def read_adapter(described: str | Mapping[str, Any] | Adapter) -> Adapter:
     return Adapter(**settings)
 
 
-def _try(layout: Layout, piece: bytes) -> Line | bytes | None:
-    """Return the fields of a piece that has any number, or a line that is no frame; else None."""
+def is_text(data: bytes) -> bool:
+    """Return whether nearly all bytes are printable."""
+    return sum(byte in b"\r\n\t\0\x1b" or 32 <= byte < 127 for byte in data) > 0.95 * len(data)
+
+
+def _try(layout: FieldFormat, piece: bytes) -> Line | bytes | None:
+    """Return the fields of a piece with any number, of our protocol with most; or a line that is none."""
     try:
         read = layout.fields(piece)
     except FrameError:
         return None
-    return read if isinstance(read, bytes) or np.isfinite(read.fields).any() else None
+    if isinstance(read, bytes):
+        return read
+    count = np.count_nonzero(np.isfinite(read.fields))
+    return read if (2 * count > len(read.fields) and not read.strange if layout.plain else count) else None
 
 
-def _why(layout: Layout, line: bytes) -> str:
+def _why(layout: FieldFormat, line: bytes) -> str:
     """Return why a line is no frame."""
     try:
         read = layout.fields(line)

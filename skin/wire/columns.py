@@ -153,6 +153,13 @@ def runs(column: np.ndarray, mostly: float = 0.75, regular: float = 10.0) -> boo
     return bool(np.mean((rising >= middle / regular) & (rising <= middle * regular)) >= mostly)
 
 
+def cycles(column: np.ndarray, most: int = 64) -> bool:
+    """Return whether a field (L,) numbers rows: from 0 or 1 to at most ``most``, again and again."""
+    first, last, steps = column.min(), column.max(), np.diff(column)
+    numbers = first in (0, 1) and first < last < most and not (column % 1).any()
+    return bool(numbers and np.mean((steps == 1) | (steps == first - last)) > 0.9)
+
+
 def _recognise(
     table: np.ndarray,
     names: Sequence[str],

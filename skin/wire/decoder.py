@@ -264,7 +264,7 @@ class Decoder:
         self.sensors = self.frame_format.sensors
         self.stats.format, self.stats.check = self.frame_format.name, self.frame_format.check
         if detected.unit is not None:
-            self._clock.expect(detected.unit, detected.settled)
+            self._clock.expect(detected.unit, self.adapter.time_unit is not None)
         self._all_valid = np.ones(self.sensors, dtype=bool)
         self._all_valid.flags.writeable = False
         if len(self._latest) != self.sensors:

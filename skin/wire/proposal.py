@@ -15,9 +15,9 @@ import numpy as np
 
 from skin.device.resampling import FrameError
 from skin.errors import InputError
-from skin.wire.adapter import Adapter, read_adapter
+from skin.wire.adapter import Adapter, is_text, read_adapter
 from skin.wire.clocks import UNITS
-from skin.wire.columns import counts, last_part, runs
+from skin.wire.columns import counts, cycles, last_part, runs
 from skin.wire.decoder import Decoder, kind_of_line
 from skin.wire.formats import RowsFormat
 from skin.wire.protocol import INVALID, Line
@@ -124,7 +124,7 @@ def _sample(data: bytes, reasons: Sequence[str]) -> str:
     if reasons:
         reason = Counter(reasons).most_common(1)[0][0]
         return f"{reason}; or read it by device.adapter.pattern (docs/hardware.md)"
-    if _is_text(data):
+    if is_text(data):
         lines = [line for line in re.split(rb"[\r\n]+", data) if line.strip()]
         texts = "; ".join(repr(line[:100].decode("ascii", "replace")) for line in lines[-3:])
         hint = "if it waits for a text, give start=; a pattern (docs/hardware.md) reads any lines"
@@ -132,10 +132,6 @@ def _sample(data: bytes, reasons: Sequence[str]) -> str:
     return (
         f"{len(data)} bytes that are no text, which begin with {data[:48].hex(' ')}: is the baud rate right?"
     )
-
-
-def _is_text(data: bytes) -> bool:
-    return sum(byte in b"\r\n\t\0\x1b" or 32 <= byte < 127 for byte in data) > 0.95 * len(data)
 
 
 def _read(adapter: Adapter, pieces: Pieces, data: bytes) -> Proposal:
@@ -406,7 +402,14 @@ def _patterns(lines: Sequence[bytes]) -> Iterator[Adapter]:
         columns = list(zip(*tokens, strict=True))
         if INVALID & {word.lower() for text in literals for word in re.findall(rb"[A-Za-z/]+", text)}:
             continue  # the text is a value that is missing
-        index = next((place for place in range(len(columns) - 1) if _cycles(columns[place])), None)
+        index = next(
+            (
+                place
+                for place in range(len(columns) - 1)
+                if b"".join(columns[place]).isdigit() and cycles(np.array(columns[place], float))
+            ),
+            None,
+        )
         first = len(columns) - 1
         while first > 0 and shape[first] == shape[-2] in (b"", b",", b";") and first - 1 != index:
             first -= 1
@@ -439,18 +442,6 @@ def _patterns(lines: Sequence[bytes]) -> Iterator[Adapter]:
             yield Adapter(kind="text", pattern=pattern, rows=0, index="row", counter=None)
 
 
-def _cycles(column: Sequence[bytes]) -> bool:
-    """Return whether numbers are those of rows: 0 or 1 to at most 64, again and again."""
-    if not all(word.isdigit() for word in column):
-        return False
-    numbers = np.array(column, dtype=float)
-    last, first = numbers.max(), numbers.min()
-    steps = np.diff(numbers)
-    return bool(
-        first in (0, 1) and first < last < 64 and np.mean((steps == 1) | (steps == first - last)) > 0.9
-    )
-
-
 def _literal(text: bytes) -> str:
     """Return a regular expression of the text between two numbers, whatever its blanks are."""
     words = [re.escape(word) for word in re.sub(rb"[^\x00-\x7f]+", b"\xff", text).decode("latin-1").split()]
@@ -480,7 +471,7 @@ _HEADERS = tuple(
 
 def _binary(data: bytes, seconds: float, longest: int = 512) -> Iterator[Adapter]:
     """Yield structs of a fixed length between bytes that repeat, the most plausible first."""
-    if _is_text(data):
+    if is_text(data):
         return
     options = list[tuple[float, Adapter]]()
     for length in range(3, min(longest, len(data) // 6)):

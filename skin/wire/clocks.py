@@ -25,6 +25,9 @@ class FramePosition(NamedTuple):
     after: After
 
 
+_STEADY = 2.0  # s after which the shortest delay is renewed: 0.5 % clock error is 20 ms of t_host
+
+
 class FrameClock:
     """Places frames in time by their numbers, the device's clock and their arrival.
 
@@ -45,20 +48,6 @@ class FrameClock:
         modulus: of the counter; None: not known.
         trusted: False: the host's clock is used instead.
     """
-
-    _SPAN, _DELIVERIES = 2.0, 4  # s and deliveries over which both clocks are compared
-    _COARSE = 0.05  # s per step of the clock, coarser than the decisions of a live view
-    _CAUGHT_UP = 0.2  # s in which the buffer of a host that was suspended is read
-    _JUDGED = 1.0, 10  # s and frames after which the unit is compared with the host's clock
-    _CLOSE = 0.7  # decades: bursts and a backlog explain a factor of 5; the units are three decades apart
-    _RATED = 8  # frames after which the rate of the header is compared
-    _GAP = 60.0, 1 / 16  # s, and part of its range, that may be missing where a clock wraps
-    _NEAR = 16  # frames that may be missing where a counter wraps at a number that no firmware counts in
-    _UNEVEN = 0.25  # deviation of the time between two frames
-    _RATE_SPAN, _ENOUGH = 8.0, 1.5  # s over which the rate of arrival is measured, at most and at least
-    _OFTEN = 0.02  # s between two counts of arrivals: more often would not help
-    _PAUSE = 1.5  # s without arrivals: longer than a burst, a pause of the device
-    _STEADY = 2.0  # s after which the shortest delay is removed; with 0.5 % clock error 20 ms of t_host
 
     def __init__(self, unit: float = UNITS["us"], fixed: bool = False, modulus: int | None = None) -> None:
         self.segment, self.modulus = 0, modulus
@@ -148,31 +137,42 @@ class FrameClock:
         self._t = t
         return FramePosition(t, self._to_host(t, now), self.segment, ahead - 1, "gap" if ahead > 1 else "")
 
-    def judge(self, now: float, speed: float = 1.0) -> bool:
+    def judge(
+        self,
+        now: float,
+        speed: float = 1.0,
+        span: float = 2.0,
+        deliveries: int = 4,
+        coarsest: float = 0.05,
+        caught_up: float = 0.2,
+    ) -> bool:
         """Return whether the device's clock stops being trusted with a delivery: its frames have been placed.
 
-        Over the longer of 2 s and four deliveries it must advance by half to twice as much as the host's, and
-        in fine steps if the frames are. What was buffered while host or bridge were suspended arrives at once
-        and does not count against it.
+        Over the longer of a span and some deliveries it must advance by half to twice as much as the host's,
+        and in fine steps if the frames are. What was buffered while host or bridge were suspended arrives at
+        once and does not count against it.
 
         Args:
             now: s, arrival by the host's clock.
             speed: at which a replay declares to run its clock; 1 of a real device.
+            span, deliveries: s and deliveries over which both clocks are compared.
+            coarsest: s per step of the clock: coarser than the decisions of a live view is too coarse.
+            caught_up: s in which the buffer of a host that was suspended is read.
         """
         self._deliveries.append((now, self._t, self._frames, self._steps))
-        while len(self._deliveries) > self._DELIVERIES + 1 and now - self._deliveries[1][0] >= self._SPAN:
+        while len(self._deliveries) > deliveries + 1 and now - self._deliveries[1][0] >= span:
             self._deliveries.popleft()
         since, t, frames, steps = self._deliveries[0]
         passed = now - since
-        if len(self._deliveries) <= self._DELIVERIES or passed < self._SPAN or not self.trusted:
+        if len(self._deliveries) <= deliveries or passed < span or not self.trusted:
             return False
         advanced, steps = (self._t - t) / speed, self._steps - steps
-        coarse = advanced > self._COARSE * steps and self._frames - frames >= 2 * steps
+        coarse = advanced > coarsest * steps and self._frames - frames >= 2 * steps
         if not coarse and passed / 2 <= advanced <= 2 * passed:
             self._doubtful_since = None
         elif self._doubtful_since is None:
             self._doubtful_since = now
-        if self._doubtful_since is None or now - self._doubtful_since < self._CAUGHT_UP:
+        if self._doubtful_since is None or now - self._doubtful_since < caught_up:
             return False
         self.trusted = False
         self.cut("reset")
@@ -185,17 +185,23 @@ class FrameClock:
             self._compare_anew()
         return FramePosition(self._t, self._to_host(self._t, now), self.segment, 0, after)
 
-    def _count_ahead(self, before: int, seq: int, elapsed: float, clocked: bool) -> int:
-        """Return by how many frames ``seq`` is ahead; 0 if the counter began again."""
+    def _count_ahead(
+        self, before: int, seq: int, elapsed: float, clocked: bool, near: int = 16, uneven: float = 0.25
+    ) -> int:
+        """Return by how many frames ``seq`` is ahead; 0 if the counter began again.
+
+        Up to ``near`` frames may be missing where it wraps at a number that no firmware counts in, and the
+        time between two frames may deviate by ``uneven``.
+        """
         if seq == before and elapsed > 0:
             return 1  # a counter that stands still tells nothing
         ahead = frames_ahead(before, seq, self.modulus)
         if ahead or self._modulus_fixed or elapsed < 0 or not self._period:
             return ahead
         frames = round(elapsed / self._period) if clocked else 1
-        uneven = abs(elapsed - frames * self._period) > self._UNEVEN * self._period and clocked
+        irregular = abs(elapsed - frames * self._period) > uneven * self._period and clocked
         modulus = before - seq + frames
-        if not 0 < frames <= self._NEAR or uneven or not 2 <= modulus <= before + frames or seq > frames:
+        if not 0 < frames <= near or irregular or not 2 <= modulus <= before + frames or seq > frames:
             return 0
         if not clocked and modulus not in (*_ROUND, self._fell) and modulus + 1 not in _ROUND:
             self._fell = modulus
@@ -203,12 +209,18 @@ class FrameClock:
         self.modulus = modulus
         return frames
 
-    def _wraps(self, before: float, ticks: float, wrap: float) -> bool:
-        gap = min(self._GAP[0] / self.unit, self._GAP[1] * wrap)
+    def _wraps(self, before: float, ticks: float, wrap: float, gap: float = 60.0) -> bool:
+        """Return whether the clock wraps, where up to ``gap`` s or a 16th of its range may be missing."""
+        gap = min(gap / self.unit, wrap / 16)
         return wrap - gap <= before < wrap and ticks - before + wrap <= gap
 
-    def _correct_unit(self, ticks: float, now: float, frames: int, rate: float | None) -> bool:
-        """Return whether the unit changes with a frame, by the header's rate or the host's clock."""
+    def _correct_unit(
+        self, ticks: float, now: float, frames: int, rate: float | None, rated: int = 8, judged: int = 10
+    ) -> bool:
+        """Return whether the unit changes with a frame: by the header's rate after ``rated`` frames.
+
+        Or by the host's clock after a second and ``judged`` frames.
+        """
         if self._judged:
             return False
         if self._first is None or ticks < self._first[0]:
@@ -218,35 +230,53 @@ class FrameClock:
         passed, received = ticks - self._first[0], now - self._first[1]
         if passed <= 0:
             return False
-        if rate and not self._rated and self._since_first >= self._RATED:
+        if rate and not self._rated and self._since_first >= rated:
             self._rated = True
             return self._compare_unit(self._since_first / rate / passed, "rate")
-        self._judged = received >= self._JUDGED[0] and self._since_first >= self._JUDGED[1]
+        self._judged = received >= 1.0 and self._since_first >= judged
         return self._judged and self._compare_unit(received / passed, "host")
 
-    def _compare_unit(self, measured: float, witness: Literal["rate", "host"]) -> bool:
+    def _compare_unit(self, measured: float, witness: Literal["rate", "host"], close: float = 0.7) -> bool:
+        """Take the unit near a measured one: bursts explain a factor of 5, and units are 1000 apart."""
         unit = min(UNITS.values(), key=lambda unit: abs(log10(measured / unit) if measured else inf))
-        if not measured or abs(log10(measured / unit)) > self._CLOSE or (unit != self.unit and self._fixed):
+        if not measured or abs(log10(measured / unit)) > close or (unit != self.unit and self._fixed):
             return False  # the host's clock will rule
         before, self.unit, self.witness = self.unit, unit, witness
         self._fixed |= unit != before
         return unit != before
 
-    def _estimate(self, arrival: float, frames: int, rate: float | None) -> float:
+    def _estimate(
+        self,
+        arrival: float,
+        frames: int,
+        rate: float | None,
+        span: float = 8.0,
+        enough: float = 1.5,
+        often: float = 0.02,
+        pause: float = 1.5,
+    ) -> float:
         """Return the time of a frame that carries none, s: from its number, the rate and its arrival.
 
         Frames may arrive in bursts. Their number tells how far apart they were measured, once the rate is
         known: measured over the last seconds, or that of the header until then.
+
+        Args:
+            arrival: s, by the host's clock.
+            frames: since the frame before.
+            rate: of the header, Hz.
+            span, enough: s over which the rate is measured, at most and at least.
+            often: s between two counts of arrivals: more often would not help.
+            pause: s without arrivals: longer than a burst, a pause of the device.
         """
         counts = self._arrivals
-        if not counts or arrival - counts[-1][0] >= self._OFTEN:
-            if counts and arrival - counts[-1][0] > self._PAUSE:
+        if not counts or arrival - counts[-1][0] >= often:
+            if counts and arrival - counts[-1][0] > pause:
                 counts.clear()
             counts.append((arrival, self._count))
-            while arrival - counts[0][0] > self._RATE_SPAN:
+            while arrival - counts[0][0] > span:
                 counts.popleft()
             passed, received = arrival - counts[0][0], self._count - counts[0][1]
-            if passed >= self._ENOUGH and received:
+            if passed >= enough and received:
                 self._arrival_period = passed / received
             elif rate and not self._arrival_period:
                 self._arrival_period = 1 / rate
@@ -254,16 +284,16 @@ class FrameClock:
         time = arrival
         if self._arrived is not None and self._arrival_period:
             time = min(self._arrived + frames * self._arrival_period, arrival)
-            time = arrival if arrival - time > self._PAUSE else time
+            time = arrival if arrival - time > pause else time
         self._shortest = min(self._shortest, arrival - time)
-        if arrival - self._shortest_since > self._STEADY:
+        if arrival - self._shortest_since > _STEADY:
             time, self._shortest, self._shortest_since = time + self._shortest, inf, arrival
         self._arrived = time
         return time
 
     def _to_host(self, t: float, arrival: float) -> float:
         """Return the host's time of a frame, s: by the least delayed frames of the last seconds."""
-        if arrival - self._least_since > self._STEADY:
+        if arrival - self._least_since > _STEADY:
             self._least_before, self._least, self._least_since = self._least, inf, arrival
         self._least = min(self._least, arrival - t)
         self._latest = max(self._latest, t + min(self._least, self._least_before))

@@ -220,6 +220,8 @@ class Decoder:
         pieces, self._buffer = self.frame_format.split(self._buffer)
         good, bad = self.stats.frames, self.stats.bad_frames
         frames = [frame for piece in pieces if (frame := self._frame(piece, now))]
+        clock, stats = self._clock, self.stats
+        stats.clock_unit, stats.clock_witness, stats.modulus = clock.unit, clock.witness, clock.modulus
         if frames and self._clocked:
             self.stats.clock_trusted = not self._clock.judge(now, (self.header and self.header.speed) or 1.0)
         if len(self._buffer) > _LONGEST:
@@ -316,7 +318,6 @@ class Decoder:
         rate = None if header is None else header.rate
         self._clocked = raw.ticks is not None and clock.trusted
         t, t_host, segment, lost, after = clock.place(raw.seq, raw.ticks, now, self._missing, rate)
-        stats.clock_unit, stats.clock_witness, stats.modulus = clock.unit, clock.witness, clock.modulus
         stats.frames += 1
         stats.resyncs += self._missing > 0
         stats.lost += lost

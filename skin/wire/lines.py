@@ -54,8 +54,10 @@ class NumberWords:
             ]
         if self.decimal == ",":
             words = [word.translate(_SWAPPED) if b":" not in word else word for word in words]
-        words = [_to_seconds(word) if b":" in word else word for word in words]
-        return parse_words(words, check, self.invalid, self.over)
+        read = parse_words(words, check, self.invalid, self.over)
+        if any(b":" in word for word in read.strange.values()):
+            return parse_words([*map(_to_seconds, words)], check, self.invalid, self.over)
+        return read
 
 
 _SWAPPED = bytes.maketrans(b".,", b",.")  # a point is no decimal sign then

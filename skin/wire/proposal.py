@@ -8,6 +8,7 @@ import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import chain, pairwise
 from typing import Any
 
@@ -16,7 +17,7 @@ import numpy as np
 from skin.device.resampling import FrameError
 from skin.errors import InputError
 from skin.wire.adapter import Adapter, is_text, read_adapter
-from skin.wire.clocks import UNITS
+from skin.wire.binary_adapters import SAME, binary_adapters
 from skin.wire.columns import counts, cycles, last_part, runs
 from skin.wire.decoder import Decoder, kind_of_line
 from skin.wire.formats import RowsFormat
@@ -26,7 +27,6 @@ Pieces = Sequence[tuple[float, bytes]]
 """Bytes with the time of their arrival, s."""
 
 _FRAMES = 10  # that a candidate must read
-_SAME = 0.98  # part of the bytes or characters that repeat from frame to frame; others are damaged
 _NUMBER = re.compile(rb"\d{1,2}:\d\d:\d\d(?:\.\d+)?|(?:(?<!\w)[-+])?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]\d+)?")
 _WORD = r"[-+.:\w/]+"  # a number, or a word in its place
 _ASIDE = re.compile(r"(?i)temp.*|.*[_\[(](t|temp.*|°?c|deg.?c)[\])]?|.*humid.*|rssi|.*batt.*|temperature")
@@ -77,7 +77,7 @@ def propose(pieces: Pieces, seconds: float | None = None, margin: float = 0.25) 
         )
     _refuse_pauses([time for time, _ in pieces], seconds)
     readings, reasons = list[Proposal](), list[str]()
-    for number, adapter in enumerate(chain(_text(data), _binary(data, pieces[-1][0] - pieces[0][0]))):
+    for number, adapter in enumerate(chain(_text(data), binary_adapters(data, pieces[-1][0] - pieces[0][0]))):
         if readings and (adapter.kind == "binary" or number / 100 > readings[0].score + margin):
             break
         try:
@@ -157,8 +157,11 @@ def _read(adapter: Adapter, pieces: Pieces, data: bytes) -> Proposal:
     score += bad / len(frames) + _judge_values(values, decoder.frame_format)
     passed = frames[-1].t_host - frames[0].t_host
     rate = f" at {(len(frames) - 1) / passed:.3g} Hz" if passed > 0 else ""
-    with np.errstate(all="ignore"):
-        levels = ", ".join(f"{value:.4g}" for value in np.nan_to_num(np.nanmedian(values, axis=0)[:64]))
+    if errors := _errors(values, passed / len(frames)):
+        adapter = replace(adapter, invalid=(*adapter.invalid, *errors))
+        notes.append(f"{', '.join(f'{error:g}' for error in errors)} in single frames is no value")
+    numbers = [column[np.isfinite(column)] for column in values.T]
+    levels = ", ".join(f"{np.median(column) if len(column) else 0:.4g}" for column in numbers[:64])
     words = [
         f"{decoder.sensors} values{rate}",
         adapter.detect(data, None).summary,
@@ -180,26 +183,42 @@ def _judge_values(values: np.ndarray, frame_format: Any, most: int = 64) -> floa
         raise _ImplausibleError("no value ever changes")
     # Between frames next to each other, readings at rest differ as much as between frames further apart.
     near = _typical_step(moving, 1)
-    steps = np.abs(np.diff(moving, axis=0))
-    resolution = np.nanmin(np.where(steps > 0, steps, np.inf), axis=0)
+    resolution = [np.diff(np.unique(column[np.isfinite(column)])).min() for column in moving.T]
     for lag in range(2, min(most, len(moving) // 4)):
-        if np.mean(near > 3 * _typical_step(moving, lag) + 2 * resolution) >= 0.5:
+        if np.mean(near > 3 * _typical_step(moving, lag) + 2 * np.array(resolution)) >= 0.5:
             raise _ImplausibleError(
                 f"every {lag} lines are alike, those between them are not: they are of several sensors; let "
                 "the firmware send a line per frame, or number the lines"
             )
     score = 0.5 * (1 - moving.shape[1] / values.shape[1])
     if isinstance(frame_format, RowsFormat) and frame_format.index is not None:
-        rows = np.nanmedian(values, axis=0).reshape(frame_format.rows, -1)
+        rows = np.median(np.nan_to_num(values), axis=0).reshape(frame_format.rows, -1)
         # A counter of a few bits numbers lines that are all alike.
-        score += 3.0 * bool((np.ptp(rows, axis=0) <= 2 * np.nanmedian(near)).all())
+        score += 3.0 * bool((np.ptp(rows, axis=0) <= 2 * np.median(near)).all())
     return score
+
+
+def _errors(values: np.ndarray, period: float, longest: float = 0.0205) -> list[float]:
+    """Return constants that one value of (F, S) jumps to in single frames again and again, as after an error.
+
+    Nothing touches a skin for one frame of 20 ms; the largest counts of converters may be meant, though.
+    """
+    values = values[:, np.isfinite(values).any(axis=0)]
+    steps, far = np.diff(values, axis=0), 50 * _typical_step(values, 1) + 1e-9
+    back = np.abs(steps[:-1] + steps[1:]) < far / 5
+    single = (np.abs(steps[:-1]) > far) & (np.abs(steps[1:]) > far) & back
+    alone = single & (single.sum(axis=1, keepdims=True) == 1)
+    often = Counter(values[1:-1][alone].tolist())
+    ends = {0.0, *(2.0**bits - 1 for bits in (8, 10, 12, 14))}
+    return sorted(
+        value for value, count in often.items() if count > 1 and value not in ends and period <= longest
+    )
 
 
 def _typical_step(values: np.ndarray, lag: int) -> np.ndarray:
     """Return the mean change of each value (S,) over ``lag`` frames, without the largest fifth."""
     steps = np.sort(np.abs(values[lag:] - values[:-lag]), axis=0)
-    return np.nan_to_num(np.nanmean(steps[: max(1, 4 * len(steps) // 5)], axis=0))
+    return np.nan_to_num(steps)[: max(1, 4 * len(steps) // 5)].mean(axis=0)
 
 
 def _settle(adapter: Adapter, data: bytes) -> tuple[Adapter, list[str], float]:
@@ -223,9 +242,15 @@ def _settle(adapter: Adapter, data: bytes) -> tuple[Adapter, list[str], float]:
         if not (isinstance(read, bytes) or (isinstance(read, Line) and len(read.fields) == width))
     ]
     ignore, kinds = _ignored(others, [piece for piece, read in reads if isinstance(read, Line)])
+    score = 0.1 * len(kinds)
     if adapter.rows is not None:
+        # Text or other data between lines of one sensor each does not make them rows.
+        between = {kind_of_line(line) for line in others}
+        score = 0.5 * any(
+            kind.count("#") > 1 or re.fullmatch(r"[^#]*[^\W\d_]{2}[^#]*", kind) for kind in between
+        )
         ignore, kinds = None, []
-    elif len(others) - sum(kinds_count for _, kinds_count in kinds) > (1 - _SAME) * len(lines):
+    elif len(others) - sum(kinds_count for _, kinds_count in kinds) > (1 - SAME) * len(lines):
         raise FrameError("structure")
     table = np.array([line.fields for line in lines])
     roles, left_out = _roles(table, names, text) if adapter.rows is None else ({"counter": None}, {})
@@ -236,7 +261,7 @@ def _settle(adapter: Adapter, data: bytes) -> tuple[Adapter, list[str], float]:
     notes += [f"{count} lines such as {kind!r} are ignored" for kind, count in kinds]
     if by_name and adapter.pattern is None and adapter.number is None:
         roles["names"] = tuple(names)
-    return replace(adapter, drop=(*adapter.drop, *described), ignore=ignore, **roles), notes, 0.1 * len(kinds)
+    return replace(adapter, drop=(*adapter.drop, *described), ignore=ignore, **roles), notes, score
 
 
 def _try(layout: Any, piece: bytes) -> Line | bytes | None:
@@ -280,6 +305,10 @@ def _text_columns(lines: Sequence[Line]) -> list[int]:
         numbers = {tuple(_NUMBER.findall(word)) for word in words}
         if place in columns and len(numbers - {()}) > 1 and not all(map(_UNIT.fullmatch, words)):
             raise FrameError("number")  # with a text beside it
+        column = [line.strange.get(place) for line in lines]
+        changes = sum(before != word for before, word in pairwise(column))
+        if 2 * changes > len(column) and not all(map(_UNIT.fullmatch, words)):
+            raise FrameError("rows")  # it names the line
     return columns
 
 
@@ -311,46 +340,49 @@ def _roles(
     table: np.ndarray, names: Sequence[str], text: Sequence[int]
 ) -> tuple[dict[str, Any], dict[int, str]]:
     """Return the settings of counter and time of fields (L, C), and why other fields are no sensors."""
-    count = table.shape[1]
-    free = [place for place in range(count) if place not in text]
+    free = [place for place in range(table.shape[1]) if place not in text]
     roles, left_out = dict[str, Any](counter=None, time=None), dict[int, str]()
-    # Of a few lines, only the first two fields may look like a clock.
-    rising = [place for place in free if place < 2 or len(table) > 30 or names]
-    counter = next((place for place in rising if counts(table[:, place], wraps=len(table) > 30)), None)
-    time = next((place for place in rising if place != counter and runs(table[:, place])), None)
-    for role, place in (("counter", counter), ("time", time)):
-        if place is not None and len(free) > 1:
-            roles[role] = place
-            free.remove(place)
-    if counter is not None and (modulus := int(table[:, counter].max()) + 1) & (modulus - 1) == 0:
-        wrapped = np.count_nonzero(np.diff(table[:, counter]) < 0) > 1
-        roles |= {"modulus": modulus} if wrapped else {}
-    for place in free:
-        name = names[place] if names else ""
-        if _ASIDE.fullmatch(last_part(name)) or _ASIDE.fullmatch(name):
-            left_out[place] = "is no force, by its name"
-    constant = {place: table[0, place] for place in free if np.ptp(table[:, place]) == 0}
-    moving = [place for place in free if place not in constant and place not in left_out]
-    guides = [
-        place
-        for place in constant
-        if moving and (constant[place] <= table[:, moving].min() or constant[place] >= table[:, moving].max())
-    ]
-    below = [place for place in guides if constant[place] <= table[:, moving].min()]
-    named = [place for place in guides if names and _GUIDE.fullmatch(last_part(names[place]))]
-    if 0 < len(below) < len(guides) and {guides[0], guides[-1]} <= {free[0], free[-1]} and len(guides) == 2:
-        named = guides
-    left_out |= {place: f"is always {constant[place]:g}, a guide of a plotter" for place in named}
+    many = len(table) > 30  # of a few lines, only the first two fields may look like a clock
+    for role, behaves in (("counter", partial(counts, wraps=many)), ("time", runs)):
+        rising = [place for place in free if (place < 2 or many or names) and behaves(table[:, place])]
+        if rising and len(free) > 1:
+            roles[role] = rising[0]
+            free.remove(rising[0])
+    counter = roles["counter"]
+    if counter is not None and np.count_nonzero(np.diff(table[:, counter]) < 0) > 1:
+        roles["modulus"] = int(table[:, counter].max()) + 1
+    if any(cycles(table[:, place]) for place in free):
+        raise FrameError("rows")
+    named = dict.fromkeys(free, "") | {place: names[place] for place in free if names}
+    aside = {
+        place for place in free if {*map(_ASIDE.fullmatch, (last_part(named[place]), named[place]))} != {None}
+    }
+    left_out |= dict.fromkeys(aside, "is no force, by its name")
+    moving = [place for place in free if np.ptp(table[:, place]) > 0 and place not in aside]
+    low, high = (table[:, moving].min(), table[:, moving].max()) if moving else (0, 0)
+    outside = [place for place in free if np.ptp(table[:, place]) == 0 and not low < table[0, place] < high]
+    pair = outside == [free[0], free[-1]] and np.count_nonzero(table[0, outside] <= low) == 1
+    guides = [place for place in outside if pair or _GUIDE.fullmatch(last_part(named[place]))]
+    left_out |= {place: f"is always {table[0, place]:g}, a guide of a plotter" for place in guides}
     rest = [place for place in free if place not in left_out]
-    if len(rest) > 2 and not (table[:, rest] % 1).any():
-        for place in (rest[-1], rest[0]):
-            inner = table[:, [other for other in rest if other != place]].astype(np.int64)
-            total, parity = inner.sum(axis=1), np.bitwise_xor.reduce(inner, axis=1)
-            sums = (total, total % 256, total % 65536, parity, parity % 256)
-            if any(np.mean(column == table[:, place]) > _SAME for column in sums):
-                left_out[place] = "is the sum of the others"
-                break
+    for place in (rest[-1], rest[0]) if len(rest) > 2 else ():
+        inner, column = table[:, [other for other in rest if other != place]], table[:, place]
+        # What varies as the others do: quiet sensors at rest are near their mean, too.
+        near = [total - column for total in _sums(inner, table, counter) if np.ptp(column) > 0]
+        if any(np.mean(np.abs(error) < 0.51) > SAME and error.std() < 0.3 * column.std() for error in near):
+            left_out[place] = "is a sum or mean of the others"
+            break
     return roles, left_out
+
+
+def _sums(inner: np.ndarray, table: np.ndarray, counter: int | None) -> Iterator[np.ndarray]:
+    """Yield what firmware sends to check fields (L, C), or beside them: sums, parities and means."""
+    yield inner.mean(axis=1)
+    parts = [inner] if counter is None else [inner, np.column_stack([table[:, counter], inner])]
+    for part in parts if not (table[:, [0]] % 1).any() else ():
+        whole = np.nan_to_num(part).astype(np.int64)
+        for total in (whole.sum(axis=1), np.bitwise_xor.reduce(whole, axis=1)):
+            yield from (total, total % 256, total % 65536)
 
 
 def _text(data: bytes) -> Iterator[Adapter]:
@@ -372,7 +404,11 @@ def _lines(lines: Sequence[bytes], data: bytes, ending: dict[str, Any]) -> Itera
         yield from (Adapter(kind="text", label=label, decimal=sign, **ending) for sign in (".", ","))
     words = [word for line in lines for word in re.split(rb"[;\t ]+", line)]
     grouped = [word for word in words if re.fullmatch(rb"[-+]?\d{1,3}(,\d{3})+", word)]
-    if grouped and any(word.isdigit() and int(word) < 1000 for word in words):
+    if (
+        grouped
+        and len(words) >= 2 * len(lines)
+        and any(word.isdigit() and int(word) < 1000 for word in words)
+    ):
         yield Adapter(kind="text", thousands=",", **ending)
     digits = re.split(r"[,;\t ]+", b" ".join(lines).decode("latin-1").strip())
     if all(re.fullmatch(r"(?i)(0x)?[0-9a-f]{2,}", word) for word in digits) and re.search(
@@ -381,6 +417,12 @@ def _lines(lines: Sequence[bytes], data: bytes, ending: dict[str, Any]) -> Itera
         yield Adapter(kind="text", base=16, **ending)
     yield from (Adapter(kind="text", decimal=sign, **ending) for sign in (".", ","))
     yield Adapter(kind="text", rows=0, counter=None, **ending)
+    firsts = [match[1].decode() for line in lines if (match := re.match(rb"\W*([A-Za-z_]\w*)", line))]
+    if 2 * sum(before != word for before, word in pairwise(firsts)) > len(lines) and len(set(firsts)) <= 64:
+        order, pattern = list(dict.fromkeys(firsts[1:])), r"\W*(?P<name>[A-Za-z_]\w*)[^-+.\w]+(?P<values>.*)"
+        begin = order.index(min(order))
+        names = (*order[begin:], *order[:begin])
+        yield Adapter(kind="text", pattern=pattern, names=names, rows=0, counter=None, **ending)
     yield from (replace(adapter, **ending) for adapter in _patterns(lines))
     yield from (replace(read_adapter("anyskin"), **ending),)
     yield from (
@@ -453,138 +495,9 @@ def _endless(data: bytes, longest: int = 512) -> Iterator[Adapter]:
     """Yield adapters of text without lines: of a fixed length, or with a word at the end of each frame."""
     classes = np.frombuffer(re.sub(rb"[-+.\d ]", b"0", data), np.uint8)
     for length in range(3, min(longest, len(data) // 4)):
-        if np.mean(classes[length:] == classes[:-length]) > _SAME:
+        if np.mean(classes[length:] == classes[:-length]) > SAME:
             yield Adapter(kind="text", end="", length=length)
     words = Counter(re.findall(rb"[^\d\s.,;+-]+", data))
     for word, count in words.most_common(2):
         if count >= _FRAMES and word.isascii():
             yield from _lines(data.split(word)[1:-1], data, {"end": word.decode()})
-
-
-_KINDS = ("<f4", ">f4", "<u2", ">u2", "<i2", ">i2", "<i4", ">i4", "<i3", ">i3", "u1")
-_HEADERS = tuple(
-    tuple(words.split())
-    for words in ("", "u1", "<u2", "<u4", ">u2", ">u4", "u1 <u4", "<u2 <u4", "<u4 <u4", ">u2 >u4")
-)
-"""Types of values, and of a counter and a clock before them."""
-
-
-def _binary(data: bytes, seconds: float, longest: int = 512) -> Iterator[Adapter]:
-    """Yield structs of a fixed length between bytes that repeat, the most plausible first."""
-    if is_text(data):
-        return
-    options = list[tuple[float, Adapter]]()
-    for length in range(3, min(longest, len(data) // 6)):
-        table = np.frombuffer(data[: len(data) // length * length], np.uint8).reshape(-1, length)
-        constant = np.mean(table == np.median(table, axis=0), axis=0) > _SAME
-        if not constant.any() or constant.all():
-            continue
-        begin, ring = _longest(constant), np.median(table, axis=0).astype(np.uint8)
-        for skip in range(begin[1]):
-            for size in range(1, min(begin[1] - skip, 4) + 1):
-                mark = bytes(np.roll(ring, -begin[0] - skip)[:size])
-                frames = np.roll(table.ravel(), -begin[0] - skip).reshape(-1, length)[:-1, size:]
-                tail = mark in (b"\r\n", b"\n")
-                place: dict[str, Any] = {"tail" if tail else "head": mark.hex(" ")}
-                options += [
-                    (
-                        cost + _mark_cost(mark),
-                        Adapter(kind="binary", struct=struct, drop=drop, **place, **roles),
-                    )
-                    for cost, struct, drop, roles in _structs(frames, seconds * length / len(data))
-                ]
-        if options:
-            break
-    options.sort(key=lambda option: option[0])
-    yield from _chips(data)
-    yield from (adapter for cost, adapter in options[:4] if cost < options[0][0] + 2)
-
-
-def _chips(data: bytes) -> Iterator[Adapter]:
-    """Yield the adapter of chips of which each sends four floats, the first its temperature."""
-    chips = read_adapter("anyskin_binary")
-    for layout in chips.layouts(data):
-        reads = [_try(layout, piece) for piece in layout.split(data)[0]]
-        table = np.array([read.fields for read in reads if isinstance(read, Line)])
-        temperatures = np.median(table, axis=0)[::4]
-        if len(temperatures) > 1 and np.ptp(temperatures) < 3 and (abs(temperatures - 30) < 20).all():
-            yield chips
-
-
-def _mark_cost(mark: bytes) -> float:
-    """Return how unlikely bytes mark a frame: zeros and small numbers are rather parts of values."""
-    return sum(1.5 for byte in mark if byte in (0, 1)) + 0.5 * (len(mark) == 1) - 0.2 * len(mark)
-
-
-def _longest(constant: np.ndarray) -> tuple[int, int]:
-    """Return begin and size of the longest run of True in a ring."""
-    count = len(constant)
-    sizes = [
-        next((step for step in range(count) if not constant[(begin + step) % count]), count)
-        for begin in range(count)
-    ]
-    return int(np.argmax(sizes)), max(sizes)
-
-
-def _structs(
-    frames: np.ndarray, period: float
-) -> Iterator[tuple[float, dict[str, str], tuple[str, ...], dict[str, Any]]]:
-    """Yield structs of frames (F, B) without marks: bits that their changes need, what to drop, roles."""
-    for header in _HEADERS:
-        head, roles, used = dict[str, str](), dict[str, Any](counter=None, time=None), 0
-        for kind in header:
-            if used + int(kind[-1]) >= frames.shape[1]:
-                break
-            column = _numbers(frames, used, kind, 1)[:, 0]
-            counting = counts(column[:256], wraps=True)
-            ticks = [np.median(np.diff(column)) * unit / (period or 1) for unit in UNITS.values()]
-            clock = runs(column[:64]) and any(0.6 < tick < 1.6 for tick in ticks)
-            name = "counter" if counting and "counter" not in head else "time" if clock else ""
-            if not name or name in head:
-                break
-            head[name], roles[name], used = kind, name, used + int(kind[-1])
-        if len(head) < len(header):
-            continue
-        for spare, end, drop, cost in _tails(frames[:, used:]):
-            for kind in _KINDS:
-                count, odd = divmod(frames.shape[1] - used - spare, int(kind[-1]))
-                if count < 1 or odd:
-                    continue
-                bits = _bits(_numbers(frames, used, kind, count), kind)
-                if np.isfinite(bits):
-                    yield bits + cost, head | {"force": f"({count},){kind}"} | end, drop, roles
-
-
-def _tails(body: np.ndarray) -> Iterator[tuple[int, dict[str, str], tuple[str, ...], float]]:
-    """Yield the size of a checksum at the end of bodies (F, B), its type, what to drop, its cost in bits."""
-    sums = body[:, :-1].sum(axis=1) % 256, np.bitwise_xor.reduce(body[:, :-1], axis=1)
-    if body.shape[1] > 2 and any(np.mean(check == body[:, -1]) > _SAME for check in sums):
-        yield 1, {"checksum": "u1"}, ("checksum",), 0.0
-        return
-    yield 0, {}, (), 0.0
-    random = np.abs(np.diff(body.astype(int), axis=0)).mean(axis=0) > 60  # 85 of bytes drawn at random
-    for size, kind in ((1, "u1"), (2, "<u2")):
-        if body.shape[1] > size and random[-size:].all():
-            yield size, {"checksum": kind}, ("checksum",), 4.0 * size
-
-
-def _numbers(frames: np.ndarray, first: int, kind: str, count: int) -> np.ndarray:
-    """Return numbers (F, N) of a type from byte ``first`` on."""
-    reader = Adapter(kind="binary", struct={"n": f"({count},){kind}"}, head="00").struct_reader(
-        len(frames), 0
-    )
-    data = np.ascontiguousarray(frames[:, first : first + count * int(kind[-1])])
-    return np.array(reader(data.tobytes()).fields).reshape(len(frames), count)
-
-
-def _bits(values: np.ndarray, kind: str) -> float:
-    """Return the bits per frame that the changes of values (F, S) need: few where bytes are read as sent."""
-    if kind.endswith("f4"):
-        size = np.abs(values[values != 0])
-        if not np.isfinite(values).all() or not ((size >= 1e-4) & (size <= 1e7)).all():
-            return np.inf
-        values = values / max(np.median(np.abs(values)), 1e-3) * 2**12  # about three digits
-    bits = np.log2(1 + 2 * np.abs(np.diff(values, axis=0))).mean(axis=0)
-    if (bits > 0.7 * 8 * int(kind[-1])).any():  # as of random bytes
-        return np.inf
-    return float(bits.sum() + 2 * np.count_nonzero(np.ptp(values, axis=0) == 0))

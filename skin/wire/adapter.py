@@ -41,7 +41,7 @@ from skin.wire.lines import (
     learn_keys,
     number_pattern,
 )
-from skin.wire.protocol import INVALID, OVER, SEPARATORS, Format, Line, parse_header
+from skin.wire.protocol import INVALID, OVER, SEPARATORS, Format, Line, parse_header, parse_words
 
 _RUN = 12  # frames alike that show a format: that noise rises as often by chance is improbable
 
@@ -197,7 +197,8 @@ class Adapter:
     @cached_property
     def _numbers(self) -> frozenset[float]:
         """Numbers that mean no value."""
-        return frozenset(_number(word) for word in self.invalid) - {None}  # type: ignore[return-value, operator]
+        read = parse_words([str(word).encode() for word in self.invalid], invalid=())
+        return frozenset(filter(isfinite, read.fields))
 
     def describe(self) -> str:
         """Return the settings that differ from their defaults, as YAML."""
@@ -335,7 +336,7 @@ class Adapter:
     ) -> DetectedFormat:
         header, count_seen, run = None, None, list[Line]()
         for piece in pieces:
-            read = _try(layout, piece)
+            read = _numeric(layout, piece)
             if isinstance(read, bytes) and (read or not layout.plain):
                 header = parse_header(read) or header
                 continue
@@ -361,7 +362,7 @@ class Adapter:
     def _detect_rows(
         self, layout: FieldFormat, pieces: Sequence[bytes], sensors: int | None
     ) -> DetectedFormat:
-        reads = [read if isinstance(read := _try(layout, piece), Line) else None for piece in pieces]
+        reads = [read if isinstance(read := _numeric(layout, piece), Line) else None for piece in pieces]
         width = Counter(len(read.fields) for read in reads if read).most_common(1)
         rows = [read if read and len(read.fields) == width[0][0] else None for read in reads]
         numbered, starts, first, count = [row for row in rows if row], list[Line](), 0.0, 0
@@ -453,13 +454,18 @@ def is_text(data: bytes) -> bool:
     return sum(byte in b"\r\n\t\0\x1b" or 32 <= byte < 127 for byte in data) > 0.95 * len(data)
 
 
-def _try(layout: FieldFormat, piece: bytes) -> Line | bytes | None:
-    """Return the fields of a piece with any number, of our protocol with most; or a line that is none."""
+def try_fields(layout: FieldFormat, piece: bytes) -> Line | bytes | None:
+    """Return the fields of a piece, or a line that is no frame; None: it is neither."""
     try:
-        read = layout.fields(piece)
+        return layout.fields(piece)
     except FrameError:
         return None
-    if isinstance(read, bytes):
+
+
+def _numeric(layout: FieldFormat, piece: bytes) -> Line | bytes | None:
+    """Return the fields of a piece with any number, of our protocol with most; or a line that is none."""
+    read = try_fields(layout, piece)
+    if not isinstance(read, Line):
         return read
     count = np.count_nonzero(np.isfinite(read.fields))
     return read if (2 * count > len(read.fields) and not read.strange if layout.plain else count) else None
@@ -475,10 +481,3 @@ def _why(layout: FieldFormat, line: bytes) -> str:
         return "ignored"
     word = next(iter(read.strange.values()), b"").decode("ascii", "replace")
     return f"field {word!r} is no number" if word else f"{len(read.fields)} fields"
-
-
-def _number(word: Any) -> float | None:
-    try:
-        return float(word)
-    except ValueError:
-        return None

@@ -5,7 +5,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from math import inf
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 
@@ -18,23 +18,6 @@ from skin.wire.protocol import Format, Header, RawFrame, parse_header
 
 Identity = Literal["known", "missing", "other", "changed"]
 """Of the device by its headers: known; none since it was connected again; another; another without that."""
-
-
-class BadShare(NamedTuple):
-    """Most frames of some time were bad.
-
-    Attributes:
-        bad, frames: number of bad frames, and of all.
-        seconds: the time, s.
-        reason: of the latest bad frame.
-        found: number of values in it, for the reason ``fields``.
-    """
-
-    bad: int
-    frames: int
-    seconds: float
-    reason: str
-    found: int | None
 
 
 @dataclass
@@ -64,7 +47,8 @@ class Stats:
         clock_trusted: False: the host's clock is used instead.
         identity: whether the device is the one of the first header.
         header, other_header: the first header, and one that differs.
-        bad_share: if most frames of the last two seconds were bad.
+        bad_share: number of bad frames and of all in 2 s, reason of the latest bad one, and number of its
+            values; None: most frames were good.
     """
 
     bytes: int = 0
@@ -90,7 +74,7 @@ class Stats:
     identity: Identity = "known"
     header: Header | None = None
     other_header: Header | None = None
-    bad_share: BadShare | None = None
+    bad_share: tuple[int, int, str, int | None] | None = None
 
     @property
     def bad_frames(self) -> int:
@@ -121,8 +105,8 @@ class Stats:
             return f"the header of the device has changed, {self.other_header.changes(self.header)}"
         if self.bad_share is None:
             return ""
-        bad, frames, seconds, reason, found = self.bad_share
-        share = f"{bad} of {frames} frames in {seconds:g} s were bad"
+        bad, frames, reason, found = self.bad_share
+        share = f"{bad} of {frames} frames in 2 s were bad"
         if reason == "fields":
             return f"{share}: the device sends {found} values per frame now"
         return f"{share} ({reason}): wrong baud rate or format?"
@@ -354,9 +338,7 @@ class Decoder:
             return
         latest, frames = self._latest_bad, self._bad + self._good
         most = self._bad > max(self._good, few)
-        self.stats.bad_share = (
-            BadShare(self._bad, frames, span, latest.reason, latest.found) if most else None
-        )
+        self.stats.bad_share = (self._bad, frames, latest.reason, latest.found) if most else None
         self._compared_at, self._good, self._bad = now, 0, 0
 
 

@@ -16,12 +16,12 @@ import numpy as np
 
 from skin.device.resampling import FrameError
 from skin.errors import InputError
-from skin.wire.adapter import Adapter, is_text, read_adapter
+from skin.wire.adapter import Adapter, is_text, read_adapter, try_fields
 from skin.wire.binary_adapters import SAME, binary_adapters
 from skin.wire.columns import counts, cycles, last_part, runs
 from skin.wire.decoder import Decoder, kind_of_line
 from skin.wire.formats import RowsFormat
-from skin.wire.protocol import INVALID, Line
+from skin.wire.protocol import INVALID, OVER, Line, split_words
 
 Pieces = Sequence[tuple[float, bytes]]
 """Bytes with the time of their arrival, s."""
@@ -183,9 +183,8 @@ def _judge_values(values: np.ndarray, frame_format: Any, most: int = 64) -> floa
         raise _ImplausibleError("no value ever changes")
     # Between frames next to each other, readings at rest differ as much as between frames further apart.
     near = _typical_step(moving, 1)
-    resolution = [np.diff(np.unique(column[np.isfinite(column)])).min() for column in moving.T]
     for lag in range(2, min(most, len(moving) // 4)):
-        if np.mean(near > 3 * _typical_step(moving, lag) + 2 * np.array(resolution)) >= 0.5:
+        if np.mean(near > 3 * _typical_step(moving, lag) + 2 * _resolution(moving)) >= 0.5:
             raise _ImplausibleError(
                 f"every {lag} lines are alike, those between them are not: they are of several sensors; let "
                 "the firmware send a line per frame, or number the lines"
@@ -204,7 +203,8 @@ def _errors(values: np.ndarray, period: float, longest: float = 0.0205) -> list[
     Nothing touches a skin for one frame of 20 ms; the largest counts of converters may be meant, though.
     """
     values = values[:, np.isfinite(values).any(axis=0)]
-    steps, far = np.diff(values, axis=0), 50 * _typical_step(values, 1) + 1e-9
+    steps = np.diff(values, axis=0)
+    far = 50 * np.maximum(_typical_step(values, 1), _resolution(values))
     back = np.abs(steps[:-1] + steps[1:]) < far / 5
     single = (np.abs(steps[:-1]) > far) & (np.abs(steps[1:]) > far) & back
     alone = single & (single.sum(axis=1, keepdims=True) == 1)
@@ -213,6 +213,12 @@ def _errors(values: np.ndarray, period: float, longest: float = 0.0205) -> list[
     return sorted(
         value for value, count in often.items() if count > 1 and value not in ends and period <= longest
     )
+
+
+def _resolution(values: np.ndarray) -> np.ndarray:
+    """Return the smallest difference of each value (S,)."""
+    steps = (np.diff(np.unique(column[np.isfinite(column)])) for column in values.T)
+    return np.array([step.min() if len(step) else 1.0 for step in steps])
 
 
 def _typical_step(values: np.ndarray, lag: int) -> np.ndarray:
@@ -225,7 +231,7 @@ def _settle(adapter: Adapter, data: bytes) -> tuple[Adapter, list[str], float]:
     """Return an adapter with the roles of its fields, what it leaves out, in words, and its score."""
     layout = next(adapter.layouts(data))
     pieces = layout.split(data)[0][1:]
-    reads = [(piece, _try(layout, piece)) for piece in pieces]
+    reads = [(piece, try_fields(layout, piece)) for piece in pieces]
     lines = [read for _, read in reads if isinstance(read, Line) and not _is_title(read)]
     if len(lines) < _FRAMES:
         raise FrameError("structure")
@@ -242,7 +248,7 @@ def _settle(adapter: Adapter, data: bytes) -> tuple[Adapter, list[str], float]:
         if not (isinstance(read, bytes) or (isinstance(read, Line) and len(read.fields) == width))
     ]
     ignore, kinds = _ignored(others, [piece for piece, read in reads if isinstance(read, Line)])
-    score = 0.1 * len(kinds)
+    score = 0.1 * len(kinds) + 0.2 * len(others) / (len(others) + len(lines))
     if adapter.rows is not None:
         # Text or other data between lines of one sensor each does not make them rows.
         between = {kind_of_line(line) for line in others}
@@ -262,13 +268,6 @@ def _settle(adapter: Adapter, data: bytes) -> tuple[Adapter, list[str], float]:
     if by_name and adapter.pattern is None and adapter.number is None:
         roles["names"] = tuple(names)
     return replace(adapter, drop=(*adapter.drop, *described), ignore=ignore, **roles), notes, score
-
-
-def _try(layout: Any, piece: bytes) -> Line | bytes | None:
-    try:
-        return layout.fields(piece)  # type: ignore[no-any-return]
-    except FrameError:
-        return None
 
 
 def _is_title(read: Line | bytes | None) -> bool:
@@ -321,15 +320,19 @@ def _ignored(others: Sequence[bytes], frames: Sequence[bytes]) -> tuple[str | No
     kinds = Counter(kind_of_line(line) for line in others)
     kept, parts = list[tuple[str, int]](), list[str]()
     for kind, count in kinds.most_common(8):
-        start = kind.partition("#")[0]
-        if len(re.findall(r"[^\W\d_]", start)) < 2 or any(
-            kind_of_line(frame).startswith(start) for frame in frames[:_FRAMES]
-        ):
+        start, words = kind.partition("#")[0], split_words(kind.lower().encode())
+        # Words for values are none of another kind: known ones, and those of several sensors.
+        values = (INVALID | OVER) & {*words} or ("#" not in kind and len({*words}) < len(words))
+        alike = any(kind_of_line(frame).startswith(start) for frame in frames[:_FRAMES])
+        if len(re.findall(r"[^\W\d_]", start)) < 2 or values or alike:
             continue
         numbers = Counter(tuple(re.findall(rb"\d+", line)) for line in others if kind_of_line(line) == kind)
-        if "#" in kind and 2 <= len(numbers) <= 64 and min(numbers.values()) > 2 and kind.count("#") < 3:
+        naming = "#" in kind and 2 <= len(numbers) <= 64 and min(numbers.values()) > 2 and kind.count("#") < 3
+        size = len(re.findall(rb"\d+", frames[0]))
+        if naming or (len(numbers) > 2 and size == len(next(iter(numbers)))):
             raise _ImplausibleError(
-                f"lines such as {kind!r} name the values after them: let the firmware send a line per frame"
+                f"lines such as {kind!r} name other values, or those after them: let the firmware send a "
+                "line per frame, or give them as device.adapter.ignore"
             )
         kept.append((kind, count))
         parts.append(re.escape(start) + ".*")

@@ -10,11 +10,14 @@ Listens for seconds=, or until Ctrl-C.
 import signal
 import sys
 from contextlib import closing, suppress
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from skin.commands._command import command
 from skin.errors import InputError
 from skin.runs.configuration import Config
+
+if TYPE_CHECKING:
+    from skin.wire.reader import Port
 
 _ENOUGH = 5.0  # s of a stream that show what a board sends
 
@@ -30,19 +33,13 @@ def main(config: Config, n: int | None, seconds: float | None, adapter: Any) -> 
 
     from skin.wire.formats import SensorCountError
     from skin.wire.monitor import PortMonitor
-    from skin.wire.proposal import listen_raw, propose
-    from skin.wire.reader import Port, SkinDisconnected, SkinTimeout, open_stream
+    from skin.wire.reader import Port, SkinDisconnected, SkinTimeout
     from skin.wire.skin import open_skin
 
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     settings = Port.select(device)
     if settings.frames.kind == "auto":
-        with closing(open_stream(str(settings.port), settings.baudrate)) as stream:
-            pieces = listen_raw(stream, _ENOUGH if seconds is None else min(seconds, _ENOUGH))
-        proposal = propose(pieces)
-        # As YAML to paste; what it makes of the board goes to standard error.
-        print(f"# {proposal.summary}", proposal.adapter.describe(), sep="\n")
-        print("save it, as board.yaml, and give device.adapter=board.yaml", file=sys.stderr)
+        _propose(settings, _ENOUGH if seconds is None else min(seconds, _ENOUGH))
         return
     sensors = None if n is None else range(n)
     with open_skin(settings, sensors) as skin:
@@ -59,3 +56,22 @@ def main(config: Config, n: int | None, seconds: float | None, adapter: Any) -> 
                 "leave it out"
             ) from error
         print(listener.summary())
+
+
+def _propose(settings: "Port", seconds: float) -> None:
+    """Print an adapter that reads the board, as YAML to paste, with what it makes of it in comments."""
+    from time import monotonic
+
+    from skin.wire.proposal import propose
+    from skin.wire.reader import open_stream
+
+    pieces, begin = list[tuple[float, bytes]](), monotonic()
+    with closing(open_stream(str(settings.port), settings.baudrate)) as stream, suppress(OSError):
+        while (now := monotonic() - begin) < seconds:
+            if data := stream.read():
+                pieces.append((now, data))
+    best, *others = propose(pieces, seconds)
+    print(f"# {best.summary}", best.adapter.describe(), sep="\n")
+    for other in others:
+        print(f"# nearly as plausible: {other.summary}", *other.adapter.describe().splitlines(), sep="\n# ")
+    print("save it, as board.yaml, and give device.adapter=board.yaml", file=sys.stderr)

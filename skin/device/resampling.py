@@ -1,6 +1,5 @@
 """Resampling of a device's frames to the rate of a model, for live and recorded touches."""
 
-from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -81,21 +80,11 @@ class FrameError(Exception):
             ``repeat``.
         found: number of fields, for the reason ``fields``.
         word: the field, for the reason ``number``.
-        numbers: the fields of a line, NaN where there is no number, for the same reason.
-        check: kind of its checksum.
     """
 
-    def __init__(
-        self,
-        reason: str,
-        count: int | None = None,
-        word: str = "",
-        numbers: Sequence[float] = (),
-        check: Check = "none",
-    ) -> None:
+    def __init__(self, reason: str, count: int | None = None, word: str = "") -> None:
         super().__init__(reason)
         self.reason, self.found, self.word = reason, count, word
-        self.numbers, self.check = list(numbers), check
 
 
 _SLOWER = 1.05  # tolerance for the error of a ceramic resonator and for lost frames

@@ -2,51 +2,53 @@
 
 import re
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import groupby
+from math import isfinite
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
 from annotated_types import Ge
-from numpy.lib.recfunctions import structured_to_unstructured
 
 from skin.core.files import CONF
 from skin.core.safe_loading import load_yaml
 from skin.core.settings import check_settings
 from skin.device.resampling import FrameError
 from skin.errors import InputError
-from skin.wire.columns import Columns, find_roles, resolve
+from skin.wire.columns import Columns, cycles, find_roles, resolve
 from skin.wire.formats import (
     DetectedFormat,
-    FixedFormat,
-    FrameFormat,
+    FieldFormat,
+    Roles,
     RowsFormat,
     SensorCountError,
-    TextFormat,
-    detect_format,
-    detection_error,
+    detect_binary,
+    fixed_length,
+    protocol_roles,
+    split_at,
 )
 from skin.wire.lines import (
     JsonReader,
-    LabelReader,
-    LineReader,
-    NumberReader,
+    NumberWords,
     PatternReader,
+    Reader,
     SeparatedReader,
+    StructReader,
+    label_pattern,
+    learn_keys,
+    number_pattern,
 )
-from skin.wire.protocol import INVALID, Format, Header, Line, parse_header
+from skin.wire.protocol import INVALID, OVER, SEPARATORS, Format, Line, parse_header, parse_words
 
-_RUN = 12  # frames alike that show a format: noise hardly rises as often by accident
-_MOST_REPEATS = 256
-_NUMBER = rb"[-+.\d ]"
+_RUN = 12  # frames alike that show a format: that noise rises as often by chance is improbable
 
 
 @dataclass(frozen=True, kw_only=True)
 class Adapter:
-    """Format of what a board sends, and texts to send to it.
+    """What a board sends, and what it must be told.
 
     Attributes:
         kind: ``protocol`` (ours, docs/hardware.md), ``text``, ``json`` (one value per line), ``binary``, or
@@ -54,16 +56,21 @@ class Adapter:
         format: of our protocol: ``auto``, ``text`` or ``binary``.
         separator: text between fields; None: comma, semicolon, tab or blanks.
         decimal: ``.`` or ``,``.
+        thousands: sign between groups of three digits.
+        base: of whole numbers, 10 or 16.
         label: text between the name of a field and its number, such as ``:``.
         pattern: regular expression of a whole line: a named group per field, or a group ``values`` with
-            fields between separators.
+            fields between separators; with a group ``value``, of one field, whose name is the group ``name``.
+            Without ``value``, a group ``name`` names the line: its place in ``names`` is that of the row.
         number: regular expression of one number, where nothing separates fields.
-        names: of the fields, repeated over all of them.
+        names: of the fields, repeated over all of them; of labelled fields and JSON their order.
+        ignore: regular expression of lines that are no frames.
         end: text after each frame; None: LF, CRLF, LF CR or CR.
         length: bytes of a frame of text that has no end.
         rows: lines per frame; 0: found in the stream; None: each line is a frame.
         index: field with the number of the row; None: another line, or an empty one, separates frames.
-        struct: name -> numpy type of each field of a binary frame, as in ``{time: <u4, force: (16,)<u2}``.
+        struct: name -> numpy type of each field of a binary frame, as in ``{time: <u4, force: (16,)<u2}``;
+            also integers of three bytes, as in ``>i3``.
         repeat: how often the fields of ``struct`` follow each other; 0: found in the stream.
         head, tail: bytes in hexadecimal at the beginning and the end of each binary frame.
         values: fields that are sensors, by number from 0 or by name with ``*``; None: all others.
@@ -74,6 +81,8 @@ class Adapter:
         time_unit: ``s``, ``ms`` or ``us``; None: found in the stream.
         modulus: number at which the counter begins again; None: found in the stream.
         invalid: words and numbers that mean that there is no value, beside those of our protocol.
+        over: words for a value beyond the range of the converter, beside those of meters, such as ``OL``.
+        limit: value that ``over`` stands for; None: the largest count, if the header gives bits.
         start: text sent until the first frame arrives.
         poll: text sent for each frame.
         stop: text sent at the end.
@@ -83,10 +92,13 @@ class Adapter:
     format: Format = "auto"
     separator: str | None = None
     decimal: Literal[".", ","] = "."
+    thousands: str = ""
+    base: Literal[10, 16] = 10
     label: str | None = None
     pattern: str | None = None
     number: str | None = None
     names: Sequence[str] = ()
+    ignore: str | None = None
     end: str | None = None
     length: Annotated[int, Ge(1)] | None = None
     rows: Annotated[int, Ge(0)] | None = None
@@ -103,45 +115,64 @@ class Adapter:
     time_unit: Literal["s", "ms", "us"] | None = None
     modulus: Annotated[int, Ge(2)] | None = None
     invalid: Sequence[int | float | str] = ()
+    over: Sequence[str] = ()
+    limit: float | None = None
     start: str | None = None
     poll: str | None = None
     stop: str | None = None
 
     def __post_init__(self) -> None:
-        settings = {entry.name: getattr(self, entry.name) for entry in fields(self)}
-        changed = {entry.name for entry in fields(self) if settings[entry.name] != entry.default}
-        check_settings(Adapter, {name: settings[name] for name in changed}, "device.adapter")
-        for name in ("pattern", "number"):
+        check_settings(Adapter, {name: getattr(self, name) for name in self._changed}, "device.adapter")
+        groups = {}
+        for name in ("pattern", "number", "ignore"):
+            text = getattr(self, name)
             try:
-                re.compile(settings[name] or "")
+                groups[name] = re.compile(text or "").groupindex
             except re.error as error:
                 raise InputError(
-                    f"device.adapter.{name}={settings[name]} is not a regular expression: {error}"
+                    f"device.adapter.{name}={text} is not a regular expression: {error}"
                 ) from error
-        if self.pattern and not re.compile(self.pattern).groupindex:
-            raise InputError("device.adapter.pattern needs a named group per field, as in (?P<values>.*)")
-        if self.decimal == "," and self.separator == ",":
-            raise InputError("device.adapter: the decimal sign cannot separate fields, too: set separator")
-        for name in ("start", "poll", "separator", "label", "end"):
-            if settings[name] == "" and name != "end":
-                raise InputError(f"device.adapter.{name} is empty: leave it out")
-        if self.kind == "text" and self.end == "" and not self.length:
-            raise InputError("device.adapter: text without an end needs its length, as in length: 11")
-        if self.kind == "binary":
-            self._check_struct()
+        binary = self.kind == "binary"
+        size = self._record.itemsize if self.struct else 1
+        empty = [name for name in ("start", "poll", "separator", "label") if getattr(self, name) == ""]
+        for wrong, message in (
+            (
+                self.pattern and not groups["pattern"],
+                ".pattern needs a named group per field, as in (?P<values>.*)",
+            ),
+            (self.decimal == self.separator, ": the decimal sign cannot separate fields, too: set separator"),
+            (empty, f".{' and '.join(empty)} is empty: leave it out"),
+            (
+                self.kind == "text" and self.end == "" and not self.length,
+                ": text without an end needs its length, as in length: 11",
+            ),
+            (binary and not self.struct, ": binary frames need a struct, as in struct: {force: (16,)<u2}"),
+            (
+                binary and not self._mark(self.head) + self._mark(self.tail),
+                ": binary frames need a head or a tail, as in head: aa 55",
+            ),
+            (not 0 < size * max(1, self.repeat) <= 2**15, f".struct has {size} bytes: at most 32768"),
+        ):
+            if wrong:
+                raise InputError(f"device.adapter{message}")
 
-    def _check_struct(self) -> None:
-        if not self.struct:
-            raise InputError("device.adapter: binary frames need a struct, as in struct: {force: (16,)<u2}")
-        if not self._mark(self.head) + self._mark(self.tail):
-            raise InputError("device.adapter: binary frames need a head or a tail, as in head: aa 55")
-        if self._record.itemsize * max(1, self.repeat) > 2**15 or not self._record.itemsize:
-            raise InputError(f"device.adapter.struct has {self._record.itemsize} bytes: at most 32768")
+    @cached_property
+    def _changed(self) -> list[str]:
+        return [entry.name for entry in fields(self) if getattr(self, entry.name) != entry.default]
+
+    @cached_property
+    def _wide(self) -> dict[str, str]:
+        """Fields of integers of three bytes, and their type."""
+        return {name: kind[-3:] for name, kind in (self.struct or {}).items() if kind[-2:] in ("i3", "u3")}
 
     @cached_property
     def _record(self) -> np.dtype:
+        struct = {
+            name: re.sub(r"(?:\((\d+),\))?[<>][iu]3", lambda found: f"({3 * int(found[1] or 1)},)u1", kind)
+            for name, kind in (self.struct or {}).items()
+        }
         try:
-            record = np.dtype([(name, kind) for name, kind in (self.struct or {}).items()])
+            record = np.dtype(list(struct.items()))
         except (TypeError, ValueError, SyntaxError) as error:
             raise InputError(f"device.adapter.struct={dict(self.struct or {})}: {error}") from error
         kinds = {record[name].base.kind for name in record.names or ()}
@@ -156,28 +187,29 @@ class Adapter:
             raise InputError(f"device.adapter: {text} are not bytes in hexadecimal, as in aa 55") from error
 
     @cached_property
-    def _words(self) -> frozenset[bytes]:
-        return INVALID | {str(word).lower().encode() for word in self.invalid}
+    def _words(self) -> NumberWords:
+        """How words become numbers."""
+        over, invalid = (
+            {str(word).lower().encode() for word in words} for words in (self.over, self.invalid)
+        )
+        return NumberWords(
+            self.decimal, self.thousands, self.base, (INVALID | invalid) - over, OVER - invalid | over
+        )
 
     @cached_property
     def _numbers(self) -> frozenset[float]:
-        numbers = set()
-        for word in self.invalid:
-            try:
-                numbers.add(float(word))
-            except ValueError:
-                continue
-        return frozenset(numbers)
+        """Numbers that mean no value."""
+        read = parse_words([str(word).encode() for word in self.invalid], invalid=())
+        return frozenset(filter(isfinite, read.fields))
 
     def describe(self) -> str:
         """Return the settings that differ from their defaults, as YAML."""
         import yaml
 
-        settings = {entry.name: getattr(self, entry.name) for entry in fields(self)}
-        changed = [entry.name for entry in fields(self) if settings[entry.name] != entry.default]
         lines = []
-        for name in dict.fromkeys(["kind", *changed]):
-            value = list(settings[name]) if isinstance(settings[name], tuple) else settings[name]
+        for name in dict.fromkeys(["kind", *self._changed]):
+            value = getattr(self, name)
+            value = list(value) if isinstance(value, tuple) else value
             text = yaml.safe_dump(value, sort_keys=False, default_flow_style=True, width=10_000)
             lines.append(f"{name}: {text.replace('...', '').strip()}")
         return "\n".join(lines)
@@ -189,7 +221,7 @@ class Adapter:
         return self.kind == "binary" or self.length is not None or self._delimiter(data) in data
 
     def _delimiter(self, data: bytes) -> bytes:
-        return self.end.encode() if self.end else b"\n" if b"\n" in data else b"\r"
+        return self.end.encode() if self.end else b"\n" if b"\n" in data or self.kind == "protocol" else b"\r"
 
     def detect(self, data: bytes, sensors: int | None) -> DetectedFormat:
         """Return the format of the first bytes of a connection.
@@ -198,175 +230,191 @@ class Adapter:
             data: from the first byte on; an incomplete piece at the end is ignored.
             sensors: S, or None to detect it.
         """
-        if self.kind == "protocol":
-            return detect_format(data, sensors, self.format)
-        if self.kind == "binary":
-            return self._detect_struct(data, sensors)
-        if self.length is not None:
-            return self._detect_endless(data, sensors, self.length)
-        if self.rows is not None or self.index is not None:
-            return self._detect_rows(data, sensors)
-        return self._detect_lines(data, sensors)
+        protocol, seen = self.kind == "protocol", DetectedFormat()
+        if protocol and self.format != "text":
+            seen = detect_binary(data, sensors)
+        if seen.frame_format or (protocol and self.format == "binary"):
+            return seen
+        for layout in self.layouts(data):
+            # Without a checksum, the first line may be half of one.
+            pieces = layout.split(data)[0][layout.frame is None and not protocol :]
+            rows = self.rows is not None or self.index is not None
+            detected = (self._detect_rows if rows else self._detect_run)(layout, pieces, sensors)
+            if detected.frame_format:
+                return detected
+            seen = seen if detected.count_seen is None and not detected.header else detected
+        return seen
 
-    def _reader(self, lines: Sequence[bytes]) -> LineReader:
-        """Return what reads the fields of lines like these; what it leaves open follows from them."""
+    def layouts(self, data: bytes) -> Iterator[FieldFormat]:
+        """Yield how data may be cut and read; what the adapter leaves open follows from them."""
+        ignore = None if self.ignore is None else re.compile(self.ignore.encode())
+        if self.kind == "binary":
+            yield from self._binary_layouts(data)
+        elif self.length is not None:
+            mark = (
+                self.separator.encode()
+                if self.separator
+                else next((m for m in SEPARATORS if m in data), b" ")
+            )
+            count = data[: self.length].count(mark) + 1
+            width, odd = divmod(self.length - (count - 1) * len(mark), count)
+            number = rb"[-+.\d ]{%d}" % width
+            pattern = re.escape(mark).join([number] * count)
+            if not odd and width > 0 and count > 1 and re.search(b"(?:" + pattern + b"){%d}" % _RUN, data):
+                split = fixed_length(self.length, pattern, number + re.escape(mark), width + len(mark))
+                yield FieldFormat(split, self._reader([data]), frame=re.compile(pattern))
+        else:
+            lines = [line for line in self._lines(data) if not (ignore and ignore.fullmatch(line))]
+            plain = self.kind == "protocol"
+            cut = partial(split_at, self._delimiter(data))
+            yield FieldFormat(cut, self._reader(lines), "text" if plain else self.kind, ignore, plain=plain)
+
+    def _binary_layouts(self, data: bytes, most_repeats: int = 256) -> Iterator[FieldFormat]:
+        head, tail = self._mark(self.head), self._mark(self.tail)
+        repeats = [self.repeat] if self.repeat else range(1, most_repeats)
+        for repeat in repeats if data.count(head or tail) >= _RUN else ():
+            size = repeat * self._record.itemsize
+            pattern = re.escape(head) + b".{%d}" % size + re.escape(tail)
+            if re.search(b"(?:" + pattern + b"){%d}" % _RUN, data, re.DOTALL):
+                follow = b"" if tail else head
+                split = fixed_length(len(head) + size + len(tail), pattern, re.escape(follow), len(follow))
+                reader, frame = self.struct_reader(repeat, len(head)), re.compile(pattern, re.DOTALL)
+                yield FieldFormat(split, reader, "binary", frame=frame)
+
+    def struct_reader(self, repeat: int, offset: int) -> StructReader:
+        """Return what reads ``struct``, ``repeat`` times from byte ``offset`` on."""
+        return StructReader(self._record, self._wide, repeat, offset)
+
+    def _reader(self, lines: Sequence[bytes]) -> Reader:
+        """Return what reads the fields of lines like these."""
         if self.kind == "json":
-            return JsonReader.learn(lines, self._words)
-        split = SeparatedReader.learn(lines, self.separator, self.decimal, self._words, self.names)
-        if self.pattern is not None:
-            return PatternReader.learn(lines, self.pattern, self.separator, split)
-        if self.label is not None:
-            return LabelReader.learn(lines, self.label, split)
-        return split if self.number is None else NumberReader(self.number, split)
+            reader = JsonReader(self._words)
+            return replace(reader, keys=tuple(self.names) or learn_keys(reader.fields, lines))
+        marks = [self.separator.encode()] if self.separator and self.separator.strip() else []
+        if self.separator is None:
+            marks = [mark for mark in SEPARATORS if mark.decode() not in (self.decimal, self.thousands)]
+        bodies = [line.rpartition(b"*")[0 if b"*" in line else 2].rstrip(b" \r") for line in lines]
+        ends = sum(body.endswith(tuple(marks)) for body in bodies)
+        split = SeparatedReader(self._words, marks, self.names, 2 * ends > len(bodies))
+        pattern = self.pattern or (label_pattern(self.label) if self.label else None)
+        pattern = pattern or (number_pattern(self.number) if self.number else None)
+        if pattern is None:
+            return split
+        named = PatternReader(re.compile(pattern.encode()), split)
+        groups = named.pattern.groupindex
+        if "name" not in groups:
+            return named
+        learn = "value" in groups and self.rows is None and not self.names
+        return replace(named, keys=learn_keys(named.fields, lines) if learn else tuple(self.names))
 
     def _lines(self, data: bytes) -> list[bytes]:
-        """Return the complete lines; the first may be half of one."""
-        return [line.strip(b"\r\n") for line in data.split(self._delimiter(data))[:-1]][1:]
+        """Return the complete lines with fields; the first may be half of one."""
+        lines = [line.strip(b"\r\n") for line in data.split(self._delimiter(data))[:-1]][1:]
+        return [line for line in lines if line and not line.startswith(b"#")]
 
-    def _detected(
-        self, layout: FrameFormat, columns: Columns, header: Header | None = None
+    def _columns(
+        self, rows: Sequence[Line], reader: Reader, sensors: int | None, *index: int
+    ) -> Columns | int | None:
+        """Return the roles of the fields of lines; None: a word stands in a field that is not dropped."""
+        names = reader.names(len(rows[0].fields))
+        dropped = [*resolve(self.drop, names, len(rows[0].fields)), *index]
+        if any(place not in dropped for row in rows for place in row.strange):
+            return None
+        return find_roles(
+            np.array([row.fields for row in rows]),
+            names,
+            sensors,
+            drop=dropped,
+            values=self.values,
+            counter=self.counter,
+            time=self.time,
+            axes=self.axes,
+            time_unit=self.time_unit,
+            invalid=self._numbers,
+        )
+
+    def _detect_run(
+        self, layout: FieldFormat, pieces: Sequence[bytes], sensors: int | None
     ) -> DetectedFormat:
-        """Return a format with what its columns show of the clock."""
-        return DetectedFormat(layout, None, header, columns.unit, self.time_unit is not None, columns.summary)
-
-    def _detect_lines(self, data: bytes, sensors: int | None) -> DetectedFormat:
-        lines, header, count_seen = self._lines(data), None, None
-        for line in lines:
-            header = parse_header(line) or header if line.startswith(b"#") else header
-        lines = [line for line in lines if line and not line.startswith(b"#")]
-        reader, run = self._reader(lines), list[Line]()
-        for line in lines:
-            read = _try(reader, line)
-            if read is None or (
-                run and (len(run[-1].fields), run[-1].check) != (len(read.fields), read.check)
-            ):
+        header, count_seen, run = None, None, list[Line]()
+        for piece in pieces:
+            read = _numeric(layout, piece)
+            if isinstance(read, bytes) and (read or not layout.plain):
+                header = parse_header(read) or header
+                continue
+            if not isinstance(read, Line):
                 run = []
-            if read is None:
                 continue
+            if run and (len(run[-1].fields), run[-1].check) != (len(read.fields), read.check):
+                run = []
             run = [*run[1 - _RUN :], read]
-            if len(run) < _RUN:
-                continue
-            table = np.array([row.fields for row in run])
-            columns = find_roles(table, reader.names(table.shape[1]), sensors, self)
-            if isinstance(columns, int):
-                count_seen = columns
-                continue
-            layout = TextFormat(
-                columns.roles,
-                read.check,
-                reader.trailing,
-                reader,
-                self._delimiter(data),
-                reader.padded,
-                self.kind,
-            )
-            return self._detected(layout, columns, header)
+            found: Columns | Roles | int | None = None
+            if layout.plain:
+                found = protocol_roles(run[-8:], sensors, header and header.n)
+            elif len(run) == _RUN:
+                found = self._columns(run, layout.reader, sensors)
+            if isinstance(found, int):
+                count_seen = found
+            elif found is not None:
+                roles, unit, summary = found if isinstance(found, Columns) else (found, None, "")
+                detected = replace(layout, roles=roles, check=read.check)
+                return DetectedFormat(detected, None, header, unit, summary)
         return DetectedFormat(count_seen=count_seen, header=header)
 
-    def _detect_rows(self, data: bytes, sensors: int | None) -> DetectedFormat:
-        lines = self._lines(data)
-        reader = self._reader([line for line in lines if line and not line.startswith(b"#")])
-        reads = [None if line.startswith(b"#") or not line else _try(reader, line) for line in lines]
-        counts = Counter(len(read.fields) for read in reads if read)
-        if not counts:
-            return DetectedFormat()
-        width = counts.most_common(1)[0][0]
-        reads = [read if read and len(read.fields) == width else None for read in reads]
-        rows = [read.fields for read in reads if read]
-        index, first = _find_index(rows, reader.names(width), self.index), 0
+    def _detect_rows(
+        self, layout: FieldFormat, pieces: Sequence[bytes], sensors: int | None
+    ) -> DetectedFormat:
+        reads = [read if isinstance(read := _numeric(layout, piece), Line) else None for piece in pieces]
+        width = Counter(len(read.fields) for read in reads if read).most_common(1)
+        rows = [read if read and len(read.fields) == width[0][0] else None for read in reads]
+        numbered, starts, first, count = [row for row in rows if row], list[Line](), 0.0, 0
+        index = self._find_index(numbered, layout.reader) if numbered else None
         if index is not None:
-            numbers = [row[index] for row in rows]
-            first, count = int(min(numbers)), int(max(numbers) - min(numbers)) + 1
-            starts = [row for row in rows if row[index] == first]
+            numbers = [row.fields[index] for row in numbered if isfinite(row.fields[index])] or [0.0]
+            first, count = min(numbers), int(max(numbers) - min(numbers)) + 1
+            starts = [row for row in numbered if row.fields[index] == first]
         else:
-            blocks = [list(block) for filled, block in groupby(reads, bool) if filled][1:-1]
+            blocks = [[row for row in block if row] for filled, block in groupby(rows, bool) if filled][1:-1]
             count = Counter(map(len, blocks)).most_common(1)[0][0] if blocks else 0
-            starts = [block[0].fields for block in blocks if block[0] and len(block) == count]
-        if count < 1 or len(starts) < _RUN or self.rows not in (None, 0, count):
+            starts = [block[0] for block in blocks if len(block) == count]
+        if len(starts) < _RUN or self.rows not in (None, 0, count):
             return DetectedFormat()
-        described = replace(self, drop=(*self.drop, *([] if index is None else [index])))
-        columns = find_roles(np.array(starts), reader.names(width), None, described)
-        if isinstance(columns, int):
+        columns = self._columns(starts, layout.reader, None, *([] if index is None else [index]))
+        if columns is None or isinstance(columns, int):
             return DetectedFormat(count_seen=columns)
         total = count * columns.roles.sensors
         if sensors not in (None, total):
             return DetectedFormat(count_seen=total)
-        line = TextFormat(columns.roles, "none", reader.trailing, reader, self._delimiter(data), False)
-        return self._detected(RowsFormat(line, count, index, first), columns)
+        detected = RowsFormat(replace(layout, roles=columns.roles), count, index, first)
+        return DetectedFormat(detected, None, None, columns.unit, columns.summary)
 
-    def _detect_struct(self, data: bytes, sensors: int | None) -> DetectedFormat:
-        head, tail, seen = self._mark(self.head), self._mark(self.tail), None
-        if data.count(head or tail) < _RUN:
-            return DetectedFormat()
-        for repeat in [self.repeat] if self.repeat else range(1, _MOST_REPEATS):
-            size = repeat * self._record.itemsize
-            length = len(head) + size + len(tail)
-            pattern = re.escape(head) + b".{%d}" % size + re.escape(tail)
-            match = re.search(b"(?:" + pattern + b"){%d}" % _RUN, data, re.DOTALL)
-            if not match:
-                continue
-            parse = _struct_parser(self._record, repeat, len(head))
-            cut = range(match.start(), match.end(), length)
-            table = np.array([parse(data[place : place + length]).fields for place in cut])
-            columns = find_roles(table, _struct_names(self._record) * repeat, sensors, self)
-            if isinstance(columns, int):
-                seen = columns
-                continue
-            follow = b"" if tail else re.escape(head)
-            layout = FixedFormat(
-                columns.roles, parse, length, re.compile(pattern, re.DOTALL), follow, 0 if tail else len(head)
-            )
-            return self._detected(layout, columns)
-        return DetectedFormat(count_seen=seen)
-
-    def _detect_endless(self, data: bytes, sensors: int | None, length: int) -> DetectedFormat:
-        split = SeparatedReader.learn([data], self.separator, self.decimal, self._words, self.names)
-        separator = split.separator or b" "
-        count = data[:length].count(separator) + 1
-        width, odd = divmod(length - (count - 1) * len(separator), count)
-        if odd or width < 1 or count < 2:
-            return DetectedFormat()
-        pattern = re.escape(separator).join([_NUMBER + b"{%d}" % width] * count)
-        match = re.search(b"(?:" + pattern + b"){%d}" % _RUN, data)
-        if not match:
-            return DetectedFormat()
-        cut = range(match.start(), match.end(), length)
-        reads = [_try(split, data[place : place + length]) for place in cut]
-        table = np.array([read.fields for read in reads if read])
-        columns = find_roles(table, (), sensors, self) if len(table) == _RUN else 0
-        if isinstance(columns, int):
-            return DetectedFormat(count_seen=columns or None)
-        follow = _NUMBER + b"{%d}" % width + re.escape(separator)
-        layout = FixedFormat(
-            columns.roles, split, length, re.compile(pattern), follow, width + len(separator), "text"
-        )
-        return self._detected(layout, columns)
+    def _find_index(self, rows: Sequence[Line], reader: Reader) -> int | None:
+        """Return the field that numbers the rows; None if there is none."""
+        names, table = reader.names(len(rows[0].fields)), np.array([row.fields for row in rows])
+        if self.index is not None or ("name" in names and self.names):
+            return resolve(["name" if self.index is None else self.index], names, table.shape[1])[0]
+        leading = range(min(2, table.shape[1] - 1))
+        return next((column for column in leading if cycles(table[:, column])), None)
 
     def explain(self, data: bytes, count_seen: int | None, sensors: int | None) -> InputError:
         """Return the error for data in which no frame was found."""
-        if self.kind == "protocol":
-            return detection_error(data, count_seen, sensors)
         if count_seen is not None and sensors is not None:
             return SensorCountError(count_seen, sensors)
-        hint = "skin listen adapter=auto proposes an adapter"
-        if self.kind == "binary" or self.length is not None or len(lines := self._lines(data)) < 2:
+        hint, start = "skin listen adapter=auto proposes an adapter", data[:64]
+        sample = repr(start.decode("ascii", "replace")) if is_text(start) else start.hex(" ")
+        if self.kind == "protocol":
             return InputError(
-                f"the adapter reads no frame in {len(data)} bytes, which begin with {data[:64].hex(' ')}, as "
-                f"text {data[:40].decode('ascii', 'replace')!r}: {hint}"
+                f"no frame in {len(data)} bytes, which begin with {sample}: is the baud rate right, as in "
+                f"device.baudrate=115200? For another format, {hint}"
             )
-        texts = [line for line in lines if line and not line.startswith(b"#")][-3:]
-        reader, reasons = self._reader(texts), list[str]()
-        for line in texts:
-            try:
-                count = len(reader(line).fields)
-                reasons.append(f"{count} fields")
-            except FrameError as error:
-                reasons.append(
-                    f"field {error.word!r} is not a number" if error.word else "its shape is another"
-                )
+        texts = [] if self.kind == "binary" or self.length is not None else self._lines(data)[-3:]
+        if not texts:
+            return InputError(
+                f"the adapter reads no frame in {len(data)} bytes, which begin with {sample}: {hint}"
+            )
+        layout = next(self.layouts(data))
         shown = "; ".join(
-            f"{line[:80].decode('ascii', 'replace')!r} ({reason})"
-            for line, reason in zip(texts, reasons, strict=True)
+            f"{line[:80].decode('ascii', 'replace')!r} ({_why(layout, line)})" for line in texts
         )
         return InputError(f"the adapter matches no {_RUN} lines in a row: {shown}: {hint}")
 
@@ -403,49 +451,35 @@ def read_adapter(described: str | Mapping[str, Any] | Adapter) -> Adapter:
     return Adapter(**settings)
 
 
-def _try(reader: Callable[[bytes], Line], line: bytes) -> Line | None:
-    """Return the fields of a line that has any number; else None."""
+def is_text(data: bytes) -> bool:
+    """Return whether nearly all bytes are printable."""
+    return sum(byte in b"\r\n\t\0\x1b" or 32 <= byte < 127 for byte in data) > 0.95 * len(data)
+
+
+def try_fields(layout: FieldFormat, piece: bytes) -> Line | bytes | None:
+    """Return the fields of a piece, or a line that is no frame; None: it is neither."""
     try:
-        read = reader(line)
+        return layout.fields(piece)
     except FrameError:
         return None
-    return read if any(np.isfinite(read.fields)) else None
 
 
-def _find_index(rows: Sequence[Sequence[float]], names: Sequence[str], field: int | str | None) -> int | None:
-    """Return the field that numbers the rows; None if there is none."""
-    if field is not None:
-        return resolve([field], names, len(rows[0]))[0]
-    table = np.array(rows)
-    for column in range(min(2, table.shape[1] - 1)):
-        numbers = table[:, column]
-        if not np.isfinite(numbers).all() or (numbers % 1).any():
-            continue
-        first, last, steps = numbers.min(), numbers.max(), np.diff(numbers)
-        if (
-            last > first
-            and 0 <= first <= 1
-            and np.mean((steps == 1) | ((numbers[:-1] == last) & (numbers[1:] == first))) > 0.9
-        ):
-            return column
-    return None
+def _numeric(layout: FieldFormat, piece: bytes) -> Line | bytes | None:
+    """Return the fields of a piece with any number, of our protocol with most; or a line that is none."""
+    read = try_fields(layout, piece)
+    if not isinstance(read, Line):
+        return read
+    count = np.count_nonzero(np.isfinite(read.fields))
+    return read if (2 * count > len(read.fields) and not read.strange if layout.plain else count) else None
 
 
-def _struct_names(record: np.dtype) -> list[str]:
-    return [name for name in record.names or () for _ in range(int(np.prod(record[name].shape, dtype=int)))]
-
-
-def _struct_parser(record: np.dtype, repeat: int, offset: int) -> Callable[[bytes], Line]:
-    bases = {record[name].base for name in record.names or ()}
-    base, count = next(iter(bases)), record.itemsize * repeat
-    plain = len(bases) == 1
-
-    def parse(piece: bytes) -> Line:
-        if plain:
-            row = np.frombuffer(piece, base, count // base.itemsize, offset).astype(np.float64)
-        else:
-            rows = np.frombuffer(piece, record, repeat, offset)
-            row = structured_to_unstructured(rows, np.float64).ravel()
-        return Line(row, "none", bool(np.isfinite(row).all()))  # type: ignore[arg-type]
-
-    return parse
+def _why(layout: FieldFormat, line: bytes) -> str:
+    """Return why a line is no frame."""
+    try:
+        read = layout.fields(line)
+    except FrameError:
+        return "its shape is another"
+    if isinstance(read, bytes):
+        return "ignored"
+    word = next(iter(read.strange.values()), b"").decode("ascii", "replace")
+    return f"field {word!r} is not a number" if word else f"{len(read.fields)} fields"

@@ -1,30 +1,25 @@
 """Tell which fields of a board's frames are a counter, a clock and sensors."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from fnmatch import fnmatchcase
-from typing import TYPE_CHECKING, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
 from skin.errors import InputError
+from skin.wire.clocks import UNITS
 from skin.wire.formats import Roles
 
-if TYPE_CHECKING:
-    from skin.wire.adapter import Adapter
-
-UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6}
-_LEADING = 2  # fields before the values that may be a counter and a clock without a name
+Field = int | str
+"""A field by its number from 0, or by its name with ``*``."""
 _AXES = 3  # values of a sensor that measures along x, y, z
-_MOSTLY = 0.75  # fraction of the steps, of which one may be a wrap and a few may miss frames
-_REGULAR = 0.1, 10.0  # times the median step of a clock
-_USUAL = 0.01  # s between two frames: the unit with the nearest steps is taken until the host's clock decides
 _CLOCKS = re.compile(r"(?i)t|t.?(s|ms|us|sec|micros|millis)|ms|us|micros|millis|clock|.*time.*|.*stamp.*")
 _COUNTERS = re.compile(r"(?i)n|i|seq|count|counter|frame|sample|packet|num|nr|.*(seq|count|frame|sample).*")
 _NAMED_UNITS = {
-    "us": re.compile(r"(?i).*(micro|[^a-z]us\b|^us$|_us|\(us|µs).*"),
-    "ms": re.compile(r"(?i).*(milli|[^a-z]ms\b|^ms$|_ms|\(ms).*"),
-    "s": re.compile(r"(?i).*([^a-z]s\b|_s$|\(s\)|sec).*"),
+    "us": re.compile(r"(?i).*(micro|[^a-z]us\b|^us$|_us|µs).*"),
+    "ms": re.compile(r"(?i).*(milli|[^a-z]ms\b|^ms$|_ms).*"),
+    "s": re.compile(r"(?i).*([^a-z]s\b|_s$|sec).*"),
 }
 
 
@@ -42,7 +37,12 @@ class Columns(NamedTuple):
     summary: str
 
 
-def resolve(selected: Sequence[int | str], names: Sequence[str], count: int) -> list[int]:
+def last_part(name: str) -> str:
+    """Return a name without the names of the objects around it, and without its unit in brackets."""
+    return re.sub(r"\s*[\[(].*[\])]$", "", name).rpartition(".")[2]
+
+
+def resolve(selected: Sequence[Field], names: Sequence[str], count: int) -> list[int]:
     """Return the numbers of fields that are given by number or by name, in order.
 
     Raises:
@@ -53,7 +53,7 @@ def resolve(selected: Sequence[int | str], names: Sequence[str], count: int) -> 
         if isinstance(field, int):
             hits = [field] if 0 <= field < count else []
         else:
-            hits = [place for place, name in enumerate(names) if fnmatchcase(name, field)]
+            hits = [place for place, name in enumerate(names) if name == field or fnmatchcase(name, field)]
         if not hits:
             listed = f"their names are {', '.join(dict.fromkeys(names))}" if names else "they have no names"
             sent = f"the board sends {count} fields, 0 to {count - 1}"
@@ -63,7 +63,17 @@ def resolve(selected: Sequence[int | str], names: Sequence[str], count: int) -> 
 
 
 def find_roles(
-    table: np.ndarray, names: Sequence[str], sensors: int | None, adapter: "Adapter"
+    table: np.ndarray,
+    names: Sequence[str],
+    sensors: int | None,
+    *,
+    drop: Sequence[Field] = (),
+    values: Sequence[Field] | None = None,
+    counter: Field | None = "auto",
+    time: Field | None = "auto",
+    axes: Literal["plain", "normal", "magnitude"] = "plain",
+    time_unit: str | None = None,
+    invalid: frozenset[float] = frozenset(),
 ) -> Columns | int:
     """Return the roles of fields; the number of values seen where it is not that of the sensors.
 
@@ -71,19 +81,22 @@ def find_roles(
         table: (L, C), fields of consecutive frames; NaN where there was no number.
         names: of the C fields; empty: they have none.
         sensors: S, or None for as many as there are.
-        adapter: says what is known.
+        drop, values, counter, time, axes, time_unit: of :class:`skin.wire.adapter.Adapter`.
+        invalid: numbers that mean no value.
     """
     count = table.shape[1]
     names = names if len(names) == count else ()
-    free = [place for place in range(count) if place not in resolve(adapter.drop, names, count)]
-    if adapter.values is not None:
-        chosen = resolve(adapter.values, names, count)
+    free = [place for place in range(count) if place not in resolve(drop, names, count)]
+    if values is not None:
+        chosen = resolve(values, names, count)
     # As many fields as sensors: none is a counter.
-    each = 1 if adapter.axes == "plain" else _AXES
-    closed = sensors == (len(free) / each if adapter.values is None else -1) and not names
+    each = 1 if axes == "plain" else _AXES
+    closed = sensors == (len(free) / each if values is None else -1) and not names
     roles: dict[str, int | None] = {}
-    for role, behaves, pattern in (("counter", counts, _COUNTERS), ("time", runs, _CLOCKS)):
-        setting = getattr(adapter, role)
+    for role, setting, behaves, pattern in (
+        ("counter", counter, counts, _COUNTERS),
+        ("time", time, runs, _CLOCKS),
+    ):
         if setting is None or (closed and setting == "auto"):
             roles[role] = None
         elif setting != "auto":
@@ -92,67 +105,99 @@ def find_roles(
             taken = [place for place in free if place not in roles.values()]
             roles[role] = _recognise(table, names, taken, behaves, pattern)
     others = [place for place in free if place not in roles.values()]
-    values = others if adapter.values is None else chosen
-    if len(values) % each:
+    picked = others if values is None else chosen
+    if len(picked) % each:
         raise InputError(
-            f"device.adapter.axes={adapter.axes} takes x, y, z of each place, but {len(values)} values "
+            f"device.adapter.axes={axes} takes x, y, z of each place, but {len(picked)} values "
             "are left: leave out the others by drop"
         )
-    if adapter.axes == "normal":
-        values, each = values[_AXES - 1 :: _AXES], 1
-    if not values or (sensors is not None and len(values) != sensors * each):
-        return len(values) // each
-    layout = Roles(
-        count, tuple(values), roles["counter"], roles["time"], adapter._numbers, adapter.axes == "magnitude"
-    )
-    return Columns(layout, *_unit(table, names, roles, adapter))
+    if axes == "normal":
+        picked, each = picked[_AXES - 1 :: _AXES], 1
+    if not picked or (sensors is not None and len(picked) != sensors * each):
+        return len(picked) // each
+    layout = Roles(count, tuple(picked), roles["counter"], roles["time"], invalid, axes == "magnitude")
+    return Columns(layout, *_unit(table, names, roles, time_unit))
 
 
-def counts(column: np.ndarray) -> bool:
-    """Return whether a field (L,) numbers the frames."""
+def counts(column: np.ndarray, mostly: float = 0.75, wraps: bool = False) -> bool:
+    """Return whether a field (L,) numbers the frames.
+
+    Args:
+        column: the field.
+        mostly: part of the steps that must be one; a few frames may be missing.
+        wraps: whether it may begin again often, at 0 or 1, as one of three bits or more.
+    """
     if len(column) < 3 or not np.isfinite(column).all() or (column < 0).any() or (column % 1).any():
         return False
     steps = np.diff(column)
-    return bool(np.mean(steps == 1) >= _MOSTLY and np.count_nonzero(steps <= 0) <= 1)
+    if wraps and column.min() in (0, 1) and column.max() >= 7:
+        steps = steps % (column.max() - column.min() + 1)
+    return bool(np.mean(steps == 1) >= mostly and np.count_nonzero(steps <= 0) <= 1)
 
 
-def runs(column: np.ndarray) -> bool:
-    """Return whether a field (L,) is a clock."""
+def runs(column: np.ndarray, mostly: float = 0.75, regular: float = 10.0) -> bool:
+    """Return whether a field (L,) is a clock.
+
+    Args:
+        column: the field.
+        mostly: part of the steps that must be upwards, of which one may be a wrap.
+        regular: times the median step that most steps may be larger or smaller.
+    """
     if len(column) < 3 or not np.isfinite(column).all() or (column < 0).any():
         return False
     steps = np.diff(column)
     rising = steps[steps > 0]
-    if len(rising) < _MOSTLY * len(steps) or np.count_nonzero(steps < 0) > 1:
+    if len(rising) < mostly * len(steps) or np.count_nonzero(steps < 0) > 1:
         return False
-    low, high = (factor * np.median(rising) for factor in _REGULAR)
-    return bool(np.mean((rising >= low) & (rising <= high)) >= _MOSTLY)
+    middle = np.median(rising)
+    return bool(np.mean((rising >= middle / regular) & (rising <= middle * regular)) >= mostly)
 
 
-def _recognise(table: np.ndarray, names: Sequence[str], free: Sequence[int], behaves, pattern) -> int | None:  # type: ignore[no-untyped-def]
-    """Return the field that behaves as a counter or a clock: with its name, or before the values."""
-    named = [place for place in free if names and pattern.fullmatch(names[place].rpartition(".")[2])]
-    leading = [place for place in free if place < _LEADING and (not names or names[place].isdigit())]
-    return next((place for place in [*named, *leading] if behaves(table[:, place])), None)
+def cycles(column: np.ndarray, most: int = 64) -> bool:
+    """Return whether a field (L,) numbers rows: from 0 or 1 to at most ``most``, again and again."""
+    first, last, steps = column.min(), column.max(), np.diff(column)
+    numbers = first in (0, 1) and first < last < most and not (column % 1).any()
+    return bool(numbers and np.mean((steps == 1) | (steps == first - last)) > 0.9)
+
+
+def _recognise(
+    table: np.ndarray,
+    names: Sequence[str],
+    free: Sequence[int],
+    behaves: Callable[[np.ndarray], bool],
+    pattern: re.Pattern[str],
+    leading: int = 2,
+) -> int | None:
+    """Return the field that behaves as a counter or a clock: by its name, or one of the ``leading``."""
+    named = [place for place in free if names and pattern.fullmatch(last_part(names[place]))]
+    first = [place for place in free if place < leading and (not names or names[place].isdigit())]
+    return next((place for place in [*named, *first] if behaves(table[:, place])), None)
 
 
 def _unit(
-    table: np.ndarray, names: Sequence[str], roles: dict[str, int | None], adapter: "Adapter"
+    table: np.ndarray,
+    names: Sequence[str],
+    roles: dict[str, int | None],
+    unit: str | None,
+    usual: float = 0.01,
 ) -> tuple[float | None, str]:
-    """Return s per tick of the clock, and what was inferred, in words."""
+    """Return s per tick of the clock, and what was inferred, in words.
+
+    Without a name, the unit is taken whose steps are nearest to ``usual`` s, until the host's clock tells.
+    """
     words = [f"field {roles['counter']} counts frames"] if roles["counter"] is not None else []
     place = roles["time"]
     if place is None:
         return None, "; ".join(words)
     steps = np.diff(table[:, place])
     step = float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
-    name = names[place].rpartition(".")[2] if names else ""
-    hinted = [unit for unit, pattern in _NAMED_UNITS.items() if name and pattern.fullmatch(name)]
-    unit: str | None = adapter.time_unit
-    source = "the adapter"
-    if unit is None and hinted:
-        unit, source = hinted[0], "its name"
+    name, source = names[place].rpartition(".")[2] if names else "", "the adapter"
+    if unit is None:
+        unit, source = (
+            next((unit for unit in _NAMED_UNITS if _NAMED_UNITS[unit].fullmatch(name)), None),
+            "its name",
+        )
     if unit is None:
         source = f"its steps of {step:.4g}"
-        periods = {name: step * scale or _USUAL for name, scale in UNITS.items()}
-        unit = min(periods, key=lambda name: abs(np.log10(periods[name] / _USUAL)))
+        unit = min(UNITS, key=lambda unit: abs(np.log10((step * UNITS[unit] or usual) / usual)))
     return UNITS[unit], "; ".join([*words, f"field {place} is the time in {unit}, by {source}"])

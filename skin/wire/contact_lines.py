@@ -1,23 +1,22 @@
 """Lines in which an emulated skin announces the contacts of its next gesture, one per frame with contact.
 
-They are comments of the text protocol, after the announcement of the gesture, in m, N and Pa, with CRC-16:
-``# contacts v=1 rate=10 number=0 lines=12 frames=30 most=3 frame=4 c0=x,y,radius,force,peak c1=...*HHHH``.
+They are notes of the text protocol (:func:`skin.wire.protocol.encode_note`), after the announcement of the
+gesture, in m, N and Pa:
+``# contacts {"number": 0, "lines": 12, ..., "contacts": {"0": [x, y, radius, force, peak]}}*HHHH``.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from math import isfinite, nan
 
 import numpy as np
 
 from skin.touch.labels import CONTACT
-from skin.wire.protocol import crc16
+from skin.wire.protocol import encode_note, parse_note
 
-_VERSION = 1
-_NUMBERS = ("number", "lines", "frames", "most", "frame")
 MOST_CONTACTS = 100
 """Contacts at a time that a line or a session may have."""
-_MOST_FRAMES = 100_000
+_MOST_FRAMES = 100_000  # of a window: a damaged or foreign line must not allocate more
 
 
 @dataclass(frozen=True)
@@ -40,7 +39,7 @@ class ContactLine:
     frames: int
     most: int
     frame: int
-    contacts: Mapping[int, tuple[float, ...]]
+    contacts: Mapping[int, Sequence[float]]
 
 
 def contact_lines(number: int, contacts: np.ndarray, rate: float) -> list[ContactLine]:
@@ -52,18 +51,19 @@ def contact_lines(number: int, contacts: np.ndarray, rate: float) -> list[Contac
         rate: of the model, Hz.
     """
     present = np.isfinite(contacts).all(axis=2)
-    touched = np.flatnonzero(present.any(axis=1)).tolist()
-    window, most = contacts.shape[:2]
+    touched, (window, most) = np.flatnonzero(present.any(axis=1)).tolist(), contacts.shape[:2]
     return [
-        ContactLine(number, len(touched), rate, window, most, frame, _present(contacts[frame]))
+        ContactLine(
+            number,
+            len(touched),
+            rate,
+            window,
+            most,
+            frame,
+            {place: contacts[frame, place].tolist() for place in np.flatnonzero(present[frame]).tolist()},
+        )
         for frame in touched
     ]
-
-
-def _present(contacts: np.ndarray) -> dict[int, tuple[float, ...]]:
-    """Return the contacts (K, 5) that are there, by their numbers."""
-    places = np.flatnonzero(np.isfinite(contacts).all(axis=1)).tolist()
-    return {place: tuple(contacts[place].tolist()) for place in places}
 
 
 def join_contact_lines(lines: Sequence[ContactLine], window: int, rate: float) -> np.ndarray | None:
@@ -88,33 +88,28 @@ def join_contact_lines(lines: Sequence[ContactLine], window: int, rate: float) -
 
 
 def encode_contact_line(line: ContactLine) -> bytes:
-    """Return ``# contacts v=1 rate=10 ...*HHHH``, LF at its end."""
-    pairs = {name: getattr(line, name) for name in ("rate", *_NUMBERS)}
-    words = [f"{name}={value:.9g}" for name, value in pairs.items()]
-    words += [
-        f"c{place}={','.join(f'{value:.9g}' for value in values)}" for place, values in line.contacts.items()
-    ]
-    body = f"# contacts v={_VERSION} {' '.join(words)}".encode("ascii")
-    return body + b"*%04X\n" % crc16(body)
+    """Return the note of a line, LF at its end."""
+    return encode_note("contacts", asdict(line))
 
 
 def parse_contact_line(line: bytes) -> ContactLine | None:
-    """Return the contacts in a line without its end; None for other lines, versions and wrong checksums."""
-    body, _, tail = line.removesuffix(b"\r").rpartition(b"*")
-    start = b"# contacts v=%d " % _VERSION
-    if not body.startswith(start) or tail != b"%04X" % crc16(body):
-        return None
+    """Return the contacts in a line without its end; None for other lines and wrong checksums."""
+    content = parse_note("contacts", line)
     try:
-        pairs = dict(word.split("=", 1) for word in body[len(start) :].decode("ascii").split())
-        number, lines, frames, most, frame = (int(pairs.pop(name)) for name in _NUMBERS)
-        rate = float(pairs.pop("rate"))
-        contacts = {int(name[1:]): tuple(map(float, values.split(","))) for name, values in pairs.items()}
-    except (KeyError, ValueError):
+        if content is None:
+            return None
+        contacts = {
+            int(place): tuple(map(float, values)) for place, values in content.pop("contacts").items()
+        }
+        read = ContactLine(**content, contacts=contacts)
+        sound = (
+            0 <= read.frame < read.frames <= _MOST_FRAMES
+            and read.most <= MOST_CONTACTS
+            and set(contacts) <= set(range(read.most))
+            and all(
+                len(values) == len(CONTACT) and all(map(isfinite, values)) for values in contacts.values()
+            )
+        )
+    except (AttributeError, KeyError, TypeError, ValueError):
         return None
-    sound = (
-        0 <= frame < frames <= _MOST_FRAMES
-        and most <= MOST_CONTACTS
-        and set(contacts) <= set(range(most))
-        and all(len(values) == len(CONTACT) and all(map(isfinite, values)) for values in contacts.values())
-    )
-    return ContactLine(number, lines, rate, frames, most, frame, contacts) if sound else None
+    return read if sound else None

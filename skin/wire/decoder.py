@@ -1,5 +1,6 @@
 """Decode bytes into frames, without input or output, and count what goes wrong."""
 
+import re
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -11,9 +12,12 @@ import numpy as np
 from skin.device.resampling import After, Frame, FrameError
 from skin.errors import InputError
 from skin.wire.adapter import Adapter
-from skin.wire.clocks import ClockUnit, ClockWatch, FrameClock, HostClock, SequenceTracker
+from skin.wire.clocks import UNITS, FrameClock
 from skin.wire.formats import FrameFormat
 from skin.wire.protocol import Format, Header, RawFrame, parse_header
+
+Identity = Literal["known", "missing", "other", "changed"]
+"""Of the device by its headers: known; none since it was connected again; another; another without that."""
 
 
 @dataclass
@@ -36,9 +40,15 @@ class Stats:
         rate_hz: frames per second by the device's clock, Hz; 0 if unknown.
         format: ``text`` or ``binary``; empty if not known yet, or if the source sends no bytes.
         check: ``crc16``, ``xor`` or ``none``; empty likewise.
-        clock: what the device's clock and its counter were found to count; empty: as they should, or unknown.
+        ignored: kind of line, with # for its numbers -> number of those lines, which are no frames.
+        clock_unit: s per tick of the device's clock; 0 as long as nothing has shown it.
+        clock_witness: what showed it.
+        modulus: number at which the counter begins again; None: unknown.
         clock_trusted: False: the host's clock is used instead.
-        trouble: a message about the current problem; empty if there is none.
+        identity: whether the device is the one of the first header.
+        header, other_header: the first header, and one that differs.
+        bad_share: number of bad frames and of all in 2 s, reason of the latest bad one, and number of its
+            values; None: most frames were good.
     """
 
     bytes: int = 0
@@ -56,35 +66,58 @@ class Stats:
     rate_hz: float = 0.0
     format: str = ""
     check: str = ""
-    clock: str = ""
+    ignored: Counter[str] = field(default_factory=Counter)
+    clock_unit: float = 0.0
+    clock_witness: Literal["", "rate", "host"] = ""
+    modulus: int | None = None
     clock_trusted: bool = True
-    trouble: str = ""
+    identity: Identity = "known"
+    header: Header | None = None
+    other_header: Header | None = None
+    bad_share: tuple[int, int, str, int | None] | None = None
 
     @property
     def bad_frames(self) -> int:
         """Number of frames that could not be decoded."""
         return self.bad.total()
 
+    @property
+    def clock(self) -> str:
+        """What the device's clock and its counter were found to count; empty: as they should, or unknown."""
+        if not self.clock_trusted:
+            return "the device's clock cannot be trusted: the host's is used"
+        if not self.clock_witness:
+            return ""
+        unit = next(name for name, unit in UNITS.items() if unit == self.clock_unit)
+        rate = f"the header's rate={self.header.rate:g}" if self.header and self.header.rate else ""
+        witness = rate if self.clock_witness == "rate" else "the host's clock"
+        modulus = f", its counter wraps at {self.modulus}" if self.modulus else ""
+        return f"the device's clock counts {unit}, by {witness}{modulus}"
+
+    @property
+    def trouble(self) -> str:
+        """A message about the current problem; empty if there is none."""
+        if self.identity == "missing":
+            return "the device has not sent its header since it was connected again"
+        if self.identity == "other":
+            return f"another device is connected: {self.other_header}"
+        if self.identity == "changed" and self.header and self.other_header:
+            return f"the header of the device has changed, {self.other_header.changes(self.header)}"
+        if self.bad_share is None:
+            return ""
+        bad, frames, reason, found = self.bad_share
+        share = f"{bad} of {frames} frames in 2 s were bad"
+        if reason == "fields":
+            return f"{share}: the device sends {found} values per frame now"
+        return f"{share} ({reason}): wrong baud rate or format?"
+
     def list_counts(self, **words: str) -> list[str]:
         """Return counts above 0 in words, as ``3 lost``; ``words`` has the word of each."""
         return [f"{count} {word}" for name, word in words.items() if (count := getattr(self, name))]
 
 
-Identity = Literal["known", "missing", "other", "changed"]
-"""Of the device by its headers: known; none since it was connected again; another; another without that."""
-
-_CORRECTED = (
-    6.0  # s in which the next header must correct one that has changed: many devices repeat it every five
-)
-_LONGEST = 65536  # bytes of a line
-_ENOUGH = 4096  # bytes in which the format must show
-_PATIENCE = 2.0  # s of receiving in which it must
-_MANY, _LONG = 65536, 4.0  # the same of an adapter, which may need a dozen frames of many lines
-_NEWS = 1 / 16  # fraction of the first bytes that must be new before the format is looked for again
-_PAUSE = 0.2  # s that a silence counts for at most, because a board may take seconds to start
-_PER_FIELD = 12  # bytes
-_SPAN = 2.0  # s over which good frames are compared with bad ones
-_FEW = 3  # bad frames, too few for a conclusion
+_CORRECTED = 6.0  # s in which the next header must correct a changed one: many devices repeat it every five
+_LONGEST = 65536  # bytes of a line, and in which a format must show that needs a dozen frames of many lines
 
 
 class Decoder:
@@ -107,7 +140,6 @@ class Decoder:
     Attributes:
         stats: numbers of frames and errors; kept by :meth:`restart`.
         frame_format: the format, once it is known.
-        header: of the device; None until it sends one.
     """
 
     def __init__(
@@ -123,20 +155,17 @@ class Decoder:
         self._compared_at: float | None = None
         self._good = self._bad = 0
         self._latest_bad = FrameError("")
-        self.header: Header | None = None
-        self._identity: Identity = "known"
         self._changed_at = inf  # s, when another header came on an open connection
-        self._order, self._clock, self._counted = (
-            SequenceTracker(modulus=self.adapter.modulus),
-            HostClock(),
-            FrameClock(),
-        )
-        self._unit = ClockUnit(self._order.unit, False)
-        self._watch, self._clocked = ClockWatch(), False
+        self._clock = FrameClock(modulus=self.adapter.modulus)
         self._latest = np.zeros(sensors or 0)
         self._channels = np.array(channels) if len(channels) else None
         self._polarity = np.array(polarity, dtype=float) if min(polarity, default=1) < 0 else None
         self._begin()
+
+    @property
+    def header(self) -> Header | None:
+        """Of the device; None until it sends one."""
+        return self.stats.header
 
     def _begin(self) -> None:
         self.frame_format: FrameFormat | None = None
@@ -150,13 +179,9 @@ class Decoder:
     def restart(self, after: After = "reconnect") -> None:
         """Start another connection: detect the format again, with the same number of sensors."""
         self._begin()
-        self._order.cut(after)
-        self._identity, self._changed_at = "missing" if self.header else "known", inf
-        self.stats.trouble = self._doubt
-        self._counted.restart()
-        self._unit.restart()
-        self._watch.restart()
-        self.stats.clock_trusted = True
+        self._clock.restart(after)
+        self.stats.identity, self._changed_at = "missing" if self.header else "known", inf
+        self.stats.bad_share, self.stats.clock_trusted = None, True
 
     def feed(self, data: bytes, now: float = 0.0) -> list[Frame]:
         """Return the frames that end in ``data``.
@@ -168,7 +193,8 @@ class Decoder:
         self.stats.bytes += len(data)
         passed, self._fed_at = now - self._fed_at, now
         if self.frame_format is None:
-            self._receiving += min(passed, _PAUSE) if passed > 0 else 0.0
+            # A silence counts for 0.2 s at most, because a board may take seconds to start.
+            self._receiving += min(passed, 0.2) if passed > 0 else 0.0
             # Bounds the search while no format is recognised.
             self._buffer = self._buffer[-2 * self._enough :]
         self._buffer += data
@@ -178,21 +204,24 @@ class Decoder:
         pieces, self._buffer = self.frame_format.split(self._buffer)
         good, bad = self.stats.frames, self.stats.bad_frames
         frames = [frame for piece in pieces if (frame := self._frame(piece, now))]
-        if frames and self.stats.clock_trusted:
-            self._judge_clock(frames, now)
+        clock, stats = self._clock, self.stats
+        stats.clock_unit, stats.clock_witness, stats.modulus = clock.unit, clock.witness, clock.modulus
+        if frames and self._clocked:
+            self.stats.clock_trusted = not self._clock.judge(now, (self.header and self.header.speed) or 1.0)
         if len(self._buffer) > _LONGEST:
             self._buffer, self._overlong = b"", True
         self._compare(now, self.stats.frames - good, self.stats.bad_frames - bad)
         return frames
 
-    def error(self) -> InputError | None:
-        """Return an error once 2 s of receiving or 4 kB (or four frames) show no format; else None.
+    def error(self, patience: float = 2.0) -> InputError | None:
+        """Return an error once receiving shows no format, or if the header has changed; else None.
 
-        Also if its header has changed.
+        Args:
+            patience: s of receiving, or 4 kB or four frames; twice that, or 64 kB, of an adapter.
         """
         if self._fed_at - self._changed_at > _CORRECTED:
-            return InputError(f"{self._doubt}: start the command again to read this device")
-        patience = _PATIENCE if self.adapter.kind == "protocol" else _LONG
+            return InputError(f"{self.stats.trouble}: start the command again to read this device")
+        patience *= 1 if self.adapter.kind == "protocol" else 2
         if self.frame_format or (self._receiving < patience and len(self._buffer) < self._enough):
             return None
         return self.explain()
@@ -203,16 +232,14 @@ class Decoder:
 
     @property
     def _enough(self) -> int:
-        """Bytes in which the format must show: 4 kB, or four frames."""
-        if self.adapter.kind != "protocol":
-            return _MANY
-        return max(_ENOUGH, 4 * _PER_FIELD * (2 + (self.sensors or 0)))
+        """Bytes in which the format must show: 4 kB, or four frames of 12 bytes a field."""
+        return _LONGEST if self.adapter.kind != "protocol" else max(4096, 4 * 12 * (2 + (self.sensors or 0)))
 
     def _recognise(self, data: bytes) -> bool:
         """Buffer the first bytes until they show the format; they are then decoded from the first one on."""
         self._unseen += len(data)
         # What is left unread grows with what was read, or the time to read it all would grow as its square.
-        if not self.adapter.may_end(data) or self._unseen < _NEWS * len(self._buffer):
+        if not self.adapter.may_end(self._buffer[-len(data) - 64 :]) or 16 * self._unseen < len(self._buffer):
             return False
         self._unseen = 0
         detected = self.adapter.detect(self._buffer, self.sensors)
@@ -222,9 +249,8 @@ class Decoder:
         self._update_header(detected.header)
         self.sensors = self.frame_format.sensors
         self.stats.format, self.stats.check = self.frame_format.name, self.frame_format.check
-        if detected.unit is not None and self._unit.unit == self._order.unit and not self._unit.summary:
-            self._order.unit = detected.unit
-            self._unit = ClockUnit(detected.unit, detected.settled)
+        if detected.unit is not None:
+            self._clock.expect(detected.unit, self.adapter.time_unit is not None)
         self._all_valid = np.ones(self.sensors, dtype=bool)
         self._all_valid.flags.writeable = False
         if len(self._latest) != self.sensors:
@@ -240,11 +266,14 @@ class Decoder:
                 raise FrameError("long")
             raw = self.frame_format.read(piece)
             if isinstance(raw, bytes):
-                self._update_header(parse_header(raw))
+                if raw.startswith(b"#"):
+                    self._update_header(parse_header(raw))
+                elif raw:
+                    self.stats.ignored[kind_of_line(raw)] += 1
                 return None
             if first and self.frame_format.check != "crc16":
                 raise FrameError("structure")
-            return self._place_frame(raw, now) if self._identity == "known" else None
+            return self._place_frame(raw, now) if self.stats.identity == "known" else None
         except FrameError as bad:
             if self._synchronous or self._missing:
                 self._synchronous, self._latest_bad = False, bad
@@ -256,43 +285,23 @@ class Decoder:
 
     def _update_header(self, header: Header | None) -> None:
         """Take a header. One that differs is of another device: frames count once the one before is back."""
+        stats = self.stats
         if header is None:
             return
-        if self.header is None or not header.changes(self.header):
-            self.header = self.header or header
-            self._identity, self._changed_at = "known", inf
-        elif self._identity in ("known", "changed"):
-            self._identity, self._changed_at = "changed", min(self._changed_at, self._fed_at)
+        if stats.header is None or not header.changes(stats.header):
+            stats.header = stats.header or header
+            stats.identity, self._changed_at = "known", inf
+        elif stats.identity in ("known", "changed"):
+            stats.identity, self._changed_at = "changed", min(self._changed_at, self._fed_at)
         else:
-            self._identity = "other"
-        self._other = header
-        self.stats.trouble = self._doubt
-
-    @property
-    def _doubt(self) -> str:
-        """Why frames do not count, in words; empty if they do."""
-        if self._identity == "known" or self.header is None:
-            return ""
-        if self._identity == "missing":
-            return "the device has not sent its header since it was connected again"
-        if self._identity == "other":
-            return f"another device is connected: {self._other}"
-        return f"the header of the device has changed, {self._other.changes(self.header)}"
+            stats.identity = "other"
+        stats.other_header = header
 
     def _place_frame(self, raw: RawFrame, now: float) -> Frame:
-        ticks, rate = raw.ticks, None if self.header is None else self.header.rate
-        self._clocked = ticks is not None and self.stats.clock_trusted
-        frames = self._order.ahead(raw.seq, self._missing)
-        if ticks is None or not self._clocked:
-            ticks = self._counted(now, frames, rate) / self._order.unit
-        elif self._unit.add(ticks, now, frames, rate):
-            self._order.unit = self._unit.unit
-            self._order.cut("reset")
-        t, segment, lost, after = self._order.place(raw.seq, ticks, self._missing, self._clocked)
-        if self._unit.summary and self.stats.clock_trusted:
-            modulus = f", its counter wraps at {self._order.modulus}" if self._order.modulus else ""
-            self.stats.clock = self._unit.summary + modulus
-        stats = self.stats
+        stats, clock, header = self.stats, self._clock, self.stats.header
+        rate = None if header is None else header.rate
+        self._clocked = raw.ticks is not None and clock.trusted
+        t, t_host, segment, lost, after = clock.place(raw.seq, raw.ticks, now, self._missing, rate)
         stats.frames += 1
         stats.resyncs += self._missing > 0
         stats.lost += lost
@@ -300,45 +309,39 @@ class Decoder:
         stats.resets += after == "reset"
         stats.weak += stats.check != "crc16"
         self._synchronous, self._missing = True, 0
-        if after and after != "gap":
-            self._clock.restart()
         if self._channels is not None:
             raw = raw._replace(values=raw.values[self._channels])
-        values, valid = raw.values, self._all_valid
+        values, valid, over = raw.values, self._all_valid, None
         if not raw.finite:
+            over = np.isinf(values)
+            limit = 2.0**header.bits - 1 if header and header.bits else self.adapter.limit
+            values = np.where(over, np.nan if limit is None else limit, values)
             valid = np.isfinite(values)
             stats.invalid += len(valid) - int(np.count_nonzero(valid))
             values = np.where(valid, values, self._latest)
         self._latest = values
-        frame = Frame(raw.seq, t, self._clock(t, now), values, valid, segment, lost, after)
-        if self._polarity is None:
-            return frame
-        # Channels whose values fall with force end at 0 counts.
-        counted = self.header is not None and self.header.bits is not None
-        at_limit = (self._polarity < 0) & (values <= 0)
-        return frame._replace(polarity=self._polarity, saturated=at_limit if counted else None)
+        if self._polarity is not None and header and header.bits:
+            # Channels whose values fall with force end at 0 counts.
+            at_limit = (self._polarity < 0) & (values <= 0)
+            over = at_limit if over is None else at_limit | over
+        return Frame(raw.seq, t, t_host, values, valid, segment, lost, after, over, self._polarity)
 
-    def _judge_clock(self, frames: Sequence[Frame], now: float) -> None:
-        """From the next frame on, take the time from the host if the device's clock cannot be trusted."""
-        if frames[0].segment != frames[-1].segment or frames[-1].after not in ("", "gap"):
-            self._watch.restart()
-        speed = (self.header and self.header.speed) or 1.0
-        if self._clocked and not self._watch.trust([frame.t for frame in frames], now, speed):
-            self.stats.clock_trusted = False
-            self._order.cut("reset")
-            self.stats.clock = "the device's clock cannot be trusted: the host's is used"
+    def _compare(self, now: float, good: int, bad: int, span: float = 2.0, few: int = 3) -> None:
+        """Compare the good frames received by ``now``, s, with the bad ones, over ``span`` s at a time.
 
-    def _compare(self, now: float, good: int, bad: int) -> None:
-        """Compare the good frames received by ``now``, s, with the bad ones, over two seconds at a time."""
+        Up to ``few`` bad frames are too few for a conclusion.
+        """
         self._compared_at = now if self._compared_at is None else self._compared_at
         self._good += good
         self._bad += bad
-        if now - self._compared_at < _SPAN:
+        if now - self._compared_at < span:
             return
-        trouble = self._doubt
-        if self._bad > max(self._good, _FEW):
-            share = f"{self._bad} of {self._bad + self._good} frames in {_SPAN:g} s were bad"
-            trouble = f"{share} ({self._latest_bad.reason}): wrong baud rate or format?"
-            if self._latest_bad.reason == "fields":
-                trouble = f"{share}: the device sends {self._latest_bad.found} values per frame now"
-        self.stats.trouble, self._compared_at, self._good, self._bad = trouble, now, 0, 0
+        latest, frames = self._latest_bad, self._bad + self._good
+        most = self._bad > max(self._good, few)
+        self.stats.bad_share = (self._bad, frames, latest.reason, latest.found) if most else None
+        self._compared_at, self._good, self._bad = now, 0, 0
+
+
+def kind_of_line(line: bytes, longest: int = 40) -> str:
+    """Return the first characters of a line, with # for its numbers."""
+    return re.sub(r"\d+", "#", line[:longest].decode("ascii", "replace").strip())

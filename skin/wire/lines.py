@@ -1,160 +1,118 @@
-"""Read the fields of a line of text: separated, labelled, without separators, by a pattern, or JSON."""
+"""Read the fields of a piece: numbers of a line, named fields by a pattern, JSON, or a struct."""
 
 import json
 import re
 from collections import Counter
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from math import isfinite, nan
-from typing import Any, Protocol
+from functools import partial
+from typing import Any
+
+import numpy as np
 
 from skin.device.resampling import FrameError
-from skin.wire.protocol import Line, ends_with_separator, parse_words, verify_line
+from skin.wire.protocol import Line, parse_words, split_words, verify_line
 
-_SEPARATORS = (b",", b";", b"\t")
-_TIME = re.compile(rb"(?:\d{4}-\d\d-\d\d[T ])?(\d{1,2}):(\d\d):(\d\d(?:\.\d+)?)")  # of the day
-_DEEP = 8  # levels of JSON
+_DAYTIME = re.compile(rb"(?:\d{4}-\d\d-\d\d[T ])?(\d{1,2}):(\d\d):(\d\d(?:\.\d+)?)")
+_HEX = re.compile(rb"(?i)(?:0x)?[0-9a-f]+")
+# Each blank is matched in one way, or blanks would take a time as the square of their number.
+_LABEL = (
+    r"\s*+(?P<name>[^\s,;\d.+-](?:[^\s,;=:]|[^\S\t]++(?![\s,;=:]))*?)\s*%s"
+    r"\s*+(?P<value>[^\s,;]*+)\s*+[,;]?\s*+"
+)
 
 
-class LineReader(Protocol):
-    """Reads the fields of a line."""
+@dataclass(frozen=True)
+class NumberWords:
+    """How words become numbers.
 
-    @property
-    def trailing(self) -> bool:
-        """Whether every line ends with a separator."""
+    Attributes:
+        decimal: the decimal sign.
+        thousands: sign between groups of three digits; empty: none.
+        base: 10 or 16.
+        invalid: words, in lower case, that mean no value.
+        over: words, in lower case, for a value beyond the range of the converter.
+    """
 
-    @property
-    def padded(self) -> bool:
-        """Whether a separator at the end of a line is an empty field."""
+    decimal: str
+    thousands: str
+    base: int
+    invalid: Collection[bytes]
+    over: Collection[bytes]
 
-    def __call__(self, line: bytes) -> Line:
-        """Return the fields; FrameError if the line is none of these."""
+    def __call__(self, words: Sequence[bytes], check: Any = "none") -> Line:
+        """Return the numbers of words; the time of the day in s."""
+        if self.base == 16:
+            words = [b"%d" % int(word, 16) if _HEX.fullmatch(word.strip()) else word for word in words]
+        if self.thousands:
+            mark = re.escape(self.thousands).encode()
+            words = [
+                word.replace(self.thousands.encode(), b"")
+                if re.fullmatch(rb"\s*[-+]?\d{1,3}(%s\d{3})+(\D\d*)?\s*" % mark, word)
+                else word
+                for word in words
+            ]
+        if self.decimal == ",":
+            words = [word.translate(_SWAPPED) if b":" not in word else word for word in words]
+        read = parse_words(words, check, self.invalid, self.over)
+        if any(b":" in word for word in read.strange.values()):
+            return parse_words([*map(_to_seconds, words)], check, self.invalid, self.over)
+        return read
 
-    def names(self, count: int) -> Sequence[str]:
-        """Return the names of ``count`` fields; empty: they have none."""
+
+_SWAPPED = bytes.maketrans(b".,", b",.")  # a point is no decimal sign then
 
 
 @dataclass(frozen=True)
 class SeparatedReader:
-    """Fields between separators.
+    """Numbers between separators.
 
     Attributes:
-        separator: between fields; None: blanks.
-        decimal: the decimal sign.
-        invalid: words that mean no value.
+        numbers: how words become numbers.
+        marks: separators, of which the first that a line has counts; blanks otherwise.
         titles: of the fields, repeated over all.
-        trailing, padded: as in :class:`LineReader`.
+        trailing: every line ends with a separator, so no line means an empty field by it.
     """
 
-    separator: bytes | None
-    decimal: str
-    invalid: Collection[bytes]
+    numbers: NumberWords
+    marks: Sequence[bytes]
     titles: Sequence[str] = ()
-    trailing: bool = False
-    padded: bool = True
-
-    @classmethod
-    def learn(
-        cls,
-        lines: Sequence[bytes],
-        separator: str | None,
-        decimal: str,
-        invalid: Collection[bytes],
-        titles: Sequence[str],
-    ) -> "SeparatedReader":
-        """Return the reader of lines, with their commonest separator where none is given."""
-        if separator is not None and separator.strip(" "):
-            mark = separator.encode()
-            return cls(mark, decimal, invalid, titles, bool(lines) and lines[-1].rstrip(b" ").endswith(mark))
-        marks = [mark for mark in _SEPARATORS if mark != decimal.encode()] if separator is None else []
-        best, most = None, 0
-        for mark in marks:
-            fields = Counter(line.count(mark) for line in lines if _is_numeric(line, mark))
-            fields.pop(0, None)
-            count = fields.most_common(1)[0][1] if fields else 0
-            if count > most:
-                best, most = mark, count
-        data = [line for line in lines if best is not None and _is_numeric(line, best)]
-        trailing = bool(data) and all(map(ends_with_separator, data))
-        return cls(best, decimal, invalid, titles, trailing)
+    trailing: bool = True
 
     def __call__(self, line: bytes) -> Line:
         """Return the fields of a line."""
         body, check = verify_line(line) if b"*" in line else (line, "none")
-        return parse_words(self.words(body), check, self.invalid)
-
-    def words(self, body: bytes) -> list[bytes]:
-        """Return the fields of a line as text with a decimal point."""
-        body = body.strip(b" ")
-        if self.separator is None:
-            words = body.split()
-        else:
-            words = body.removesuffix(self.separator).split(self.separator)
-        if self.decimal == ",":
-            if b"." in body and b":" not in body:
-                raise FrameError("number", word=body.decode("ascii", "replace"))
-            words = [word.replace(b",", b".") for word in words]
-        return [_to_seconds(word) for word in words] if b":" in body else words
+        return self.numbers(split_words(body, self.marks, self.trailing), check)
 
     def names(self, count: int) -> Sequence[str]:
-        """Return the names of ``count`` fields."""
-        return repeated(self.titles, count)
-
-
-@dataclass(frozen=True)
-class NumberReader:
-    """Numbers of a fixed shape, with nothing or anything of a separator between them."""
-
-    number: str
-    split: SeparatedReader
-    trailing: bool = False
-    padded: bool = False
-
-    def __call__(self, line: bytes) -> Line:
-        """Return the fields of a line."""
-        number = re.compile(self.number.encode())  # re caches it
-        words, place = list[bytes](), 0
-        while place < len(line):
-            match = number.match(line, place)
-            if match is not None and match.end() > place:
-                words.append(match[0])
-                place = match.end()
-            elif line[place] in b" \t,;":
-                place += 1
-            else:  # not searched for further on: it would take as long as the square of the line's length
-                raise FrameError("number", word=line[place:][:80].decode("ascii", "replace"))
-        if self.split.decimal == ",":
-            words = [word.replace(b",", b".") for word in words]
-        return parse_words(words, "none", self.split.invalid)
-
-    def names(self, count: int) -> Sequence[str]:
-        """Return the names of ``count`` fields."""
-        return repeated(self.split.titles, count)
+        """Return the names of ``count`` fields; empty: they have none."""
+        fits = bool(self.titles) and count % len(self.titles) == 0
+        return list(self.titles) * (count // len(self.titles)) if fits else ()
 
 
 @dataclass(frozen=True)
 class PatternReader:
-    """Fields in the named groups of a regular expression, of which ``values`` holds separated ones."""
+    """Fields in the named groups of a regular expression.
+
+    A group ``values`` holds separated fields. With a group ``value``, the expression matches one field, and
+    the line is a row of them, named by a group ``name``. A group ``name`` without ``value`` names the line.
+
+    Attributes:
+        pattern: of the line, or of one field.
+        split: reads ``values``.
+        keys: names of the fields, or of the lines, in the order of the frame.
+    """
 
     pattern: re.Pattern[bytes]
     split: SeparatedReader
-    trailing: bool = False
-    padded: bool = False
-
-    @classmethod
-    def learn(
-        cls, lines: Sequence[bytes], pattern: str, separator: str | None, split: SeparatedReader
-    ) -> "PatternReader":
-        """Return the reader of lines that match a pattern."""
-        compiled = re.compile(pattern.encode())
-        matches = [match for line in lines if (match := compiled.fullmatch(line))]
-        inner = [match["values"] or b"" for match in matches if "values" in compiled.groupindex]
-        if inner:
-            split = SeparatedReader.learn(inner, separator, split.decimal, split.invalid, split.titles)
-        return cls(compiled, split)
+    keys: Sequence[str] = ()
 
     def __call__(self, line: bytes) -> Line:
         """Return the fields of a line."""
+        if "value" in self.pattern.groupindex:
+            fields = self.fields(line)
+            words = place_by_key(fields, self.keys) if self.keys else fields.values()
+            return self.split.numbers([word or b"" for word in words])
         match = self.pattern.fullmatch(line)
         if match is None:
             raise FrameError("structure")
@@ -162,147 +120,178 @@ class PatternReader:
         for name, place in self.pattern.groupindex.items():
             text = match[place] or b""
             if name == "values":
-                words += self.split.words(text)
+                words += split_words(text, self.split.marks)
+            elif name == "name" and self.keys:
+                key = text.decode("ascii", "replace")
+                if key not in self.keys:
+                    raise FrameError("structure")
+                words.append(b"%d" % self.keys.index(key))
             else:
-                text = text.replace(b",", b".") if self.split.decimal == "," else text
-                words.append(_to_seconds(text) if b":" in text else text)
-        return parse_words(words, "none", self.split.invalid)
+                words.append(text)
+        return self.split.numbers(words)
+
+    def fields(self, line: bytes) -> dict[str, bytes]:
+        """Return the text of each field of a row by its name, or by its number.
+
+        Raises:
+            FrameError: ``structure``: the line holds anything else, or a name twice.
+        """
+        fields, place = dict[str, bytes](), 0
+        while place < len(line):
+            match = self.pattern.match(line, place)
+            if match is None or match.end() == place:
+                raise FrameError("structure")
+            found = match.groupdict()
+            name = found["name"].decode("ascii", "replace") if "name" in found else str(len(fields))
+            if name in fields:
+                raise FrameError("structure")
+            fields[name], place = found["value"], match.end()
+        return fields
 
     def names(self, count: int) -> Sequence[str]:
-        """Return the names of the groups."""
+        """Return the names of the fields."""
         groups = list(self.pattern.groupindex)
-        more_fields = count - len(groups) + 1
-        inner = [f"values.{place}" for place in range(more_fields)]
+        if "value" in groups:
+            return self.keys or self.split.names(count)
+        inner = [f"values.{place}" for place in range(count - len(groups) + 1)]
         return [title for name in groups for title in (inner if name == "values" else [name])]
 
 
 @dataclass(frozen=True)
-class LabelReader:
-    """Fields with names, as in ``A0: 12, A1: 13``; every line has the same names in the same order."""
-
-    pattern: re.Pattern[bytes]
-    labels: Sequence[bytes]
-    split: SeparatedReader
-    trailing: bool = False
-    padded: bool = False
-
-    @classmethod
-    def learn(cls, lines: Sequence[bytes], label: str, split: SeparatedReader) -> "LabelReader":
-        """Return the reader of lines with the commonest names."""
-        mark = re.escape(label.encode())
-        # Each blank is matched in one way, or blanks would take a time as the square of their number.
-        field = re.compile(
-            rb"\s*([^\s,;\d.+-](?:[^\s,;=:]|[^\S\t]++(?![\s,;=:]))*?)\s*"
-            + mark
-            + rb"\s*([^\s,;]+)\s*[,;\t ]?\s*"
-        )
-        seen = Counter(names for line in lines if (names := _names_of(field, line)))
-        labels = seen.most_common(1)[0][0] if seen else ()
-        parts = [re.escape(name) + rb"\s*" + mark + rb"\s*+([^\s,;]*)" for name in labels]
-        separator = rb"(?:\s*+[,;]\s*+|\s++|(?<=\s))"  # the last one: behind an empty field
-        pattern = re.compile(rb"\s*+" + separator.join(parts) + rb"\s*+[,;]?\s*+")
-        return cls(pattern, labels, split)
-
-    def __call__(self, line: bytes) -> Line:
-        """Return the fields of a line."""
-        match = self.pattern.fullmatch(line)
-        if match is None or not self.labels:
-            raise FrameError("structure")
-        words = (
-            [word.replace(b",", b".") for word in match.groups()]
-            if self.split.decimal == ","
-            else match.groups()
-        )
-        return parse_words(words, "none", self.split.invalid)
-
-    def names(self, count: int) -> Sequence[str]:
-        """Return the labels."""
-        return [name.decode("ascii", "replace") for name in self.labels]
-
-
-@dataclass(frozen=True)
 class JsonReader:
-    """Numbers of a JSON value; their names are the keys, with a number for an entry of a list."""
+    """Numbers of a JSON value, with or without a text before it; keys name the fields, as ``v.0``.
 
-    keys: tuple[str, ...]
-    invalid: Collection[bytes]
-    trailing: bool = False
-    padded: bool = False
+    Attributes:
+        numbers: how words become numbers.
+        keys: of the fields, in the order of the frame.
+    """
 
-    @classmethod
-    def learn(cls, lines: Sequence[bytes], invalid: Collection[bytes]) -> "JsonReader":
-        """Return the reader of lines with the commonest keys."""
-        seen = Counter(keys for line in lines if (keys := _keys_of(line)))
-        return cls(seen.most_common(1)[0][0] if seen else (), invalid)
+    numbers: NumberWords
+    keys: Sequence[str] = ()
 
     def __call__(self, line: bytes) -> Line:
         """Return the fields of a line."""
-        content = dict(_flatten("", _parse_json(line), 0))
-        if content.keys() != set(self.keys):
-            raise FrameError("structure")
-        return self._numbers([content[key] for key in self.keys])
+        values = place_by_key(self.fields(line), self.keys)
+        return self.numbers([b"" if value is None else str(value).encode() for value in values])
 
-    def _numbers(self, content: Sequence[Any]) -> Line:
-        numbers = list[float]()
-        for value in content:
-            if type(value) in (int, float):
-                try:
-                    numbers.append(float(value))
-                except OverflowError:
-                    numbers.append(nan)
-            elif value is None:
-                numbers.append(nan)
-            elif isinstance(value, str):
-                numbers += parse_words([value.encode()], "none", self.invalid).fields
-            else:
-                raise FrameError("number", word=str(value))
-        numbers = [number if isfinite(number) else nan for number in numbers]
-        return Line(numbers, "none", all(map(isfinite, numbers)))
+    def fields(self, line: bytes) -> dict[str, Any]:
+        """Return the value of each key.
+
+        Raises:
+            FrameError: ``structure``: the line ends with no object or list.
+        """
+        begin = min((place for place in (line.find(b"{"), line.find(b"[")) if place >= 0), default=0)
+        try:
+            content = json.loads(line[begin:], object_pairs_hook=_distinct)
+        except (ValueError, RecursionError) as error:
+            raise FrameError("structure") from error
+        if not isinstance(content, dict | list):
+            raise FrameError("structure")
+        return dict(_flatten("", content))
 
     def names(self, count: int) -> Sequence[str]:
         """Return the keys."""
         return self.keys
 
 
-def repeated(titles: Sequence[str], count: int) -> Sequence[str]:
-    """Return names of ``count`` fields that repeat; empty where they do not fit."""
-    if not titles or count % len(titles):
-        return ()
-    return list(titles) * (count // len(titles))
+@dataclass(frozen=True)
+class StructReader:
+    """Numbers of a binary frame.
+
+    Attributes:
+        record: numpy type of the fields; integers of three bytes are three bytes each.
+        wide: name of a field of such integers -> their type, as in ``<i3``.
+        repeat: how often the fields follow each other.
+        offset: bytes before them.
+    """
+
+    record: np.dtype
+    wide: Mapping[str, str]
+    repeat: int
+    offset: int
+
+    def __call__(self, piece: bytes) -> Line:
+        """Return the fields of a frame."""
+        rows = np.frombuffer(piece, self.record, self.repeat, self.offset)
+        names = self.record.names or ()
+        row = np.concatenate([self._numbers(name, rows[name]) for name in names], axis=1).ravel()
+        finite = np.isfinite(row)
+        if whole := bool(finite.all()):
+            return Line(row, "none", whole)  # type: ignore[arg-type]
+        return Line(np.where(finite, row, np.nan), "none", whole)  # type: ignore[arg-type]
+
+    def _numbers(self, name: str, column: np.ndarray) -> np.ndarray:
+        """Return the numbers (R, N) of a field of all repetitions."""
+        column, kind = column.reshape(len(column), -1), self.wide.get(name)
+        if kind is None:
+            with np.errstate(invalid="ignore"):
+                return column.astype(np.float64)
+        order = np.arange(3) if kind.startswith("<") else np.arange(3)[::-1]
+        numbers = (column.reshape(len(column), -1, 3).astype(np.int64) << 8 * order).sum(axis=2)
+        signed = numbers - (numbers >> 23 << 24) if "i" in kind else numbers
+        return signed.astype(np.float64)
+
+    def names(self, count: int) -> Sequence[str]:
+        """Return the names of the fields; a field of several numbers has them all."""
+        sizes = {
+            name: int(np.prod(self.record[name].shape, dtype=int)) // (3 if name in self.wide else 1)
+            for name in self.record.names or ()
+        }
+        return [name for name, size in sizes.items() for _ in range(size)] * self.repeat
 
 
-def _is_numeric(line: bytes, mark: bytes) -> bool:
-    """Return whether most fields of a line begin like a number."""
-    words = [word.strip()[:1] for word in line.removesuffix(mark).split(mark)]
-    return 2 * sum(word in b"+-.0123456789" and word != b"" for word in words) >= len(words)
+Reader = SeparatedReader | PatternReader | JsonReader | StructReader
+"""Returns the :class:`skin.wire.protocol.Line` of a piece, or raises FrameError."""
 
 
-def _names_of(field: re.Pattern[bytes], line: bytes) -> tuple[bytes, ...]:
-    """Return the labels of a line that consists of nothing else; empty otherwise."""
-    names, place = list[bytes](), 0
-    while place < len(line):
-        match = field.match(line, place)
-        if match is None or match.end() == place:
-            return ()
-        names.append(match[1])
-        place = match.end()
-    return tuple(names) if len(set(names)) == len(names) else ()
+def label_pattern(label: str) -> str:
+    """Return the pattern of one field with a name, as in ``A0: 12``."""
+    return _LABEL % re.escape(label)
 
 
-def _keys_of(line: bytes) -> tuple[str, ...]:
+def number_pattern(number: str) -> str:
+    """Return the pattern of one number of a given shape, with anything of a separator after it."""
+    return rf"(?P<value>{number})[ \t,;]*+"
+
+
+def learn_keys(read: Callable[[bytes], Mapping[str, Any]], lines: Sequence[bytes]) -> tuple[str, ...]:
+    """Return the names of the fields of lines: in their order, or by name where it changes.
+
+    A name that less than a quarter of the lines have is left out.
+    """
+    seen = Counter(keys for line in lines if (keys := _keys(read, line)))
+    counts = Counter[str]()
+    for keys, count in seen.items():
+        counts.update(dict.fromkeys(keys, count))
+    common = [key for key, count in counts.items() if 4 * count >= seen.total()]
+    first = max(seen, key=lambda keys: (len(keys), seen[keys]), default=())
+    if set(common) <= set(first) and all(
+        [key for key in first if key in keys] == [key for key in keys if key in first] for keys in seen
+    ):
+        return tuple(key for key in first if key in common)
+    natural = partial(re.sub, r"\d+", lambda match: match[0].zfill(9))
+    return tuple(sorted(common, key=natural))
+
+
+def _keys(read: Callable[[bytes], Mapping[str, Any]], line: bytes) -> tuple[str, ...]:
     try:
-        return tuple(key for key, _ in _flatten("", _parse_json(line), 0))
+        return tuple(read(line))
     except FrameError:
         return ()
 
 
-def _parse_json(line: bytes) -> Any:
-    if not line.lstrip().startswith((b"{", b"[")):
+def place_by_key(fields: Mapping[str, Any], keys: Sequence[str]) -> list[Any]:
+    """Return fields in the order of keys, None where one is missing.
+
+    Raises:
+        FrameError: ``structure``: most are missing; ``fields``: an entry of a list is, perhaps not the last.
+    """
+    missing = [key for key in keys if key not in fields]
+    if 2 * len(missing) > len(keys) or not keys:
         raise FrameError("structure")
-    try:
-        return json.loads(line, object_pairs_hook=_distinct)
-    except (ValueError, RecursionError) as error:
-        raise FrameError("structure") from error
+    if any(key.rpartition(".")[2].isdigit() for key in missing):
+        raise FrameError("fields", len(fields))
+    return [fields.get(key) for key in keys]
 
 
 def _distinct(pairs: Sequence[tuple[str, Any]]) -> dict[str, Any]:
@@ -312,23 +301,21 @@ def _distinct(pairs: Sequence[tuple[str, Any]]) -> dict[str, Any]:
     return content
 
 
-def _flatten(name: str, value: Any, depth: int) -> Iterator[tuple[str, Any]]:
-    if depth > _DEEP:
+def _flatten(name: str, value: Any, depth: int = 8) -> Iterator[tuple[str, Any]]:
+    """Yield the values of nested objects and lists with their names."""
+    if depth < 0:
         raise FrameError("structure")
-    entries = (
-        value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else None
-    )
-    if entries is None:
+    if not isinstance(value, dict | list):
         yield name, value
         return
-    for key, entry in entries:
-        yield from _flatten(f"{name}.{key}" if name else str(key), entry, depth + 1)
+    for key, entry in value.items() if isinstance(value, dict) else enumerate(value):
+        yield from _flatten(f"{name}.{key}" if name else str(key), entry, depth - 1)
 
 
 def _to_seconds(word: bytes) -> bytes:
     """Return the time of the day in s where a field is one; else the field."""
-    match = _TIME.fullmatch(word.strip())
+    match = _DAYTIME.fullmatch(word.strip())
     if match is None:
         return word
-    hours, minutes, seconds = (float(part) for part in match.groups())
+    hours, minutes, seconds = map(float, match.groups())
     return b"%.6f" % (3600 * hours + 60 * minutes + seconds)

@@ -1,38 +1,38 @@
-"""Propose an adapter from a few seconds of a stream: ``skin listen adapter=auto``."""
+"""Propose an adapter from a few seconds of a stream: ``skin listen adapter=auto``.
+
+Candidates are played through a decoder; what decides is how plausible the values are, not how many lines
+match.
+"""
 
 import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
-from itertools import chain
-from time import monotonic
+from functools import partial
+from itertools import chain, pairwise
 from typing import Any
 
 import numpy as np
 
-from skin.device.resampling import Frame
+from skin.device.resampling import FrameError
 from skin.errors import InputError
-from skin.wire.adapter import Adapter
-from skin.wire.columns import counts, runs
-from skin.wire.decoder import Decoder
-from skin.wire.reader import ByteStream
+from skin.wire.adapter import Adapter, is_text, read_adapter, try_fields
+from skin.wire.binary_adapters import SAME, binary_adapters
+from skin.wire.columns import counts, cycles, last_part, runs
+from skin.wire.decoder import Decoder, kind_of_line
+from skin.wire.formats import RowsFormat
+from skin.wire.protocol import INVALID, OVER, Line, split_words
 
-_SHARE = 0.9  # of the pieces after the first frame that an adapter must read
-_FRAMES = 10  # that it must read
-_MOST_ROWS = 64
-_LONGEST = 512  # bytes of a frame without an end
-_SAME = 0.98  # fraction of the characters that repeat from frame to frame
-_SIZE = 1e-4, 1e7  # of floats that are readings
-_LONGEST_MARK = 8  # bytes
-_MARKED = 0.01  # that a byte of a mark counts against the spread of readings
-_NARROW, _CONSTANT = 0.1, 0.05  # that a counter of 8 bits and a constant channel count for it
-_SINGLE = (0xA5, 0xAA, 0x55, 0xFF, 0xFE, 0x7E, 0x02)
-"""Bytes that mark a frame alone."""
-_NUMBER = re.compile(rb"(?<![\w.])(?:\d{1,2}:\d\d:\d\d(?:\.\d+)?|[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)")
-_INDEXED = re.compile(rb"([A-Za-z_ \[(]*?)(\d+)([^\w.+-]+)([-+.\d].*)")
-_ASIDE = re.compile(r"(?i)temp.*|.*_t|.*_temp.*|.*humid.*|rssi|.*batt.*")
-"""Names of fields that are not forces."""
+Pieces = Sequence[tuple[float, bytes]]
+"""Bytes with the time of their arrival, s."""
+
+_FRAMES = 10  # that a candidate must read
+_NUMBER = re.compile(rb"\d{1,2}:\d\d:\d\d(?:\.\d+)?|(?:(?<!\w)[-+])?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]\d+)?")
+_WORD = r"[-+.:\w/]+"  # a number, or a word in its place
+_ASIDE = re.compile(r"(?i)temp.*|.*[_\[(](t|temp.*|°?c|deg.?c)[\])]?|.*humid.*|rssi|.*batt.*|temperature")
+_GUIDE = re.compile(r"(?i)min|max|low|lower|high|upper|zero|ref.*|limit")
+"""Names of fields that are not forces, and of lines that keep a plotter from scaling."""
+_UNIT = re.compile(rb"[-+]?\d+\.?\d*\s*(?:[^\x00-\x7f]+)?(?:C|F|%|V|dBm?)")
 
 
 @dataclass(frozen=True)
@@ -43,28 +43,28 @@ class Proposal:
         adapter: for the configuration.
         summary: what it makes of the stream, in words.
         sensors: values per frame.
+        score: the lower, the more plausible.
+        values: (F, S), of all frames; NaN where there was none.
     """
 
     adapter: Adapter
     summary: str
     sensors: int
+    score: float
+    values: np.ndarray
 
 
-def listen_raw(stream: ByteStream, seconds: float) -> list[tuple[float, bytes]]:
-    """Return what a stream sends within ``seconds`` s, with the time of arrival, s."""
-    begin, pieces = monotonic(), list[tuple[float, bytes]]()
-    with suppress(OSError):
-        while (now := monotonic()) - begin < seconds:
-            if data := stream.read():
-                pieces.append((now - begin, data))
-    return pieces
+class _ImplausibleError(Exception):
+    """A candidate reads the stream, but not as frames of a skin; the message says why."""
 
 
-def propose(pieces: Sequence[tuple[float, bytes]]) -> Proposal:
-    """Return the first adapter that reads a stream.
+def propose(pieces: Pieces, seconds: float | None = None, margin: float = 0.25) -> list[Proposal]:
+    """Return the adapters that read a stream, the most plausible first.
 
     Args:
-        pieces: bytes with the time of their arrival, s.
+        pieces: what was received.
+        seconds: for which the stream was read; None: until the last piece.
+        margin: difference of the score up to which another reading is returned, too.
 
     Raises:
         InputError: nothing was received, or no adapter reads it; the text is in the message.
@@ -75,15 +75,56 @@ def propose(pieces: Sequence[tuple[float, bytes]]) -> Proposal:
             "nothing received: is the board plugged in and sending? If it waits for a text, give it, as in "
             "'device.adapter={kind: text, start: s}' or poll for a text per frame"
         )
-    for adapter in _candidates(data):
-        if proposal := _try(adapter, pieces):
-            return proposal
-    raise InputError(f"no adapter reads what the board sends: {_sample(data)}")
+    _refuse_pauses([time for time, _ in pieces], seconds)
+    readings, reasons = list[Proposal](), list[str]()
+    for number, adapter in enumerate(chain(_text(data), binary_adapters(data, pieces[-1][0] - pieces[0][0]))):
+        if readings and (adapter.kind == "binary" or number / 100 > readings[0].score + margin):
+            break
+        try:
+            reading = _read(adapter, pieces, data)
+        except _ImplausibleError as error:
+            reasons.append(str(error))
+        except (InputError, FrameError):
+            continue
+        else:
+            readings.append(replace(reading, score=reading.score + number / 100))
+            readings.sort(key=lambda reading: reading.score)
+    if not readings:
+        raise InputError(f"no adapter reads what the board sends: {_sample(data, reasons)}")
+    best = readings[0]
+    others = [
+        other for other in readings[1:] if other.score < best.score + margin and not _alike(other, best)
+    ]
+    return [best, *others[:1]]
 
 
-def _sample(data: bytes) -> str:
+def _alike(other: Proposal, best: Proposal) -> bool:
+    """Return whether two readings are the same values."""
+    count = min(len(other.values), len(best.values))
+    shape = other.values[-count:].shape == best.values[-count:].shape
+    return shape and bool(np.allclose(other.values[-count:], best.values[-count:], equal_nan=True))
+
+
+def _refuse_pauses(
+    times: Sequence[float], seconds: float | None, boot: float = 2.5, pause: float = 0.5
+) -> None:
+    """Refuse a stream that is silent for more than a fifth of the time, apart from ``boot`` s at first."""
+    end = times[-1] if seconds is None else seconds
+    gaps = [end - times[-1], times[0] - boot, *(later - before for before, later in pairwise(times))]
+    silent = sum(gap for gap in gaps if gap > pause)
+    if 5 * silent > end - min(times[0], boot) and len(times) > _FRAMES:
+        raise InputError(
+            f"the board sent nothing for {silent:.1f} of {end:.1f} s: if it only sends what changes, nobody "
+            "knows whether the skin is untouched; let the firmware send every frame, or listen again"
+        )
+
+
+def _sample(data: bytes, reasons: Sequence[str]) -> str:
     """Return the text that was received, or its bytes, and what may help."""
-    if _is_text(data):
+    if reasons:
+        reason = Counter(reasons).most_common(1)[0][0]
+        return f"{reason}; or read it by device.adapter.pattern (docs/hardware.md)"
+    if is_text(data):
         lines = [line for line in re.split(rb"[\r\n]+", data) if line.strip()]
         texts = "; ".join(repr(line[:100].decode("ascii", "replace")) for line in lines[-3:])
         hint = "if it waits for a text, give start=; a pattern (docs/hardware.md) reads any lines"
@@ -93,273 +134,373 @@ def _sample(data: bytes) -> str:
     )
 
 
-def _is_text(data: bytes) -> bool:
-    printable = sum(byte in b"\r\n\t" or 32 <= byte < 127 for byte in data)
-    return printable > 0.95 * len(data)
+def _read(adapter: Adapter, pieces: Pieces, data: bytes) -> Proposal:
+    """Return what an adapter makes of a stream.
 
-
-def _try(adapter: Adapter, pieces: Sequence[tuple[float, bytes]]) -> Proposal | None:
-    """Return a proposal if an adapter reads nearly all of a stream."""
-    decoder, frames = Decoder(adapter=adapter), list[Frame]()
-    try:
-        for now, data in pieces:
-            frames += decoder.feed(data, now)
-        if decoder.frame_format is None or decoder.error() is not None:
-            return None
-    except InputError:
-        return None
-    if len(frames) < max(_FRAMES, _SHARE * (len(frames) + decoder.stats.bad_frames)):
-        return None
-    if adapter.kind == "protocol" and decoder.stats.check == "none" and decoder.header is None:
-        return None
+    Raises:
+        InputError, FrameError: it reads nothing.
+        _ImplausibleError: what it reads are no frames of a skin.
+    """
+    notes, score = list[str](), 0.0
+    if adapter.kind in ("text", "json") and adapter.length is None:
+        adapter, notes, score = _settle(adapter, data)
+    decoder = Decoder(adapter=adapter)
+    frames = [frame for now, piece in pieces for frame in decoder.feed(piece, now)]
+    stats, bad = decoder.stats, decoder.stats.bad_frames
+    if decoder.frame_format is None or len(frames) < max(_FRAMES, 0.9 * (len(frames) + bad)):
+        raise FrameError("structure")
+    if adapter.kind == "protocol" and stats.check == "none" and decoder.header is None:
+        raise FrameError("structure")
+    values = np.array([np.where(frame.valid, frame.values, np.nan) for frame in frames])
+    if not stats.clock_trusted:
+        raise _ImplausibleError("a field that rises is no clock in s, ms or us")
+    score += bad / len(frames) + _judge_values(values, decoder.frame_format)
     passed = frames[-1].t_host - frames[0].t_host
     rate = f" at {(len(frames) - 1) / passed:.3g} Hz" if passed > 0 else ""
-    detected = adapter.detect(b"".join(data for _, data in pieces), None)
-    middle = np.median([frame.values for frame in frames], axis=0)[:_MOST_ROWS]
-    levels = ", ".join(f"{value:.4g}" for value in middle)
-    words = [f"{decoder.sensors} values{rate}", detected.summary, decoder.stats.clock, f"medians {levels}"]
-    return Proposal(adapter, "; ".join(word for word in words if word), decoder.sensors or 0)
+    if errors := _errors(values, passed / len(frames)):
+        adapter = replace(adapter, invalid=(*adapter.invalid, *errors))
+        notes.append(f"{', '.join(f'{error:g}' for error in errors)} in single frames is no value")
+    numbers = [column[np.isfinite(column)] for column in values.T]
+    levels = ", ".join(f"{np.median(column) if len(column) else 0:.4g}" for column in numbers[:64])
+    words = [
+        f"{decoder.sensors} values{rate}",
+        adapter.detect(data, None).summary,
+        stats.clock,
+        *notes,
+        f"medians {levels}",
+    ]
+    return Proposal(adapter, "; ".join(filter(None, words)), decoder.sensors or 0, score, values)
 
 
-def _candidates(data: bytes) -> Iterator[Adapter]:
+def _judge_values(values: np.ndarray, frame_format: Any, most: int = 64) -> float:
+    """Return how implausible values (F, S) are.
+
+    Raises:
+        _ImplausibleError: the values of several sensors follow one another in a field, or nothing changes.
+    """
+    moving = values[:, np.nanmax(values, axis=0, initial=-np.inf) > np.nanmin(values, axis=0, initial=np.inf)]
+    if not moving.shape[1]:
+        raise _ImplausibleError("no value ever changes")
+    # Between frames next to each other, readings at rest differ as much as between frames further apart.
+    near = _typical_step(moving, 1)
+    for lag in range(2, min(most, len(moving) // 4)):
+        if np.mean(near > 3 * _typical_step(moving, lag) + 2 * _resolution(moving)) >= 0.5:
+            raise _ImplausibleError(
+                f"every {lag} lines are alike, those between them are not: they are of several sensors; let "
+                "the firmware send a line per frame, or number the lines"
+            )
+    score = 0.5 * (1 - moving.shape[1] / values.shape[1])
+    if isinstance(frame_format, RowsFormat) and frame_format.index is not None:
+        rows = np.median(np.nan_to_num(values), axis=0).reshape(frame_format.rows, -1)
+        # A counter of a few bits numbers lines that are all alike.
+        score += 3.0 * bool((np.ptp(rows, axis=0) <= 2 * np.median(near)).all())
+    return score
+
+
+def _errors(values: np.ndarray, period: float, longest: float = 0.0205) -> list[float]:
+    """Return constants that one value of (F, S) jumps to in single frames again and again, as after an error.
+
+    Nothing touches a skin for one frame of 20 ms; the largest counts of converters may be meant, though.
+    """
+    values = values[:, np.isfinite(values).any(axis=0)]
+    steps = np.diff(values, axis=0)
+    far = 50 * np.maximum(_typical_step(values, 1), _resolution(values))
+    back = np.abs(steps[:-1] + steps[1:]) < far / 5
+    single = (np.abs(steps[:-1]) > far) & (np.abs(steps[1:]) > far) & back
+    alone = single & (single.sum(axis=1, keepdims=True) == 1)
+    often = Counter(values[1:-1][alone].tolist())
+    ends = {0.0, *(2.0**bits - 1 for bits in (8, 10, 12, 14))}
+    return sorted(
+        value for value, count in often.items() if count > 1 and value not in ends and period <= longest
+    )
+
+
+def _resolution(values: np.ndarray) -> np.ndarray:
+    """Return the smallest difference of each value (S,)."""
+    steps = (np.diff(np.unique(column[np.isfinite(column)])) for column in values.T)
+    return np.array([step.min() if len(step) else 1.0 for step in steps])
+
+
+def _typical_step(values: np.ndarray, lag: int) -> np.ndarray:
+    """Return the mean change of each value (S,) over ``lag`` frames, without the largest fifth."""
+    steps = np.sort(np.abs(values[lag:] - values[:-lag]), axis=0)
+    return np.nan_to_num(steps)[: max(1, 4 * len(steps) // 5)].mean(axis=0)
+
+
+def _settle(adapter: Adapter, data: bytes) -> tuple[Adapter, list[str], float]:
+    """Return an adapter with the roles of its fields, what it leaves out, in words, and its score."""
+    layout = next(adapter.layouts(data))
+    pieces = layout.split(data)[0][1:]
+    reads = [(piece, try_fields(layout, piece)) for piece in pieces]
+    lines = [read for _, read in reads if isinstance(read, Line) and not _is_title(read)]
+    if len(lines) < _FRAMES:
+        raise FrameError("structure")
+    width = Counter(len(line.fields) for line in lines).most_common(1)[0][0]
+    reads = [(piece, None if _is_title(read) else read) for piece, read in reads]
+    lines = [read for _, read in reads if isinstance(read, Line) and len(read.fields) == width]
+    names = layout.reader.names(width)
+    if not names and adapter.pattern is None and adapter.rows is None:
+        names = _titles(adapter, pieces, width)
+    text = _text_columns(lines)
+    others = [
+        piece.strip(b"\r\n ")
+        for piece, read in reads
+        if not (isinstance(read, bytes) or (isinstance(read, Line) and len(read.fields) == width))
+    ]
+    ignore, kinds = _ignored(others, [piece for piece, read in reads if isinstance(read, Line)])
+    score = 0.1 * len(kinds) + 0.2 * len(others) / (len(others) + len(lines))
+    if adapter.rows is not None:
+        # Text or other data between lines of one sensor each does not make them rows.
+        between = {kind_of_line(line) for line in others}
+        score = 0.5 * any(
+            kind.count("#") > 1 or re.fullmatch(r"[^#]*[^\W\d_]{2}[^#]*", kind) for kind in between
+        )
+        ignore, kinds = None, []
+    elif len(others) - sum(kinds_count for _, kinds_count in kinds) > (1 - SAME) * len(lines):
+        raise FrameError("structure")
+    table = np.array([line.fields for line in lines])
+    roles, left_out = _roles(table, names, text) if adapter.rows is None else ({"counter": None}, {})
+    left_out |= dict.fromkeys(text, "is text")
+    by_name = bool(names) and len(set(names)) == len(names)
+    described = [names[place] if by_name else place for place in sorted(left_out)]
+    notes = [f"field {names[place] if by_name else place} {why}" for place, why in sorted(left_out.items())]
+    notes += [f"{count} lines such as {kind!r} are ignored" for kind, count in kinds]
+    if by_name and adapter.pattern is None and adapter.number is None:
+        roles["names"] = tuple(names)
+    return replace(adapter, drop=(*adapter.drop, *described), ignore=ignore, **roles), notes, score
+
+
+def _is_title(read: Line | bytes | None) -> bool:
+    return isinstance(read, Line) and len(read.strange) == len(read.fields)
+
+
+def _titles(adapter: Adapter, pieces: Sequence[bytes], width: int) -> Sequence[str]:
+    """Return the names in a line of names between separators; empty: there is none."""
+    for piece in pieces:
+        line = piece.strip(b"\r\n #")
+        for mark in (b",", b";", b"\t"):
+            words = [word.strip(b' "').decode("utf-8", "replace") for word in line.split(mark)]
+            if len(words) == width > 1 and all(re.match(r"[^\W\d]", word) for word in words):
+                return words
+    return ()
+
+
+def _text_columns(lines: Sequence[Line]) -> list[int]:
+    """Return the fields that are text in most lines.
+
+    Raises:
+        _ImplausibleError: a field is text now and then, or hides a number.
+    """
+    strange = Counter(place for line in lines for place in line.strange)
+    columns = [place for place, count in strange.items() if count > 0.9 * len(lines)]
+    for place, count in strange.items():
+        words = {line.strange[place] for line in lines if place in line.strange}
+        word = min(words).decode("ascii", "replace")
+        if place not in columns and (count > 2 or re.fullmatch(r"[0-9A-Fa-f]+", word)):
+            raise _ImplausibleError(
+                f"the word {word!r} stands in place of numbers: give device.adapter.over=[{word}] if that is "
+                f"beyond the range, device.adapter.invalid=[{word}] if it is no value"
+            )
+        numbers = {tuple(_NUMBER.findall(word)) for word in words}
+        if place in columns and len(numbers - {()}) > 1 and not all(map(_UNIT.fullmatch, words)):
+            raise FrameError("number")  # with a text beside it
+        column = [line.strange.get(place) for line in lines]
+        changes = sum(before != word for before, word in pairwise(column))
+        if 2 * changes > len(column) and not all(map(_UNIT.fullmatch, words)):
+            raise FrameError("rows")  # it names the line
+    return columns
+
+
+def _ignored(others: Sequence[bytes], frames: Sequence[bytes]) -> tuple[str | None, list[tuple[str, int]]]:
+    """Return a pattern of lines of another kind than frames, and their kinds with their numbers.
+
+    Raises:
+        _ImplausibleError: such lines name what follows them.
+    """
+    kinds = Counter(kind_of_line(line) for line in others)
+    kept, parts = list[tuple[str, int]](), list[str]()
+    for kind, count in kinds.most_common(8):
+        start, words = kind.partition("#")[0], split_words(kind.lower().encode())
+        # Words for values are none of another kind: known ones, and those of several sensors.
+        values = (INVALID | OVER) & {*words} or ("#" not in kind and len({*words}) < len(words))
+        alike = any(kind_of_line(frame).startswith(start) for frame in frames[:_FRAMES])
+        if len(re.findall(r"[^\W\d_]", start)) < 2 or values or alike:
+            continue
+        numbers = Counter(tuple(re.findall(rb"\d+", line)) for line in others if kind_of_line(line) == kind)
+        naming = "#" in kind and 2 <= len(numbers) <= 64 and min(numbers.values()) > 2 and kind.count("#") < 3
+        size = len(re.findall(rb"\d+", frames[0]))
+        if naming or (len(numbers) > 2 and size == len(next(iter(numbers)))):
+            raise _ImplausibleError(
+                f"lines such as {kind!r} name other values, or those after them: let the firmware send a "
+                "line per frame, or give them as device.adapter.ignore"
+            )
+        kept.append((kind, count))
+        parts.append(re.escape(start) + ".*")
+    return "|".join(dict.fromkeys(parts)) or None, kept
+
+
+def _roles(
+    table: np.ndarray, names: Sequence[str], text: Sequence[int]
+) -> tuple[dict[str, Any], dict[int, str]]:
+    """Return the settings of counter and time of fields (L, C), and why other fields are no sensors."""
+    free = [place for place in range(table.shape[1]) if place not in text]
+    roles, left_out = dict[str, Any](counter=None, time=None), dict[int, str]()
+    many = len(table) > 30  # of a few lines, only the first two fields may look like a clock
+    for role, behaves in (("counter", partial(counts, wraps=many)), ("time", runs)):
+        rising = [place for place in free if (place < 2 or many or names) and behaves(table[:, place])]
+        if rising and len(free) > 1:
+            roles[role] = rising[0]
+            free.remove(rising[0])
+    counter = roles["counter"]
+    if counter is not None and np.count_nonzero(np.diff(table[:, counter]) < 0) > 1:
+        roles["modulus"] = int(table[:, counter].max()) + 1
+    if any(cycles(table[:, place]) for place in free):
+        raise FrameError("rows")
+    named = dict.fromkeys(free, "") | {place: names[place] for place in free if names}
+    aside = {
+        place for place in free if {*map(_ASIDE.fullmatch, (last_part(named[place]), named[place]))} != {None}
+    }
+    left_out |= dict.fromkeys(aside, "is no force, by its name")
+    moving = [place for place in free if np.ptp(table[:, place]) > 0 and place not in aside]
+    low, high = (table[:, moving].min(), table[:, moving].max()) if moving else (0, 0)
+    outside = [place for place in free if np.ptp(table[:, place]) == 0 and not low < table[0, place] < high]
+    pair = outside == [free[0], free[-1]] and np.count_nonzero(table[0, outside] <= low) == 1
+    guides = [place for place in outside if pair or _GUIDE.fullmatch(last_part(named[place]))]
+    left_out |= {place: f"is always {table[0, place]:g}, a guide of a plotter" for place in guides}
+    rest = [place for place in free if place not in left_out]
+    for place in (rest[-1], rest[0]) if len(rest) > 2 else ():
+        inner, column = table[:, [other for other in rest if other != place]], table[:, place]
+        # What varies as the others do: quiet sensors at rest are near their mean, too.
+        near = [total - column for total in _sums(inner, table, counter) if np.ptp(column) > 0]
+        if any(np.mean(np.abs(error) < 0.51) > SAME and error.std() < 0.3 * column.std() for error in near):
+            left_out[place] = "is a sum or mean of the others"
+            break
+    return roles, left_out
+
+
+def _sums(inner: np.ndarray, table: np.ndarray, counter: int | None) -> Iterator[np.ndarray]:
+    """Yield what firmware sends to check fields (L, C), or beside them: sums, parities and means."""
+    yield inner.mean(axis=1)
+    parts = [inner] if counter is None else [inner, np.column_stack([table[:, counter], inner])]
+    for part in parts if not (table[:, [0]] % 1).any() else ():
+        whole = np.nan_to_num(part).astype(np.int64)
+        for total in (whole.sum(axis=1), np.bitwise_xor.reduce(whole, axis=1)):
+            yield from (total, total % 256, total % 65536)
+
+
+def _text(data: bytes) -> Iterator[Adapter]:
+    """Yield adapters of text, the most specific first."""
     yield Adapter()
-    if not _is_text(data):
-        yield from _binary(data)
-        return
-    if not {10, 13} & set(data):
+    if data.count(b"\n") + data.count(b"\r") < _FRAMES:
         yield from _endless(data)
         return
     mark = b"\n" if b"\n" in data else b"\r"
-    lines = [line.strip(b"\r\n ") for line in data.split(mark)[1:-1]]
-    lines = [line for line in lines if line and not line.startswith(b"#")]
-    yield from _named(Adapter(kind="json"), data, lines)
-    plain = [Adapter(kind="text", decimal=sign) for sign in (".", ",")]
-    labelled = [Adapter(kind="text", label=mark, decimal=sign) for mark in (":", "=") for sign in (".", ",")]
-    patterns = [*_indexed(lines), *_skeleton(lines)]
-    for adapter in chain(plain, labelled, patterns):
-        rows = replace(adapter, rows=0, counter=None if adapter.pattern else adapter.counter)
-        if _has_rows(rows, data):
-            yield rows
-        yield from _named(adapter, data, lines)
-    for decimals in range(1, 7):
-        yield Adapter(kind="text", number=rf"-?\d+\.\d{{{decimals}}}")
+    lines = [
+        re.sub(rb"\x1b\[[0-9;]*[A-Za-z]|\0", b"", line).strip(b"\r\n ") for line in data.split(mark)[1:-1]
+    ]
+    yield from _lines([line for line in lines if line and not line.startswith(b"#")], data, {})
 
 
-def _has_rows(adapter: Adapter, data: bytes) -> bool:
-    return 1 < getattr(adapter.detect(data, None).frame_format, "rows", 0) <= _MOST_ROWS
+def _lines(lines: Sequence[bytes], data: bytes, ending: dict[str, Any]) -> Iterator[Adapter]:
+    yield Adapter(kind="json", **ending)
+    for label in (":", "="):
+        yield from (Adapter(kind="text", label=label, decimal=sign, **ending) for sign in (".", ","))
+    words = [word for line in lines for word in re.split(rb"[;\t ]+", line)]
+    grouped = [word for word in words if re.fullmatch(rb"[-+]?\d{1,3}(,\d{3})+", word)]
+    if (
+        grouped
+        and len(words) >= 2 * len(lines)
+        and any(word.isdigit() and int(word) < 1000 for word in words)
+    ):
+        yield Adapter(kind="text", thousands=",", **ending)
+    digits = re.split(r"[,;\t ]+", b" ".join(lines).decode("latin-1").strip())
+    if all(re.fullmatch(r"(?i)(0x)?[0-9a-f]{2,}", word) for word in digits) and re.search(
+        r"(?i)[a-f]|0x", str(digits)
+    ):
+        yield Adapter(kind="text", base=16, **ending)
+    yield from (Adapter(kind="text", decimal=sign, **ending) for sign in (".", ","))
+    yield Adapter(kind="text", rows=0, counter=None, **ending)
+    firsts = [match[1].decode() for line in lines if (match := re.match(rb"\W*([A-Za-z_]\w*)", line))]
+    if 2 * sum(before != word for before, word in pairwise(firsts)) > len(lines) and len(set(firsts)) <= 64:
+        order, pattern = list(dict.fromkeys(firsts[1:])), r"\W*(?P<name>[A-Za-z_]\w*)[^-+.\w]+(?P<values>.*)"
+        begin = order.index(min(order))
+        names = (*order[begin:], *order[:begin])
+        yield Adapter(kind="text", pattern=pattern, names=names, rows=0, counter=None, **ending)
+    yield from (replace(adapter, **ending) for adapter in _patterns(lines))
+    yield from (replace(read_adapter("anyskin"), **ending),)
+    yield from (
+        Adapter(kind="text", number=rf"-?\d+\.\d{{{decimals}}}", **ending) for decimals in range(1, 7)
+    )
 
 
-def _named(adapter: Adapter, data: bytes, lines: Sequence[bytes]) -> Iterator[Adapter]:
-    """Yield an adapter with names of its fields and without those that are not forces, and the adapter."""
-    try:
-        detected = adapter.detect(data, None).frame_format
-    except InputError:
-        return
-    reader, roles = getattr(detected, "parse", None), getattr(detected, "roles", None)
-    if detected is None or reader is None or roles is None:
-        return
-    names = reader.names(roles.count)
-    if not names and adapter.pattern is None and getattr(reader, "separator", None):
-        titles = [
-            line.split(reader.separator) for line in lines if line.count(reader.separator) == roles.count - 1
+def _patterns(lines: Sequence[bytes]) -> Iterator[Adapter]:
+    """Yield patterns of the text around the numbers that many lines share."""
+    shapes = Counter(tuple(b" ".join(text.split()) for text in _NUMBER.split(line)) for line in lines)
+    for shape, _ in shapes.most_common(3):
+        alike = [line for line in lines if tuple(b" ".join(t.split()) for t in _NUMBER.split(line)) == shape]
+        if len(alike) < _FRAMES or len(shape) < 2:
+            continue
+        tokens = [_NUMBER.findall(line) for line in alike]
+        literals = [
+            Counter(column).most_common(1)[0][0] for column in zip(*map(_NUMBER.split, alike), strict=True)
         ]
-        heads = [row for row in titles if all(re.match(rb"\s*[\"A-Za-z]", word) for word in row)]
-        if heads:
-            names = tuple(word.decode("ascii", "replace").strip(' "') for word in heads[0])
-            adapter = replace(adapter, names=names)
-    aside = tuple(name for name in dict.fromkeys(names) if _ASIDE.fullmatch(name.rpartition(".")[2]))
-    if aside and len(aside) < len(names):
-        yield replace(adapter, drop=aside)
-    yield adapter
+        columns = list(zip(*tokens, strict=True))
+        if INVALID & {word.lower() for text in literals for word in re.findall(rb"[A-Za-z/]+", text)}:
+            continue  # the text is a value that is missing
+        index = next(
+            (
+                place
+                for place in range(len(columns) - 1)
+                if b"".join(columns[place]).isdigit() and cycles(np.array(columns[place], float))
+            ),
+            None,
+        )
+        first = len(columns) - 1
+        while first > 0 and shape[first] == shape[-2] in (b"", b",", b";") and first - 1 != index:
+            first -= 1
+        parts, used = list[str](), set[str]()
+        for place, column in enumerate(
+            columns[: first if first < len(columns) - 1 or index is not None else None]
+        ):
+            parts.append(_literal(literals[place]))
+            if len(set(column)) == 1 and re.search(rb"\w$", literals[place]):
+                parts.append(re.escape(column[0].decode()))  # digits of a word
+                continue
+            word = re.sub(r"\W+", "_", literals[place].decode("ascii", "ignore")).strip("_").lower()
+            name = "row" if place == index else word if word and not word[0].isdigit() else f"f{place}"
+            name = name if name not in (*used, "values", "value", "name") else f"f{place}"
+            used.add(name)
+            attached = place != index and index is not None
+            parts.append(
+                rf"{_WORD}?"
+                if attached
+                else rf"(?P<{name}>\d+)"
+                if place == index
+                else rf"(?P<{name}>{_WORD})"
+            )
+        if first < len(columns) - 1 or index is not None:
+            parts += [_literal(literals[first]), "(?P<values>.*?)"]
+        pattern = "".join(parts) + _literal(literals[-1])
+        if index is None:
+            yield Adapter(kind="text", pattern=pattern)
+        else:
+            yield Adapter(kind="text", pattern=pattern, rows=0, index="row", counter=None)
 
 
 def _literal(text: bytes) -> str:
     """Return a regular expression of the text between two numbers, whatever its blanks are."""
-    inner = r"\s+".join(re.escape(word) for word in text.decode("ascii", "replace").split())
+    words = [re.escape(word) for word in re.sub(rb"[^\x00-\x7f]+", b"\xff", text).decode("latin-1").split()]
+    inner = r"\s+".join(word.replace("\xff", r"[^\x00-\x7f]+") for word in words)
     return rf"\s*{inner}\s*" if inner else r"\s+" if text else ""
 
 
-def _skeleton(lines: Sequence[bytes]) -> Iterator[Adapter]:
-    """Yield a pattern of the text around the numbers that most lines share."""
-    shapes = Counter(map(_shape, lines))
-    if not shapes:
-        return
-    shape = shapes.most_common(1)[0][0]
-    alike = [line for line in lines if _shape(line) == shape]
-    count = len(shape) - 1
-    if count < 1 or len(alike) < _FRAMES:
-        return
-    literals = [
-        Counter(_NUMBER.split(line)[place] for line in alike).most_common(1)[0][0]
-        for place in range(count + 1)
-    ]
-    tokens = [_NUMBER.findall(line) for line in alike]
-    first = count - 1
-    while first > 0 and shape[first] == shape[count - 1]:
-        first -= 1
-    tail = count - first
-    if (shape[count - 1] in (b"", b",", b";") and tail > 1) or count == 1:
-        start = first if tail > 1 else 0
-        start = 0 if all(text == shape[count - 1] for text in shape[1:count]) else start
-        heads = _groups(tokens, literals, start, named=False)
-        yield Adapter(
-            kind="text", pattern=f"{heads}{_literal(literals[start])}(?P<values>.*?){_literal(literals[-1])}"
-        )
-    yield Adapter(kind="text", pattern=_groups(tokens, literals, count, named=True) + _literal(literals[-1]))
-
-
-def _shape(line: bytes) -> tuple[bytes, ...]:
-    """Return the text around the numbers of a line, whatever its blanks are."""
-    return tuple(b" ".join(text.split()) for text in _NUMBER.split(line))
-
-
-def _groups(tokens: Sequence[Sequence[bytes]], literals: Sequence[bytes], count: int, named: bool) -> str:
-    """Return the named groups of the first ``count`` numbers, each behind the text before it."""
-    parts, used = list[str](), set[str]()
-    for place in range(count):
-        column = [row[place] for row in tokens]
-        word = re.sub(r"\W+", "_", literals[place].decode("ascii", "ignore")).strip("_").lower()
-        name = word if named and word and not word[0].isdigit() else f"f{place}"
-        if all(b":" in text for text in column):
-            name = "time"
-        else:
-            with suppress(ValueError):
-                numbers = np.array([float(text) for text in column])
-                if place < 2:
-                    name = "counter" if counts(numbers) else "time" if runs(numbers) else name
-        name = name if name not in used else f"{name}_{place}"
-        used.add(name)
-        parts.append(rf"{_literal(literals[place])}(?P<{name}>[-+.:\w/]+)")
-    return "".join(parts)
-
-
-def _indexed(lines: Sequence[bytes]) -> Iterator[Adapter]:
-    """Yield a pattern of lines with a word and a number of the row before the values."""
-    matches = [match for line in lines if (match := _INDEXED.fullmatch(line))]
-    if 2 * len(matches) < len(lines) or not matches:
-        return
-    before, after = (Counter(match[group] for match in matches).most_common(1)[0][0] for group in (1, 3))
-    if len({match[2] for match in matches}) < 2:
-        return
-    yield Adapter(kind="text", pattern=rf"{_literal(before)}(?P<row>\d+){_literal(after)}(?P<values>.*)")
-
-
-def _endless(data: bytes) -> Iterator[Adapter]:
-    """Yield lengths of frames of text without an end."""
+def _endless(data: bytes, longest: int = 512) -> Iterator[Adapter]:
+    """Yield adapters of text without lines: of a fixed length, or with a word at the end of each frame."""
     classes = np.frombuffer(re.sub(rb"[-+.\d ]", b"0", data), np.uint8)
-    for length in range(3, min(_LONGEST, len(data) // 4)):
-        if np.mean(classes[length:] == classes[:-length]) > _SAME:
+    for length in range(3, min(longest, len(data) // 4)):
+        if np.mean(classes[length:] == classes[:-length]) > SAME:
             yield Adapter(kind="text", end="", length=length)
-
-
-def _binary(data: bytes) -> Iterator[Adapter]:
-    """Yield structs of a fixed length between bytes that repeat."""
-    for length in range(3, min(_LONGEST, len(data) // 6)):
-        table = np.frombuffer(data[: len(data) // length * length], np.uint8).reshape(-1, length)
-        constant = np.mean(table == np.median(table, axis=0), axis=0) > _SAME
-        if not constant.any() or constant.all():
-            continue
-        begin, size = _longest(constant)
-        ring = bytes(np.median(np.roll(table, -begin, axis=1), axis=0).astype(np.uint8)[:size])
-        options = list[tuple[float, Adapter]]()
-        for skip, where, mark in _marks(ring):
-            shifted = np.roll(table.ravel(), -begin - skip)
-            frames = shifted.reshape(-1, length)[:-1, len(mark) :]
-            for spread, struct, drop in _structs(frames):
-                place: dict[str, Any] = {where: mark.hex(" ")}
-                described = Adapter(kind="binary", struct=struct, drop=drop, **place)
-                options.append((spread - _MARKED * len(mark), described))
-        yield from (adapter for _, adapter in sorted(options, key=lambda option: option[0]))
-
-
-def _marks(constant: bytes) -> Iterator[tuple[int, str, bytes]]:
-    """Yield what of constant bytes may be a mark: the bytes before it, ``head`` or ``tail``, and the mark."""
-    for ending in (b"\r\n", b"\n"):
-        if constant.endswith(ending):
-            yield len(constant) - len(ending), "tail", ending
-            return
-    # Constant bytes of the values may stand beside the mark.
-    for skip in range(min(len(constant), _LONGEST_MARK)):
-        for size in range(1, min(len(constant) - skip, _LONGEST_MARK) + 1):
-            mark = constant[skip : skip + size]
-            if mark[-1] and (size > 1 or mark[0] in _SINGLE):
-                yield skip, "head", mark
-
-
-def _longest(constant: np.ndarray) -> tuple[int, int]:
-    """Return begin and size of the longest run of True in a ring."""
-    count, best = len(constant), (0, 0)
-    for begin in range(count):
-        size = next((step for step in range(count) if not constant[(begin + step) % count]), count)
-        if size > best[1]:
-            best = (begin, size)
-    return best
-
-
-def _structs(frames: np.ndarray) -> Iterator[tuple[float, dict[str, str], tuple[str, ...]]]:
-    """Yield structs of frames (F, B) without their marks: how unlikely they are, and what to drop."""
-    size = frames.shape[1]
-    sums = np.cumsum(frames, axis=1, dtype=np.int64)[:, -2] % 256 if size > 2 else None
-    xors = np.bitwise_xor.reduce(frames[:, :-1], axis=1)
-    checks = [] if sums is None else [np.mean(check == frames[:, -1]) > _SAME for check in (sums, xors)]
-    checked = any(checks)
-    spare = 1 if checked else 0
-    end, drop = ({"checksum": "u1"}, ("checksum",)) if checked else ({}, ())
-    for head in _headers(frames):
-        used = sum(np.dtype(kind).itemsize for kind in head.values())
-        for kind in ("<f4", ">f4", "<u2", ">u2", "<i2", ">i2", "<i4", ">i4", "u1"):
-            item = np.dtype(kind)
-            left = size - used - spare
-            if left <= 0 or left % item.itemsize:
-                continue
-            body = np.ascontiguousarray(frames[:, used : used + left])
-            with np.errstate(invalid="ignore"):
-                values = body.view(item).astype(np.float64)
-            struct = head | {"force": f"({values.shape[1]},){kind}"} | end
-            narrow = _NARROW * ("u1" in head.values()) + _CONSTANT * np.sum(np.ptp(values, axis=0) == 0)
-            yield _spread(values, item) + narrow - len(head), struct, drop
-
-
-_HEADERS = tuple(
-    tuple(words.split())
-    for words in ("u1", "<u2", "<u4", ">u2", ">u4", "u1 <u4", "<u2 <u4", "<u4 <u4", ">u2 >u4")
-)
-"""Types of a counter and a clock before the values."""
-
-
-def _headers(frames: np.ndarray) -> Iterator[dict[str, str]]:
-    """Yield counters and clocks before the values: none, or those that count."""
-    yield {}
-    for kinds in _HEADERS:
-        place, head = 0, dict[str, str]()
-        for kind in kinds:
-            item = np.dtype(kind)
-            if place + item.itemsize >= frames.shape[1]:
-                break
-            column = (
-                np.ascontiguousarray(frames[:, place : place + item.itemsize]).view(item)[:, 0].astype(float)
-            )
-            part = column[:64] if item.itemsize > 1 else column[np.argmin(column) :][:64]
-            name = "counter" if counts(part) and "counter" not in head else "time" if runs(part) else ""
-            if not name or name in head:
-                break
-            head[name] = kind
-            place += item.itemsize
-        else:
-            yield head
-
-
-def _spread(values: np.ndarray, item: np.dtype) -> float:
-    """Return how unlikely values (F, S) of a type are readings, 0 to 2: these keep to a part of the range."""
-    turned = 0.03 * (item.str[0] == ">")
-    if item.kind == "f":
-        size = np.abs(values[values != 0])
-        sound = np.isfinite(values).all() and bool(((size >= _SIZE[0]) & (size <= _SIZE[1])).all())
-        return turned if sound else 2.0
-    low, high = np.percentile(values, [5, 95], axis=0)
-    wide = float(np.max((high - low) / 256**item.itemsize))
-    # Of types that hold the same, the one that needs fewer bytes of zeros per value, and no sign.
-    empty = np.abs(values).max() < 256 ** (item.itemsize // 2) and item.itemsize > 2
-    return (
-        0.1 + wide + 0.5 * empty + (0.01 if item.kind == "i" else 0.0) + (0.3 if item.itemsize == 1 else 0.0)
-    )
+    words = Counter(re.findall(rb"[^\d\s.,;+-]+", data))
+    for word, count in words.most_common(2):
+        if count >= _FRAMES and word.isascii():
+            yield from _lines(data.split(word)[1:-1], data, {"end": word.decode()})

@@ -8,18 +8,19 @@ u16 seq, u32 t_us, u16 n, n values, u16 CRC-16/CCITT-FALSE of all before it. A c
 u8 0xA5, u8 type 35 (``#``), a comment line of the text protocol without its checksum, u16 CRC. COBS: Cheshire
 and Baker, "Consistent overhead byte stuffing", IEEE/ACM ToN 7 (1999).
 
-Announcements: comments of the text protocol in which an emulated skin describes its next gesture; for its
-contacts see :mod:`skin.wire.contact_lines`.
+Notes: comments of the text protocol with JSON and CRC-16, in which an emulated skin announces its next
+gesture, ``# gesture {"number": 0, ...}*HHHH``; for its contacts see :mod:`skin.wire.contact_lines`.
 """
 
 import binascii
+import json
 import struct
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from functools import reduce
-from math import isclose, isfinite, nan
+from math import inf, isclose, isfinite, nan
 from operator import xor
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -39,13 +40,19 @@ def xor8(data: bytes) -> int:
     return reduce(xor, data, 0)
 
 
-_SEPARATORS = (b",", b";", b"\t")
+SEPARATORS = (b",", b";", b"\t")
+"""Between fields, instead of blanks."""
 
 INVALID = frozenset(
     (b"", b"-", b"--", b"nan", b"inf", b"-inf", b"ovf", b"err", b"error", b"na", b"n/a", b"null", b"none")
 )
 """Fields, in lower case, that firmware sends instead of a value that it could not read; also an empty one."""
 
+
+OVER = frozenset(
+    (b"ol", b"+ol", b"0l", b"o.l", b"o.l.", b"ovl", b"over", b"overrange", b"overload", b"sat", b"clip")
+)
+"""Fields, in lower case, for a value beyond the range of the converter, as meters show it."""
 
 _MEASURED = 0.05  # part by which a rate that firmware measures may vary
 
@@ -54,14 +61,17 @@ class Line(NamedTuple):
     """The numbers of a line, and the kind of its checksum.
 
     Attributes:
-        fields: NaN where a field is one of ``INVALID``, or a number that is too large for a float.
+        fields: NaN where a field is one of ``INVALID``, a number that is too large for a float, or strange;
+            infinite where it is one of ``OVER``.
         check: kind of checksum.
         finite: whether every field is a number.
+        strange: number of a field that is none of these -> the field.
     """
 
     fields: list[float]
-    check: Check
+    check: Check = "none"
     finite: bool = True
+    strange: Mapping[int, bytes] = {}
 
 
 EMULATED = "emulated"
@@ -130,58 +140,67 @@ def parse_line(line: bytes) -> Line:
         FrameError: ``checksum`` is wrong or unknown, or a field is no ``number`` and not one of ``INVALID``.
     """
     body, check = verify_line(line)
-    return parse_words(_split(body.lstrip().rstrip(b" \r")), check)
+    read = parse_words(split_words(body), check)
+    if read.strange:
+        raise FrameError("number", word=next(iter(read.strange.values())).decode("ascii", "replace"))
+    return read
 
 
-def parse_words(words: Sequence[bytes], check: Check = "none", invalid: Collection[bytes] = INVALID) -> Line:
+def parse_words(
+    words: Sequence[bytes],
+    check: Check = "none",
+    invalid: Collection[bytes] = INVALID,
+    over: Collection[bytes] = OVER,
+) -> Line:
     """Return the numbers of fields.
 
     Args:
         words: the fields.
         check: kind of checksum of their line.
         invalid: fields, in lower case, that firmware sends instead of a value.
-
-    Raises:
-        FrameError: a field is no ``number`` and not one of ``invalid``.
+        over: those that it sends beyond the range of the converter.
     """
     try:
         fields = [float(word) for word in words]
     except ValueError:
         fields = [nan]
-    finite = all(map(isfinite, fields))
+    finite, strange = all(map(isfinite, fields)), dict[int, bytes]()
     if not finite:
-        values = [_field(word) for word in words]
-        fields = [value if value is not None and isfinite(value) else nan for value in values]
-        strange = [
-            word.strip()
-            for word, value in zip(words, values, strict=True)
-            if value is None and word.strip().lower() not in invalid
-        ]
-        if strange:
-            # A word, or digits of another base, cost one value; anything else may be a line that is damaged.
-            words_alone = all(word.isalpha() or not word.strip(b"0123456789abcdefABCDEF") for word in strange)
-            raise FrameError(
-                "number",
-                word=strange[0].decode("ascii", "replace"),
-                numbers=fields if words_alone else (),
-                check=check,
-            )
-    if any(b"_" in word for word in words):  # valid in Python's grammar only
-        raise FrameError("number")
-    return Line(fields, check, finite)
+        fields = []
+        for place, word in enumerate(words):
+            text = word.strip().lower()
+            try:
+                value = float(text)
+            except ValueError:
+                value = inf if text in over else nan
+                if text not in over and text not in invalid:
+                    strange[place] = word.strip()
+            else:
+                value = value if isfinite(value) else nan
+            fields.append(value)
+    if b"_" in b"".join(words):  # valid in Python's grammar only
+        strange |= {place: word for place, word in enumerate(words) if b"_" in word}
+    return Line(fields, check, finite and not strange, strange)
+
+
+def split_words(body: bytes, marks: Sequence[bytes] = SEPARATORS, trailing: bool = True) -> list[bytes]:
+    """Return the fields between the first of ``marks`` that a line has, or between blanks.
+
+    Args:
+        body: the line.
+        marks: separators.
+        trailing: a separator at the end is none; else it is followed by an empty field.
+    """
+    body = body.strip(b" \r")
+    for mark in marks:
+        if mark in body:
+            return (body.removesuffix(mark) if trailing else body).split(mark)
+    return body.split()
 
 
 def ends_with_separator(line: bytes) -> bool:
     """Return whether a separator ends the line: its last field is empty, or firmware always writes one."""
-    return line.rpartition(b"*")[0 if b"*" in line else 2].rstrip(b" \r")[-1:] in _SEPARATORS
-
-
-def _field(word: bytes) -> float | None:
-    """Return the number of a field; None if it is no number."""
-    try:
-        return float(word)
-    except ValueError:
-        return None
+    return line.rpartition(b"*")[0 if b"*" in line else 2].rstrip(b" \r")[-1:] in SEPARATORS
 
 
 def parse_header(line: bytes) -> Header | None:
@@ -226,13 +245,6 @@ def _checked(text: str, check: Check) -> bytes:
     body = text.encode("ascii")
     tails = {"crc16": b"*%04X" % crc16(body), "xor": b"*%02X" % xor8(body), "none": b""}
     return body + tails[check] + b"\n"
-
-
-def _split(body: bytes) -> list[bytes]:
-    for separator in _SEPARATORS:
-        if separator in body:
-            return body.removesuffix(separator).split(separator)
-    return body.split()
 
 
 def _number(value: object) -> str:
@@ -361,7 +373,21 @@ def unstuff(data: bytes) -> bytes:
     return bytes(out)
 
 
-_KNOWN = ("number", "seq", "frames")
+def encode_note(name: str, content: Mapping[str, Any]) -> bytes:
+    """Return ``# name {JSON}*HHHH``, LF at its end."""
+    return _checked(f"# {name} {json.dumps(content)}", "crc16")
+
+
+def parse_note(name: str, line: bytes) -> dict[str, Any] | None:
+    """Return the content of a note without its end; None for other lines and wrong checksums."""
+    body, _, tail = line.removesuffix(b"\r").rpartition(b"*")
+    start = b"# %s {" % name.encode()
+    if not body.startswith(start) or tail != b"%04X" % crc16(body):
+        return None
+    try:
+        return dict(json.loads(body[len(start) - 1 :]))
+    except ValueError:
+        return None
 
 
 @dataclass(frozen=True)
@@ -382,22 +408,16 @@ class Announcement:
 
 
 def encode_announcement(announcement: Announcement) -> bytes:
-    """Return ``# gesture number=0 seq=300 frames=300 big=1 ...*HHHH``, LF at its end."""
-    pairs = {name: getattr(announcement, name) for name in _KNOWN} | dict(announcement.labels)
-    return _checked("# gesture " + " ".join(f"{name}={value}" for name, value in pairs.items()), "crc16")
+    """Return ``# gesture {"number": 0, "seq": 300, "frames": 300, "labels": {"big": 1, ...}}*HHHH``."""
+    return encode_note("gesture", asdict(announcement))
 
 
 def parse_announcement(line: bytes) -> Announcement | None:
     """Return the announcement in a line without its end; None for other lines and wrong checksums."""
-    body, _, tail = line.removesuffix(b"\r").rpartition(b"*")
-    if not body.startswith(b"# gesture ") or tail != b"%04X" % crc16(body):
-        return None
+    content = parse_note("gesture", line)
     try:
-        pairs = dict(word.split("=", 1) for word in body.decode("ascii").split()[2:])
-        numbers = {name: int(value) for name, value in pairs.items()}
-        number, seq, frames = (numbers.pop(name) for name in _KNOWN)
-        return Announcement(number, seq, frames, numbers)
-    except (KeyError, ValueError):
+        return None if content is None else Announcement(**content)
+    except TypeError:
         return None
 
 

@@ -16,7 +16,7 @@ from skin.record.serial import Serial
 from skin.runs.build import build_data, build_device, build_learner
 from skin.runs.torch_model import window_classifier
 from skin.touch.labels import TOUCH
-from skin.wire.clocks import ClockWatch
+from skin.wire.clocks import FrameClock
 from skin.wire.decoder import Decoder
 from skin.wire.protocol import (
     Announcement,
@@ -105,7 +105,7 @@ def sent(monkeypatch):
         pieces = [data for _, data in stream]
         monkeypatch.setattr("skin.wire.skin.open_stream", lambda *port: Sent(*pieces))
 
-    monkeypatch.setattr(ClockWatch, "_SPAN", np.inf)  # the stream comes as fast as it is read
+    monkeypatch.setattr(FrameClock, "judge", lambda *given: False)  # the stream comes as fast as it is read
     return send
 
 

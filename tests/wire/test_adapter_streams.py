@@ -142,6 +142,64 @@ STREAMS: dict[str, tuple[Callable, np.ndarray, float | None]] = {
         packed("<HI{}H", b"\xab\xcd", values=lambda n, r: [n, 20 * n + 3_000, *r]), table(5), 0.02
     ),
     "no end": (lambda n, r: ",".join(f"{int(v):03d}" for v in r).encode(), table(5), None),
+    "word at the end": (joined(",", "ZZ", before="QQ,"), table(5), None),
+    "hex": (lambda n, r: " ".join(f"{int(v):03X}" for v in r).encode() + b"\n", table(5, 0, 500, 90), None),
+    "thousands": (
+        lambda n, r: ";".join(f"{int(v):,}" for v in r).encode() + b"\n", table(4, 0, 960, 40), None
+    ),
+    "nul": (joined(",", end="\n\0"), table(4), None),
+    "bytes before": (lambda n, r: b"\xff\xfe&" + joined(",")(n, r), table(4), None),
+    "colours": (joined(", ", before="\x1b[0;33mW skin: ", after="\x1b[0m"), table(4), None),
+    "status": (lambda n, r: (b"OK;" if n % 9 else b"LOW;") + joined(";")(n, r), table(4), None),
+    "degrees": (lambda n, r: "F0={:.0f};F1={:.0f};T=2{}.5°C\n".format(*r, n % 9).encode(), table(2), None),
+    "temperature": (lambda n, r: joined(",", after=f",2{n % 9}.5C")(n, r), table(4), None),
+    "title with units": (
+        lambda n, r: (b"t [ms];A [kPa];B [kPa];C [kPa];Temp [degC]\n" if n % 90 == 40 else b"")
+        + b"%d;%s;24.5\n" % (20 * n, joined(";", "")(n, r)), table(3), 0.02,
+    ),
+    "labels in any order": (
+        lambda n, r: joined("\t")(n, r) and "\t".join(
+            f"s{k}:{r[k]:.0f}" for k in (range(4) if n % 3 else range(3, -1, -1))).encode() + b"\n",
+        table(4), None,
+    ),
+    "keys in any order": (
+        lambda n, r: json.dumps(
+            {f"s{k}": r[k] for k in (range(4) if n % 3 else (2, 0, 3, 1))}).encode() + b"\n",
+        table(4), None,
+    ),
+    "topic before json": (
+        lambda n, r: b"skin/a " + json.dumps({"id": "esp-07", "f": list(r)}).encode() + b"\n", table(4), None,
+    ),
+    "two kinds of lines": (
+        lambda n, r: b"Filt: " + joined("\t")(n, r) + b"Base: 1\t2\t3\t4\n", table(4), None,
+    ),
+    "text now and then": (
+        lambda n, r: (b"no data\n" if n % 11 == 4 else b"") + joined(",")(n, r), table(4), None
+    ),
+    "guides": (joined(" ", before="0 ", after=" 1023"), table(4), None),
+    "guides by name": (
+        lambda n, r: b"Min:0," + labelled("f{}:{}", ",", "")(n, r) + b",Max:900\n", table(4), None,
+    ),
+    "clock last": (lambda n, r: joined(",", "")(n, r) + b",%d\n" % (20 * n), table(4), 0.02),
+    "sum last": (lambda n, r: joined(",", "")(n, r) + b",%d\n" % (int(sum(r)) & 255), table(4), None),
+    "counter of 16": (clocked(0, counter=16), table(4), None),
+    "a line per name": (
+        lambda n, r: "".join(f">f{k}:{v:.0f}\n" for k, v in enumerate(r)).encode(), table(4), None,
+    ),
+    "a line per pad": (
+        lambda n, r: "".join(
+            f"[10:00:{n // 50:02d}] Pad 'p_{k + 1}' (T{k + 4}): {v:.0f}\n" for k, v in enumerate(r)).encode(),
+        table(4), None,
+    ),
+    "u8": (packed("<{}B", b"\xff"), table(4, 0, 40, 1), None),
+    "u8 six": (packed("<{}B", b"\xaa\x55"), table(6, 0, 40, 1), None),
+    "u8 counter u16": (
+        packed("<B{}H", b"\xaa\x55", values=lambda n, r: [n % 256, *r]), table(6, 0, 100), None
+    ),
+    "i24": (
+        lambda n, r: b"\xaa\x55" + b"".join(int(v).to_bytes(3, "big", signed=True) for v in r),
+        table(4, 0, -20_000, 300), None,
+    ),
 }  # fmt: skip
 
 
@@ -170,7 +228,7 @@ def check_frames(decoder, pieces, rows):
 def test_a_proposed_adapter_reads_what_was_sent(name):
     _, rows, period = STREAMS[name]
     pieces = sent(name)
-    proposal = propose(pieces)
+    proposal = propose(pieces)[0]
     assert proposal.sensors == rows.shape[1]
     # What a person pastes is what is read.
     import yaml
@@ -195,10 +253,89 @@ def test_bursts_are_read_with_the_time_between_their_frames(name, burst):
         (pieces[min(n + burst, len(pieces)) - 1][0], b"".join(data for _, data in pieces[n : n + burst]))
         for n in range(0, len(pieces), burst)
     ]
-    decoder = Decoder(adapter=propose(bursts).adapter)
+    decoder = Decoder(adapter=propose(bursts)[0].adapter)
     frames = check_frames(decoder, bursts, rows)
     steps = np.diff([frame.t for frame in frames])[len(frames) // 2 :]
     assert np.median(steps) == pytest.approx(period or 1 / RATE, rel=0.1)
+
+
+def pressed(n, k):
+    """Return a value with some noise that rises by 300 for half a second in every two."""
+    return 100 + 20 * k + (n * 7919 + k * 104_729) % 997 % 4 + (300 if k == 2 and n % 100 >= 75 else 0)
+
+
+REFUSED = {
+    # name: (bytes of frame n, what the sentence names)
+    "unknown word": (
+        lambda n: ",".join("XYZ" if pressed(n, k) > 300 else str(pressed(n, k)) for k in range(4)) + "\n",
+        r"the word 'XYZ' stands in place of numbers: give device.adapter.over=\[XYZ\]",
+    ),
+    "names before": (
+        lambda n: "".join(f"chip{k}:\n{pressed(n, k)},{pressed(n, k + 1)}\n" for k in range(3)),
+        r"'chip#:' name other values, or those after them: let the firmware send a line per frame",
+    ),
+    "only what changes": (
+        lambda n: f"pad 2 = {pressed(n, 2)}\n" if pressed(n, 2) > 300 else "",
+        "let the firmware send every frame",
+    ),
+    "nothing changes": (lambda n: "12,13,14\n", "no value ever changes"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_would_be_read_wrongly_is_refused_with_a_remedy(name):
+    encode, said = REFUSED[name]
+    pieces = [(n / RATE, encode(n).encode()) for n in range(COUNT) if encode(n)]
+    with pytest.raises(InputError, match=said):
+        propose(pieces, COUNT / RATE)
+
+
+def test_letters_that_only_a_press_shows_are_no_decimal_numbers():
+    """At rest, hexadecimal digits look like decimal ones: a press then shows no value that is wrong."""
+    lines = [
+        b"%03X %03X 215\n" % (0x200 + pressed(n, 0) % 10, 0x210 + pressed(n, 1) % 7) for n in range(COUNT)
+    ]
+    press = b"29F 212 215\n"
+    rest = propose([(n / RATE, line) for n, line in enumerate(lines)])[0]
+    frames = Decoder(adapter=rest.adapter).feed(b"".join(lines) + press)
+    assert frames[-1].valid.tolist() == [False, True, True]
+    pieces = [(n / RATE, press if n % 20 == 7 else line) for n, line in enumerate(lines)]
+    assert propose(pieces)[0].adapter.base == 16
+
+
+@pytest.mark.parametrize(("limit", "valid"), [(None, False), (1023.0, True)])
+def test_a_word_for_over_range_is_no_missing_value(limit, valid):
+    lines = b"".join(b"%d,%d\n" % (100 + n % 3, 120 + n % 2) for n in range(40)) + b"OL,121\n"
+    frame = Decoder(adapter=Adapter(kind="text", limit=limit)).feed(lines)[-1]
+    assert frame.saturated.tolist() == [True, False]
+    assert frame.valid.tolist() == [valid, True]
+    assert frame.values[0] == (limit or 100)
+
+
+def test_keys_that_are_missing_are_channels_without_a_value():
+    rows = [{f"s{k}": pressed(n, k) for k in range(4) if n % 7 or k != 1} for n in range(COUNT)]
+    text = [json.dumps(row).encode() + b"\n" for row in rows]
+    labels = ["\t".join(f"{name}:{value}" for name, value in row.items()).encode() + b"\n" for row in rows]
+    for lines in (text, labels):
+        proposal = propose([(n / RATE, line) for n, line in enumerate(lines)])[0]
+        frames = Decoder(adapter=proposal.adapter).feed(b"".join(lines))
+        assert {tuple(frame.valid.tolist()) for frame in frames} == {(True,) * 4, (True, False, True, True)}
+
+
+def test_a_constant_in_single_frames_is_no_value():
+    lines = [b"%d,%d\n" % (65535 if n % 70 == 50 else pressed(n, 0), pressed(n, 1)) for n in range(COUNT)]
+    proposal = propose([(n / 100, line) for n, line in enumerate(lines)])[0]
+    assert proposal.adapter.invalid == (65535,)
+    slower = propose([(n / 20, line) for n, line in enumerate(lines)])[0]
+    assert slower.adapter.invalid == ()  # 50 ms: it may be a touch beyond the range
+    quiet = [b"%d,%d\n" % (100 + (n % 9 == 4), 120 - (n % 7 == 2)) for n in range(COUNT)]
+    assert propose([(n / 100, line) for n, line in enumerate(quiet)])[0].adapter.invalid == ()
+
+
+def test_rows_that_are_alike_are_lines_with_a_counter_of_a_few_bits():
+    lines = [b"%d,%d,%d\n" % (n % 16, pressed(n, 0), pressed(n, 1)) for n in range(COUNT)]
+    proposal = propose([(n / RATE, line) for n, line in enumerate(lines)])[0]
+    assert (proposal.sensors, proposal.adapter.counter, proposal.adapter.modulus) == (2, 0, 16)
 
 
 def test_what_is_no_stream_is_shown():

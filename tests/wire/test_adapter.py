@@ -16,7 +16,7 @@ from skin.wire.adapter import Adapter, read_adapter
 from skin.wire.clocks import FrameClock
 from skin.wire.decoder import Decoder
 from skin.wire.proposal import propose
-from skin.wire.reader import PortSettings, SkinTimeout
+from skin.wire.reader import Port, SkinTimeout
 from skin.wire.skin import open_skin
 
 PATIENT = 60.0  # s: machines are busy at times
@@ -39,7 +39,7 @@ def test_every_shipped_adapter_is_read_and_written(name, tmp_path):
     path = tmp_path / "board.yaml"
     path.write_text(ALL[name].describe())
     assert read_adapter(str(path)) == ALL[name]
-    assert PortSettings(adapter=name).frames == ALL[name]
+    assert Port(adapter=name).frames == ALL[name]
 
 
 @pytest.mark.parametrize(

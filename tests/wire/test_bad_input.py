@@ -17,9 +17,9 @@ from skin.record.recorder import record_session
 from skin.record.serial import Serial
 from skin.record.session import read_session
 from skin.touch.labels import TOUCH
-from skin.wire.channels import Tare
 from skin.wire.protocol import Header, encode_header, encode_line
 from skin.wire.skin import open_skin
+from skin.wire.tare import Tare
 
 PATIENT = 300.0  # s: machines are busy at times
 SHEET = Sheet((0.16, 0.16), (32, 32), [{"material": "EcoFlex 00-30", "thickness": 0.005}])

@@ -353,8 +353,7 @@ def adapt(config: Config, run: str, overrides: Sequence[str]) -> None:
         config, run, overrides: configuration, name of the run, and overrides of ``skin adapt``.
 
     Raises:
-        InputError: the run has no network or does not fit the skin, the gestures have no labels, or there are
-            fewer than wanted.
+        InputError: the run has no network or does not fit the skin, or there are too few labelled gestures.
     """
     settings, tracking = configured(FineTuning, config.adapt, "adapt"), config.tracking
     options = {str(name): default_option("learner", name) for name in settings.scratch}

@@ -161,7 +161,7 @@ def test_live_raises_the_alarm_where_it_is_told(run, folder, above, alarm):
         there = ["device=serial", f"device.port={port}", *LIVE]
         done = run(folder, "live.py", *there, f"live.patience.above={above}")
     assert re.search(r"[1-9]\d* verdicts", done.stderr)
-    assert ("DANGEROUS" in done.stdout) == alarm
+    assert ('"dangerous": true' in done.stdout) == alarm
     assert f"alarm above {float(above):g}" in done.stderr
 
 

@@ -32,6 +32,12 @@ class Steps(Progress):
 
     def begin(self, name: str) -> None:
         """Show which step begins; those before it have ended."""
+        self._name = name
+        self.update(self._task, description=name)
+        self.report(0.0)
+
+    def report(self, fraction: float) -> None:
+        """Show how much of the present step is done, from 0 to 1."""
         names = list(self._seconds)
-        done = sum(self._seconds[before] for before in names[: names.index(name)])
-        self.update(self._task, description=name, completed=done)
+        done = sum(self._seconds[before] for before in names[: names.index(self._name)])
+        self.update(self._task, completed=done + fraction * self._seconds[self._name])

@@ -409,8 +409,9 @@ def _on_touches_of(
     chosen = np.concatenate([safe, others])
     with Steps({"choosing the threshold of the alarm": 20.0}) as steps:
         # More threads than free cores take many times as long.
-        report = lambda done: setattr(steps, "share", done / len(chosen))  # noqa: E731
-        scores = touch_scores(learner, device, live, chosen, seed, report)
+        scores = touch_scores(
+            learner, device, live, chosen, seed, lambda done: steps.report(done / len(chosen))
+        )
     threshold = _lowest_threshold(scores[: len(safe)], target)
     point = OperatingPoint(threshold, target, len(safe), 0, seed, len(others), rate=live.rate)
     alarms = point.alarm(scores)

@@ -25,6 +25,8 @@ def test_a_bar_of_steps_is_shown_on_a_terminal_only(monkeypatch, terminal):
         steps.begin("evaluate")
         steps.refresh()
         assert steps.tasks[0].percentage == 25
+        steps.report(0.5)
+        assert steps.tasks[0].percentage == 62.5
         with Steps({"choose": 1}) as inner:
             inner.refresh()
     shown = file.getvalue()

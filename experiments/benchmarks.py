@@ -184,8 +184,8 @@ def measure_latency(row: str, onnx: bool = False, frames: int = 3000, rate: floa
     """Return the time from a frame at ``rate`` Hz to the verdict on it, ms: median and the 99th percentile.
 
     One thread watches a simulated stream of touches and decides twenty times per second. ``core_ms`` is the
-    99th percentile of the processor time, which excludes other processes; ``core_share`` is the fraction of a
-    core for all frames, and ``memory_mb`` the memory of the process at its end.
+    99th percentile of the processor time, which excludes other processes; ``core_fraction`` is the fraction
+    of a core for all frames, and ``memory_mb`` the memory of the process at its end.
 
     Args:
         row: of the table, untrained, because speed does not depend on the weights.
@@ -199,7 +199,7 @@ def measure_latency(row: str, onnx: bool = False, frames: int = 3000, rate: floa
         return _time_verdicts(device, model, frames, rate)
     with TemporaryDirectory() as folder:
         path = Path(folder) / "model.onnx"
-        write_model(model.learner.pipeline(model.places), model.describe(), data.touches("train"), path)
+        write_model(model.learner.pipeline(model.sites), model.describe(), data.touches("train"), path)
         return _time_verdicts(device, OnnxModel(path), frames, rate)
 
 

@@ -105,8 +105,8 @@ class Budget:
         """Compare with the limit."""
         result = yield
         seconds = spent() - _free - self._begin
-        most = SPREAD * self.limit
-        if seconds > most and not item.get_closest_marker("slow") and seconds > most * slowness():
+        maximum = SPREAD * self.limit
+        if seconds > maximum and not item.get_closest_marker("slow") and seconds > maximum * slowness():
             pytest.fail(
                 f"{seconds:.1f} s of processor time: more than {self.limit} s needs pytest.mark.slow(reason)"
             )

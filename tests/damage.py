@@ -65,7 +65,7 @@ def damaged(draw: Callable[..., Any], content: bytes) -> bytes:
     return result if result != content else content[:-1]
 
 
-def _place(draw: Callable[..., Any], content: bytes) -> tuple[int, int]:
+def _position(draw: Callable[..., Any], content: bytes) -> tuple[int, int]:
     """Draw a part of a file, often a short one."""
     start = draw(st.integers(0, max(0, len(content) - 1)))
     length = draw(st.integers(1, 8) | st.integers(1, max(1, len(content) // 2)))
@@ -73,49 +73,49 @@ def _place(draw: Callable[..., Any], content: bytes) -> tuple[int, int]:
 
 
 def _flip(draw: Callable[..., Any], content: bytes) -> bytes:
-    start, _ = _place(draw, content)
+    start, _ = _position(draw, content)
     bit = 1 << draw(st.integers(0, 7))
     return content[:start] + bytes([content[start] ^ bit]) + content[start + 1 :]
 
 
 def _overwrite(draw: Callable[..., Any], content: bytes) -> bytes:
-    start, _ = _place(draw, content)
+    start, _ = _position(draw, content)
     new = draw(st.binary(min_size=1, max_size=12) | st.sampled_from((b"\0" * 64, b"\xff" * 16)))
     return content[:start] + new + content[start + len(new) :]
 
 
 def _insert(draw: Callable[..., Any], content: bytes) -> bytes:
-    start, _ = _place(draw, content)
+    start, _ = _position(draw, content)
     return content[:start] + draw(st.binary(min_size=1, max_size=12)) + content[start:]
 
 
 def _delete(draw: Callable[..., Any], content: bytes) -> bytes:
-    start, end = _place(draw, content)
+    start, end = _position(draw, content)
     return content[:start] + content[end:]
 
 
 def _repeat(draw: Callable[..., Any], content: bytes) -> bytes:
-    start, end = _place(draw, content)
+    start, end = _position(draw, content)
     return content[:end] + content[start:]
 
 
 def _truncate(draw: Callable[..., Any], content: bytes) -> bytes:
-    return content[: _place(draw, content)[0]]
+    return content[: _position(draw, content)[0]]
 
 
 def _swap(draw: Callable[..., Any], content: bytes) -> bytes:
     """Swap two neighbouring parts."""
-    start, end = _place(draw, content)
+    start, end = _position(draw, content)
     middle = (start + end) // 2
     return content[:start] + content[middle:end] + content[start:middle] + content[end:]
 
 
 def _number(draw: Callable[..., Any], content: bytes) -> bytes:
     """Replace a number, as far as there is text."""
-    places = [place.span() for place in _NUMBER.finditer(content[: 1 << 14])]
-    if not places:
+    positions = [position.span() for position in _NUMBER.finditer(content[: 1 << 14])]
+    if not positions:
         return _flip(draw, content)
-    start, end = draw(st.sampled_from(places))
+    start, end = draw(st.sampled_from(positions))
     return content[:start] + draw(st.sampled_from(_ODD_NUMBERS + _ODD_TEXTS)) + content[end:]
 
 

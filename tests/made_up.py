@@ -29,8 +29,8 @@ class MadeUpDevice(AbstractDevice):
             force = reached * (1 + 4 * dangerous)
             readings[:, :, sensor] += force[:, None] * during
         grid = torch.cartesian_prod(torch.tensor([0.02, 0.06, 0.1]), torch.tensor([0.02, 0.06, 0.1, 0.14]))
-        places = grid.flip(1) + 0.004 * torch.rand(12, 2, generator=torch.Generator().manual_seed(0))
-        positions = torch.cat([places, torch.full((12, 1), 0.005)], dim=1)
+        sites = grid.flip(1) + 0.004 * torch.rand(12, 2, generator=torch.Generator().manual_seed(0))
+        positions = torch.cat([sites, torch.full((12, 1), 0.005)], dim=1)
         return Touches(readings, torch.ones_like(readings, dtype=torch.bool), positions, labels, self.rate)
 
 

@@ -34,8 +34,8 @@ class Plain(nn.Module):
 
 def _edges(positions: Tensor) -> tuple[Tensor, Tensor]:
     """Return edge index (2, E) and weights (E,) of the six nearest neighbours."""
-    places = positions.double().numpy()
-    weights = torch.from_numpy(adjacency(places, neighbours(places, "knn", 6), "exp")).float()
+    sites = positions.double().numpy()
+    weights = torch.from_numpy(adjacency(sites, neighbours(sites, "knn", 6), "exp")).float()
     index = weights.nonzero().T
     return index, weights[index[0], index[1]]
 

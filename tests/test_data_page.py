@@ -20,15 +20,15 @@ LINES = {
 
 
 @pytest.fixture(scope="module")
-def place(tmp_path_factory):
+def position(tmp_path_factory):
     """Return a folder with a data set of three shards, ``touches``."""
-    place = tmp_path_factory.mktemp("data")
+    position = tmp_path_factory.mktemp("data")
     with initialize_config_dir(str(CONF), version_base="1.3"), pytest.MonkeyPatch.context() as patch:
         patch.setattr("skin.device.simulated._BATCH", 16)
         patch.setattr("skin.device.base._PART", 1)
         config = validate_config(compose("generate", ["simulator=naive", "n=48", "device.dead=1"]))
-        generate_data_set(build_device(config), settings_of(config), place / "touches")
-    return place
+        generate_data_set(build_device(config), settings_of(config), position / "touches")
+    return position
 
 
 def peaks(folder) -> dict[int, float]:
@@ -43,9 +43,9 @@ def peaks(folder) -> dict[int, float]:
 
 
 @pytest.mark.parametrize("library", sorted(LINES))
-def test_a_library_reads_a_data_set_by_the_lines_of_the_page(library, place, monkeypatch):
+def test_a_library_reads_a_data_set_by_the_lines_of_the_page(library, position, monkeypatch):
     pytest.importorskip(library)
-    monkeypatch.chdir(place)
+    monkeypatch.chdir(position)
     names = {}
     exec(LINES[library], names)
     found = names["peaks"]
@@ -53,7 +53,7 @@ def test_a_library_reads_a_data_set_by_the_lines_of_the_page(library, place, mon
         found = found.to_dict()
     else:
         found = dict(zip(found["simulation"].to_list(), found["reading_00"].to_list(), strict=True))
-    expected = peaks(place / "touches")
+    expected = peaks(position / "touches")
     assert 10 < len(expected) < 48
     assert list(found) == sorted(expected)
     assert found == expected
@@ -74,10 +74,10 @@ def test_the_page_names_the_keys_of_the_manifest():
     assert sorted(named) == sorted(Manifest.__annotations__)
 
 
-def test_the_page_names_the_columns(place):
+def test_the_page_names_the_columns(position):
     table = PAGE[PAGE.index("| column |") : PAGE.index("## Training")]
     named = first_column(table)
-    known = Manifest.read(place / "touches").columns
+    known = Manifest.read(position / "touches").columns
     assert {name for name in named if not name.endswith("_")} <= set(known)
     own = {name for name in known if not name.startswith(("reading_", "saturated_", "gesture_"))}
     assert own <= set(named)

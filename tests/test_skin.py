@@ -76,10 +76,10 @@ def test_a_run_is_loaded_and_predicts_a_recording(run, tmp_path):
         assert done.returncode == 0, done.stderr
     trained = skin.load_run("latest", f"sqlite:///{tmp_path}/m.db")
     touches = skin.read_recording(tmp_path / "x.csv").touches
-    chances = trained.predict(touches)
-    assert chances.shape == (20, len(trained.labels))
+    probabilities = trained.predict(touches)
+    assert probabilities.shape == (20, len(trained.labels))
     assert trained.labels == ("big", "dynamic", "press", "dangerous")
-    assert 0 <= chances.min() <= chances.max() <= 1
+    assert 0 <= probabilities.min() <= probabilities.max() <= 1
     with pytest.raises(skin.InputError, match="no finished training run none"):
         skin.load_run("none", f"sqlite:///{tmp_path}/m.db")
 
@@ -127,8 +127,8 @@ def test_what_only_training_needs_is_not_imported(code, readme, tmp_path):
 def test_the_example_of_the_readme_runs(readme):
     made, said = readme
     assert len(made["run"].labels) == 4
-    chances = dict(zip(made["run"].labels, made["run"].predict(made["readings"])[0], strict=True))
-    assert chances["press"] > 0.5 > chances["big"]
+    probabilities = dict(zip(made["run"].labels, made["run"].predict(made["readings"])[0], strict=True))
+    assert probabilities["press"] > 0.5 > probabilities["big"]
     assert "dangerous" in said
 
 
@@ -185,8 +185,8 @@ def test_the_example_predicts_from_an_array(example):
     assert run.positions.shape == (9, 3)
     assert isinstance(probabilities, np.ndarray)
     assert (probabilities.shape, probabilities.dtype) == ((1, 4), np.float32)
-    chances = dict(zip(run.labels, probabilities[0], strict=True))
-    assert chances["press"] > 0.5 > chances["big"]
+    expected = dict(zip(run.labels, probabilities[0], strict=True))
+    assert expected["press"] > 0.5 > expected["big"]
 
 
 def test_one_window_a_list_and_touches_give_the_same(example):
@@ -194,7 +194,7 @@ def test_one_window_a_list_and_touches_give_the_same(example):
     np.testing.assert_allclose(run.predict(readings[0]), probabilities[0], atol=1e-5)
     np.testing.assert_allclose(run.predict(readings.tolist()), probabilities, atol=1e-5)
     values = torch.from_numpy(readings).float()
-    touches = Touches(values.nan_to_num(), ~values.isnan(), run.places, None, run.rate)
+    touches = Touches(values.nan_to_num(), ~values.isnan(), run.positions, None, run.rate)
     tensor = run.predict(touches)
     assert isinstance(tensor, torch.Tensor)
     np.testing.assert_allclose(tensor.numpy(), probabilities, atol=1e-5)

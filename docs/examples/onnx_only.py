@@ -97,19 +97,19 @@ def read_text(line, count, adapter):
     invalid = INVALID | {str(word).lower() for word in adapter.get("invalid", [])}
     numbers = [np.nan if word.lower() in invalid else float(word) for word in words]
 
-    def places(fields):
+    def positions(fields):
         names = adapter.get("names") or [""]
         names = [names[n % len(names)] for n in range(len(words))]
         return [n for f in fields for n in range(len(words)) if n == f or fnmatchcase(names[n], str(f))]
 
     roles = {
-        role: places([adapter[role]])
+        role: positions([adapter[role]])
         for role in ("counter", "time")
         if adapter.get(role) not in (None, "auto")
     }
-    aside = {*places(adapter.get("drop") or []), *(n for found in roles.values() for n in found)}
+    aside = {*positions(adapter.get("drop") or []), *(n for found in roles.values() for n in found)}
     kept = [n for n in range(len(words)) if n not in aside]
-    kept = places(adapter["values"]) if adapter.get("values") else kept
+    kept = positions(adapter["values"]) if adapter.get("values") else kept
     spare = sum(
         adapter.get(role, "auto") == "auto" for role in ("counter", "time") if not adapter.get("names")
     )
@@ -173,11 +173,13 @@ def main():
             newtons = np.stack(window) - np.nanmedian(quiet, axis=0)
             valid = np.isfinite(newtons) & ~broken
             readings = np.where(valid, newtons, 0).astype(np.float32)
-            chances = session.run(None, {"readings": readings[None], "valid": valid[None]})[0][0].tolist()
-            chances = dict(zip(about["labels"], chances, strict=True))
+            probabilities = session.run(None, {"readings": readings[None], "valid": valid[None]})[0][
+                0
+            ].tolist()
+            probabilities = dict(zip(about["labels"], probabilities, strict=True))
             touched = bool(readings.max() >= about["contact"])
-            alarm = touched and chances["dangerous"] > about["threshold"]
-            print(json.dumps({"touched": touched, "alarm": alarm, **chances}), flush=True)
+            alarm = touched and probabilities["dangerous"] > about["threshold"]
+            print(json.dumps({"touched": touched, "alarm": alarm, **probabilities}), flush=True)
     end(f"{port} sends no line for {SILENCE} s")
 
 

@@ -73,12 +73,14 @@ with chdir(folder):
 with chdir(folder):
     run = skin.load_run("latest")
 touches = run.device.touches("test")[:5]
-chances = run.predict(touches)
-alarms = run.point.alarm(chances[:, run.labels.index("dangerous")])
+probabilities = run.predict(touches)
+alarms = run.point.alarm(probabilities[:, run.labels.index("dangerous")])
 print(*(f"{label:>10}" for label in run.labels), "     alarm", "  truly dangerous")
-for row, alarm, truth in zip(chances, alarms, touches.labels, strict=True):
+for row, alarm, truth in zip(probabilities, alarms, touches.labels, strict=True):
     print(
-        *(f"{chance:10.2f}" for chance in row), f"{'yes' if alarm else 'no':>10}", f"{bool(truth[-1])!s:>17}"
+        *(f"{probability:10.2f}" for probability in row),
+        f"{'yes' if alarm else 'no':>10}",
+        f"{bool(truth[-1])!s:>17}",
     )
 
 # %%

@@ -40,14 +40,19 @@ class KernelModel:
         self.make = partial(TRANSFORMS[transform], jobs, seed, settings)
 
     def fit(
-        self, x: np.ndarray, labels: np.ndarray, held: np.ndarray, held_labels: np.ndarray, most: int = 4096
+        self,
+        x: np.ndarray,
+        labels: np.ndarray,
+        held: np.ndarray,
+        held_labels: np.ndarray,
+        maximum: int = 4096,
     ) -> float:
-        """Fit kernels, to the first ``most`` touches, ridges and logistic curves; return the duration, s.
+        """Fit kernels, to the first ``maximum`` touches, ridges and logistic curves; return the duration, s.
 
         Compilation is not part of the duration.
         """
         self.make().fit_transform(x[:32])
-        began, self.first = time.perf_counter(), x[:most]
+        began, self.first = time.perf_counter(), x[:maximum]
         self.transform = self.make().fit(self.first)
         table = np.concatenate(list(self._parts(x)))
         # aeon's strengths end at 1e3, but stronger ridges are selected here.

@@ -231,7 +231,7 @@ def summarise_estimates(
     for estimate, truths in zip(estimates, contacts, strict=True):
         if not number or estimate.number != number:
             continue
-        centres = np.array([contact.place for contact in estimate.contacts])
+        centres = np.array([contact.position for contact in estimate.contacts])
         distances = np.linalg.norm(centres[:, None] - truths[:, :2], axis=2)
         for index, true in zip(*linear_sum_assignment(distances**2), strict=True):
             contact, (*position, radius, force) = estimate.contacts[index], truths[true]
@@ -419,5 +419,5 @@ def posterior_errors(strip: Strip, x: np.ndarray, measured: np.ndarray) -> np.nd
     posterior = Posterior(strip.simulator, noise, strip.body, prior, contacts=1)
     estimates = posterior.estimate(measured / strip.gains)
     assert isinstance(estimates, list)
-    positions = np.array([estimate.contacts[0].place[0] for estimate in estimates])
+    positions = np.array([estimate.contacts[0].position[0] for estimate in estimates])
     return 1e3 * (positions - strip.offset) - x

@@ -37,7 +37,7 @@ from skin.plot.figures import (
     confusions,
     force_and_reading,
     misclassified,
-    misclassified_shares,
+    misclassified_fractions,
     save_figure,
     traces,
 )
@@ -398,7 +398,7 @@ def draw_report(trials: pd.DataFrame, skins: Mapping[str, Config], folder: Path)
         matrices = {row: _confusion(outcomes) for row, outcomes in codes.items()}
         drawn = devices[name].recording("test", complete=False).parameters["speed"].numpy()
         courses = {
-            row: misclassified_shares(drawn * devices[name].model_rate, each, speeds)
+            row: misclassified_fractions(drawn * devices[name].model_rate, each, speeds)
             for row, outcomes in codes.items()
             for each in [1 - decode(outcomes, "big/accuracy", TOUCH).mean(axis=0)]
         }

@@ -65,9 +65,9 @@ class Material:
         """
         if self.relaxation is None:
             return self
-        relaxed_share = 1 / (1 + speed * self.relaxation.time)
+        relaxed_fraction = 1 / (1 + speed * self.relaxation.time)
         return Material(
-            self.name, self.young * (1 + self.relaxation.strength * (1 - relaxed_share)), self.poisson
+            self.name, self.young * (1 + self.relaxation.strength * (1 - relaxed_fraction)), self.poisson
         )
 
     @classmethod

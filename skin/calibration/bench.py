@@ -108,7 +108,7 @@ class Gauge:
     Attributes:
         time: (N,), s, by the clock of the session.
         force: (N,), N.
-        place: (N, 2), m: centre of the indenter, x right and y down from the upper left corner.
+        position: (N, 2), m: centre of the indenter, x right and y down from the upper left corner.
         radius: (N,), m: half the larger extent of the indenter.
         angle: (N,), rad: rotation from x towards y.
         indenter: (N,), names as in ``touch.shapes``.
@@ -117,7 +117,7 @@ class Gauge:
 
     time: np.ndarray
     force: np.ndarray
-    place: np.ndarray
+    position: np.ndarray
     radius: np.ndarray
     angle: np.ndarray
     indenter: np.ndarray
@@ -152,7 +152,7 @@ class Gauge:
         """
         force, press = self.at(time)
         rows = self.first[np.maximum(press, 0)]
-        values = np.column_stack([self.place[rows], self.radius[rows], force, force * peaks[press]])
+        values = np.column_stack([self.position[rows], self.radius[rows], force, force * peaks[press]])
         return np.where((force > 0)[:, None], values, np.nan)[:, None]
 
 
@@ -252,14 +252,14 @@ def gauge_from_table(
         )
     if force.min() < -0.05 * force.max():
         raise InputError(f"{where}: force must be at least 0 N, got {force.min():g}: zero the gauge")
-    place = np.stack([complete["x_m"], complete["y_m"]], axis=1)
-    same = np.column_stack([place, complete["radius_m"], complete["angle"], complete["press"]])
+    position = np.stack([complete["x_m"], complete["y_m"]], axis=1)
+    same = np.column_stack([position, complete["radius_m"], complete["angle"], complete["press"]])
     new = (np.diff(same, axis=0) != 0).any(axis=1) | (names[rows][1:] != names[rows][:-1])
     press = np.concatenate([[0], np.cumsum(new | (np.diff(time) > _PAUSE))])
     return Gauge(
         time,
         np.maximum(force, 0),
-        place,
+        position,
         complete["radius_m"],
         complete["angle"],
         names[rows].astype(str),
@@ -274,12 +274,12 @@ def per_newton(simulator: AbstractSimulator, body: AbstractBody, gauge: Gauge) -
     Simulators are positively homogeneous, so one frame of 1 N determines a press of any force.
 
     Raises:
-        InputError: a place outside the sheet, a radius that is not above 0, or an unknown indenter.
+        InputError: a position outside the sheet, a radius that is not above 0, or an unknown indenter.
     """
     rows = gauge.first
-    place, radius, angle = gauge.place[rows], gauge.radius[rows], gauge.angle[rows]
-    if (place < 0).any() or (place > body.size).any():
-        wrong = place[((place < 0) | (place > body.size)).any(axis=1)][0]
+    position, radius, angle = gauge.position[rows], gauge.radius[rows], gauge.angle[rows]
+    if (position < 0).any() or (position > body.size).any():
+        wrong = position[((position < 0) | (position > body.size)).any(axis=1)][0]
         raise InputError(
             f"a press at {wrong.tolist()} m is outside the sheet of {list(body.size)} m: x_m and y_m are "
             "metres from its upper left corner"
@@ -289,7 +289,7 @@ def per_newton(simulator: AbstractSimulator, body: AbstractBody, gauge: Gauge) -
     shapes, kind, scale = _indenters(body, gauge)
     area = float(np.prod(body.cell))
     pieces = [slice(number, number + 1) for number in range(len(kind))]
-    images = (shapes.render(kind[n], angle[n], scale[n], place[n]) / area for n in pieces)
+    images = (shapes.render(kind[n], angle[n], scale[n], position[n]) / area for n in pieces)
     return torch.cat([simulator(image).readings for image in images]).double().numpy()
 
 
@@ -401,8 +401,8 @@ def write_bench_session(session: BenchSession, path: str | Path) -> Path:
     if (gauge := session.gauge) is not None:
         force, press = gauge.at(session.time)
         row = gauge.first[np.maximum(press, 0)]
-        place, shape = gauge.place[row].T, (gauge.indenter[row], gauge.radius[row], gauge.angle[row])
-        values = zip(GAUGE, (force, *place, *shape, press), strict=True)
+        position, shape = gauge.position[row].T, (gauge.indenter[row], gauge.radius[row], gauge.angle[row])
+        values = zip(GAUGE, (force, *position, *shape, press), strict=True)
         columns |= {name: np.ma.masked_array(column, press < 0) for name, column in values}
     table, about = pa.table(columns), json.dumps({"unit": session.unit, "bits": session.bits})
     with whole(path) as partial:

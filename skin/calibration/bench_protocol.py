@@ -16,7 +16,7 @@ from skin.wire.emulator import Converter
 
 @dataclass(frozen=True)
 class Protocol:
-    """Idle time, then a staircase at each place: up, down, up to the peak, and a sudden release.
+    """Idle time, then a staircase at each position: up, down, up to the peak, and a sudden release.
 
     The upward steps determine gains, the downward steps hysteresis, the release the lag, and idle time
     offset, noise and drift.
@@ -43,8 +43,8 @@ class Protocol:
     radius: PositiveFloat = 0.01
     rate: PositiveFloat = 100.0
 
-    def gauge(self, places: np.ndarray) -> Gauge:
-        """Return a gauge's rows for presses at places (P, 2), m."""
+    def gauge(self, positions: np.ndarray) -> Gauge:
+        """Return a gauge's rows for presses at positions (P, 2), m."""
         levels = [0.0, *self.steps, *list(self.steps)[-2::-1], self.steps[-1]]
         corners = np.cumsum([0.0, *[self.ramp, self.hold] * (len(levels) - 1)])
         heights = self.peak * np.repeat(levels, 2)[1:]
@@ -53,21 +53,21 @@ class Protocol:
             [np.interp(inside, corners, heights), np.zeros(max(2, round(0.2 * self.rate)))]
         )
         pause, start = round(self.rest * self.rate), round(self.idle * self.rate)
-        starts = start + np.arange(len(places)) * (len(press) + pause)
+        starts = start + np.arange(len(positions)) * (len(press) + pause)
         frame = (starts[:, None] + np.arange(len(press))).ravel()
         rows = len(frame)
         return Gauge(
             frame / self.rate,
-            np.tile(press, len(places)),
-            np.repeat(places, len(press), axis=0),
+            np.tile(press, len(positions)),
+            np.repeat(positions, len(press), axis=0),
             np.full(rows, self.radius),
             np.zeros(rows),
             np.full(rows, self.indenter),
-            np.repeat(np.arange(len(places)), len(press)),
+            np.repeat(np.arange(len(positions)), len(press)),
         )
 
-    def places(self, device: AbstractSimulated, generator: np.random.Generator) -> np.ndarray:
-        """Return two places per sensor, on it and up to 3 mm beside it, (2 S, 2), m, inside the sheet."""
+    def positions(self, device: AbstractSimulated, generator: np.random.Generator) -> np.ndarray:
+        """Return two positions per sensor, on it and up to 3 mm beside it, (2 S, 2), m, inside the sheet."""
         centre = device.sensors.positions[:, :2]
         beside = centre + generator.uniform(-0.003, 0.003, centre.shape)
         return np.clip(np.concatenate([centre, beside]), 0, device.size)
@@ -116,6 +116,6 @@ def write_demo_session(device: AbstractSimulated, settings: Mapping[str, Any], p
     """
     protocol = configured(Protocol, settings["protocol"], "calibrate.protocol")
     randomness = np.random.default_rng(device.seed)
-    rows = protocol.gauge(protocol.places(device, randomness))
+    rows = protocol.gauge(protocol.positions(device, randomness))
     session = emulate_session(device, rows, protocol, randomness, settings["bits"])
     return f"{write_bench_session(session, path)}: {len(rows)} presses in {session.time[-1]:.0f} s"

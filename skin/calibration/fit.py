@@ -183,16 +183,16 @@ def _fit_time_constant(bench: BenchData, used: np.ndarray, linear: np.ndarray, f
     """Return the weighted mean over releases of presses that reach a channel with linear changes (T,), s."""
     time = bench.session.time
     # Clipped readings contain no information on the lag.
-    most = 0.8 * np.nanmax(linear)
+    maximum = 0.8 * np.nanmax(linear)
     decays = []
     for release in bench.releases:
         if not used[release.start - 2] and not used[release.start - 1]:
             continue
         values = linear[release]
-        start = int(np.argmax(values < most)) if len(values) and (values < most).any() else 0
+        start = int(np.argmax(values < maximum)) if len(values) and (values < maximum).any() else 0
         decays.append(fit_decay(time[release][start:], np.nan_to_num(values[start:]), floor))
-    weight = sum(share for _, share in decays)
-    return sum(value * share for value, share in decays) / weight if weight else 0.0
+    weight = sum(fraction for _, fraction in decays)
+    return sum(value * fraction for value, fraction in decays) / weight if weight else 0.0
 
 
 def fit_decay(time: np.ndarray, values: np.ndarray, floor: float) -> tuple[float, float]:
@@ -310,9 +310,9 @@ def _fit_branches(
         return
     bent, lever = measured[down] - gain * lagged[down], gain * bend[down]
     keep = np.abs(bent - np.median(bent)) <= 6 * np.median(np.abs(bent - np.median(bent)))
-    share = float((bent[keep] * lever[keep]).sum() / (lever[keep] ** 2).sum())
-    error = float(np.std(bent[keep] - share * lever[keep]) / np.sqrt((lever[keep] ** 2).sum()))
-    channel.hysteresis = share if share > 2 * error else 0.0
+    fraction = float((bent[keep] * lever[keep]).sum() / (lever[keep] ** 2).sum())
+    error = float(np.std(bent[keep] - fraction * lever[keep]) / np.sqrt((lever[keep] ** 2).sum()))
+    channel.hysteresis = fraction if fraction > 2 * error else 0.0
 
 
 def _convert_to_newton(
@@ -404,12 +404,12 @@ class HeldOutErrors:
         return self.calibrated < min(self.simulated, self.tared)
 
 
-def evaluate_held_out(bench: BenchData, share: float) -> HeldOutErrors:
+def evaluate_held_out(bench: BenchData, fraction: float) -> HeldOutErrors:
     """Calibrate without some presses, and compare their simulation with the measured readings.
 
     Args:
         bench: the session.
-        share: of the presses that is held out.
+        fraction: of the presses that is held out.
 
     Raises:
         InputError: no sensor has two presses.
@@ -419,7 +419,7 @@ def evaluate_held_out(bench: BenchData, share: float) -> HeldOutErrors:
     spare = [n for n in range(len(strongest)) if (strongest[:n] == strongest[n]).any()]
     if not spare:
         raise InputError("no press can be held out: press near every sensor at least twice")
-    count = min(len(spare), max(1, round(share * len(strongest))))
+    count = min(len(spare), max(1, round(fraction * len(strongest))))
     held = [spare[n] for n in np.linspace(0, len(spare) - 1, count).round().astype(int)]
     calibration = fit_calibration(bench, [n for n in range(len(bench.gauge)) if n not in held])
     answers = bench.each[bench.applied[1]]
@@ -457,7 +457,7 @@ def estimate_force(raw: np.ndarray, each: np.ndarray, calibration: Calibration) 
 
     Args:
         raw: (..., S), in the session's unit.
-        each: (S,), true readings per N of that indenter at that place, as
+        each: (S,), true readings per N of that indenter at that position, as
             :func:`skin.calibration.bench.per_newton` gives them.
         calibration: of this skin.
 
@@ -480,12 +480,12 @@ def _estimate_forces(bench: BenchData, presses: Sequence[int], calibration: Cali
     late_force = late[0, :, 0].numpy()
     per_second = calibration.signs * calibration.known("drift") / calibration.scale
     drift = per_second * bench.session.time[:, None]
-    raw, shares = bench.session.raw - drift, []
+    raw, fractions = bench.session.raw - drift, []
     for number in presses:
         mine = bench.loading & (press == number)
         mine &= force > _LOADED * force[press == number].max()
-        shares.append(estimate_force(raw[mine], bench.each[number], calibration) / late_force[mine])
-    finite = [ratios[np.isfinite(ratios)] for ratios in shares]
+        fractions.append(estimate_force(raw[mine], bench.each[number], calibration) / late_force[mine])
+    finite = [ratios[np.isfinite(ratios)] for ratios in fractions]
     return np.array([np.median(ratios) for ratios in finite if len(ratios)])
 
 

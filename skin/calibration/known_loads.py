@@ -126,11 +126,11 @@ def base_readings(model: AbstractSimulator, body: AbstractBody, sensors: Sensors
 
     Near the rim the base is as far inside as it needs to be to lie on the skin.
     """
-    places = np.clip(sensors.positions[:, :2], base, np.array(body.size) - base)
-    count = len(places)
+    positions = np.clip(sensors.positions[:, :2], base, np.array(body.size) - base)
+    count = len(positions)
     zeros, names = np.zeros(count), np.full(count, "disc")
     presses = np.arange(count)
-    rows = Gauge(presses.astype(float), zeros + 1, places, zeros + base, zeros, names, presses)
+    rows = Gauge(presses.astype(float), zeros + 1, positions, zeros + base, zeros, names, presses)
     return per_newton(model, body, rows)
 
 
@@ -169,8 +169,8 @@ def _sign(placements: Placements) -> np.ndarray:
     """Return 1 or -1 per channel, (S,): whether it rises under load; as most others, if it is silent."""
     strongest = np.abs(placements.change).argmax(axis=0)
     signs = np.sign(placements.change[strongest, np.arange(placements.change.shape[1])])
-    most = -1.0 if signs[placements.reached].sum() < 0 else 1.0
-    return np.where(placements.reached & (signs != 0), signs, most)
+    maximum = -1.0 if signs[placements.reached].sum() < 0 else 1.0
+    return np.where(placements.reached & (signs != 0), signs, maximum)
 
 
 def _build(
@@ -348,8 +348,8 @@ def emulate_placements(
     number = np.floor((time - protocol.idle) / period).astype(int)
     inside = (time - protocol.idle) % period
     corners = [0.0, protocol.ramp, protocol.ramp + 2.0, 2 * protocol.ramp + 2.0]
-    share = np.where(number >= 0, np.interp(inside, corners, [0.0, 1.0, 1.0, 0.0]), 0.0)
-    true = share[:, None] * readings[np.maximum(number, 0)]
+    fraction = np.where(number >= 0, np.interp(inside, corners, [0.0, 1.0, 1.0, 0.0]), 0.0)
+    true = fraction[:, None] * readings[np.maximum(number, 0)]
     return sent_session(device, true, time, generator, bits)
 
 

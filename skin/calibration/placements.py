@@ -65,7 +65,7 @@ def find_placements(session: BenchSession) -> Placements:
         idle[margin] = False
         if starts[end - 1] - starts[begin] < _SHORTEST:
             continue
-        low, high = (begin + round(share * (end - begin)) for share in _STEADY)
+        low, high = (begin + round(fraction * (end - begin)) for fraction in _STEADY)
         steady = values[low : max(high, low + 3)] - (before + after) / 2
         change = np.median(steady, axis=0)
         if (np.ptp(steady, axis=0) > _UNSTEADY * np.abs(change).max() + _LOADED * noise).any():

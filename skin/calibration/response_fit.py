@@ -99,8 +99,8 @@ def fit_shape(true: np.ndarray, measured: np.ndarray, press: np.ndarray, noise: 
 
 
 def _clearly_better(error: float, simpler: float) -> bool:
-    factor, least = _BETTER
-    return error < factor * simpler and error < simpler - least
+    factor, minimum = _BETTER
+    return error < factor * simpler and error < simpler - minimum
 
 
 def collect_points(
@@ -122,8 +122,8 @@ def collect_points(
     rows = []
     for number in np.unique(press[usable]):
         mine = usable & (press == number)
-        for place in np.unique(bins[mine]):
-            group = mine & (bins == place)
+        for position in np.unique(bins[mine]):
+            group = mine & (bins == position)
             rows.append((np.median(np.log(true[group])), np.log(np.median(measured[group])), number))
     values = np.array(rows).reshape(-1, 3)
     enough = [np.sum(values[:, 2] == number) >= _FEWEST for number in values[:, 2]]
@@ -136,8 +136,8 @@ def _find_limit(true: np.ndarray, measured: np.ndarray, level: float, noise: flo
     high = measured > level - max(3 * noise, _PLATEAU * level)
     if not high.any():
         return np.inf
-    start, most = np.quantile(true[high], 0.05), true.max()
-    if start > _WIDE * most:
+    start, maximum = np.quantile(true[high], 0.05), true.max()
+    if start > _WIDE * maximum:
         return np.inf
     inside = high & (true > start)
     half = true[inside] > np.median(true[inside])

@@ -1,7 +1,7 @@
 """Find out which channel belongs to which sensor, from idle frames and the responses to presses.
 
 A channel that responds at other presses than its sensor should is not dead. The session is compared with what
-it would be if the places of the presses were mirrored or turned, or the channels in another order.
+it would be if the positions of the presses were mirrored or turned, or the channels in another order.
 """
 
 import math
@@ -94,8 +94,8 @@ def _spread(values: np.ndarray, step: float) -> np.ndarray:
     rank = np.empty(len(values))
     rank[order] = np.arange(len(values)) - np.repeat(np.cumsum(count) - count, count)
     # Ranks follow time; a fixed shuffle keeps them from distorting a drift.
-    place = (rank * 0.6180339887498949) % 1
-    return values + step * (place - 0.5)
+    position = (rank * 0.6180339887498949) % 1
+    return values + step * (position - 0.5)
 
 
 @dataclass(frozen=True)
@@ -193,8 +193,8 @@ def match_channels(responses: Responses, per_newton: np.ndarray) -> Match:
     sign = np.where(best < 0, -1.0, 1.0)
     # Beside a press the surface may rise: a channel that is inverse alone has to fit better.
     nearest = sign[np.arange(len(sign)), residual.argmin(axis=1)][responses.responding]
-    most = -1.0 if nearest.sum() < 0 else 1.0
-    residual = np.where(sign == most, residual, np.minimum(_INVERSE * residual, 1.0))
+    maximum = -1.0 if nearest.sum() < 0 else 1.0
+    residual = np.where(sign == maximum, residual, np.minimum(_INVERSE * residual, 1.0))
     return Match(residual, sign, expected)
 
 
@@ -204,8 +204,8 @@ def find_polarity(responses: Responses, per_newton: np.ndarray) -> np.ndarray:
     A channel that does not respond has the polarity of most others.
     """
     signs = np.diagonal(match_channels(responses, per_newton).sign)
-    most = -1.0 if signs[responses.responding].sum() < 0 else 1.0
-    return np.where(responses.responding, signs, most)
+    maximum = -1.0 if signs[responses.responding].sum() < 0 else 1.0
+    return np.where(responses.responding, signs, maximum)
 
 
 def find_medians(values: np.ndarray) -> np.ndarray:
@@ -283,15 +283,15 @@ def turn_gauge(gauge: Gauge, turn: Turn, size: Sequence[float]) -> Gauge:
     """
     matrix = np.array(_MATRICES[turn], dtype=float)
     middle = np.array(size) / 2
-    centred = gauge.place - np.abs(matrix).T @ middle
+    centred = gauge.position - np.abs(matrix).T @ middle
     direction = matrix @ np.stack([np.cos(gauge.angle), np.sin(gauge.angle)])
     angle = gauge.angle if turn == "as_given" else np.arctan2(direction[1], direction[0])
-    return replace(gauge, place=centred @ matrix.T + middle, angle=angle)
+    return replace(gauge, position=centred @ matrix.T + middle, angle=angle)
 
 
 def lies_on_sheet(gauge: Gauge, size: Sequence[float]) -> bool:
-    """Return whether all places of a gauge are on a sheet of this size, x and y, m."""
-    return bool((gauge.place >= 0).all() and (gauge.place <= np.array(size)).all())
+    """Return whether all positions of a gauge are on a sheet of this size, x and y, m."""
+    return bool((gauge.position >= 0).all() and (gauge.position <= np.array(size)).all())
 
 
 def compose_turns(first: Turn, then: Turn) -> Turn:
@@ -306,7 +306,7 @@ class Confirmed:
     """What the user confirms about a session.
 
     Attributes:
-        places: how the places of the presses are turned to be those of the sheet.
+        places: how the positions of the presses are turned to be those of the sheet.
         channels: column of the session, from 0, of every sensor; None: the same order.
         broken: sensors, from 0, that count as dead.
 
@@ -341,10 +341,10 @@ class Confirmed:
 
 @dataclass(frozen=True)
 class _Explanation:
-    """A turn of the places and the sensor of every channel, with what they leave unexplained.
+    """A turn of the positions and the sensor of every channel, with what they leave unexplained.
 
     Attributes:
-        turn: of the places.
+        turn: of the positions.
         sensors: (S,), sensor of every channel.
         residual: (S,), of every channel at its sensor, 0 to 1; 0 where it does not respond.
         sure: whether no other sensor explains a channel that is not at its own sensor about as well.
@@ -373,9 +373,9 @@ class _Explanation:
     def clearly_worse(self, rival: "_Explanation") -> bool:
         """Return whether another explanation leaves clearly less."""
         differs = (self.sensors != rival.sensors) | (self.turn != rival.turn)
-        factor, least = _CLEARER
+        factor, minimum = _CLEARER
         leaves_more = len(self.unexplained) > len(rival.unexplained)
-        return leaves_more or self.residual[differs].sum() > factor * rival.residual[differs].sum() + least
+        return leaves_more or self.residual[differs].sum() > factor * rival.residual[differs].sum() + minimum
 
 
 def wired_bench(
@@ -401,7 +401,7 @@ def wired_bench(
     gauge = turn_gauge(rows, confirmed.places, device.size)
     turned = {turn: turn_gauge(gauge, turn, device.size) for turn in TURNS}
     allowed = {turn: places for turn, places in turned.items() if lies_on_sheet(places, device.size)}
-    # Where no turn brings all places onto the sheet, they are refused here.
+    # Where no turn brings all positions onto the sheet, they are refused here.
     bench = build_bench_data(device, session, next(iter(allowed.values()), gauge))
     responses = collect_responses(bench)
     straight, best = _compare_turns(device, bench, responses, allowed)
@@ -417,7 +417,7 @@ def _compare_turns(
 ) -> tuple[_Explanation | None, list[_Explanation]]:
     """Return the explanation by the layout as it is, and those about as good as the best, simplest first.
 
-    The first is None where the places as given are not on the sheet.
+    The first is None where the positions as given are not on the sheet.
     """
     explanations = list[_Explanation]()
     for turn, gauge in allowed.items():
@@ -445,11 +445,13 @@ def _explain(match: Match, responding: np.ndarray, turn: Turn) -> tuple[_Explana
     for channel in np.flatnonzero(~settled):
         sensors[channel] = -1 if channel in sensors else channel
     sensors[sensors < 0] = np.setdiff1d(channels, sensors)
-    straight, permuted = (np.where(responding, cost[channels, place], 0.0) for place in (channels, sensors))
-    factor, least = _CLEARER
+    straight, permuted = (
+        np.where(responding, cost[channels, position], 0.0) for position in (channels, sensors)
+    )
+    factor, minimum = _CLEARER
     moved = np.flatnonzero(settled & (sensors != channels))
     seconds = [
-        np.delete(cost[channel], sensors[channel]).min(initial=1.0) > factor * permuted[channel] + least
+        np.delete(cost[channel], sensors[channel]).min(initial=1.0) > factor * permuted[channel] + minimum
         for channel in moved
     ]
     seconds += list((match.expected[sensors[moved]] >= _PRESSED) & (permuted[moved] <= _WELL))
@@ -473,10 +475,12 @@ def _phrase_refusal(
     else:
         wrong = np.flatnonzero(straight.residual > _CLEARER[0] * best.residual + _CLEARER[1])
         wrong = np.union1d(wrong, straight.unexplained).astype(int)
-        noun, verb, place = ("channels", "respond", "their sensors") if len(wrong) > 1 else (
+        noun, verb, position = ("channels", "respond", "their sensors") if len(wrong) > 1 else (
             "channel", "responds", "its sensor"
         )  # fmt: skip
-        trouble = f"{noun} {list_numbers(sorted(order[wrong]))} {verb}, but not to the presses near {place}"
+        trouble = (
+            f"{noun} {list_numbers(sorted(order[wrong]))} {verb}, but not to the presses near {position}"
+        )
     if not clear and 2 * len(wrong) > responding.sum():
         return (
             f"{trouble}: neither another order of the channels nor other axes explain the session; check the "

@@ -107,7 +107,7 @@ def _export_file(
     run = find_run(config.tracking, name, config.trust)
     whole = run.configured(overrides())
     model = load_model(run, whole, touch=touch, one_skin=True)
-    module = model.learner.pipeline(model.places)  # refused before anything else is simulated
+    module = model.learner.pipeline(model.sites)  # refused before anything else is simulated
     if advice := equation10_warning(run.stored):
         print(advice, file=sys.stderr)
     steps.begin("tuning the contact threshold")

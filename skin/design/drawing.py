@@ -30,7 +30,7 @@ def print_expected(findings: Sequence[Findings]) -> None:
 
 
 def draw_expected(body: AbstractBody, sensors: Sensors, maps: Mapping[float, np.ndarray], path: Path) -> Path:
-    """Draw the expected error of the place for each force, with the sensors, and return the path.
+    """Draw the expected error of the position for each force, with the sensors, and return the path.
 
     Args:
         body: the skin.
@@ -77,7 +77,7 @@ def print_sweep(steps: Sequence[Step]) -> None:
 
 
 def draw_sweep(steps: Sequence[Step], path: Path) -> Path:
-    """Draw the error of the place against thickness, and return the path.
+    """Draw the error of the position against thickness, and return the path.
 
     There is a line per number of sensors.
 

@@ -46,20 +46,20 @@ Lengths = Annotated[tuple[PositiveFloat, PositiveFloat], RISING]
 class Findings:
     """Errors of the posterior mean for drawn touches around one force.
 
-    The error of a place is that along one axis, the root of the mean square along x and y.
+    The error of a position is that along one axis, the root of the mean square along x and y.
 
     Attributes:
         force_N: median of the forces.
         blind_share: touches that raise no sensor above three standard deviations of the noise of a frame.
-        place_m: error of the place, root of the mean square over touches.
+        place_m: error of the position, root of the mean square over touches.
         place_median_m: its median.
         place_90_m: its 90 % quantile.
         place_raised_m: as ``place_m``, over touches that raise a sensor; NaN without any.
         radius_m: error of the radius, median over touches.
-        force_relative: error of the force, as a share of it, median over touches.
+        force_relative: error of the force, as a fraction of it, median over touches.
         receptive_radius_m: radius of the disc with the area over which a touch raises a sensor above three
             standard deviations, median over sensors.
-        local_precision_m: standard deviation of the place near the true touch, to first order, median over
+        local_precision_m: standard deviation of the position near the true touch, to first order, median over
             touches (:mod:`skin.design.precision`). It is no limit.
     """
 
@@ -83,7 +83,7 @@ class Trials:
         touches: (B, 4), x, y and radius, m, and force, N.
         raised: (B, S), bool, sensors above three standard deviations of the noise of a frame.
         means: (B, 4), posterior means of the touches.
-        deviation: (B,), posterior standard deviation of the place along one axis, m.
+        deviation: (B,), posterior standard deviation of the position along one axis, m.
     """
 
     touches: np.ndarray
@@ -121,7 +121,7 @@ def try_touches(
 
 
 def _moments(cloud: Cloud) -> tuple[np.ndarray, float]:
-    """Return the mean (4,) of a contact, and the standard deviation of its place along one axis."""
+    """Return the mean (4,) of a contact, and the standard deviation of its position along one axis."""
     weight, (centre, width) = cloud.weight.sum(1), cloud.boxes
     mean = weight @ centre
     variance = weight @ ((centre - mean) ** 2 + width**2 / 12)
@@ -164,7 +164,7 @@ class ExpectedPosterior:
         """Write design.json and design.png for a skin, and print a table; no device is needed.
 
         Raises:
-            InputError: a skin that cannot be built, or a margin that leaves no place.
+            InputError: a skin that cannot be built, or a margin that leaves no position.
         """
         from skin.design.drawing import draw_expected, print_expected
 
@@ -189,17 +189,17 @@ class ExpectedPosterior:
         """Return what the posterior tells of touches around each force, N.
 
         Raises:
-            InputError: the margin leaves no place.
+            InputError: the margin leaves no position.
         """
-        places = self.sample(body)
+        positions = self.sample(body)
         priors = {force: FingertipPrior(force, radii=self.radii, rim=self.rim) for force in self.forces}
         candidates = CandidateReadings(simulator, body, next(iter(priors.values())))
-        responses = disc_readings(simulator, body, places, self.rim)
+        responses = disc_readings(simulator, body, positions, self.rim)
         trials = dict[float, Trials]()
         for number, (force, prior) in enumerate(priors.items()):
             rng = generator(Stream.DESIGN, self.seed, number)
-            drawn = force * np.exp(prior.spread * rng.standard_normal(len(places)))
-            touches = np.column_stack([places, drawn])
+            drawn = force * np.exp(prior.spread * rng.standard_normal(len(positions)))
+            touches = np.column_stack([positions, drawn])
             trials[force] = try_touches(
                 candidates, prior, self._noise, touches, responses * drawn[:, None], rng
             )
@@ -215,7 +215,7 @@ class ExpectedPosterior:
             trials: of :meth:`trials`; None: they are computed.
 
         Raises:
-            InputError: the margin leaves no place.
+            InputError: the margin leaves no position.
         """
         trials = trials or self.trials(simulator, body)
         unit = torch.from_numpy(np.column_stack([self.sample(body), np.ones(self.touches)]))
@@ -228,7 +228,7 @@ class ExpectedPosterior:
         ]
 
     def _local_precision(self, responses: Sensitivity, force: float, body: AbstractBody) -> float:
-        """Return the median local precision of the place, m."""
+        """Return the median local precision of the position, m."""
         variances = local_covariance(responses, self._noise, self.priors(force, body)).diagonal(
             dim1=1, dim2=2
         )
@@ -250,11 +250,11 @@ class ExpectedPosterior:
         """Return places and radii of touches, (B, 3), m.
 
         Raises:
-            InputError: the margin leaves no place.
+            InputError: the margin leaves no position.
         """
-        shares = Halton(3, seed=self.seed).random(self.touches)
+        fractions = Halton(3, seed=self.seed).random(self.touches)
         extent = np.array([*self._extent(body), self.radii[1] - self.radii[0]])
-        return np.array([self.margin, self.margin, self.radii[0]]) + shares * extent
+        return np.array([self.margin, self.margin, self.radii[0]]) + fractions * extent
 
     def _extent(self, body: AbstractBody) -> tuple[float, float]:
         width, height = (side - 2 * self.margin for side in body.size)
@@ -266,7 +266,7 @@ class ExpectedPosterior:
         return width, height
 
     def expected_map(self, trials: Trials, body: AbstractBody) -> np.ndarray:
-        """Return the expected error of the place along one axis on each cell, (H, W), m.
+        """Return the expected error of the position along one axis on each cell, (H, W), m.
 
         It is the root of the mean posterior variance of the touches around a cell, weighted by a normal
         distribution as wide as their mean distance. Cells nearer to the edge than the margin are NaN.
@@ -285,14 +285,14 @@ class ExpectedPosterior:
 def _findings(force: float, trials: Trials, area: float, local: float) -> Findings:
     """Return the findings of touches on an area, m^2."""
     errors = trials.means - trials.touches
-    place = np.sqrt((errors[:, :2] ** 2).mean(1))
+    position = np.sqrt((errors[:, :2] ** 2).mean(1))
     raised = trials.raised.any(1)
     numbers = (
         1 - raised.mean(),
-        _rms(place),
-        np.median(place),
-        np.quantile(place, 0.9),
-        _rms(place[raised]) if raised.any() else math.nan,
+        _rms(position),
+        np.median(position),
+        np.quantile(position, 0.9),
+        _rms(position[raised]) if raised.any() else math.nan,
         np.median(np.abs(errors[:, 2])),
         np.median(np.abs(errors[:, 3]) / trials.touches[:, 3]),
         np.median(np.sqrt(trials.raised.mean(0) * area / math.pi)),

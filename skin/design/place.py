@@ -161,11 +161,11 @@ class Place:
         forbidden: np.ndarray | None,
         folder: Path,
     ) -> list[Path]:
-        places = problem.sensors.positions[:, :2]
+        positions = problem.sensors.positions[:, :2]
         figure = placement(
-            places[chosen],
-            places[problem.layout],
-            places[: problem.sites],
+            positions[chosen],
+            positions[problem.layout],
+            positions[: problem.sites],
             problem.body.size,
             forbidden,
             f"{content['information_nats']:.1f} nats",

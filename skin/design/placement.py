@@ -39,15 +39,15 @@ def mutual_information(signal: np.ndarray, sites: Sites) -> float:
     return float(np.linalg.slogdet(np.eye(len(chosen)) + signal[np.ix_(chosen, chosen)])[1] / 2)
 
 
-def too_near(places: np.ndarray, distance: float) -> np.ndarray:
+def too_near(positions: np.ndarray, distance: float) -> np.ndarray:
     """Return which sites cannot both carry a sensor, (C, C), bool; a site is too near to itself.
 
     Args:
-        places: (C, 2), m.
+        positions: (C, 2), m.
         distance: least distance of two sensors, m; it is compared to within 1 micrometre.
     """
-    apart = np.linalg.norm(places[:, None] - places[None], axis=-1)
-    return (apart < distance - 1e-6) | np.eye(len(places), dtype=bool)
+    apart = np.linalg.norm(positions[:, None] - positions[None], axis=-1)
+    return (apart < distance - 1e-6) | np.eye(len(positions), dtype=bool)
 
 
 def greedy(signal: np.ndarray, count: int, near: np.ndarray, fixed: Sites = ()) -> list[int]:
@@ -103,22 +103,22 @@ def exchange(signal: np.ndarray, sites: Sites, near: np.ndarray, fixed: int = 0)
     Returns:
         the sites, in the same order.
     """
-    places, moved = list(sites), True
+    positions, moved = list(sites), True
     while moved:
         moved = False
-        for number in range(fixed, len(places)):
-            others = places[:number] + places[number + 1 :]
+        for number in range(fixed, len(positions)):
+            others = positions[:number] + positions[number + 1 :]
             variance = _variance(signal, others)
             best = _find_best(variance, np.logical_not(near[others].any(axis=0)))
-            if variance[best] > variance[places[number]] * (1 + _TIE):
-                places[number], moved = best, True
-    return places
+            if variance[best] > variance[positions[number]] * (1 + _TIE):
+                positions[number], moved = best, True
+    return positions
 
 
 def _find_best(variance: np.ndarray, allowed: np.ndarray) -> int:
     """Return the first of the allowed sites with the largest variance (C,), to within rounding."""
-    most = variance[allowed].max()
-    return int(np.flatnonzero(allowed & (variance >= most * (1 - _TIE)))[0])
+    maximum = variance[allowed].max()
+    return int(np.flatnonzero(allowed & (variance >= maximum * (1 - _TIE)))[0])
 
 
 def _variance(signal: np.ndarray, sites: Sites) -> np.ndarray:
@@ -135,7 +135,7 @@ def _variance(signal: np.ndarray, sites: Sites) -> np.ndarray:
 Zones = Sequence[Sequence[tuple[float, float]]]
 """Polygons, each of at least three corners (x, y), m."""
 
-_COVERED = 0.02  # share of a footprint that a zone may cover, because pixels approximate its outline
+_COVERED = 0.02  # fraction of a footprint that a zone may cover, because pixels approximate its outline
 _PIXELS = 512
 _ASPECT = 0.03
 _DARK = 128
@@ -212,7 +212,7 @@ def keep_out(zones: Zones | str | None, size: tuple[float, float]) -> np.ndarray
 
 def _picture(name: str, size: tuple[float, float]) -> np.ndarray:
     """Return the dark pixels of a picture; transparent ones are not dark."""
-    path = next((place for place in candidates(name) if place.is_file()), None)
+    path = next((position for position in candidates(name) if position.is_file()), None)
     if path is None:
         raise InputError(f"no picture {name}: give design.keep_out=FILE.png, or polygons")
     try:
@@ -246,12 +246,12 @@ def _covered(
     sites: tuple[np.ndarray, np.ndarray],
     footprint: tuple[float, float],
 ) -> np.ndarray:
-    """Return the share of the footprint that is forbidden, at each y and x of the sites, (n_y, n_x)."""
-    shares = [
+    """Return the fraction of the footprint that is forbidden, at each y and x of the sites, (n_y, n_x)."""
+    fractions = [
         overlaps(np.linspace(0, extent, count + 1), centres, length) / length
         for extent, count, centres, length in zip(size, forbidden.shape[::-1], sites, footprint, strict=True)
     ]
-    return shares[1] @ forbidden @ shares[0].T
+    return fractions[1] @ forbidden @ fractions[0].T
 
 
 # The sites of a skin, the sensors that stay, and other layouts for comparison.

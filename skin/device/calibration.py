@@ -186,8 +186,8 @@ class Calibration:
             converted[name] = (
                 drawn if name in self.ranges else np.broadcast_to(own_values[name], shape).copy()
             )
-        fewest, most = self.ranges.get("dead", (0, 0))
-        count = generator.integers(int(fewest), int(most), (*shape[:-1], 1), endpoint=True)
+        fewest, maximum = self.ranges.get("dead", (0, 0))
+        count = generator.integers(int(fewest), int(maximum), (*shape[:-1], 1), endpoint=True)
         rank = generator.random(shape).argsort(axis=-1).argsort(axis=-1)
         return converted | {"dead": rank < count, "level": np.zeros(shape)}
 
@@ -284,10 +284,10 @@ def _known(names_given: Mapping[str, Any], names: Sequence[str] | Mapping[str, A
 def _check(name: str, values: Sequence[float]) -> None:
     numbers = isinstance(values, Sequence) and all(_is_number(name, value) for value in values)
     if not numbers or (name not in _SIGNED and min(values, default=0) < 0):
-        least = "" if name in _SIGNED else " from 0 up"
-        least += " (a channel whose values fall with force has polarity: -1)" if name == "gain" else ""
+        minimum = "" if name in _SIGNED else " from 0 up"
+        minimum += " (a channel whose values fall with force has polarity: -1)" if name == "gain" else ""
         text = str(values)
-        raise InputError(f"{name} must be numbers{least}, got {text[:80]}")
+        raise InputError(f"{name} must be numbers{minimum}, got {text[:80]}")
 
 
 def _is_number(name: str, value: Any, largest: float = 1e12) -> bool:

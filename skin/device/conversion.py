@@ -361,7 +361,7 @@ def build_recording(
             parameters[CLASS], metadata["classes"] = numbers_of_kinds, present
         else:
             task, known = Task(tuple(present), "exclusive"), one_hot(numbers_of_kinds, len(present))
-    sensors, extent = _place(positions, readings.shape[2] // per_sensor, size, footprint)
+    sensors, extent = _position(positions, readings.shape[2] // per_sensor, size, footprint)
     touches = Touches(
         torch.from_numpy(np.nan_to_num(readings)),
         torch.from_numpy(~np.isnan(readings)),
@@ -392,7 +392,7 @@ def _number(kinds: Sequence[str | None], names: Sequence[str] | None) -> tuple[l
     return present, torch.tensor(numbers, dtype=torch.float32)
 
 
-def _place(
+def _position(
     positions: Positions,
     count: int,
     size: Sequence[float] | None,

@@ -92,7 +92,7 @@ def read_tables(stored: Mapping[Any, Any], sensors: int) -> dict[int, Table]:
     return {number: check_table(table) for number, table in tables.items()}
 
 
-def check_table(table: Any, most: int = 1000) -> Table:
+def check_table(table: Any, maximum: int = 1000) -> Table:
     """Return a table whose rows, linear readings and values, rise from 0.
 
     Raises:
@@ -102,7 +102,7 @@ def check_table(table: Any, most: int = 1000) -> Table:
         rows = np.array(table, dtype=float)
     except (TypeError, ValueError):
         rows = np.empty(0)
-    fits = rows.ndim == 2 and rows.shape[0] == 2 and 2 <= rows.shape[1] <= most
+    fits = rows.ndim == 2 and rows.shape[0] == 2 and 2 <= rows.shape[1] <= maximum
     if not fits or not np.isfinite(rows).all() or (rows[:, 0] != 0).any() or (np.diff(rows) <= 0).any():
         raise InputError(
             "a table of a curve has two rows of numbers, readings and values in N, each rising from 0, as in "

@@ -190,11 +190,11 @@ class Imperfection(ImperfectionSettings):
             )
         idle = values["offset"] + values["noise"] / np.sqrt(idle_frames) * values.pop("idle")
         values["baseline"] = idle if self.tare else np.zeros(shape)
-        least, most = np.log(np.broadcast_to(self.rate, 2))
+        minimum, maximum = np.log(np.broadcast_to(self.rate, 2))
         values["rate"] = (
             np.asarray(self.slowest)
-            if least == most
-            else np.exp(generator.uniform(least, most, (*shape[:-1], 1)))
+            if minimum == maximum
+            else np.exp(generator.uniform(minimum, maximum, (*shape[:-1], 1)))
         )
         tensors = {name: torch.from_numpy(np.asarray(value)).float() for name, value in values.items()}
         rate = torch.from_numpy(values["rate"])
@@ -338,18 +338,18 @@ def outside(settings: Mapping[str, Any], ranges: Mapping[str, Any], rounding: fl
     for name, (text, unit) in _COMPARED.items():
         if settings.get(name) is None or ranges.get(name) is None:
             continue
-        (least, most), (low, high) = (np.broadcast_to(values[name], 2) for values in (settings, ranges))
+        (minimum, maximum), (low, high) = (np.broadcast_to(values[name], 2) for values in (settings, ranges))
         # A device with less noise, drift or lag is easier; a slower one is not.
-        if most > high * (1 + rounding) or (name == "rate" and least < low * (1 - rounding)):
-            value = f"{least:g}" if least == most else f"{least:g} to {most:g}"
+        if maximum > high * (1 + rounding) or (name == "rate" and minimum < low * (1 - rounding)):
+            value = f"{minimum:g}" if minimum == maximum else f"{minimum:g} to {maximum:g}"
             texts.append(f"{text} {value}{unit} ({low:g} to {high:g}{unit})")
     return texts
 
 
 def _interpolate(spread: Spread, fraction: np.ndarray) -> np.ndarray:
     """Interpolate between the limits of a range by a fraction, 0 to 1; a number is returned as it is."""
-    least, most = spread if isinstance(spread, list | tuple) else (spread, spread)
-    return np.asarray(least + (most - least) * fraction)
+    minimum, maximum = spread if isinstance(spread, list | tuple) else (spread, spread)
+    return np.asarray(minimum + (maximum - minimum) * fraction)
 
 
 def _settings(settings: ImperfectionSettings) -> dict[str, Any]:

@@ -139,9 +139,9 @@ def resample(
     values = values if polarity is None else values * polarity
     age = np.floor((end - time) / interval)
     inside = np.flatnonzero((age >= 0) & (age < window))
-    place = window - 1 - age[inside].astype(np.int64)
-    begins = np.searchsorted(place, np.arange(window))
-    some = np.diff(begins, append=len(place)) > 0
+    position = window - 1 - age[inside].astype(np.int64)
+    begins = np.searchsorted(position, np.arange(window))
+    some = np.diff(begins, append=len(position)) > 0
     good = valid[inside]
     highest = np.full((window, values.shape[1]), -np.inf)
     limited = np.zeros(highest.shape, dtype=bool)

@@ -404,8 +404,8 @@ class Skins(ImperfectionSettings, AbstractDevice):
 
         Groups of fewer gestures than ``largest`` take longer.
         """
-        most = min(largest, -(-count // len(skins)))
-        sizes = [min(most, count - first) for first in range(0, count, most)]
+        maximum = min(largest, -(-count // len(skins)))
+        sizes = [min(maximum, count - first) for first in range(0, count, maximum)]
         rounds = -(-len(sizes) // len(skins))
         # No skin has the key of the test touches: they keep the order of the published ones.
         order = generator(Stream.SKIN if key[1] == _NUMBERS["test"] else Stream.SKIN_ORDER, *key)
@@ -451,14 +451,16 @@ def join_skins(parts: Sequence[Touches]) -> Touches:
     Args:
         parts: each with positions (S, 3) and geometry (S, G) of its own.
     """
-    most = max(part.readings.shape[2] for part in parts)
+    maximum = max(part.readings.shape[2] for part in parts)
     first = parts[0]
 
     def together(name: str, axis: int) -> Tensor:
-        return torch.cat([_widen(getattr(part, name), most, axis) for part in parts])
+        return torch.cat([_widen(getattr(part, name), maximum, axis) for part in parts])
 
     def expanded(name: str) -> Tensor:
-        return torch.cat([_widen(getattr(part, name), most, 0).expand(len(part), -1, -1) for part in parts])
+        return torch.cat(
+            [_widen(getattr(part, name), maximum, 0).expand(len(part), -1, -1) for part in parts]
+        )
 
     return Touches(
         together("readings", 2),

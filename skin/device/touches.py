@@ -207,8 +207,8 @@ def join_contacts(parts: Sequence[Tensor | None]) -> Tensor | None:
     tensors = [part for part in parts if part is not None]
     if len(tensors) < len(parts):
         return None
-    most = max(tensor.shape[2] for tensor in tensors)
-    return torch.cat([pad(tensor, (0, 0, 0, most - tensor.shape[2]), value=nan) for tensor in tensors])
+    maximum = max(tensor.shape[2] for tensor in tensors)
+    return torch.cat([pad(tensor, (0, 0, 0, maximum - tensor.shape[2]), value=nan) for tensor in tensors])
 
 
 CLASS = "class"
@@ -283,8 +283,8 @@ class Timeline:
         """
         nearest = torch.searchsorted(self.end, starts, right=True)
         last = torch.searchsorted(self.begin, starts + window)
-        most = max(1, int((last - nearest).amax()))
-        candidates = (nearest[:, None] + torch.arange(most)).clamp(max=len(self.begin) - 1)
+        maximum = max(1, int((last - nearest).amax()))
+        candidates = (nearest[:, None] + torch.arange(maximum)).clamp(max=len(self.begin) - 1)
         first = torch.maximum(self.begin[candidates], starts[:, None])
         beyond = torch.minimum(self.end[candidates], starts[:, None] + window)
         seen, best = (beyond - first).clamp(min=0).max(dim=1)
@@ -374,12 +374,12 @@ class TouchStream:
     def cut(self, starts: Tensor, window: int) -> Recording:
         """Return the windows (W, T, ...) of T = ``window`` frames that begin at ``starts`` (W,).
 
-        Labels and ``share`` are those of :meth:`Timeline.window_content`. The other parameters are those of
-        the gesture in the window, with its onset counted from the window's first frame, and 0 without a
+        Labels and ``fraction`` are those of :meth:`Timeline.window_content`. The other parameters are those
+        of the gesture in the window, with its onset counted from the window's first frame, and 0 without a
         touch; ``clipped`` refers to the frames of the window.
         """
         frames = starts[:, None] + torch.arange(window)
-        gesture, share, labels = self.timeline.window_content(starts, window)
+        gesture, fraction, labels = self.timeline.window_content(starts, window)
 
         def windows(values: Tensor | None) -> Tensor | None:
             return None if values is None else values[0][frames]
@@ -390,7 +390,7 @@ class TouchStream:
         parameters = {name: values.where(gesture >= 0, 0) for name, values in drawn.items()}
         saturated = windows(shown.saturated)
         content = {} if saturated is None else {"clipped": saturated.flatten(1).any(1).float()}
-        content |= {"share": share.float()}
+        content |= {"share": fraction.float()}
         return replace(
             whole,
             touches=replace(

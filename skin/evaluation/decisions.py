@@ -113,7 +113,7 @@ class ContactLimits:
 _LIMITS = ContactLimits()
 
 
-def least_visible(noise: np.ndarray, threshold: float) -> np.ndarray:
+def minimum_visible(noise: np.ndarray, threshold: float) -> np.ndarray:
     """Return the readings (S,), N, half of which is no noise, given its standard deviation (S,), N."""
     return 2 * np.maximum(_LIMITS.noise * noise, _LIMITS.faint * threshold)
 
@@ -137,8 +137,8 @@ class ContactDetector:
         rate: of the readings, Hz.
         threshold: N.
         drift: N/s.
-        shares: (S, S), reading of each sensor under a touch on another, of whose reading it is a share; None:
-            no sensor feels what is on another.
+        fractions: (S, S), reading of each sensor under a touch on another, of whose reading it is a share;
+            None: no sensor feels what is on another.
 
     Attributes:
         baseline: (S,), N, above which readings rise.
@@ -158,11 +158,11 @@ class ContactDetector:
         rate: float,
         threshold: float,
         drift: float = DRIFT,
-        shares: np.ndarray | None = None,
+        fractions: np.ndarray | None = None,
     ) -> None:
         self._rate, self._threshold, self._drift = rate, threshold, drift
         self._recent, self._long = (max(1, ceil(span * rate - 1e-9)) for span in (RELEASE, _LIMITS.rest))
-        self._shares = np.zeros((sensors, sensors)) if shares is None else shares
+        self._fractions = np.zeros((sensors, sensors)) if fractions is None else fractions
         self._witnesses = np.zeros((sensors, sensors), dtype=bool)
         self._touched, self._doubtful, self._held = (np.zeros(sensors, dtype=bool) for _ in range(3))
         self.noise = np.zeros(sensors)
@@ -194,10 +194,10 @@ class ContactDetector:
         The wire is broken, the values fall with force, or the tare was taken under a load.
         """
         rise = np.where(valid, readings - self.rest, 0.0)
-        return np.asarray(rise < -(self._least + _LIMITS.lift * rise.max(axis=-1, keepdims=True)))
+        return np.asarray(rise < -(self._minimum + _LIMITS.lift * rise.max(axis=-1, keepdims=True)))
 
     @property
-    def _least(self) -> np.ndarray:
+    def _minimum(self) -> np.ndarray:
         """(S,), N, that a reading falls below its rest where neither noise nor drift explains it."""
         return np.maximum(self._threshold, _LIMITS.noise * self.noise)
 
@@ -238,7 +238,7 @@ class ContactDetector:
         fallen = self._held & (rises <= self._top - self._threshold)
         self._held &= ~fallen
         # The skin may sink below its rest for a while after a touch.
-        self.void |= rises < -(self._least + _LIMITS.lift * self._peak)
+        self.void |= rises < -(self._minimum + _LIMITS.lift * self._peak)
         self._peak = max(self._peak, float(np.where(valid[-1], readings[-1] - self.rest, 0.0).max()))
         return fallen
 
@@ -256,7 +256,7 @@ class ContactDetector:
         # Sensors that lag may fall a little later than others.
         before, latest, now = np.where(valid, readings - self.rest, np.nan)[-3:]
         self.beyond = ~valid[-1] & (self.beyond | self._touched | (latest >= _LIMITS.begun * self._threshold))
-        expected, visible = before[:, None] * self._shares, least_visible(self.noise, self._threshold)
+        expected, visible = before[:, None] * self._fractions, minimum_visible(self.noise, self._threshold)
         shown = expected >= visible
         steady = np.abs(now - before) < expected / 2
         witnesses = shown & steady & (np.minimum(before, now) >= expected / 2)

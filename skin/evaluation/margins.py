@@ -114,10 +114,10 @@ def measure_margins(
     predicted, parameters = probabilities > 0.5, recording.parameters
     measures = Measures(*(parameters[name] for name in Measures._fields))
     settings = simulation.sampler.settings
-    shares = _shares(measures, settings.thresholds, settings.frames.duration)
-    spans = {name: find_spans(predicted[:, n], shares[:, n]) for n, name in enumerate(TOUCH.names)}
+    fractions = _fractions(measures, settings.thresholds, settings.frames.duration)
+    spans = {name: find_spans(predicted[:, n], fractions[:, n]) for n, name in enumerate(TOUCH.names)}
     danger = TOUCH.names.index(LABEL)
-    spans[ALARM_NAME] = find_spans(point.alarm(probabilities[:, danger]), shares[:, danger])
+    spans[ALARM_NAME] = find_spans(point.alarm(probabilities[:, danger]), fractions[:, danger])
     wrong = predicted != (labels > 0.5)
     faint = [
         Faint(
@@ -132,20 +132,20 @@ def measure_margins(
     return MarginReport(spans, faint, point, point.reached(probabilities, labels, TOUCH), overall)
 
 
-def find_spans(predicted: Tensor, shares: Tensor) -> list[Span]:
+def find_spans(predicted: Tensor, fractions: Tensor) -> list[Span]:
     """Return the spans that are not empty.
 
     Args:
         predicted: (B,), bool, whether the learner predicts the label.
-        shares: (B,), measure divided by its threshold.
+        fractions: (B,), measure divided by its threshold.
     """
     return [
-        Span(low, high, float(shares[inside].mean()), int(inside.sum()), int(predicted[inside].sum()))
-        for low, high, inside in _split_ranges(_SHARES, shares)
+        Span(low, high, float(fractions[inside].mean()), int(inside.sum()), int(predicted[inside].sum()))
+        for low, high, inside in _split_ranges(_SHARES, fractions)
     ]
 
 
-def _shares(measures: Measures, thresholds: Thresholds, longest_tap: int) -> Tensor:
+def _fractions(measures: Measures, thresholds: Thresholds, longest_tap: int) -> Tensor:
     """Return each measure divided by its threshold, (B, 4), in the order of ``TOUCH``."""
     pairs = (
         (measures.area, thresholds.area),

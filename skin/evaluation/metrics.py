@@ -37,8 +37,8 @@ def compute_metrics(
         of errors up to 45 degrees, on the touches that have one (random guesses: 90 and .25); both do not
         count in the overall values. A regression has ``<target>/rms_mm``, ``/rms_N`` or ``/rms``, the root
         of the mean square error, the same of ``place`` for x and y together, and ``overall/r2``, the mean
-        over the targets of the share of the variance that is predicted. Values are NaN where the touches do
-        not define them: a recall needs touches with and without the label.
+        over the targets of the fraction of the variance that is predicted. Values are NaN where the touches
+        do not define them: a recall needs touches with and without the label.
     """
     alarm: dict[str, float] = {}
     if point is not None:
@@ -93,8 +93,8 @@ def _errors(predicted: Tensor, labels: Tensor, task: Task) -> dict[str, float]:
 def calibration_error(probability: Tensor, label: Tensor, bins: int = 15) -> float:
     """Return the expected calibration error in bins of equal numbers of touches; NaN without touches.
 
-    It is the mean distance between the mean probability of a bin and the share of true labels in it (Nguyen
-    and O'Connor, 2015).
+    It is the mean distance between the mean probability of a bin and the fraction of true labels in it
+    (Nguyen and O'Connor, 2015).
 
     Args:
         probability: (B,), probabilities.
@@ -212,12 +212,12 @@ def vote(outcomes: np.ndarray) -> np.ndarray:
         outcomes: (M, B), uint8, of M models on the same gestures.
     """
     bits = np.arange(8)
-    shares = (outcomes[..., None] >> bits & 1).mean(axis=0)
-    decided = np.where(1 << bits == _ALARM, shares > 0.5, shares >= 0.5)
+    fractions = (outcomes[..., None] >> bits & 1).mean(axis=0)
+    decided = np.where(1 << bits == _ALARM, fractions > 0.5, fractions >= 0.5)
     return (decided << bits).sum(axis=-1).astype(np.uint8)
 
 
 def disagreement(outcomes: np.ndarray) -> float:
-    """Return the share of gestures for which models (M, B) differ in a label."""
+    """Return the fraction of gestures for which models (M, B) differ in a label."""
     wrong = outcomes & ((1 << _MOST_LABELS) - 1)
     return float((wrong != wrong[0]).any(axis=0).mean())

@@ -130,14 +130,14 @@ def _test(device: AbstractDevice) -> tuple[Touches, dict[str, Tensor]]:
 
 
 def _devices(device: AbstractSimulated, settings: Evaluation) -> Iterator[Touches]:
-    """Yield the share of the test touches that each of some other devices of the same kind measures."""
+    """Yield the fraction of the test touches that each of some other devices of the same kind measures."""
     for number in range(settings.devices):
         sibling = device.replace(seed=1 + number)  # the default device has 0
         yield sibling.touches("test")[number :: settings.devices]
 
 
 def _layouts(device: AbstractSimulated, settings: Evaluation) -> Iterator[Touches]:
-    """Yield the share of the test touches for each of some other layouts.
+    """Yield the fraction of the test touches for each of some other layouts.
 
     A gesture whose dangerous pressure no sensor of a layout would feel takes another path there.
     """
@@ -255,7 +255,7 @@ def publish_evaluation(path: Path, report: Report, task: Task, title: str, descr
     return written
 
 
-def write_chances(probabilities: Tensor, task: Task, point: OperatingPoint | None, path: Path) -> str:
+def write_probabilities(probabilities: Tensor, task: Task, point: OperatingPoint | None, path: Path) -> str:
     """Write the probability of each label, gesture by gesture, where nobody knows the truth.
 
     Args:

@@ -27,9 +27,9 @@ class Evaluation:
 def check_evaluation(settings: Evaluation | None) -> Evaluation:
     """Return the settings of an evaluation, or raise InputError where they cannot be used."""
     assert settings is not None
-    for name, least in (("devices", 0), ("layouts", 0)):
-        if getattr(settings, name) < least:
-            raise InputError(f"evaluation.{name}={getattr(settings, name)} must be at least {least}")
+    for name, minimum in (("devices", 0), ("layouts", 0)):
+        if getattr(settings, name) < minimum:
+            raise InputError(f"evaluation.{name}={getattr(settings, name)} must be at least {minimum}")
     if not 0 < settings.false_alarm_rate < 1:
         raise InputError(
             f"a false-alarm rate is between 0 and 1, got {settings.false_alarm_rate:g}: "

@@ -38,14 +38,14 @@ def rise(touches: Touches, idle: Tensor | float = 0.0) -> Tensor:
 
 @dataclass(frozen=True)
 class ContactThreshold:
-    """Predicts contact if a reading rises by ``least`` N or more above its baseline.
+    """Predicts contact if a reading rises by ``minimum`` N or more above its baseline.
 
     Attributes:
-        least: N.
+        minimum: N.
         idle: (S,), N, as in :func:`rise`.
     """
 
-    least: float
+    minimum: float
     idle: Tensor | float = 0.0
 
     @classmethod
@@ -74,7 +74,7 @@ class ContactThreshold:
 
     def touched(self, touches: Touches) -> Tensor:
         """Return which windows are touched, (B,), bool."""
-        return rise(touches, self.idle) >= self.least
+        return rise(touches, self.idle) >= self.minimum
 
 
 def gates(threshold: ContactThreshold, task: Task) -> dict[str, Gate]:
@@ -155,7 +155,7 @@ def count_alarms(alarm: Tensor, gesture: Tensor, dangerous: Tensor, hours: float
 
 @dataclass(frozen=True)
 class Bin:
-    """Windows that show a similar share of a touch.
+    """Windows that show a similar fraction of a touch.
 
     Attributes:
         name: such as ``0.2-0.4``, upper end included; ``whole`` for windows with a whole touch.
@@ -180,7 +180,7 @@ class WindowReport:
     """Result of an evaluation on sliding windows.
 
     Attributes:
-        bins: accuracy by the share of the touch in the window.
+        bins: accuracy by the fraction of the touch in the window.
         gates: gate -> (2, 2) counts of windows: truth idle and touched down, predicted across.
         threshold: of the gate by threshold, N.
         alarms: gate -> alarms on the long stream.
@@ -251,9 +251,9 @@ def evaluate_windows(
     probabilities = learner.probabilities(touches)
     answers = {name: gate(touches, probabilities) for name, gate in all_gates.items() if name != "none"}
     return WindowReport(
-        bin_by_share(probabilities, labels, recording.parameters["share"], device.task),
+        bin_by_fraction(probabilities, labels, recording.parameters["share"], device.task),
         {name: count_confusions(gate[:, None].float(), labels[:, -1:])[0] for name, gate in answers.items()},
-        threshold.least,
+        threshold.minimum,
         _listen(learner, streamed, device.task, all_gates, settings, point, track),
         settings.hours,
         {window: _measure_length(learner, device, window) for window in settings.windows},
@@ -262,35 +262,35 @@ def evaluate_windows(
     )
 
 
-def bin_by_share(
+def bin_by_fraction(
     probabilities: Tensor,
     labels: Tensor,
-    share: Tensor,
+    fraction: Tensor,
     task: Task,
     edges: Sequence[float] = (0.2, 0.4, 0.6, 0.8),
 ) -> list[Bin]:
-    """Return accuracies by the share of the touch in the window, for windows that show a touch.
+    """Return accuracies by the fraction of the touch in the window, for windows that show a touch.
 
     Args:
         probabilities: (W, L), probabilities of the labels of ``task``.
         labels: (W, 5), of ``TOUCH_OR_NOT``.
-        share: (W,), fraction of the touch in the window; 0 without touch.
+        fraction: (W,), fraction of the touch in the window; 0 without touch.
         task: task of the learner.
         edges: of the bins, fractions of the touch.
     """
     names = TOUCH_OR_NOT.gated
     truth = labels[:, : len(names)] > 0.5
     right = (probabilities[:, [task.names.index(name) for name in names]] > 0.5) == truth
-    group = torch.bucketize(share, torch.tensor(edges)).where(share < 1, len(edges) + 1)
+    group = torch.bucketize(fraction, torch.tensor(edges)).where(fraction < 1, len(edges) + 1)
     ends = [0.0, *edges, 1.0]
     titles = [*(f"{low:g}-{high:g}" for low, high in pairwise(ends)), "whole"]
     bins = []
     for number, title in enumerate(titles):
-        inside = (group == number) & (share > 0)
+        inside = (group == number) & (fraction > 0)
         if inside.any():
             yes = truth[inside].float().mean(0)
-            shares = right[inside].float().mean(0).tolist(), torch.maximum(yes, 1 - yes).tolist()
-            tables = (dict(zip(names, values, strict=True)) for values in shares)
+            fractions = right[inside].float().mean(0).tolist(), torch.maximum(yes, 1 - yes).tolist()
+            tables = (dict(zip(names, values, strict=True)) for values in fractions)
             bins.append(Bin(title, int(inside.sum()), *tables))
     return bins
 

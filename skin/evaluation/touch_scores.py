@@ -53,8 +53,8 @@ def touch_scores(
             learner, device, live, readings[contact], valid[contact.nonzero()[:, 0]]
         )
         row = live.decisions(_round_rate(device, live))
-        least = -max_pool1d(-pad(probabilities, (row - 1, 0)), row, 1) if row > 1 else probabilities
-        scores.append(least.amax(dim=1))
+        minimum = -max_pool1d(-pad(probabilities, (row - 1, 0)), row, 1) if row > 1 else probabilities
+        scores.append(minimum.amax(dim=1))
         if report is not None:
             report(first + len(batch))
     return torch.cat(scores)

@@ -62,8 +62,8 @@ class FingertipPrior:
         """Radii, m, and the pressure in the middle of fingertips of 1 N, Pa."""
         knots = np.linspace(*self.radii, 33)
         reach = np.linspace(0, 1, 400)[:, None] * (knots + 12 * self.rim)
-        share = 1 / (1 + np.exp((reach - knots) / self.rim))
-        return knots, share[0] / np.trapezoid(2 * np.pi * reach * share, reach, axis=0)
+        fraction = 1 / (1 + np.exp((reach - knots) / self.rim))
+        return knots, fraction[0] / np.trapezoid(2 * np.pi * reach * fraction, reach, axis=0)
 
 
 def disc_readings(
@@ -179,12 +179,12 @@ class CandidateReadings:
         centre = np.stack(np.meshgrid(y, x, radius, indexing="ij"), -1)[..., [1, 0, 2]].reshape(-1, 3)
         return Boxes(centre, np.broadcast_to(width, centre.shape).copy())
 
-    def at(self, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def at(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return readings (N, S), N/N, and slopes (N, 3, S), N/N/m, at x, y and radius (N, 3), m; float32."""
-        patch = np.clip((places[:, :2] / self._patch).astype(int), 0, self._counts - 1)
-        across, down = (2 * (places[:, :2] / self._patch - patch) - 1).T
+        patch = np.clip((positions[:, :2] / self._patch).astype(int), 0, self._counts - 1)
+        across, down = (2 * (positions[:, :2] / self._patch - patch) - 1).T
         half = self.span / 2
-        wide = (places[:, 2] - self.radii[0]) / half - 1
+        wide = (positions[:, 2] - self.radii[0]) / half - 1
         scales = (2 / self._patch[0], 2 / self._patch[1], 1 / half)
         powers = _monomials(across, down, wide, scales)
         felt = np.matmul(powers, self._coefficients[patch[:, 1] * self._counts[0] + patch[:, 0]])
@@ -207,12 +207,12 @@ def _monomials(
     i, j = _EXPONENTS
     (x, y, r), (dx, dy, dr) = powers, slopes
     columns = y[j]
-    place = x[i] * columns
+    position = x[i] * columns
     terms = np.empty((4, len(_POWERS), _RADII, len(across)), np.float32)
-    np.multiply(place[:, None], r, out=terms[0])
+    np.multiply(position[:, None], r, out=terms[0])
     np.multiply((dx[i] * columns)[:, None], r, out=terms[1])
     np.multiply((x[i] * dy[j])[:, None], r, out=terms[2])
-    np.multiply(place[:, None], dr, out=terms[3])
+    np.multiply(position[:, None], dr, out=terms[3])
     return terms.reshape(4, -1, len(across)).transpose(2, 0, 1)
 
 

@@ -164,9 +164,9 @@ def _blurred(boxes: Boxes, slopes: np.ndarray, spread: np.ndarray | None) -> np.
 def _probable(evidence: np.ndarray, others: list[np.ndarray]) -> np.ndarray:
     """Return the indices of what holds nearly all probability, in their order, beside that of others."""
     top = max(float(part.max()) for part in [evidence, *others] if len(part))
-    chance = np.exp(evidence - top)
-    order = np.argsort(chance)
-    lost = np.cumsum(chance[order], dtype=float)
+    probability = np.exp(evidence - top)
+    order = np.argsort(probability)
+    lost = np.cumsum(probability[order], dtype=float)
     whole = lost[-1] + sum(float(np.exp(part - top).sum()) for part in others)
     return np.sort(order[lost > _DROPPED * whole])
 

@@ -75,13 +75,13 @@ class Search:
     def __init__(self, candidates: CandidateReadings, prior: FingertipPrior) -> None:
         self.candidates, self.prior = candidates, prior
         size, radii = candidates.size, candidates.radii
-        self._least, self._range = radii[0], radii[1] - radii[0]
+        self._minimum, self._range = radii[0], radii[1] - radii[0]
         self._scale = np.array([*(size / math.sqrt(12)), 1, 1])
         self._density = -math.log(size[0] * size[1])
         counts = np.ceil(size / _LATTICE).astype(int)
         x, y = ((np.arange(count) + 0.5) * side / count for count, side in zip(counts, size, strict=True))
-        self._places = np.stack(np.meshgrid(x, y, [sum(radii) / 2], indexing="ij"), -1).reshape(-1, 3)
-        self._lattice = np.ascontiguousarray(candidates.at(self._places)[0])
+        self._positions = np.stack(np.meshgrid(x, y, [sum(radii) / 2], indexing="ij"), -1).reshape(-1, 3)
+        self._lattice = np.ascontiguousarray(candidates.at(self._positions)[0])
 
     @cached_property
     def _normal(self) -> np.ndarray:
@@ -96,26 +96,26 @@ class Search:
     def felt(self, guess: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return readings (M, S), N, and their derivatives (M, 4 n, S) by position, radius and log force."""
         count, number, _ = guess.shape
-        places, force, stretch = self._places_of(guess.reshape(-1, 4))
-        readings, slopes = self.candidates.at(places)
+        positions, force, stretch = self._positions_of(guess.reshape(-1, 4))
+        readings, slopes = self.candidates.at(positions)
         felt = force[:, None] * readings
-        columns = np.empty((len(places), 4, felt.shape[1]))
+        columns = np.empty((len(positions), 4, felt.shape[1]))
         np.multiply(force[:, None, None], slopes, out=columns[:, :3])
         columns[:, 2] *= stretch[:, None]
         columns[:, 3] = self.prior.spread * felt
         return felt.reshape(count, number, -1).sum(1), columns.reshape(count, 4 * number, -1)
 
-    def _places_of(self, guess: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _positions_of(self, guess: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return positions and radii (N, 3), m, forces (N,), N, and m of radius per score (N,)."""
-        radius = self._least + self._range * ndtr(guess[:, 2])
+        radius = self._minimum + self._range * ndtr(guess[:, 2])
         stretch = self._range * np.exp(-0.5 * guess[:, 2] ** 2) / math.sqrt(2 * math.pi)
         force = self.prior.force * np.exp(self.prior.spread * guess[:, 3])
         return np.column_stack([guess[:, :2], radius]), force, stretch
 
     def scores(self, radius: np.ndarray, force: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the scores of radii, m, and forces, N."""
-        share = ((radius - self._least) / self._range).clip(0.02, 0.98)
-        return ndtri(share), np.log(force / self.prior.force) / self.prior.spread
+        fraction = ((radius - self._minimum) / self._range).clip(0.02, 0.98)
+        return ndtri(fraction), np.log(force / self.prior.force) / self.prior.spread
 
     def variance(self, frame: Observation, felt: np.ndarray, columns: np.ndarray) -> np.ndarray:
         """Return the variance (M, S), N^2, of readings as of :meth:`felt`."""
@@ -187,17 +187,17 @@ class Search:
 
     def extend(self, guess: np.ndarray, addition: "Addition") -> np.ndarray:
         """Return guesses (M, n + 1, 4) with the best further contacts."""
-        best = self._apart(addition.ratio, self._places, 3)
-        scores = self.scores(self._places[best, 2], np.exp(addition.mode[best]))
-        new = np.column_stack([self._places[best, :2], *scores])[:, None]
+        best = self._apart(addition.ratio, self._positions, 3)
+        scores = self.scores(self._positions[best, 2], np.exp(addition.mode[best]))
+        new = np.column_stack([self._positions[best, :2], *scores])[:, None]
         return np.concatenate([np.repeat(guess[None], len(best), 0), new], axis=1)
 
     @staticmethod
-    def _apart(score: np.ndarray, places: np.ndarray, number: int) -> list[int]:
+    def _apart(score: np.ndarray, positions: np.ndarray, number: int) -> list[int]:
         """Return the best candidates that are not next to each other."""
         chosen = list[int]()
         for index in np.argsort(-score)[: 20 * number]:
-            near = np.linalg.norm(places[chosen, :2] - places[index, :2], axis=1)
+            near = np.linalg.norm(positions[chosen, :2] - positions[index, :2], axis=1)
             if len(chosen) < number and (near > 2 * _LATTICE).all():
                 chosen.append(int(index))
         return chosen
@@ -227,15 +227,18 @@ class Search:
         index = np.array(chosen, int).reshape(-1, 2)
         i, j = index.T
         force = np.stack([first[i, j], first[j, i]], 1) / np.maximum(determinant[i, j], 1e-30)[:, None]
-        places = self._places[index]
-        radius, score = self.scores(places[..., 2], np.maximum(force, 1e-3 * self.prior.force))
-        return np.concatenate([places[..., :2], np.stack([radius, score.clip(-4, 4)], -1)], axis=2)
+        positions = self._positions[index]
+        radius, score = self.scores(positions[..., 2], np.maximum(force, 1e-3 * self.prior.force))
+        return np.concatenate([positions[..., :2], np.stack([radius, score.clip(-4, 4)], -1)], axis=2)
 
     def _new(self, pair: tuple[int, int], chosen: list[tuple[int, int]]) -> bool:
         """Return whether a pair is not nearly one of those that are chosen."""
-        places = self._places[:, :2]
+        positions = self._positions[:, :2]
         return all(
-            max(np.abs(places[pair[0]] - places[a]).max(), np.abs(places[pair[1]] - places[b]).max())
+            max(
+                np.abs(positions[pair[0]] - positions[a]).max(),
+                np.abs(positions[pair[1]] - positions[b]).max(),
+            )
             > 1.5 * _LATTICE
             for a, b in chosen
         )
@@ -337,8 +340,8 @@ class Search:
 
     def contacts(self, samples: np.ndarray) -> np.ndarray:
         """Return x, y and radius, m, and force, N, of samples (N, n, 4)."""
-        places, force, _ = self._places_of(samples.reshape(-1, 4))
-        return np.column_stack([places, force]).reshape(samples.shape)
+        positions, force, _ = self._positions_of(samples.reshape(-1, 4))
+        return np.column_stack([positions, force]).reshape(samples.shape)
 
 
 def _order(guess: np.ndarray, mode: np.ndarray) -> np.ndarray:

@@ -75,12 +75,12 @@ def draw_large(candidates: CandidateReadings, count: int, rng: np.random.Generat
     small = candidates.at(np.column_stack([points, np.full(len(points), radii[0])]))[0]
     pictures = [load_image(name) for name in SHAPES]
     shape, angle = rng.integers(0, len(SHAPES), count), rng.uniform(0, 2 * np.pi, count)
-    least, most = math.pi * radii[1] ** 2, _SHARE * size.prod()
-    area = least * (most / least) ** rng.random(count)
-    place = size * rng.random((count, 2))
+    minimum, maximum = math.pi * radii[1] ** 2, _SHARE * size.prod()
+    area = minimum * (maximum / minimum) ** rng.random(count)
+    position = size * rng.random((count, 2))
     readings, cell = np.empty((count, small.shape[1]), np.float32), float(size.prod() / len(points))
     for number in range(count):
-        pressure = _sample(pictures[shape[number]], area[number], angle[number], points - place[number])
+        pressure = _sample(pictures[shape[number]], area[number], angle[number], points - position[number])
         readings[number] = _PRESSURE * cell * (pressure @ small)
     return readings[(readings != 0).any(1)]
 

@@ -39,21 +39,21 @@ class Region:
     Attributes:
         cells: (C, 2), x and y of their centres, m.
         width: (2,), of a cell, m.
-        share: probability that they hold.
+        fraction: probability that they hold.
     """
 
     cells: np.ndarray
     width: np.ndarray
-    share: float
+    fraction: float
 
     @property
     def area(self) -> float:
         """Area of all cells, m^2."""
         return float(len(self.cells) * self.width.prod())
 
-    def contains(self, place: np.ndarray) -> bool:
+    def contains(self, position: np.ndarray) -> bool:
         """Return whether a position (2,), m, lies in a cell."""
-        return bool((np.abs(self.cells - place) <= self.width / 2).all(axis=1).any())
+        return bool((np.abs(self.cells - position) <= self.width / 2).all(axis=1).any())
 
 
 @dataclass(frozen=True)
@@ -61,25 +61,25 @@ class ContactEstimate:
     """Posterior of one contact; samples are weighted.
 
     Attributes:
-        place, place_deviation: (2,), mean and standard deviation of x and y, m.
+        position, position_deviation: (2,), mean and standard deviation of x and y, m.
         force, force_deviation: N.
         radius, radius_deviation: m.
         peak: highest pressure of the most probable contact, Pa.
         peak_interval: contains the highest pressure with 90 %, Pa; readings hardly determine the radius.
-        places, widths: (N, 2), boxes that hold the position, m.
+        positions, widths: (N, 2), boxes that hold the position, m.
         peaks: (N, J), Pa, of the boxes' forces.
         weights: (N, J), probabilities that sum to 1.
     """
 
-    place: np.ndarray
-    place_deviation: np.ndarray
+    position: np.ndarray
+    position_deviation: np.ndarray
     force: float
     force_deviation: float
     radius: float
     radius_deviation: float
     peak: float
     peak_interval: tuple[float, float]
-    places: np.ndarray = field(repr=False)
+    positions: np.ndarray = field(repr=False)
     widths: np.ndarray = field(repr=False)
     peaks: np.ndarray = field(repr=False)
     weights: np.ndarray = field(repr=False)
@@ -88,28 +88,28 @@ class ContactEstimate:
         """Return the probability that the highest pressure is above a limit, Pa."""
         return float(self.weights[self.peaks > pressure].sum())
 
-    def region(self, share: float = 0.9, least: float = 0.0) -> Region:
+    def region(self, fraction: float = 0.9, minimum: float = 0.0) -> Region:
         """Return the smallest set of cells that holds the position with a probability; it may have parts.
 
         Each sample counts as a normal distribution of the variance of its box: boxes are up to 1.8 standard
         deviations long, and what is uniform over each holds 2 points less than it says.
 
         Args:
-            share: the probability.
-            least: smallest width of a cell, m.
+            fraction: the probability.
+            minimum: smallest width of a cell, m.
         """
         weight = self.weights.sum(1)
-        low, high = (self.places - self.widths).min(0), (self.places + self.widths).max(0)
-        width = np.maximum(self.widths.min(0), least)
+        low, high = (self.positions - self.widths).min(0), (self.positions + self.widths).max(0)
+        width = np.maximum(self.widths.min(0), minimum)
         steps = np.clip(np.ceil((high - low) / width - 1e-6), 1, _CELLS).astype(int)
         edges = [np.linspace(low[axis], high[axis], steps[axis] + 1) for axis in (0, 1)]
-        parts = [_overlap(edges[axis], self.places[:, axis], self.widths[:, axis]) for axis in (0, 1)]
+        parts = [_overlap(edges[axis], self.positions[:, axis], self.widths[:, axis]) for axis in (0, 1)]
         mass = (parts[0] * weight[:, None]).T @ parts[1]
         mass /= mass.sum()
         order = np.argsort(-mass, axis=None, kind="stable")
         total = np.cumsum(mass.ravel()[order])
-        # The last cell is included if the probability is nearer to ``share`` with it than without.
-        count = max(1, int(np.argmin(np.abs(total - share))) + 1)
+        # The last cell is included if the probability is nearer to ``fraction`` with it than without.
+        count = max(1, int(np.argmin(np.abs(total - fraction))) + 1)
         chosen = np.unravel_index(order[:count], mass.shape)
         middles = [(line[1:] + line[:-1]) / 2 for line in edges]
         cells = np.stack([middles[axis][chosen[axis]] for axis in (0, 1)], axis=1)
@@ -187,13 +187,13 @@ class Posterior:
             )
         self.noise, self.prior = noise, prior or FingertipPrior()
         possible = np.flatnonzero(self.prior.numbers[: contacts + 1])
-        self._most = int(possible[-1])
+        self._maximum = int(possible[-1])
         self.candidates = CandidateReadings(simulator, body, self.prior)
         self._first = blur_first(self.candidates, noise)
         self._search = Search(self.candidates, self.prior)
         self._large = LargeContacts(self.candidates, noise) if self.prior.large else None
         with np.errstate(divide="ignore"):
-            self._numbers = np.log(np.array(self.prior.numbers[: self._most + 1]))
+            self._numbers = np.log(np.array(self.prior.numbers[: self._maximum + 1]))
         self._peak = self.prior.peak
 
     def estimate(
@@ -249,7 +249,7 @@ class Posterior:
         """Return the estimate of a frame, which depends on nothing else."""
         single = one_contact(self.candidates, self.prior, frame, self._first)
         sensors = int(frame.counts.sum()) + len(frame.clipped)
-        evidence, mixtures = self._several(frame, single, min(self._most, max(1, sensors // _PER_CONTACT)))
+        evidence, mixtures = self._several(frame, single, min(self._maximum, max(1, sensors // _PER_CONTACT)))
         logs = np.full(len(self._numbers), -np.inf)
         logs[: len(evidence)] = np.array(evidence) + self._numbers[: len(evidence)]
         number = int(logs.argmax())
@@ -274,7 +274,7 @@ class Posterior:
         return float(expit(odds))
 
     def _several(
-        self, frame: Observation, single: Cloud, most: int
+        self, frame: Observation, single: Cloud, maximum: int
     ) -> tuple[list[float], dict[int, Mixture]]:
         """Return the log evidence of each number of contacts, and the posteriors of several."""
         evidence, mixtures, misfit = [frame.empty(), single.evidence], dict[int, Mixture](), single.misfit
@@ -283,7 +283,7 @@ class Posterior:
         )
         sensors = max(frame.counts.sum(), 1) / 2
         felt = self._search.felt(mode[None])[0][0]
-        for number in range(2, most + 1):
+        for number in range(2, maximum + 1):
             addition = self._search.add(frame, mode)
             # It explains no more than the first contact: where no sensor responds, both are hidden.
             factor = min(addition.factor, single.evidence - evidence[0])
@@ -370,8 +370,8 @@ class Posterior:
         )
 
 
-def _variance(places: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    return weight @ (places - weight @ places) ** 2
+def _variance(positions: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    return weight @ (positions - weight @ positions) ** 2
 
 
 def _unknown(sensors: int, frame: Observation) -> str | None:

@@ -213,7 +213,7 @@ class BoostedTrees(FeatureLearner):
                 )
             if not len(validation[1]):
                 raise InputError(f"no validation touch has a label {name}: give more touches")
-            with threadpool_limits(torch.get_num_threads(), "openmp"):  # a job's share of the cores
+            with threadpool_limits(torch.get_num_threads(), "openmp"):  # a job's fraction of the cores
                 models.append(kind(**self._settings).fit(*train, X_val=validation[0], y_val=validation[1]))
         self.seconds_per_epoch = time.perf_counter() - began
         self._set(models, data.task)

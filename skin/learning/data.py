@@ -276,9 +276,9 @@ class _Batches:
         for touches in data.parts(self.split, epoch, generator):
             for index in torch.randperm(len(touches), generator=generator).split(data.batch_size):
                 batch = touches[index]
-                yield self._share(data.augmentation(batch, generator) if data.augmentation else batch)
+                yield self._fraction(data.augmentation(batch, generator) if data.augmentation else batch)
 
-    def _share(self, batch: Touches) -> Touches:
+    def _fraction(self, batch: Touches) -> Touches:
         """Return this process's part of a batch where several train together.
 
         Each takes a whole batch that has less than two gestures for each of them: batch norm needs two.

@@ -105,8 +105,8 @@ class TouchClassifier(nn.Module):
         if self.task.kind == "exclusive":
             return F.cross_entropy(logits[counts[:, 0]], labels[counts[:, 0]])
         if counts.all():
-            return F.binary_cross_entropy_with_logits(logits, self.task.shares(labels))
-        return F.binary_cross_entropy_with_logits(logits[counts], self.task.shares(labels)[counts])
+            return F.binary_cross_entropy_with_logits(logits, self.task.fractions(labels))
+        return F.binary_cross_entropy_with_logits(logits[counts], self.task.fractions(labels)[counts])
 
     def accuracy(self, logits: Tensor, labels: Tensor) -> dict[str, Tensor]:
         """Return ``accuracy`` and, of binary tasks, ``accuracy_<label>`` of logits and labels (B, L)."""

@@ -370,7 +370,7 @@ def touch_losses(
         return np.asarray(-(truth * np.log(probabilities.clip(minimum, 1))).sum(axis=1))
     else:
         predicted, target = (
-            task.shares(torch.from_numpy(np.asarray(values, dtype=float))).numpy()
+            task.fractions(torch.from_numpy(np.asarray(values, dtype=float))).numpy()
             for values in (probabilities, truth)
         )
         predicted = predicted.clip(minimum, 1 - minimum)

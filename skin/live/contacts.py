@@ -89,10 +89,10 @@ def _contact(contact: "ContactEstimate", probability: float = 0.9, cell: float =
     """
     region = contact.region(probability, cell)
     origin = region.cells.min(axis=0)
-    place, spread = contact.place.round(5).tolist(), contact.place_deviation.round(5).tolist()
+    position, spread = contact.position.round(5).tolist(), contact.position_deviation.round(5).tolist()
     return {
-        "x": place[0],
-        "y": place[1],
+        "x": position[0],
+        "y": position[1],
         "x_deviation": spread[0],
         "y_deviation": spread[1],
         "force": round(contact.force, 4),
@@ -102,7 +102,7 @@ def _contact(contact: "ContactEstimate", probability: float = 0.9, cell: float =
         "peak": round(contact.peak),
         "peak_interval": [round(limit) for limit in contact.peak_interval],
         "region": {
-            "share": round(region.share, 4),
+            "share": round(region.fraction, 4),
             "origin": origin.round(6).tolist(),
             "cell": region.width.round(6).tolist(),
             "cells": ((region.cells - origin) / region.width).round().astype(int).tolist(),
@@ -355,7 +355,7 @@ class LiveContacts:
             mechanics: of the skin.
             whole: tells whether the device sends whole numbers.
         """
-        places = os.pathsep.join(path for path in sys.path if path)
+        positions = os.pathsep.join(path for path in sys.path if path)
         self._whole = whole
         self.explain(PREPARING)
         # In a group of its own, Ctrl-C does not reach it. In a session of its own, its priority would not
@@ -365,7 +365,7 @@ class LiveContacts:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
-            env=os.environ | dict.fromkeys(_THREADS, "1") | {"PYTHONPATH": places},
+            env=os.environ | dict.fromkeys(_THREADS, "1") | {"PYTHONPATH": positions},
             process_group=0,
         )
         self._thread = Thread(target=self._run, args=(mechanics,), name="skin-contacts", daemon=True)

@@ -144,7 +144,7 @@ class Engine:
         detection: settings of the contact detection.
         patience: settings of debouncing.
         presses: (S, S), N, readings of a press at the limit of ``dangerous`` on each sensor: where no valid
-            one rises by the threshold, the place is unknown. None: each sensor feels what is on itself.
+            one rises by the threshold, the position is unknown. None: each sensor feels what is on itself.
 
     Attributes:
         window: of the latest readings, N.
@@ -163,7 +163,7 @@ class Engine:
     def __post_init__(self) -> None:
         self.window = Window(self.frames, self.rate, self.sensors)
         threshold, drift = self.detection.threshold, self.detection.drift
-        self._contact = ContactDetector(self.sensors, self.rate, threshold, drift, self.shares)
+        self._contact = ContactDetector(self.sensors, self.rate, threshold, drift, self.fractions)
         self._held = held_frames(self.detection.longest, self.rate, self.frames)
         self._shown = longest_shown(self._held, ceil(RELEASE * self.rate - 1e-9), self.frames)
         self._above = 0.5 if self.patience.above is None else self.patience.above
@@ -180,7 +180,7 @@ class Engine:
         return replace(self)
 
     @property
-    def shares(self) -> np.ndarray | None:
+    def fractions(self) -> np.ndarray | None:
         """(S, S), readings of other sensors under a touch, relative to that of the sensor; None: unknown."""
         if self.presses is None:
             return None
@@ -333,23 +333,23 @@ class Engine:
         notes += [Note("unreadable")] * self._losses.excessive + [Note("pause", seconds=pause)] * (pause > 0)
         return tuple(notes)
 
-    def _conclude(self, decision: _Decision, probabilities: Sequence[float]) -> Verdict:
-        """Return the verdict on a decision, given the probabilities of its window, one per label."""
-        chances = dict(zip(self.task.names, probabilities, strict=True))
-        learned = self.detection.learned and chances[self.task.gate or ""] > 0.5
+    def _conclude(self, decision: _Decision, outputs: Sequence[float]) -> Verdict:
+        """Return the verdict on a decision, given the outputs of its window, probabilities, one per label."""
+        probabilities = dict(zip(self.task.names, outputs, strict=True))
+        learned = self.detection.learned and probabilities[self.task.gate or ""] > 0.5
         period = max(self.window.period, 1 / DECISIONS)
-        self._update_alarm(decision, chances, learned, period)
+        self._update_alarm(decision, probabilities, learned, period)
         touching = decision.draft.contact is not None or decision.risen or learned
         # An alarm does not wait for the touch.
         touched = self._touch(touching, decision.time, period) or self.alarm
-        labels = self._debounce_labels(decision.time, chances, period)
-        notes = self._collect_notes(decision.draft.notes, chances, touched)
-        if "dangerous" in chances:
+        labels = self._debounce_labels(decision.time, probabilities, period)
+        notes = self._collect_notes(decision.draft.notes, probabilities, touched)
+        if "dangerous" in probabilities:
             labels |= {"dangerous": self.alarm}
-            chances |= {"dangerous": max(self._peak_probability, chances["dangerous"])}
+            probabilities |= {"dangerous": max(self._peak_probability, probabilities["dangerous"])}
         return replace(
             decision.draft,
-            chances=chances,
+            probabilities=probabilities,
             touched=touched,
             labels=labels if touched else {},
             dangerous=self.alarm,
@@ -358,45 +358,47 @@ class Engine:
         )
 
     def _update_alarm(
-        self, decision: _Decision, chances: dict[str, float], learned: bool, period: float
+        self, decision: _Decision, probabilities: dict[str, float], learned: bool, period: float
     ) -> None:
         """Raise the alarm during a contact that is dangerous; keep it until the contact ends."""
         contact = decision.draft.contact is not None
         # A touch that the window shows, but that has ended, raises no alarm.
         present = contact or (learned and not decision.risen)
-        chance = chances.get("dangerous", 0.0)
+        probability = probabilities.get("dangerous", 0.0)
         # A NaN probability must not make a touch safe.
-        dangerous = present and not chance <= self._above
+        dangerous = present and not probability <= self._above
         # No second decision can follow the last one before an interruption.
         period = inf if decision.last and dangerous else period
         raised = self._labels["dangerous"](dangerous, decision.time, period)
         self.alarm = raised or (self.alarm and contact)
-        self._peak_probability = max(self._peak_probability, chance) if self.alarm else 0.0
+        self._peak_probability = max(self._peak_probability, probability) if self.alarm else 0.0
 
     def _collect_notes(
-        self, present: Sequence[Note], chances: dict[str, float], touched: bool
+        self, present: Sequence[Note], probabilities: dict[str, float], touched: bool
     ) -> tuple[Note, ...]:
         """Return the notes on a decision, those of the touch so far, and on its danger."""
         notes = self._lasting | {note.code: note for note in present}
         # What makes a touch uncertain holds until it ends.
         self._lasting = {code: note for code, note in notes.items() if code in LASTING and touched}
-        if 0.5 < chances.get("dangerous", 0.0) <= self._above and touched and not self.alarm:
+        if 0.5 < probabilities.get("dangerous", 0.0) <= self._above and touched and not self.alarm:
             notes["near_threshold"] = Note("near_threshold")
         return order_notes(notes.values())
 
-    def _debounce_labels(self, time: float, chances: dict[str, float], period: float) -> dict[str, bool]:
+    def _debounce_labels(
+        self, time: float, probabilities: dict[str, float], period: float
+    ) -> dict[str, bool]:
         """Return the predicted labels but ``dangerous``: the likeliest one if they exclude each other."""
-        best = max(chances, key=chances.__getitem__)
+        best = max(probabilities, key=probabilities.__getitem__)
         exclusive = self.task.kind == "exclusive"
         labels = {}
         for name in self.task.gated:
             if name == "dangerous":
                 continue
-            predicted = name == best if exclusive else chances[name] > 0.5
+            predicted = name == best if exclusive else probabilities[name] > 0.5
             labels[name] = self._labels[name](predicted, time, period)
             # A word must not stand beside the probability of its opposite.
             if labels[name] == predicted:
-                self._agreeing[name] = chances[name]
+                self._agreeing[name] = probabilities[name]
         return labels
 
 

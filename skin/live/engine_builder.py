@@ -18,7 +18,7 @@ from skin.core.settings import configured
 from skin.device.resampling import Frame
 from skin.errors import InputError
 from skin.evaluation.alarm import choose_alarm_threshold
-from skin.evaluation.decisions import DRIFT, least_visible
+from skin.evaluation.decisions import DRIFT, minimum_visible
 from skin.live.contacts import Mechanics
 from skin.live.engine import DebounceSettings, Detection, Engine
 from skin.live.verdict import Note, sensor_list
@@ -43,7 +43,7 @@ class SelfTest:
         nominal: engine with those that the model brings.
         weak: as ``STRENGTH``, of weaker presses: a network is surer of strong touches than of those that a
             limit hides.
-        least: fraction of the presses that must raise the alarm with nominal settings.
+        minimum: fraction of the presses that must raise the alarm with nominal settings.
         found: fraction of what the model finds with nominal settings that the settings in use must find.
         masked: largest fraction of the sensors without a valid reading.
         slowly: sensors that are pressed slowly, too.
@@ -54,7 +54,7 @@ class SelfTest:
     used: Engine
     nominal: Engine
     weak: float = 1.2
-    least: float = 0.5
+    minimum: float = 0.5
     found: float = 0.9
     masked: float = 0.25
     slowly: int = 5
@@ -87,7 +87,7 @@ class SelfTest:
         say(f"{nominally}; {'' if device.known else 'the device declares no range, '}{untested}")
         text += f", not {expected.sum()}"
         text += f"; {sensor_list(missed.tolist())} cannot raise it" * bool(len(missed))
-        if expected.mean() < self.least:
+        if expected.mean() < self.minimum:
             raise InputError(
                 f"{text}, even with nominal settings: train another run, or a longer one; {_OVERRIDE}"
             )
@@ -196,8 +196,8 @@ def _press(
     with np.errstate(all="ignore"):  # any scale is tried
         values = np.nan_to_num(conversion.raw(load[:, None] * press))
         values = np.round(values) if device.whole else values
-        if (device.least, device.most) != (None, None):
-            values = np.clip(values, device.least, device.most)
+        if (device.minimum, device.maximum) != (None, None):
+            values = np.clip(values, device.minimum, device.maximum)
     low, high = (
         np.inf * sign if limit is None else limit for sign, limit in zip((-1, 1), device.limits, strict=True)
     )
@@ -304,7 +304,7 @@ class LiveSession:
             selftest.run(conversion, self.source.raw_range, say)
             dead = int(selftest.masked * dead)
         if presses is not None and conversion.noise is not None:
-            visible = presses >= least_visible(conversion.noise, self.engine.detection.threshold)
+            visible = presses >= minimum_visible(conversion.noise, self.engine.detection.threshold)
             if alone := np.flatnonzero(visible.sum(axis=1) < 2).tolist():
                 say(f"no neighbour would show that the wire of {sensor_list(alone)} breaks to its rest value")
         return dead, raised
@@ -354,7 +354,7 @@ class LiveSetup:
         patience = replace(live.patience, above=usual if given is None else given)
         engine = engine_settings(model, patience, live.touch, live.drift)
         source = self.port or self.begin()
-        source.tare.glitches.shares = engine.shares
+        source.tare.glitches.fractions = engine.fractions
         return LiveSession(model, source, engine, nominal)
 
 

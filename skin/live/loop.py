@@ -374,7 +374,7 @@ class LiveLoop:
         self._skin, self._tare, self._engine, self._display = skin, tare, engine, display
         self._verify, self._clock, self._read_wait, self._at_once = verify, clock, wait, at_once
         self._status, self._proved, self._enough = status, proved, enough
-        self._received_at, self._most_dead, self._tested_at = clock(), inf, inf
+        self._received_at, self._maximum_dead, self._tested_at = clock(), inf, inf
         self._delays: deque[float] = deque(maxlen=2000)  # verdicts for the percentile of the delay
         self._updated_at = -inf
         self.verdicts = 0
@@ -466,7 +466,7 @@ class LiveLoop:
         assert self._tare.conversion is not None
         raised = None
         if self._verify is not None:
-            (self._most_dead, raised), self._verify = self._verify(self._tare.conversion), None
+            (self._maximum_dead, raised), self._verify = self._verify(self._tare.conversion), None
             self._tested_at = now
         self._engine.reset(raised, self._tare.conversion.noise)
         self._engine.remember(self._tare.take_earlier())
@@ -474,10 +474,10 @@ class LiveLoop:
     def _count_dead(self, now: float) -> None:
         """Refuse a skin of which much proves dead soon after the test."""
         dead = [number for number, state in enumerate(self._skin.channels) if state == "dead"]
-        if len(dead) > self._most_dead and now - self._tested_at < self._proved:
+        if len(dead) > self._maximum_dead and now - self._tested_at < self._proved:
             raise InputError(
                 f"self-test: {sensor_list(dead)} have never changed and are dead, more than "
-                f"{self._most_dead} of {len(self._skin.channels)}: check their wires; live.selftest=false "
+                f"{self._maximum_dead} of {len(self._skin.channels)}: check their wires; live.selftest=false "
                 "skips this test"
             )
 

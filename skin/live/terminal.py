@@ -72,9 +72,9 @@ def _verdict(state: DisplayState, width: int = 20) -> RenderableType:
     notes += [f"{count} sensors at their limit"] if (count := int(state.saturated.sum())) else []
     notes += ["frames are missing"] * verdict.gap
     bars = Table.grid(padding=(0, 1))
-    for word, chance in verdict.words():
-        filled = round(width * chance)
-        bars.add_row(word, "█" * filled + "░" * (width - filled), f"{100 * chance:.0f} %")
+    for word, probability in verdict.words():
+        filled = round(width * probability)
+        bars.add_row(word, "█" * filled + "░" * (width - filled), f"{100 * probability:.0f} %")
     return Group(head, Text(), bars, Text("\n".join(filter(None, notes)), "yellow"))
 
 

@@ -28,10 +28,10 @@ LASTING = frozenset(("over_range", "unreadable", "lost_wire"))
 """Notes with which no touch is safe, until it ends."""
 
 
-def sensor_list(sensors: Sequence[int], most: int = 3) -> str:
+def sensor_list(sensors: Sequence[int], maximum: int = 3) -> str:
     """Return the numbers of sensors in words, at most so many."""
-    omitted = f" and {len(sensors) - most} more" if len(sensors) > most else ""
-    numbers = ", ".join(map(str, sensors[:most]))
+    omitted = f" and {len(sensors) - maximum} more" if len(sensors) > maximum else ""
+    numbers = ", ".join(map(str, sensors[:maximum]))
     return f"sensor{'s' * (len(sensors) > 1)} {numbers}{omitted}"
 
 
@@ -81,8 +81,8 @@ class Verdict:
     Attributes:
         t: s, the device's clock at the latest frame.
         t_host: s, the host's clock at that frame.
-        chances: label -> its probability in this window; of ``dangerous`` the largest since the alarm was
-            raised, while it lasts.
+        probabilities: label -> its probability in this window; of ``dangerous`` the largest since the alarm
+            was raised, while it lasts.
         touched: debounced; if False, nothing touches the skin and the labels are meaningless.
         labels: label -> debounced prediction; empty without touch.
         dangerous: the alarm, which lasts until the contact ends.
@@ -97,7 +97,7 @@ class Verdict:
 
     t: float
     t_host: float
-    chances: dict[str, float] = field(default_factory=dict)
+    probabilities: dict[str, float] = field(default_factory=dict)
     touched: bool = False
     labels: dict[str, bool] = field(default_factory=dict)
     dangerous: bool = False
@@ -127,17 +127,19 @@ class Verdict:
 
     def words(self) -> list[tuple[str, float]]:
         """Return the predicted classes, each with its probability; empty without touch."""
-        chances = self.chances | self.agreeing
+        probabilities = self.probabilities | self.agreeing
         pairs = [
-            (OPPOSITE.get(name, ""), 1 - chances[name])
+            (OPPOSITE.get(name, ""), 1 - probabilities[name])
             if yes is False
-            else (name if yes else f"{name}?", chances[name])
+            else (name if yes else f"{name}?", probabilities[name])
             for name, yes in self.known.items()
         ]
-        return [(word, chance) for word, chance in pairs if word and isfinite(chance)]
+        return [(word, probability) for word, probability in pairs if word and isfinite(probability)]
 
     @property
     def in_alarm(self) -> "Verdict":
         """This verdict during an alarm that has begun before it, whose probability it does not know."""
         labels = self.labels | ({"dangerous": True} if "dangerous" in self.labels else {})
-        return replace(self, dangerous=True, labels=labels, chances=self.chances | {"dangerous": nan})
+        return replace(
+            self, dangerous=True, labels=labels, probabilities=self.probabilities | {"dangerous": nan}
+        )

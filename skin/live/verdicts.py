@@ -56,7 +56,7 @@ def verdict_message(
         # JSON has no NaN, and the probabilities of an untouched skin mean nothing.
         "probabilities": {
             name: round(value, 6) if isfinite(value) and verdict.state == "touch" else None
-            for name, value in verdict.chances.items()
+            for name, value in verdict.probabilities.items()
         },
         "contact": verdict.contact,
         "gap": verdict.gap,
@@ -182,8 +182,8 @@ def write_changes(
 ) -> Iterator[None]:
     """Write a line to a file for each change of alarm, state and baseline while the block runs.
 
-    The events are ``started``, ``alarm``, ``cleared``, ``stale``, ``resumed``, ``unknown`` (of a place: its
-    sensors have no valid reading), ``known``, ``tare``, ``tare_refused``, ``tare_forced`` and ``ended``.
+    The events are ``started``, ``alarm``, ``cleared``, ``stale``, ``resumed``, ``unknown`` (of a position:
+    its sensors have no valid reading), ``known``, ``tare``, ``tare_refused``, ``tare_forced`` and ``ended``.
 
     Args:
         display: gives the verdicts.

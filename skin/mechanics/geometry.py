@@ -42,11 +42,11 @@ class Fingertip:
         # Weights of the samples along an axis in the load of each cell.
         self._across, self._down = (
             torch.from_numpy(
-                splines.spline_values(places.numpy() / cell, count) / number
+                splines.spline_values(positions.numpy() / cell, count) / number
                 if smooth
                 else np.repeat(np.eye(count), number, axis=0) / number
             )
-            for places, count, cell, number in zip(
+            for positions, count, cell, number in zip(
                 (self._x, self._y), body.cells, body.cell, samples, strict=True
             )
         )
@@ -57,8 +57,8 @@ class Fingertip:
         across, down = (self._x.to(touches) - x) / self._rim, (self._y.to(touches)[:, None] - y) / self._rim
         # The root of 0 has no derivative; a micrometre changes nothing.
         distance = (across.square() + (down.square() + (1e-6 / self._rim) ** 2)).sqrt()
-        share = torch.sigmoid(radius / self._rim - distance)
-        cells = self._down.to(touches).T @ (share @ self._across.to(touches))
+        fraction = torch.sigmoid(radius / self._rim - distance)
+        cells = self._down.to(touches).T @ (fraction @ self._across.to(touches))
         return force * cells / (self._area * cells.sum((1, 2), keepdim=True))
 
 
@@ -105,10 +105,10 @@ def sensor_geometry(body: AbstractBody, sensors: Sensors, model: AbstractSimulat
         np.full((count, 1), body.thickness),
     ]
     uniform = model(torch.full((1, *body.shape), _UNIFORM)).readings[0]
-    share = uniform / (_UNIFORM * math.prod(sensors.footprint))
+    fraction = uniform / (_UNIFORM * math.prod(sensors.footprint))
     reaches = torch.stack([_response(body, sensors, model, reach) for reach in REACHES], dim=1)
     design = torch.from_numpy(np.concatenate(parts, axis=1)).float()
-    columns = torch.cat([design, share[:, None].float(), reaches.float()], dim=1)
+    columns = torch.cat([design, fraction[:, None].float(), reaches.float()], dim=1)
     assert columns.shape == (count, len(GEOMETRY))
     return columns
 
@@ -117,14 +117,16 @@ def _response(body: AbstractBody, sensors: Sensors, model: AbstractSimulator, re
     """Return the mean reading (S,), N, of each sensor under fingertips of 1 N at a distance, m."""
     angles = np.linspace(0, 2 * np.pi, _AROUND if reach else 1, endpoint=False)
     around = reach * np.stack([np.cos(angles), np.sin(angles)], axis=1)
-    places = sensors.positions[:, None, :2] + around
-    inside = ((places >= 0) & (places <= body.size)).all(axis=2)
+    positions = sensors.positions[:, None, :2] + around
+    inside = ((positions >= 0) & (positions <= body.size)).all(axis=2)
     inside |= ~np.any(
         inside, axis=1, keepdims=True
     )  # of a small body: beyond the edge is better than nowhere
     owner, number = np.nonzero(inside)
     constants = np.broadcast_to([_RADIUS, 1.0], (len(owner), 2))
-    touches = torch.from_numpy(np.concatenate([places[owner, number].clip(0, body.size), constants], axis=1))
+    touches = torch.from_numpy(
+        np.concatenate([positions[owner, number].clip(0, body.size), constants], axis=1)
+    )
     rows = torch.arange(len(owner))
     index = torch.from_numpy(owner)
     # A simulator of a user's own computes in single precision.

@@ -123,7 +123,7 @@ class Relaxing(AbstractSimulator):
         lags: theta_j, s.
     """
 
-    shares: Tensor
+    fractions: Tensor
 
     def __init__(
         self,
@@ -139,7 +139,7 @@ class Relaxing(AbstractSimulator):
         self.models = nn.ModuleList(simulator(elastic, sensors) for elastic in bodies)
         self._relaxed.linear(torch.zeros(body.shape))  # raises here instead of in the first batch
         terms = 1 / (1 + np.outer(at, self.lags))
-        self.register_buffer("shares", torch.from_numpy(np.linalg.inv(terms)))
+        self.register_buffer("fractions", torch.from_numpy(np.linalg.inv(terms)))
 
     @property
     def feels_shear(self) -> bool:  # type: ignore[override]
@@ -197,8 +197,8 @@ class Relaxing(AbstractSimulator):
         felt = parts[-1]
         # A difference of operators that are alike; in float32 the lags' shares would magnify its rounding.
         slow = torch.stack(parts[:-1]).double() - felt.double()
-        for lag, share in zip(self.lags, self.shares, strict=True):
-            term = torch.einsum("i,i...->...", share, slow)
+        for lag, fraction in zip(self.lags, self.fractions, strict=True):
+            term = torch.einsum("i,i...->...", fraction, slow)
             constant = torch.full_like(term[:, 0], lag)
             felt = felt + first_order_lag(term, constant, time).to(felt)
         response = self._relaxed.read(felt)

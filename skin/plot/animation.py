@@ -29,7 +29,7 @@ from skin.plot.plot3d import (
     beside_traces,
     draw_surface,
     draw_traces,
-    places,
+    positions,
     sensors_in_space,
     skin_in_space,
     surface_motion,
@@ -136,7 +136,12 @@ def _flat(figure: Figure, scene: Scene) -> Draw:
     )
     figure.colorbar(picture, ax=left, label=what, shrink=0.8)
     dots = left.scatter(
-        *places(scene, 0), s=60, cmap=FORCE, norm=Normalize(0, scene.strongest), c=scene.readings[0], zorder=3
+        *positions(scene, 0),
+        s=60,
+        cmap=FORCE,
+        norm=Normalize(0, scene.strongest),
+        c=scene.readings[0],
+        zorder=3,
     )
     few = range(scene.readings.shape[1]) if scene.readings.shape[1] <= _NAMED else range(0)
     numbers = [left.text(0, 0, "", fontsize=7, color="#B03A00", ha="center", path_effects=_HALO) for _ in few]
@@ -146,7 +151,7 @@ def _flat(figure: Figure, scene: Scene) -> Draw:
     def draw(frame: int) -> None:
         picture.set_data(movie[frame])
         dots.set_array(scene.readings[frame])
-        where = places(scene, frame)
+        where = positions(scene, frame)
         dots.set_offsets(where.T)
         for number, x, y, reading in zip(numbers, *where, scene.readings[frame], strict=False):
             number.set_position((x, y - 0.03 * scene.extent[2]))
@@ -173,7 +178,7 @@ def _bars(axis: Axes3D, scene: Scene) -> Draw:
 
     def draw(frame: int) -> None:
         height = np.maximum(scene.readings[frame], 0)
-        x, y = places(scene, frame)
+        x, y = positions(scene, frame)
         colours = colormaps[FORCE](colour(height))
         axis.bar3d(x - width / 2, y - width / 2, 0, width, width, height, color=colours)
 

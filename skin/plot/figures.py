@@ -59,14 +59,14 @@ def confusions(matrices: Mapping[str, np.ndarray], names: tuple[str, str]) -> Fi
     for axis in axes[len(matrices) :]:
         axis.set_visible(False)
     for axis, (title, counts) in zip(axes, matrices.items(), strict=False):
-        shares = counts / counts.sum(axis=1, keepdims=True).clip(min=1)
-        axis.imshow(shares, cmap="Blues", vmin=0, vmax=1)
+        fractions = counts / counts.sum(axis=1, keepdims=True).clip(min=1)
+        axis.imshow(fractions, cmap="Blues", vmin=0, vmax=1)
         for (true, predicted), count in np.ndenumerate(counts):
-            ink = "white" if shares[true, predicted] > 0.5 else "black"
+            ink = "white" if fractions[true, predicted] > 0.5 else "black"
             axis.text(
                 predicted,
                 true,
-                f"{shares[true, predicted]:.1%}\n{count:.0f}",
+                f"{fractions[true, predicted]:.1%}\n{count:.0f}",
                 ha="center",
                 va="center",
                 color=ink,
@@ -77,7 +77,7 @@ def confusions(matrices: Mapping[str, np.ndarray], names: tuple[str, str]) -> Fi
     return figure
 
 
-def misclassified_shares(
+def misclassified_fractions(
     speeds: np.ndarray, wrong: np.ndarray, bins: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the fraction of gestures with a wrong label, and its standard error, by the speed of the slide.
@@ -93,9 +93,9 @@ def misclassified_shares(
     # Static touches go to group 0, a slide in bin k to group k.
     group = np.where(speeds == 0, 0, np.clip(np.digitize(speeds, bins), 1, len(bins) - 1))
     counts = np.maximum(np.bincount(group, minlength=len(bins)), 1)
-    shares = np.bincount(group, weights=wrong, minlength=len(bins)) / counts
-    squares = np.bincount(group, weights=(wrong - shares[group]) ** 2, minlength=len(bins))
-    return shares, np.sqrt(squares) / counts
+    fractions = np.bincount(group, weights=wrong, minlength=len(bins)) / counts
+    squares = np.bincount(group, weights=(wrong - fractions[group]) ** 2, minlength=len(bins))
+    return fractions, np.sqrt(squares) / counts
 
 
 def misclassified(
@@ -115,9 +115,16 @@ def misclassified(
     middles = np.concatenate([[0.0], (bins[1:] + bins[:-1]) / 2])
     # Every colour comes with one mark after the other, so that any number of rows can be distinguished.
     styles = product(MARKS, COLOURS)
-    for (row, (shares, errors)), (mark, colour) in zip(courses.items(), styles, strict=False):
+    for (row, (fractions, errors)), (mark, colour) in zip(courses.items(), styles, strict=False):
         axis.errorbar(
-            middles * 1e3, shares, 2 * errors, marker=mark, markersize=4, capsize=2, color=colour, label=row
+            middles * 1e3,
+            fractions,
+            2 * errors,
+            marker=mark,
+            markersize=4,
+            capsize=2,
+            color=colour,
+            label=row,
         )
     axis.set(xlabel="speed, mm/s (0: static)", ylabel=f"fraction with “{label}” wrong")
     axis.set_ylim(bottom=0)

@@ -54,8 +54,8 @@ class Scene:
     @property
     def strongest(self) -> float:
         """The largest reading, N; 1 where there is none above 0."""
-        most = float(self.readings.max(initial=0))
-        return most if most > 0 else 1.0
+        maximum = float(self.readings.max(initial=0))
+        return maximum if maximum > 0 else 1.0
 
     @property
     def extent(self) -> tuple[float, float, float, float]:
@@ -92,7 +92,7 @@ def draw_traces(axis: Axes, scene: Scene) -> Draw:
     return draw
 
 
-def places(scene: Scene, frame: int) -> np.ndarray:
+def positions(scene: Scene, frame: int) -> np.ndarray:
     """Return where the sensors are, x and y, (2, S), mm."""
     return 1e3 * scene.positions[frame, :, :2].T
 
@@ -158,7 +158,7 @@ def surface_motion(model: AbstractSimulator, body: AbstractBody, loads: Tensor) 
 
 
 def draw_surface(
-    axis: Axes3D, moved: np.ndarray, depth: float, size: tuple[float, float], most: float
+    axis: Axes3D, moved: np.ndarray, depth: float, size: tuple[float, float], maximum: float
 ) -> None:
     """Draw a face of the deformed skin in space, its height stretched to be seen.
 
@@ -167,20 +167,20 @@ def draw_surface(
         moved: (ny + 1, nx + 1), m, into the skin.
         depth: of the face below the surface where nothing presses, m.
         size: extent (x, y) of the sheet, m.
-        most: the movement that takes the last colour and the whole height, m.
+        maximum: the movement that takes the last colour and the whole height, m.
     """
-    most = max(most, 1e-9)
-    places = np.meshgrid(*(np.linspace(0, 1e3 * size[axis], moved.shape[1 - axis]) for axis in (0, 1)))
+    maximum = max(maximum, 1e-9)
+    positions = np.meshgrid(*(np.linspace(0, 1e3 * size[axis], moved.shape[1 - axis]) for axis in (0, 1)))
     height = -1e3 * (moved + depth)
-    colours = colormaps["viridis"](moved / most)
-    axis.plot_surface(*places, height, facecolors=colours, rcount=50, ccount=50, shade=False)
+    colours = colormaps["viridis"](moved / maximum)
+    axis.plot_surface(*positions, height, facecolors=colours, rcount=50, ccount=50, shade=False)
     axis.set(
         xlabel="x, mm",
         ylabel="y, mm",
         zlabel="height, mm",
         xlim=(0, 1e3 * size[0]),
         ylim=(1e3 * size[1], 0),
-        zlim=(-1e3 * (depth + most), -1e3 * depth),
+        zlim=(-1e3 * (depth + maximum), -1e3 * depth),
     )
     axis.zaxis.set_major_locator(MaxNLocator(4))
     axis.set_box_aspect((size[0], size[1], 0.3 * max(size)))
@@ -242,14 +242,14 @@ class _Shell:
 
     def surface(self, depth: np.ndarray) -> np.ndarray:
         """Return where the surface is, (ny + 1, nx + 1, 3), mm, pushed in by a depth (ny + 1, nx + 1), m."""
-        return 1e3 * self.body.place(np.stack([*self.lines, depth], axis=-1))
+        return 1e3 * self.body.position(np.stack([*self.lines, depth], axis=-1))
 
     def rims(self) -> list[np.ndarray]:
         """Return the layers' faces where y ends, from the core outwards, (2, nx + 1, 3) each, mm."""
         depths = (self.body.thickness, *self.body.interfaces)
         x, y = (line[-1] for line in self.lines)
         return [
-            1e3 * self.body.place(np.stack([np.stack([x, y, 0 * x + depth], axis=-1) for depth in pair]))
+            1e3 * self.body.position(np.stack([np.stack([x, y, 0 * x + depth], axis=-1) for depth in pair]))
             for pair in pairwise(depths)
         ]
 
@@ -257,21 +257,23 @@ class _Shell:
 def skin_in_space(axis: Axes3D, scene: Scene, body: AbstractBody) -> Draw:
     """Show the surface as it moves and the sensors; where nobody knows the movement, the pressure."""
     frames = scene.known(scene.pressure if scene.moved is None else scene.moved)
-    shell, most, stretch = _Shell(body), max(float(frames.max()), 1e-9), 1.0
+    shell, maximum, stretch = _Shell(body), max(float(frames.max()), 1e-9), 1.0
     if scene.moved is None:
-        scale, what = Normalize(0, most / 1e3), "pressure, kPa"
+        scale, what = Normalize(0, maximum / 1e3), "pressure, kPa"
     else:
-        stretch = max(1.0, float(round(0.5 * body.thickness / most)))
-        scale, what = Normalize(0, 1e3 * most), f"into the skin, mm (drawn {stretch:g} times)"
+        stretch = max(1.0, float(round(0.5 * body.thickness / maximum)))
+        scale, what = Normalize(0, 1e3 * maximum), f"into the skin, mm (drawn {stretch:g} times)"
     axis.figure.colorbar(ScalarMappable(scale, FORCE), ax=axis, label=what, shrink=0.6, pad=0.02)
     _stand(axis, shell)
 
     def draw(frame: int) -> None:
         if scene.moved is None:
-            _skin(axis, shell.surface(np.zeros_like(shell.lines[0])), colormaps[FORCE](frames[frame] / most))
+            _skin(
+                axis, shell.surface(np.zeros_like(shell.lines[0])), colormaps[FORCE](frames[frame] / maximum)
+            )
         else:
             moved = scene.moved[frame]
-            _skin(axis, shell.surface(stretch * moved), colormaps[FORCE](_mean(moved) / most))
+            _skin(axis, shell.surface(stretch * moved), colormaps[FORCE](_mean(moved) / maximum))
         _rims(axis, shell)
         _dots(axis, body, scene.positions[frame])
 
@@ -291,7 +293,7 @@ def sensors_in_space(axis: Axes3D, scene: Scene, body: AbstractBody) -> Draw:
         height = np.maximum(scene.readings[frame], 0)
         foot = scene.positions[frame] * [1.0, 1.0, 0.0]
         tip = foot - np.outer(longest * height / scene.strongest, [0.0, 0.0, 1.0])
-        ends = 1e3 * np.stack([body.place(foot), body.place(tip)], axis=1)
+        ends = 1e3 * np.stack([body.position(foot), body.position(tip)], axis=1)
         _rims(axis, shell)
         _dots(axis, body, foot)
         seen, colours = _faces_eye(body, foot), colormaps[FORCE](colour(height))
@@ -317,14 +319,14 @@ def _stand(axis: Axes3D, shell: _Shell, above: float = 0.0) -> None:
     axis.set_axis_off()
 
 
-def _skin(axis: Axes3D, places: np.ndarray, colours: np.ndarray) -> None:
+def _skin(axis: Axes3D, positions: np.ndarray, colours: np.ndarray) -> None:
     """Draw a surface (ny + 1, nx + 1, 3), mm, with the colours (ny, nx, 4) of its faces, lit from above."""
-    across = places[1:, 1:] - places[:-1, :-1], places[1:, :-1] - places[:-1, 1:]
+    across = positions[1:, 1:] - positions[:-1, :-1], positions[1:, :-1] - positions[:-1, 1:]
     outwards = np.cross(*across)
     outwards /= np.linalg.norm(outwards, axis=-1, keepdims=True)
     light = 1 - _SHADE + _SHADE * np.clip(outwards @ _LIGHT, 0, 1)[..., None]
     lit = np.concatenate([colours[..., :3] * light, colours[..., 3:]], axis=-1)
-    x, y, z = np.moveaxis(places, -1, 0)
+    x, y, z = np.moveaxis(positions, -1, 0)
     axis.plot_surface(x, y, z, facecolors=lit, rcount=200, ccount=200, shade=False, zorder=1)
 
 
@@ -338,7 +340,7 @@ def _rims(axis: Axes3D, shell: _Shell) -> None:
 
 def _dots(axis: Axes3D, body: AbstractBody, positions: np.ndarray) -> None:
     """Draw the sensors (S, 3), m, that lie on the side of the eye."""
-    x, y, z = 1e3 * body.place(positions[_faces_eye(body, positions)]).T
+    x, y, z = 1e3 * body.position(positions[_faces_eye(body, positions)]).T
     axis.scatter(x, y, z, s=9, c="black", depthshade=False, zorder=3)
 
 

@@ -50,7 +50,7 @@ class Pair:
 
     Attributes:
         number: of the touch in its session.
-        labels: name -> 0 or 1; None: a press of a bench, at one place.
+        labels: name -> 0 or 1; None: a press of a bench, at one position.
         time: (T,), s, from the beginning of the touch.
         applied: force on the simulated skin, (T,), N.
         simulated: (T, S), N.
@@ -386,10 +386,10 @@ def comparison_markdown(comparison: SessionComparison, agreement: Agreement | No
     ]
     if same:
         rmse = np.sqrt(np.mean([pair.rmse**2 for pair in pairs]))
-        shares = [np.median([pair.peaks[side] / pair.force for pair in pairs]) for side in (0, 1)]
+        fractions = [np.median([pair.peaks[side] / pair.force for pair in pairs]) for side in (0, 1)]
         lines += [
             f"- RMSE of readings: {rmse:.3f} N",
-            f"- largest reading per applied force: {shares[0]:.1%} simulated, {shares[1]:.1%} recorded "
+            f"- largest reading per applied force: {fractions[0]:.1%} simulated, {fractions[1]:.1%} recorded "
             "(the report's skin: about 5 %)",
         ]
     else:

@@ -164,12 +164,12 @@ class Serial(AbstractDevice):
         left = (
             (number, labels) for number, labels in planned if number < self.gestures and number not in done
         )
-        least = self._least_response(conversion, first)
+        minimum = self._minimum_response(conversion, first)
         return PromptedSegmenter(
-            window, left, _print, lambda seen: bool((conversion(seen.values, seen.valid)[0] > least).any())
+            window, left, _print, lambda seen: bool((conversion(seen.values, seen.valid)[0] > minimum).any())
         )
 
-    def _least_response(self, conversion: UnitConversion, first: Sequence[Frame]) -> np.ndarray | float:
+    def _minimum_response(self, conversion: UnitConversion, first: Sequence[Frame]) -> np.ndarray | float:
         """Return the reading of each sensor (S,), N, that neither its noise nor a count explains."""
         if conversion.noise is None or conversion.rest is None:
             return self.trigger

@@ -131,9 +131,9 @@ def _about(beside: Path) -> dict[str, Any]:
         raise ValueError("its checksum is not that of its content")
     if not isinstance(about, dict) or not {"positions", "started_unix"} <= set(about):
         raise ValueError("it has no positions or no started_unix")
-    places = np.array(about["positions"], dtype=float)
+    positions = np.array(about["positions"], dtype=float)
     numbers = [about["started_unix"], *(about[name] for name in ("window", "rate") if name in about)]
-    if places.ndim != 2 or not 1 <= len(places) <= MOST or not np.isfinite(places).all():
+    if positions.ndim != 2 or not 1 <= len(positions) <= MOST or not np.isfinite(positions).all():
         raise ValueError(f"positions are not 1 to {MOST} rows of numbers")
     if not all(isinstance(value, int | float) and 0 < value < inf for value in numbers):
         raise ValueError("started_unix, window and rate must be numbers above 0")
@@ -342,21 +342,21 @@ class _Reading:
 
 def describe_contacts(contacts: np.ndarray) -> dict[str, Any]:
     """Return contacts (T, K, 5), NaN where there is none, as JSON data: each that is there in a row."""
-    places = np.argwhere(np.isfinite(contacts).all(axis=2))
-    rows = [[*place, *contacts[tuple(place)].tolist()] for place in places.tolist()]
+    positions = np.argwhere(np.isfinite(contacts).all(axis=2))
+    rows = [[*position, *contacts[tuple(position)].tolist()] for position in positions.tolist()]
     return {"most": contacts.shape[1], "rows": rows}
 
 
 def _decode_contacts(content: dict[str, Any], frames: int) -> np.ndarray:
     """Return the contacts (T, K, 5) of a window of T ``frames``; an error of _BAD if they are invalid."""
-    most = content["most"]
-    if not isinstance(most, int) or not 1 <= most <= MOST_CONTACTS:
+    maximum = content["most"]
+    if not isinstance(maximum, int) or not 1 <= maximum <= MOST_CONTACTS:
         raise ValueError("no number of contacts")
-    contacts = np.full((frames, most, len(CONTACT)), np.nan)
-    for frame, place, *values in content["rows"]:
-        if not (0 <= frame < frames and 0 <= place < most and len(values) == len(CONTACT)):
+    contacts = np.full((frames, maximum, len(CONTACT)), np.nan)
+    for frame, position, *values in content["rows"]:
+        if not (0 <= frame < frames and 0 <= position < maximum and len(values) == len(CONTACT)):
             raise ValueError("no contact of the window")
-        contacts[frame, place] = values
+        contacts[frame, position] = values
     return contacts
 
 

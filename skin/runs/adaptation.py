@@ -88,13 +88,13 @@ class Candidate:
 
     Attributes:
         name: what is done, for people; empty: nothing.
-        chances: probabilities (B, L) of the gestures, each from a learner that was not trained on it.
+        probabilities: probabilities (B, L) of the gestures, each from a learner that was not trained on it.
         train: returns a learner that was trained on all gestures.
         settings: of the learner; empty: those of the run.
     """
 
     name: str
-    chances: np.ndarray
+    probabilities: np.ndarray
     train: Callable[[], AbstractLearner]
     settings: dict[str, Any] = field(default_factory=dict)
 
@@ -131,14 +131,14 @@ def fine_tune(
                 _train(network, data, touches[fold != number], settings, (layers, lr, number))
                 for number in range(settings.folds)
             ]
-            losses = [float(touch_losses(candidates[0].chances, labels.numpy(), network.task).mean())]
+            losses = [float(touch_losses(candidates[0].probabilities, labels.numpy(), network.task).mean())]
             while len(losses) <= settings.epochs and len(losses) - np.argmin(losses) <= settings.patience:
-                chances = np.empty_like(candidates[0].chances)
+                predicted = np.empty_like(candidates[0].probabilities)
                 for number, training in enumerate(trainings):
-                    chances[fold == number] = _predict(next(training), data, touches[fold == number])
+                    predicted[fold == number] = _predict(next(training), data, touches[fold == number])
                 choice = f"layers={layers} lr={lr:g} epochs={len(losses)}"
-                candidates.append(Candidate(choice, chances, partial(finish, layers, lr, len(losses))))
-                losses.append(float(touch_losses(chances, labels.numpy(), network.task).mean()))
+                candidates.append(Candidate(choice, predicted, partial(finish, layers, lr, len(losses))))
+                losses.append(float(touch_losses(predicted, labels.numpy(), network.task).mean()))
             text = f"layers={layers} lr={lr:g}: held-out loss {losses[0]:.4f} before, {min(losses):.4f} after"
             print(f"{text} {np.argmin(losses)} epochs", file=sys.stderr, flush=True)
     return candidates
@@ -203,13 +203,13 @@ def learn_from_scratch(
     for name, option in options.items():
         make: Callable[[], SmallDataLearner] = partial(instantiate, option, seed=settings.seed)
         try:
-            chances = predict_held_out(make, matrix, labels, task, fold)
+            predicted = predict_held_out(make, matrix, labels, task, fold)
         except InputError as reason:
             print(f"from scratch: {name} is not compared: {reason}", file=sys.stderr)
             continue
-        print(f"{name}: held-out loss {touch_losses(chances, labels, task).mean():.4f}", file=sys.stderr)
+        print(f"{name}: held-out loss {touch_losses(predicted, labels, task).mean():.4f}", file=sys.stderr)
         train = partial(lambda make: make().learn(matrix, labels, task), make)
-        yield Candidate(f"{name}, from scratch", chances, train, option)
+        yield Candidate(f"{name}, from scratch", predicted, train, option)
 
 
 def choose_candidate(
@@ -225,18 +225,18 @@ def choose_candidate(
     """
     labels, before = touches.known_labels, candidates[0]
     fold = split_folds(labels, settings.folds, settings.seed)
-    losses = np.stack([touch_losses(one.chances, labels.numpy(), task) for one in candidates])
-    judged = np.empty_like(before.chances)
+    losses = np.stack([touch_losses(one.probabilities, labels.numpy(), task) for one in candidates])
+    judged = np.empty_like(before.probabilities)
     for number in range(settings.folds):
         held = (fold == number).numpy()
-        judged[held] = candidates[losses[:, ~held].mean(axis=1).argmin()].chances[held]
+        judged[held] = candidates[losses[:, ~held].mean(axis=1).argmin()].probabilities[held]
     gain = losses[0] - touch_losses(judged, labels.numpy(), task)
     name = "overall/r2" if task.kind == "regression" else "overall/accuracy"
     scores = [
-        compute_metrics(torch.from_numpy(chances), labels, task)[name] for chances in (before.chances, judged)
+        compute_metrics(torch.from_numpy(side), labels, task)[name] for side in (before.probabilities, judged)
     ]
     if gain.mean() <= 2 * gain.std(ddof=1) / len(gain) ** 0.5 or not scores[1] >= scores[0]:
-        return before, before.chances
+        return before, before.probabilities
     return candidates[losses.mean(axis=1).argmin()], judged
 
 
@@ -393,7 +393,7 @@ def adapt(config: Config, run: str, overrides: Sequence[str]) -> None:
             log_learner(store, made, learner)
             if best.name and point is not None:
                 point = choose(replace(source, learner=learner), anew=True)
-            figures |= _figures("validation_before", candidates[0].chances, touches, task)
+            figures |= _figures("validation_before", candidates[0].probabilities, touches, task)
             figures |= _figures("validation", after, touches, task)
             if others is None:
                 store.client.set_tag(made.info.run_id, TAG, "null" if point is None else point.text())
@@ -416,8 +416,8 @@ def _announce(figures: dict[str, float], title: str, reported: bool, chosen: str
 
 
 def _figures(
-    column: str, chances: np.ndarray, touches: Touches, task: Task, point: OperatingPoint | None = None
+    column: str, predicted: np.ndarray, touches: Touches, task: Task, point: OperatingPoint | None = None
 ) -> dict[str, float]:
     """Return the metrics of predictions (B, L) of gestures, as ``column/name``."""
-    figures = compute_metrics(torch.from_numpy(chances), touches.known_labels, task, point)
+    figures = compute_metrics(torch.from_numpy(predicted), touches.known_labels, task, point)
     return {f"{column}/{name}": value for name, value in figures.items()}

@@ -159,19 +159,19 @@ class FinishedRun:
         Raises:
             InputError: the run does not have it, or it cannot be read.
         """
-        place = self.run.info.artifact_uri
-        parts = urlsplit(place)
+        position = self.run.info.artifact_uri
+        parts = urlsplit(position)
         try:
             if not parts.netloc and parts.scheme in ("", "file"):  # a folder of this machine
-                local = Path(url2pathname(parts.path) if parts.scheme else place)
+                local = Path(url2pathname(parts.path) if parts.scheme else position)
                 return _copied(local / name, Path(folder) / name)
             from mlflow.artifacts import download_artifacts
 
             assert self.store is not None
             uri = reveal_password(self.store.uri)
-            return Path(download_artifacts(f"{place}/{name}", None, None, folder, uri))
+            return Path(download_artifacts(f"{position}/{name}", None, None, folder, uri))
         except Exception as error:  # of the file system, of MLflow, or of the library of another storage
-            raise InputError(f"run {self.identity} has no {name} in {place}: {one_line(error)}") from error
+            raise InputError(f"run {self.identity} has no {name} in {position}: {one_line(error)}") from error
 
 
 def find_run(tracking: Tracking, name: str, trust: bool = False) -> FinishedRun:

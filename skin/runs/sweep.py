@@ -282,7 +282,7 @@ def _identify_job(config: DictConfig, job: Mapping[str, str]) -> str:
 
 
 def _share_cores(launcher: DictConfig) -> None:
-    """Give every job of a parallel launcher (joblib's, submitit's) its share of the cores.
+    """Give every job of a parallel launcher (joblib's, submitit's) its fraction of the cores.
 
     Two jobs with two threads each are several times slower than two with one.
     """

@@ -86,7 +86,7 @@ class TorchModel(Model):
 
     Attributes:
         device, learner, point, run, config: as above; ``config`` is ``used``.
-        places: :attr:`positions` as a tensor.
+        sites: :attr:`positions` as a tensor.
     """
 
     def __init__(
@@ -103,7 +103,7 @@ class TorchModel(Model):
         self.identity, self.title = ("none", "untrained") if run is None else (run.identity, run.title)
         self.task, self.size = device.task, device.size
         self.window, self.rate = example.readings.shape[1], example.rate
-        self.places, self.positions = example.positions, example.positions.numpy()
+        self.sites, self.positions = example.positions, example.positions.numpy()
         self.threshold = None if point is None else point.threshold
         self.learned, self._touch = touch is None and self.task.gate is not None, touch
         if run is not None and used is not None:
@@ -126,7 +126,7 @@ class TorchModel(Model):
             )
         streams = self.device.reference.replace(stream=True, direction=False, tare=True, gestures=_MANY)
         touches = streams.touches("validation")
-        return ContactThreshold.tuned(rise(touches), touches.known_labels[:, -1] > 0.5).least
+        return ContactThreshold.tuned(rise(touches), touches.known_labels[:, -1] > 0.5).minimum
 
     @cached_property
     def longest(self) -> float:  # type: ignore[override]
@@ -168,7 +168,7 @@ class TorchModel(Model):
 
     def probabilities(self, readings: np.ndarray, valid: np.ndarray) -> np.ndarray:
         """Return the probability of each label, (B, L), for readings (B, T, S), N, and their validity."""
-        return window_classifier(self.learner, self.places, self.rate)(readings, valid)
+        return window_classifier(self.learner, self.sites, self.rate)(readings, valid)
 
     def describe(self, thresholds: Mapping[str, float] | None = None) -> ModelMetadata:
         """Return the description of the model for an exported file.

@@ -31,7 +31,7 @@ from skin.device.balance import report_balance
 from skin.errors import InputError
 from skin.evaluation.alarm import AlarmSource, choose_alarm_threshold, threshold_device
 from skin.evaluation.metrics import OUTCOMES, compute_metrics
-from skin.evaluation.report import Report, evaluate, metrics_table, publish_evaluation, write_chances
+from skin.evaluation.report import Report, evaluate, metrics_table, publish_evaluation, write_probabilities
 from skin.evaluation.report import print_report as show
 from skin.evaluation.settings import check_evaluation
 from skin.learning.learner import AbstractLearner
@@ -314,8 +314,8 @@ def evaluate_run(name: str, tracking: Tracking, trust: bool, folder: Path, chang
             path = folder / f"evaluation_{option_name(device)}_{evaluation.info.run_id[:8]}.md"
             if touches.labels is None:
                 written = [path.with_suffix(".csv")]
-                chances = learner.probabilities(touches)
-                print(title, write_chances(chances, device.task, point, *written), sep="\n")
+                probabilities = learner.probabilities(touches)
+                print(title, write_probabilities(probabilities, device.task, point, *written), sep="\n")
             else:
                 report = evaluate(learner, device, settings, point)
                 log_report(store, evaluation, report, device.task, {})

@@ -56,10 +56,10 @@ class FingertipSettings(TouchSettings):
     apart: NonNegativeFloat = 0.005
 
     def __post_init__(self) -> None:
-        most = self.pressure * np.pi * self.radius[0] ** 2
-        if self.force > most:
+        maximum = self.pressure * np.pi * self.radius[0] ** 2
+        if self.force > maximum:
             raise InputError(
-                f"touch.force={self.force:g} N is more than the {most:.3g} N that touch.pressure="
+                f"touch.force={self.force:g} N is more than the {maximum:.3g} N that touch.pressure="
                 f"{self.pressure:g} Pa gives a fingertip of the least touch.radius={self.radius[0]:g} m: "
                 "lower touch.force, or raise touch.radius"
             )
@@ -134,23 +134,23 @@ def draw_groups(
     Raises:
         InputError: the sheet has no room for them.
     """
-    least, most = settings.contacts
-    number = generator.integers(least, most, count, endpoint=True)
-    shape = generator.integers(0, shapes, (count, most))
+    minimum, maximum = settings.contacts
+    number = generator.integers(minimum, maximum, count, endpoint=True)
+    shape = generator.integers(0, shapes, (count, maximum))
     small, large = settings.radius
-    radius = small + (large - small) * generator.random((count, most))
+    radius = small + (large - small) * generator.random((count, maximum))
     highest = settings.pressure * np.pi * radius**2
-    force = settings.force * (highest / settings.force) ** generator.random((count, most))
-    absent = np.arange(most) >= number[:, None]
+    force = settings.force * (highest / settings.force) ** generator.random((count, maximum))
+    absent = np.arange(maximum) >= number[:, None]
 
     def draw(todo: np.ndarray) -> Draws:
         reach = radius[todo][..., None]
-        centre = reach + generator.random((count, most, 2))[todo] * (np.array(size) - 2 * reach)
+        centre = reach + generator.random((count, maximum, 2))[todo] * (np.array(size) - 2 * reach)
         hidden = absent[todo][..., None]
         low = np.where(hidden, np.inf, centre - reach).min(axis=1) - centre[:, 0]
         high = np.where(hidden, -np.inf, centre + reach).max(axis=1) - centre[:, 0]
         fits = (high - low + settings.spare <= size).all(axis=1)
-        first, second = np.triu_indices(most, 1)
+        first, second = np.triu_indices(maximum, 1)
         near, far = radius[todo][:, first], radius[todo][:, second]
         distance = np.linalg.norm(centre[:, first] - centre[:, second], axis=2)
         missing = absent[todo][:, first] | absent[todo][:, second]
@@ -293,7 +293,7 @@ class FingertipSampler(AbstractSampler):
             The sum of their pressures, (U, H, W), Pa, the highest one, (U,), Pa, and the fraction of the
             sheet in contact, (U,), or None where cells are counted.
         """
-        owner, place = paths.trajectories.owner, paths.trajectories.poses.place
+        owner, position = paths.trajectories.owner, paths.trajectories.poses.position
         shape, scale = drawn["tips"], drawn["radius"] / half_extents(self.shapes)[drawn["tips"]]
         frames = torch.zeros(len(owner), *self.body.shape)
         highest, areas = torch.zeros(2, len(owner))
@@ -302,7 +302,7 @@ class FingertipSampler(AbstractSampler):
             # Sorted by scale, because frames of one texture level are rendered together.
             rows = rows[np.argsort(scale[owner[rows], k], kind="stable")]
             mine, todo = owner[rows], torch.from_numpy(rows)
-            centres = place[rows] + drawn["offset"][mine, k]
+            centres = position[rows] + drawn["offset"][mine, k]
             pose = shape[mine, k], np.zeros(len(rows)), scale[mine, k], centres
             full = torch.from_numpy(drawn["forces"][mine, k] / float(np.prod(self.body.cell))).float()
             if self.shapes.fine:
@@ -327,7 +327,7 @@ def _contacts(paths: SampledPaths, drawn: Draws, highest: np.ndarray, present: n
         present: (B, K), bool.
     """
     profile = paths.trajectories.profile.double().numpy()[..., None]
-    positions = paths.trajectories.poses.place[paths.trajectories.index.numpy()]
+    positions = paths.trajectories.poses.position[paths.trajectories.index.numpy()]
     centre = positions[:, :, None] + drawn["offset"][:, None]
     values = np.empty((*centre.shape[:3], len(CONTACT)))
     values[..., :2], values[..., 2] = centre, drawn["radius"][:, None]

@@ -249,14 +249,14 @@ def _between(
     holds: np.ndarray, yes: tuple[float, float], no: tuple[float, float], random: np.ndarray
 ) -> np.ndarray:
     """Return numbers (B,) within one range where a label holds, and within another where it does not."""
-    least, most = np.where(holds[:, None], yes, no).T
-    return least + (most - least) * random
+    minimum, maximum = np.where(holds[:, None], yes, no).T
+    return minimum + (maximum - minimum) * random
 
 
 def _explain_no_room(settings: GestureSettings, size: tuple[float, float]) -> InputError:
-    least, most = settings.big_area
+    minimum, maximum = settings.big_area
     return InputError(
-        f"none of touch.shapes={list(settings.shapes)} covers {least:g} to {most:g} of a sheet of "
+        f"none of touch.shapes={list(settings.shapes)} covers {minimum:g} to {maximum:g} of a sheet of "
         f"{size[0]:g} x {size[1]:g} m and leaves touch.spare={settings.spare:g} m along x and y, even turned "
         f"and stretched by up to touch.stretch={settings.stretch:g}: lower touch.spare or touch.big_area, "
         "raise touch.stretch, or add a compact shape such as disc"

@@ -99,5 +99,5 @@ def hulls(images: np.ndarray, contact: float) -> np.ndarray:
         rows, columns = np.nonzero(image > contact)
         corners = np.concatenate([np.stack([columns + dx, rows + dy], 1) for dx in (0, 1) for dy in (0, 1)])
         outlines.append(corners[ConvexHull(corners).vertices] / pixels * 2 - 1)
-    most = max(map(len, outlines))
-    return np.stack([np.pad(hull, ((0, most - len(hull)), (0, 0)), mode="edge") for hull in outlines])
+    maximum = max(map(len, outlines))
+    return np.stack([np.pad(hull, ((0, maximum - len(hull)), (0, 0)), mode="edge") for hull in outlines])

@@ -80,7 +80,7 @@ class Task:
             counts[:, -2:] &= (labels[:, -2:] != 0).any(dim=1, keepdim=True)
         return counts & ~labels.isnan()
 
-    def shares(self, labels: "Tensor") -> "Tensor":
+    def fractions(self, labels: "Tensor") -> "Tensor":
         """Return labels (B, L) as the expected probabilities, 0 to 1: cosines c become (1 + c) / 2.
 
         The mean of c then minimises the cross-entropy, as the fraction of true cases does for a label.

@@ -113,15 +113,15 @@ class TouchSettings(ABC):
 
     def __post_init__(self) -> None:
         frames, rate = self.frames, self.rate
-        for name, (least, most), low, high in (
+        for name, (minimum, maximum), low, high in (
             ("window", (frames.window, frames.window), 1, inf),
             ("tap", frames.tap, 1, min(frames.duration, frames.window)),
             ("press", frames.press, frames.duration + 1, frames.window),
             ("gap", frames.gap, 1, inf),
             ("stride", frames.stride, 1, inf),
         ):
-            if not low <= least <= most <= high:
-                counts = f"{least}" if least == most else f"{least} to {most}"
+            if not low <= minimum <= maximum <= high:
+                counts = f"{minimum}" if minimum == maximum else f"{minimum} to {maximum}"
                 within = (
                     f"{low} to {high} ({low / rate:g} to {high / rate:g} s) with this touch.window and "
                     "touch.thresholds.duration"
@@ -209,10 +209,10 @@ def draw_times(
     """
     _, dynamic, press, _ = labels.T
     frames = settings.frames
-    least, most = np.where(press[:, None], frames.press, frames.tap).T
-    least = np.where(dynamic, np.maximum(least, frames.slide), least)
+    minimum, maximum = np.where(press[:, None], frames.press, frames.tap).T
+    minimum = np.where(dynamic, np.maximum(minimum, frames.slide), minimum)
     random = generator.random((len(labels), 2))
-    duration = least + (random[:, 0] * (most - least + 1)).astype(int)
+    duration = minimum + (random[:, 0] * (maximum - minimum + 1)).astype(int)
     onset = (random[:, 1] * (1 + padded * (frames.window - duration))).astype(int)
     if padded and settings.ongoing:
         ongoing, moment = generator.random((2, len(labels)))
@@ -274,9 +274,9 @@ def draw_motion(
         start (B, 2) within the span (m), span (B, 2) (m), direction (rad), speed (m per frame).
     """
     span = size - (gestures["high"] - gestures["low"])
-    least_speed, most_speed = settings.frames.speed
-    slowest = np.maximum(least_speed, settings.path / np.maximum(gestures["duration"] - 1, 1))
-    speed = slowest + (most_speed - slowest) * random[:, 3]
+    minimum_speed, maximum_speed = settings.frames.speed
+    slowest = np.maximum(minimum_speed, settings.path / np.maximum(gestures["duration"] - 1, 1))
+    speed = slowest + (maximum_speed - slowest) * random[:, 3]
     return {
         "start": random[:, :2] * span,
         "span": span,
@@ -285,25 +285,25 @@ def draw_motion(
     }
 
 
-def fold(place: np.ndarray, span: np.ndarray) -> np.ndarray:
+def fold(position: np.ndarray, span: np.ndarray) -> np.ndarray:
     """Return positions reflected at 0 and ``span`` (a triangle wave)."""
-    round_trip = np.mod(place, 2 * span)
+    round_trip = np.mod(position, 2 * span)
     return np.minimum(round_trip, 2 * span - round_trip)
 
 
-def heading(place: np.ndarray, first: np.ndarray) -> np.ndarray:
+def heading(position: np.ndarray, first: np.ndarray) -> np.ndarray:
     """Return the unit vectors (U, 2) of the last step to each position; 0 for objects at rest.
 
     A reflected step points from position to position. The first frame of a path takes the direction of the
     first step.
 
     Args:
-        place: (U, 2), m, the positions of all paths, one path after another.
+        position: (U, 2), m, the positions of all paths, one path after another.
         first: (B,), ascending, the first frame of each path.
     """
-    steps = np.diff(place, axis=0, prepend=place[:1])
+    steps = np.diff(position, axis=0, prepend=position[:1])
     steps[first] = 0
-    longer = first[np.diff(first, append=len(place)) > 1]
+    longer = first[np.diff(first, append=len(position)) > 1]
     steps[longer] = steps[longer + 1]
     length = np.linalg.norm(steps, axis=1, keepdims=True)
     return np.divide(steps, length, out=np.zeros_like(steps), where=length > 0)
@@ -316,7 +316,7 @@ class Trajectories:
     Attributes:
         owner: (U,), the gesture of each frame, ascending.
         poses: (U,).
-        share: (U,), the largest fraction of full force at which a frame is shown.
+        fraction: (U,), the largest fraction of full force at which a frame is shown.
         index: (B, T), the frame at each time.
         profile: (B, T), its fraction of full force; 0 without contact.
         peak: (B,), the wanted highest cell pressure, Pa.
@@ -325,7 +325,7 @@ class Trajectories:
 
     owner: np.ndarray
     poses: Pose
-    share: np.ndarray
+    fraction: np.ndarray
     index: Tensor
     profile: Tensor
     peak: np.ndarray
@@ -337,14 +337,14 @@ class SampledPaths(NamedTuple):
 
     Attributes:
         trajectories: the frames (U,) of gestures (B,).
-        place: (U, 2), position of each frame within the gesture's span, m.
+        position: (U, 2), position of each frame within the gesture's span, m.
         first: (B,), the first frame of each gesture.
         net: (B, 2), from its first position to its last, m.
         travel: (B,), largest distance from its first position, m.
     """
 
     trajectories: Trajectories
-    place: np.ndarray
+    position: np.ndarray
     first: np.ndarray
     net: np.ndarray
     travel: np.ndarray
@@ -378,21 +378,21 @@ def sample_paths(
     owner = np.repeat(np.arange(len(counts)), counts)
     step = np.arange(len(owner)) - first[owner]
     velocity = gestures["speed"] * np.stack([np.cos(gestures["direction"]), np.sin(gestures["direction"])])
-    place = fold(gestures["start"][owner] + step[:, None] * velocity.T[owner], gestures["span"][owner])
+    position = fold(gestures["start"][owner] + step[:, None] * velocity.T[owner], gestures["span"][owner])
 
     shape, angle, scales, stretch = (gestures[name][owner] for name in ("shape", "angle", "scale", "stretch"))
-    poses = Pose(shape, angle, scales, place - gestures["low"][owner], stretch)
-    share = np.zeros(len(owner))
-    np.maximum.at(share, index, scale)
+    poses = Pose(shape, angle, scales, position - gestures["low"][owner], stretch)
+    fraction = np.zeros(len(owner))
+    np.maximum.at(fraction, index, scale)
     trajectories = Trajectories(
         owner,
         poses,
-        share,
+        fraction,
         torch.from_numpy(index),
         torch.from_numpy(scale).float(),
         gestures["peak"],
         wanted,
     )
-    from_first = place - place[first[owner]]
+    from_first = position - position[first[owner]]
     travel = np.maximum.reduceat(np.hypot(*from_first.T), first)
-    return SampledPaths(trajectories, place, first, from_first[first + counts - 1], travel)
+    return SampledPaths(trajectories, position, first, from_first[first + counts - 1], travel)

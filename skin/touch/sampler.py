@@ -162,11 +162,11 @@ class AbstractSampler(ABC):
             contacts: of fingertips; see :class:`skin.touch.movie.Movie`.
         """
         drawn = drawn | dict(zip(("net_x", "net_y"), paths.net.T, strict=True))
-        drawn |= dict(zip("xy", paths.trajectories.poses.place[paths.first].T, strict=True))
+        drawn |= dict(zip("xy", paths.trajectories.poses.position[paths.first].T, strict=True))
         floats = {name: torch.from_numpy(drawn[name]).float() for name in _PARAMETERS}
         floats |= {name: value.float() for name, value in measures._asdict().items()}
         trajectories, friction = paths.trajectories, self.settings.shear
-        drag = torch.from_numpy(friction * heading(paths.place, paths.first)).float()
+        drag = torch.from_numpy(friction * heading(paths.position, paths.first)).float()
         movie = Movie(
             frames,
             trajectories.index,

@@ -47,14 +47,14 @@ class Pose(NamedTuple):
         shape: index of the shape.
         angle: rotation from x towards y, rad.
         scale: half the side of the texture, m.
-        place: (F, 2), position of its centre, m.
+        position: (F, 2), position of its centre, m.
         stretch: along x after the rotation.
     """
 
     shape: np.ndarray
     angle: np.ndarray
     scale: np.ndarray
-    place: np.ndarray
+    position: np.ndarray
     stretch: np.ndarray
 
     def rows(self, rows: np.ndarray) -> Pose:
@@ -171,9 +171,11 @@ class Shapes:
         width = np.ptp(self.hulls, axis=1).min(axis=1)
         scales = (1.5 * max(self.body.size) / width)[:, None] * np.geomspace(1 / 128, 1, sizes)
         number = np.repeat(np.arange(len(scales)), sizes * poses)
-        place = np.array(self.body.size) / 2 + (np.stack(offset, axis=1) - 0.5) * self.body.cell
+        position = np.array(self.body.size) / 2 + (np.stack(offset, axis=1) - 0.5) * self.body.cell
         fractions = torch.empty(len(number), dtype=torch.float64)
-        drawn = Pose(number, 2 * np.pi * angle, np.repeat(scales.ravel(), poses), place, np.ones(len(number)))
+        drawn = Pose(
+            number, 2 * np.pi * angle, np.repeat(scales.ravel(), poses), position, np.ones(len(number))
+        )
         for part, covered in count(drawn):
             fractions[torch.from_numpy(part)] = covered
         means = fractions.view(len(scales), sizes, poses).mean(2).numpy()
@@ -197,7 +199,7 @@ class Shapes:
         shape: np.ndarray,
         angle: np.ndarray,
         scale: np.ndarray,
-        place: np.ndarray,
+        position: np.ndarray,
         stretch: np.ndarray | None = None,
         frames_at_once: int = 128,
     ) -> tuple[Tensor, Tensor, np.ndarray]:
@@ -208,7 +210,7 @@ class Shapes:
             pressure as a fraction of the force by the area of a cell, (F,), float32; and the fraction of the
             sheet in contact, (F,).
         """
-        drawn = Pose(shape, angle, scale, place, np.ones(len(shape)) if stretch is None else stretch)
+        drawn = Pose(shape, angle, scale, position, np.ones(len(shape)) if stretch is None else stretch)
         # Adjacent frames that differ in their position alone, as those of a path, share a picture.
         same = [np.diff(values) == 0 for values in drawn if values.ndim == 1]
         first = np.flatnonzero(np.append(True, ~np.logical_and.reduce(same)))
@@ -217,7 +219,7 @@ class Shapes:
         for part, corner, count, pictures in self._pictures(drawn.rows(first)):
             frames = np.concatenate([np.arange(first[row], last[row]) for row in part])
             number = np.repeat(np.arange(len(part)), (last - first)[part])
-            at = place[frames] / self.body.cell + corner[number]
+            at = position[frames] / self.body.cell + corner[number]
             highest = pictures.amax((1, 2))
             for rows in np.split(
                 np.arange(len(frames)), np.arange(frames_at_once, len(frames), frames_at_once)
@@ -296,9 +298,9 @@ class Shapes:
         wide = [side + 2 * splines.REACH for side in self.body.shape]
         height, width = (max(side, part) for side, part in zip(wide, box.shape[1:], strict=True))
         row, column = (torch.arange(part) for part in box.shape[1:])
-        place = (cells[1][:, None, None] + row[:, None]) * width + cells[0][:, None, None] + column
+        position = (cells[1][:, None, None] + row[:, None]) * width + cells[0][:, None, None] + column
         sheet = torch.zeros(len(box), height * width)
-        sheet.scatter_(1, place.flatten(1), box.flatten(1))
+        sheet.scatter_(1, position.flatten(1), box.flatten(1))
         sheet = splines.fold_back(sheet.view(-1, height, width)[:, : wide[0], : wide[1]])
         return splines.fold_back(sheet.mT).mT
 
@@ -307,7 +309,7 @@ class Shapes:
         shape: np.ndarray,
         angle: np.ndarray,
         scale: np.ndarray,
-        place: np.ndarray,
+        position: np.ndarray,
         stretch: np.ndarray | None = None,
     ) -> Tensor:
         """Return frames (F, H, W), float32, each of sum 1 (report, equation 1).
@@ -320,11 +322,11 @@ class Shapes:
             shape: (F,), index of the shape.
             angle: (F,), rotation from x towards y, rad.
             scale: (F,), m.
-            place: (F, 2), m.
+            position: (F, 2), m.
             stretch: (F,), along x after the rotation.
         """
         frames = torch.empty(len(shape), *self.body.shape)
-        for part, cells in self._render_parts(self.levels, shape, angle, scale, place, stretch):
+        for part, cells in self._render_parts(self.levels, shape, angle, scale, position, stretch):
             frames[part] = cells[:, 0].div_(cells.sum((2, 3)).unsqueeze(2))
         return frames
 
@@ -333,7 +335,7 @@ class Shapes:
         shape: np.ndarray,
         angle: np.ndarray,
         scale: np.ndarray,
-        place: np.ndarray,
+        position: np.ndarray,
         stretch: np.ndarray | None = None,
     ) -> Solids:
         """Return shapes as objects on the cells; the arguments are those of :meth:`render`.
@@ -341,11 +343,11 @@ class Shapes:
         The object is where the image is brighter than ``contact``. Stretching does not change ``rim``.
         """
         cells = torch.empty(len(shape), 3, *self.body.shape)
-        for part, values in self._render_parts(self._objects, shape, angle, scale, place, stretch):
+        for part, values in self._render_parts(self._objects, shape, angle, scale, position, stretch):
             cells[part] = values
         cover, grey, rim = cells.unbind(1)
-        most = cover.amax((1, 2), keepdim=True)
-        inside = cover >= torch.minimum(most, torch.tensor(_POINTS / 2))
+        maximum = cover.amax((1, 2), keepdim=True)
+        inside = cover >= torch.minimum(maximum, torch.tensor(_POINTS / 2))
         size = torch.from_numpy(self._visible(scale, stretch)).float()[:, None, None]
         return Solids(inside, *((value / cover).where(inside, 0) for value in (grey, rim * size)))
 
@@ -370,7 +372,7 @@ class Shapes:
         shape: np.ndarray,
         angle: np.ndarray,
         scale: np.ndarray,
-        place: np.ndarray,
+        position: np.ndarray,
         stretch: np.ndarray | None,
     ) -> Iterator[tuple[slice, Tensor]]:
         """Yield parts of the frames and sums (f, C, H, W) of their cells' samples of levels (N, C, p, p)."""
@@ -380,7 +382,7 @@ class Shapes:
         level = np.clip(np.floor(np.log2(self.spacing / texel)), 0, len(levels) - 1).astype(int)
         turn = np.exp(-1j * angle) / scale
         turns = np.stack([turn / wide, turn * wide])
-        shift = turn * (place[:, 0] / wide + 1j * (place[:, 1] * wide))
+        shift = turn * (position[:, 0] / wide + 1j * (position[:, 1] * wide))
         step = max(1, _CELLS_AT_ONCE // int(np.prod(self.body.shape)))
         runs = np.split(np.arange(len(level)), np.flatnonzero(np.diff(level)) + 1)
         for run in runs:

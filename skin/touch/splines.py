@@ -28,19 +28,21 @@ def spline_values(points: np.ndarray, count: int) -> np.ndarray:
     return fold_back(torch.from_numpy(np.nan_to_num(_PIECE(points[:, None] - middles)))).numpy()
 
 
-def sampled(begin: np.ndarray, count: int, samples: int, least: np.ndarray, most: np.ndarray) -> torch.Tensor:
+def sampled(
+    begin: np.ndarray, count: int, samples: int, minimum: np.ndarray, maximum: np.ndarray
+) -> torch.Tensor:
     """Return the splines of cells -2 to ``count`` + 2 at even samples of ``count`` cells' lengths.
 
     Args:
         begin: (F,), of the first length, in cells, 0 to 1 unless it begins beyond an edge.
         count: of lengths.
         samples: of each length.
-        least, most: (F,), the edges of the sheet, in cells; samples beyond them weigh 0.
+        minimum, maximum: (F,), the edges of the sheet, in cells; samples beyond them weigh 0.
 
     Returns:
         (F, count * samples, count + 5), float32, divided by ``samples``.
     """
-    start, low, high = (torch.from_numpy(ends)[:, None].float() for ends in (begin, least, most))
+    start, low, high = (torch.from_numpy(ends)[:, None].float() for ends in (begin, minimum, maximum))
     points = start + (torch.arange(count * samples) + 0.5) / samples
     inside = (points >= low) & (points <= high)
     middles = torch.arange(-REACH, count + 1 + REACH) + 0.5

@@ -61,7 +61,7 @@ class Adapter:
         label: text between the name of a field and its number, such as ``:``.
         pattern: regular expression of a whole line: a named group per field, or a group ``values`` with
             fields between separators; with a group ``value``, of one field, whose name is the group ``name``.
-            Without ``value``, a group ``name`` names the line: its place in ``names`` is that of the row.
+            Without ``value``, a group ``name`` names the line: its position in ``names`` is that of the row.
         number: regular expression of one number, where nothing separates fields.
         names: of the fields, repeated over all of them; of labelled fields and JSON their order.
         ignore: regular expression of lines that are no frames.
@@ -76,7 +76,7 @@ class Adapter:
         values: fields that are sensors, by number from 0 or by name with ``*``; None: all others.
         drop: fields to leave out.
         axes: ``plain``: every value is a sensor; ``normal`` or ``magnitude``: three in a row are x, y, z at
-            one place, of which z, or the length, is the sensor.
+            one position, of which z, or the length, is the sensor.
         counter, time: fields that number the frames and hold the clock; ``auto``: recognised; None: none.
         time_unit: ``s``, ``ms`` or ``us``; None: found in the stream.
         modulus: number at which the counter begins again; None: found in the stream.
@@ -269,9 +269,9 @@ class Adapter:
             cut = partial(split_at, self._delimiter(data))
             yield FieldFormat(cut, self._reader(lines), "text" if plain else self.kind, ignore, plain=plain)
 
-    def _binary_layouts(self, data: bytes, most_repeats: int = 256) -> Iterator[FieldFormat]:
+    def _binary_layouts(self, data: bytes, maximum_repeats: int = 256) -> Iterator[FieldFormat]:
         head, tail = self._mark(self.head), self._mark(self.tail)
-        repeats = [self.repeat] if self.repeat else range(1, most_repeats)
+        repeats = [self.repeat] if self.repeat else range(1, maximum_repeats)
         for repeat in repeats if data.count(head or tail) >= _RUN else ():
             size = repeat * self._record.itemsize
             pattern = re.escape(head) + b".{%d}" % size + re.escape(tail)
@@ -318,7 +318,7 @@ class Adapter:
         """Return the roles of the fields of lines; None: a word stands in a field that is not dropped."""
         names = reader.names(len(rows[0].fields))
         dropped = [*resolve(self.drop, names, len(rows[0].fields)), *index]
-        if any(place not in dropped for row in rows for place in row.strange):
+        if any(position not in dropped for row in rows for position in row.strange):
             return None
         return find_roles(
             np.array([row.fields for row in rows]),

@@ -1,6 +1,6 @@
 """Propose structs of binary frames: the fewer bits the changes of the values need, the more plausible.
 
-Bytes that are read in another order, from another place or as another type jump.
+Bytes that are read in another order, from another position or as another type jump.
 """
 
 from collections.abc import Iterator
@@ -44,11 +44,11 @@ def binary_adapters(data: bytes, seconds: float, longest: int = 512) -> Iterator
                 mark = bytes(np.roll(ring, -begin[0] - skip)[:size])
                 frames = np.roll(table.ravel(), -begin[0] - skip).reshape(-1, length)[:-1, size:]
                 tail = mark in (b"\r\n", b"\n")
-                place: dict[str, Any] = {"tail" if tail else "head": mark.hex(" ")}
+                position: dict[str, Any] = {"tail" if tail else "head": mark.hex(" ")}
                 options += [
                     (
                         cost + _mark_cost(mark),
-                        Adapter(kind="binary", struct=struct, drop=drop, **place, **roles),
+                        Adapter(kind="binary", struct=struct, drop=drop, **position, **roles),
                     )
                     for cost, struct, drop, roles in _structs(frames, seconds * length / len(data))
                 ]

@@ -43,20 +43,20 @@ class RawRange:
     """Values that a device can send.
 
     Attributes:
-        least, most: of a channel; None: unknown.
+        minimum, maximum: of a channel; None: unknown.
         whole: it sends whole numbers.
         limits: at which a channel is saturated.
     """
 
-    least: float | None = None
-    most: float | None = None
+    minimum: float | None = None
+    maximum: float | None = None
     whole: bool = False
     limits: Limits = (None, None)
 
     @property
     def known(self) -> bool:
         """Whether the scale can be checked: too large or too small a force would leave the range."""
-        return self.most is not None
+        return self.maximum is not None
 
 
 class ChannelHealth:
@@ -112,7 +112,7 @@ class ChannelHealth:
         """
         if self._last is None or len(values) != len(self._last):
             self._last, self._begins = values, True
-            self._least, self._most = np.array(values, dtype=float), np.array(values, dtype=float)
+            self._minimum, self._maximum = np.array(values, dtype=float), np.array(values, dtype=float)
             self._smallest = np.full(len(values), np.inf)
             self._ever = np.zeros(len(values), dtype=bool)
         if self._begins:
@@ -123,8 +123,8 @@ class ChannelHealth:
         self._changed_at[changed] = t
         self._ever |= changed
         self._smallest = np.minimum(self._smallest, np.where(changed, step, np.inf))
-        np.minimum(self._least, values, out=self._least)
-        np.maximum(self._most, values, out=self._most)
+        np.minimum(self._minimum, values, out=self._minimum)
+        np.maximum(self._maximum, values, out=self._maximum)
         unchanged = t - self._changed_at
         if 2 * np.count_nonzero(unchanged < self._active) <= len(values):
             self._active_since = t
@@ -136,8 +136,8 @@ class ChannelHealth:
         inactive = (unchanged >= self._silent) & (others_change | never)
         low, high = self.limits
         low, high = -inf if low is None else low, inf if high is None else high
-        loaded = self._ever & (self._most - self._least >= self._far * self._smallest)
-        saturated = (values >= high) | (values <= low) | (inactive & loaded & (values >= self._most))
+        loaded = self._ever & (self._maximum - self._minimum >= self._far * self._smallest)
+        saturated = (values >= high) | (values <= low) | (inactive & loaded & (values >= self._maximum))
         saturated = saturated if limited is None else saturated | limited
         impossible = (values > self.largest) | (values < -self._below * self.largest)
         self.mask = np.where(
@@ -329,7 +329,7 @@ def fails_in_contact(
     *,
     enough: tuple[int, int] = (3, 100),
     times: float = 2.0,
-    chance: float = 1e-4,
+    probability: float = 1e-4,
 ) -> bool:
     """Return whether so many frames fail in a contact that it is no accident, given those at rest.
 
@@ -340,8 +340,8 @@ def fails_in_contact(
         failed_at_rest, frames_at_rest: the same at rest.
         enough: failures in contact, and frames at rest, of which less tell nothing.
         times: frames may fail so many times as often as at rest.
-        chance: greatest probability of so many failures or more that is no accident.
+        probability: greatest probability of so many failures or more that is no accident.
     """
     usual = min(times * (failed_at_rest + 1) / (frames_at_rest + enough[1]), 1.0)
     known = failed >= enough[0] and frames_at_rest >= enough[1]
-    return bool(known and betainc(failed, frames - failed + 1, usual) < chance)
+    return bool(known and betainc(failed, frames - failed + 1, usual) < probability)

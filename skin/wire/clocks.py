@@ -85,13 +85,13 @@ class FrameClock:
 
     def _compare_anew(self) -> None:
         """Forget the relation of both clocks: another segment has begun."""
-        self._least = self._least_before = inf
-        self._least_since = -inf
+        self._minimum = self._minimum_before = inf
+        self._minimum_since = -inf
         self._deliveries = deque[tuple[float, float, int, int]]()
         self._frames = self._steps = 0
         self._doubtful_since: float | None = None
 
-    def place(
+    def position(
         self, seq: int | None, ticks: float | None, now: float, missing: int = 0, rate: float | None = None
     ) -> FramePosition:
         """Return the position of a frame.
@@ -293,8 +293,8 @@ class FrameClock:
 
     def _to_host(self, t: float, arrival: float) -> float:
         """Return the host's time of a frame, s: by the least delayed frames of the last seconds."""
-        if arrival - self._least_since > _STEADY:
-            self._least_before, self._least, self._least_since = self._least, inf, arrival
-        self._least = min(self._least, arrival - t)
-        self._latest = max(self._latest, t + min(self._least, self._least_before))
+        if arrival - self._minimum_since > _STEADY:
+            self._minimum_before, self._minimum, self._minimum_since = self._minimum, inf, arrival
+        self._minimum = min(self._minimum, arrival - t)
+        self._latest = max(self._latest, t + min(self._minimum, self._minimum_before))
         return self._latest

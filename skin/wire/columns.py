@@ -48,18 +48,20 @@ def resolve(selected: Sequence[Field], names: Sequence[str], count: int) -> list
     Raises:
         InputError: there is no such field.
     """
-    places = list[int]()
+    positions = list[int]()
     for field in selected:
         if isinstance(field, int):
             hits = [field] if 0 <= field < count else []
         else:
-            hits = [place for place, name in enumerate(names) if name == field or fnmatchcase(name, field)]
+            hits = [
+                position for position, name in enumerate(names) if name == field or fnmatchcase(name, field)
+            ]
         if not hits:
             listed = f"their names are {', '.join(dict.fromkeys(names))}" if names else "they have no names"
             sent = f"the board sends {count} fields, 0 to {count - 1}"
             raise InputError(f"the adapter names a field {field}, {sent}; {listed}")
-        places += [place for place in hits if place not in places]
-    return places
+        positions += [position for position in hits if position not in positions]
+    return positions
 
 
 def find_roles(
@@ -86,7 +88,7 @@ def find_roles(
     """
     count = table.shape[1]
     names = names if len(names) == count else ()
-    free = [place for place in range(count) if place not in resolve(drop, names, count)]
+    free = [position for position in range(count) if position not in resolve(drop, names, count)]
     if values is not None:
         chosen = resolve(values, names, count)
     # As many fields as sensors: none is a counter.
@@ -102,9 +104,9 @@ def find_roles(
         elif setting != "auto":
             roles[role] = resolve([setting], names, count)[0]
         else:
-            taken = [place for place in free if place not in roles.values()]
+            taken = [position for position in free if position not in roles.values()]
             roles[role] = _recognise(table, names, taken, behaves, pattern)
-    others = [place for place in free if place not in roles.values()]
+    others = [position for position in free if position not in roles.values()]
     picked = others if values is None else chosen
     if len(picked) % each:
         raise InputError(
@@ -153,10 +155,10 @@ def runs(column: np.ndarray, mostly: float = 0.75, regular: float = 10.0) -> boo
     return bool(np.mean((rising >= middle / regular) & (rising <= middle * regular)) >= mostly)
 
 
-def cycles(column: np.ndarray, most: int = 64) -> bool:
-    """Return whether a field (L,) numbers rows: from 0 or 1 to at most ``most``, again and again."""
+def cycles(column: np.ndarray, maximum: int = 64) -> bool:
+    """Return whether a field (L,) numbers rows: from 0 or 1 to at most ``maximum``, again and again."""
     first, last, steps = column.min(), column.max(), np.diff(column)
-    numbers = first in (0, 1) and first < last < most and not (column % 1).any()
+    numbers = first in (0, 1) and first < last < maximum and not (column % 1).any()
     return bool(numbers and np.mean((steps == 1) | (steps == first - last)) > 0.9)
 
 
@@ -169,9 +171,9 @@ def _recognise(
     leading: int = 2,
 ) -> int | None:
     """Return the field that behaves as a counter or a clock: by its name, or one of the ``leading``."""
-    named = [place for place in free if names and pattern.fullmatch(last_part(names[place]))]
-    first = [place for place in free if place < leading and (not names or names[place].isdigit())]
-    return next((place for place in [*named, *first] if behaves(table[:, place])), None)
+    named = [position for position in free if names and pattern.fullmatch(last_part(names[position]))]
+    first = [position for position in free if position < leading and (not names or names[position].isdigit())]
+    return next((position for position in [*named, *first] if behaves(table[:, position])), None)
 
 
 def _unit(
@@ -186,12 +188,12 @@ def _unit(
     Without a name, the unit is taken whose steps are nearest to ``usual`` s, until the host's clock tells.
     """
     words = [f"field {roles['counter']} counts frames"] if roles["counter"] is not None else []
-    place = roles["time"]
-    if place is None:
+    position = roles["time"]
+    if position is None:
         return None, "; ".join(words)
-    steps = np.diff(table[:, place])
+    steps = np.diff(table[:, position])
     step = float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
-    name, source = names[place].rpartition(".")[2] if names else "", "the adapter"
+    name, source = names[position].rpartition(".")[2] if names else "", "the adapter"
     if unit is None:
         unit, source = (
             next((unit for unit in _NAMED_UNITS if _NAMED_UNITS[unit].fullmatch(name)), None),
@@ -200,4 +202,4 @@ def _unit(
     if unit is None:
         source = f"its steps of {step:.4g}"
         unit = min(UNITS, key=lambda unit: abs(np.log10((step * UNITS[unit] or usual) / usual)))
-    return UNITS[unit], "; ".join([*words, f"field {place} is the time in {unit}, by {source}"])
+    return UNITS[unit], "; ".join([*words, f"field {position} is the time in {unit}, by {source}"])

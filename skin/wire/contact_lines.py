@@ -28,7 +28,7 @@ class ContactLine:
         lines: number of such lines of the gesture.
         rate: of the model's frames, Hz.
         frames: of the model in the window.
-        most: K, contacts at a time.
+        maximum: K, contacts at a time.
         frame: of the model, from 0.
         contacts: number of a contact, below K -> its x, y, radius (m), force (N) and peak pressure (Pa).
     """
@@ -37,7 +37,7 @@ class ContactLine:
     lines: int
     rate: float
     frames: int
-    most: int
+    maximum: int
     frame: int
     contacts: Mapping[int, Sequence[float]]
 
@@ -51,16 +51,19 @@ def contact_lines(number: int, contacts: np.ndarray, rate: float) -> list[Contac
         rate: of the model, Hz.
     """
     present = np.isfinite(contacts).all(axis=2)
-    touched, (window, most) = np.flatnonzero(present.any(axis=1)).tolist(), contacts.shape[:2]
+    touched, (window, maximum) = np.flatnonzero(present.any(axis=1)).tolist(), contacts.shape[:2]
     return [
         ContactLine(
             number,
             len(touched),
             rate,
             window,
-            most,
+            maximum,
             frame,
-            {place: contacts[frame, place].tolist() for place in np.flatnonzero(present[frame]).tolist()},
+            {
+                position: contacts[frame, position].tolist()
+                for position in np.flatnonzero(present[frame]).tolist()
+            },
         )
         for frame in touched
     ]
@@ -76,14 +79,15 @@ def join_contact_lines(lines: Sequence[ContactLine], window: int, rate: float) -
     """
     frames = {line.frame: line for line in lines}
     if not lines or any(
-        (line.frames, line.rate, line.lines) != (window, rate, len(frames)) or line.most != lines[0].most
+        (line.frames, line.rate, line.lines) != (window, rate, len(frames))
+        or line.maximum != lines[0].maximum
         for line in lines
     ):
         return None
-    contacts = np.full((window, lines[0].most, len(CONTACT)), nan)
+    contacts = np.full((window, lines[0].maximum, len(CONTACT)), nan)
     for line in frames.values():
-        for place, values in line.contacts.items():
-            contacts[line.frame, place] = values
+        for position, values in line.contacts.items():
+            contacts[line.frame, position] = values
     return contacts
 
 
@@ -99,13 +103,13 @@ def parse_contact_line(line: bytes) -> ContactLine | None:
         if content is None:
             return None
         contacts = {
-            int(place): tuple(map(float, values)) for place, values in content.pop("contacts").items()
+            int(position): tuple(map(float, values)) for position, values in content.pop("contacts").items()
         }
         read = ContactLine(**content, contacts=contacts)
         sound = (
             0 <= read.frame < read.frames <= _MOST_FRAMES
-            and read.most <= MOST_CONTACTS
-            and set(contacts) <= set(range(read.most))
+            and read.maximum <= MOST_CONTACTS
+            and set(contacts) <= set(range(read.maximum))
             and all(
                 len(values) == len(CONTACT) and all(map(isfinite, values)) for values in contacts.values()
             )

@@ -47,7 +47,7 @@ class Stats:
         clock_trusted: False: the host's clock is used instead.
         identity: whether the device is the one of the first header.
         header, other_header: the first header, and one that differs.
-        bad_share: number of bad frames and of all in 2 s, reason of the latest bad one, and number of its
+        bad_fraction: number of bad frames and of all in 2 s, reason of the latest bad one, and number of its
             values; None: most frames were good.
     """
 
@@ -74,7 +74,7 @@ class Stats:
     identity: Identity = "known"
     header: Header | None = None
     other_header: Header | None = None
-    bad_share: tuple[int, int, str, int | None] | None = None
+    bad_fraction: tuple[int, int, str, int | None] | None = None
 
     @property
     def bad_frames(self) -> int:
@@ -103,13 +103,13 @@ class Stats:
             return f"another device is connected: {self.other_header}"
         if self.identity == "changed" and self.header and self.other_header:
             return f"the header of the device has changed, {self.other_header.changes(self.header)}"
-        if self.bad_share is None:
+        if self.bad_fraction is None:
             return ""
-        bad, frames, reason, found = self.bad_share
-        share = f"{bad} of {frames} frames in 2 s were bad"
+        bad, frames, reason, found = self.bad_fraction
+        fraction = f"{bad} of {frames} frames in 2 s were bad"
         if reason == "fields":
-            return f"{share}: the device sends {found} values per frame now"
-        return f"{share} ({reason}): wrong baud rate or format?"
+            return f"{fraction}: the device sends {found} values per frame now"
+        return f"{fraction} ({reason}): wrong baud rate or format?"
 
     def list_counts(self, **words: str) -> list[str]:
         """Return counts above 0 in words, as ``3 lost``; ``words`` has the word of each."""
@@ -181,7 +181,7 @@ class Decoder:
         self._begin()
         self._clock.restart(after)
         self.stats.identity, self._changed_at = "missing" if self.header else "known", inf
-        self.stats.bad_share, self.stats.clock_trusted = None, True
+        self.stats.bad_fraction, self.stats.clock_trusted = None, True
 
     def feed(self, data: bytes, now: float = 0.0) -> list[Frame]:
         """Return the frames that end in ``data``.
@@ -301,7 +301,7 @@ class Decoder:
         stats, clock, header = self.stats, self._clock, self.stats.header
         rate = None if header is None else header.rate
         self._clocked = raw.ticks is not None and clock.trusted
-        t, t_host, segment, lost, after = clock.place(raw.seq, raw.ticks, now, self._missing, rate)
+        t, t_host, segment, lost, after = clock.position(raw.seq, raw.ticks, now, self._missing, rate)
         stats.frames += 1
         stats.resyncs += self._missing > 0
         stats.lost += lost
@@ -337,8 +337,8 @@ class Decoder:
         if now - self._compared_at < span:
             return
         latest, frames = self._latest_bad, self._bad + self._good
-        most = self._bad > max(self._good, few)
-        self.stats.bad_share = (self._bad, frames, latest.reason, latest.found) if most else None
+        maximum = self._bad > max(self._good, few)
+        self.stats.bad_fraction = (self._bad, frames, latest.reason, latest.found) if maximum else None
         self._compared_at, self._good, self._bad = now, 0, 0
 
 

@@ -127,9 +127,9 @@ def upsample(force: np.ndarray, model_rate: float, rate: float, ramp: float = 0.
         ramp: fraction of the interval in which force rises, and falls.
     """
     frames = round(len(force) * rate / model_rate)
-    place = (np.arange(frames) + 0.5) * model_rate / rate
-    now = np.minimum(place.astype(int), len(force) - 1)
-    fraction = (place - now)[:, None]
+    position = (np.arange(frames) + 0.5) * model_rate / rate
+    now = np.minimum(position.astype(int), len(force) - 1)
+    fraction = (position - now)[:, None]
     padded = np.concatenate([np.zeros_like(force[:1]), force, np.zeros_like(force[:1])])
     level = padded[now + 1]
     before, after = np.minimum(padded[now], level), np.minimum(padded[now + 2], level)
@@ -436,7 +436,7 @@ class Emulator:
         self._silent_until = -1
         self._over = Event()
         self._noise = generator(Stream.NOISE, device.seed, Stream.TEST, 2, settings.seed)
-        self._chance = generator(Stream.TEST, 3, settings.seed)
+        self._probability = generator(Stream.TEST, 3, settings.seed)
 
     def run(self, seconds: float | None = None, count: int | None = None) -> None:
         """Send until ``count`` gestures or ``seconds`` of device time are over, or until :meth:`stop`."""
@@ -478,15 +478,15 @@ class Emulator:
         """Send frames when they are due; return whether the run is over."""
         rate = self.settings.rate
         happen = self.faults.happen
-        faults = {kind: happen(kind, self._number, len(values), rate, self._chance) for kind in KINDS}
-        for place, row in enumerate(values):
+        faults = {kind: happen(kind, self._number, len(values), rate, self._probability) for kind in KINDS}
+        for position, row in enumerate(values):
             if end is not None and self._number >= end:
                 return True
             due = self._start + self._number / (rate * self.settings.speed)
             if self._over.wait(max(0.0, due - monotonic())):
                 return True
             for kind in KINDS:
-                if faults[kind][place]:
+                if faults[kind][position]:
                     getattr(self, f"_{kind}")()
             if self._number % max(1, round(rate)) == 0:  # each second
                 self._header()
@@ -508,7 +508,7 @@ class Emulator:
 
     def _send(self, data: bytes) -> None:
         if self._number >= self._silent_until:
-            self.port.write(self.faults.damaged(data, self._chance))
+            self.port.write(self.faults.damaged(data, self._probability))
 
     def _broken(self, row: np.ndarray) -> np.ndarray:
         faults = self.faults

@@ -64,7 +64,7 @@ class Roles:
             raise FrameError("number")
         values = np.array(fields, dtype=np.float64)[self._take]  # type: ignore[attr-defined]
         if not finite:
-            strange = [word for place, word in line.strange.items() if place in self.values]
+            strange = [word for position, word in line.strange.items() if position in self.values]
             words_alone = all(word.isalpha() or not word.strip(b"0123456789abcdefABCDEF") for word in strange)
             if strange and not (words_alone and 2 * np.isfinite(values).sum() > len(values)):
                 raise FrameError("number", word=strange[0].decode("ascii", "replace"))
@@ -103,16 +103,16 @@ def fixed_length(length: int, pattern: bytes, follow: bytes = b"", margin: int =
     both = re.compile(b"(?=" + pattern * 2 + b")", re.DOTALL)
 
     def split(data: bytes) -> tuple[list[bytes], bytes]:
-        pieces, place = list[bytes](), 0
-        while len(data) - place >= length + margin:
-            following = None if (fits := step.match(data, place)) else both.search(data, place + 1)
+        pieces, position = list[bytes](), 0
+        while len(data) - position >= length + margin:
+            following = None if (fits := step.match(data, position)) else both.search(data, position + 1)
             end = following.start() if following else len(data) - 2 * length + 1
-            end = place + length if fits else end
-            if end <= place:
+            end = position + length if fits else end
+            if end <= position:
                 break
-            pieces.append(data[place:end])
-            place = end
-        return pieces, data[place:]
+            pieces.append(data[position:end])
+            position = end
+        return pieces, data[position:]
 
     return split
 

@@ -111,14 +111,14 @@ class PatternReader:
         """Return the fields of a line."""
         if "value" in self.pattern.groupindex:
             fields = self.fields(line)
-            words = place_by_key(fields, self.keys) if self.keys else fields.values()
+            words = position_by_key(fields, self.keys) if self.keys else fields.values()
             return self.split.numbers([word or b"" for word in words])
         match = self.pattern.fullmatch(line)
         if match is None:
             raise FrameError("structure")
         words = list[bytes]()
-        for name, place in self.pattern.groupindex.items():
-            text = match[place] or b""
+        for name, position in self.pattern.groupindex.items():
+            text = match[position] or b""
             if name == "values":
                 words += split_words(text, self.split.marks)
             elif name == "name" and self.keys:
@@ -136,16 +136,16 @@ class PatternReader:
         Raises:
             FrameError: ``structure``: the line holds anything else, or a name twice.
         """
-        fields, place = dict[str, bytes](), 0
-        while place < len(line):
-            match = self.pattern.match(line, place)
-            if match is None or match.end() == place:
+        fields, position = dict[str, bytes](), 0
+        while position < len(line):
+            match = self.pattern.match(line, position)
+            if match is None or match.end() == position:
                 raise FrameError("structure")
             found = match.groupdict()
             name = found["name"].decode("ascii", "replace") if "name" in found else str(len(fields))
             if name in fields:
                 raise FrameError("structure")
-            fields[name], place = found["value"], match.end()
+            fields[name], position = found["value"], match.end()
         return fields
 
     def names(self, count: int) -> Sequence[str]:
@@ -153,7 +153,7 @@ class PatternReader:
         groups = list(self.pattern.groupindex)
         if "value" in groups:
             return self.keys or self.split.names(count)
-        inner = [f"values.{place}" for place in range(count - len(groups) + 1)]
+        inner = [f"values.{position}" for position in range(count - len(groups) + 1)]
         return [title for name in groups for title in (inner if name == "values" else [name])]
 
 
@@ -171,7 +171,7 @@ class JsonReader:
 
     def __call__(self, line: bytes) -> Line:
         """Return the fields of a line."""
-        values = place_by_key(self.fields(line), self.keys)
+        values = position_by_key(self.fields(line), self.keys)
         return self.numbers([b"" if value is None else str(value).encode() for value in values])
 
     def fields(self, line: bytes) -> dict[str, Any]:
@@ -180,7 +180,7 @@ class JsonReader:
         Raises:
             FrameError: ``structure``: the line ends with no object or list.
         """
-        begin = min((place for place in (line.find(b"{"), line.find(b"[")) if place >= 0), default=0)
+        begin = min((position for position in (line.find(b"{"), line.find(b"[")) if position >= 0), default=0)
         try:
             content = json.loads(line[begin:], object_pairs_hook=_distinct)
         except (ValueError, RecursionError) as error:
@@ -280,7 +280,7 @@ def _keys(read: Callable[[bytes], Mapping[str, Any]], line: bytes) -> tuple[str,
         return ()
 
 
-def place_by_key(fields: Mapping[str, Any], keys: Sequence[str]) -> list[Any]:
+def position_by_key(fields: Mapping[str, Any], keys: Sequence[str]) -> list[Any]:
     """Return fields in the order of keys, None where one is missing.
 
     Raises:

@@ -28,7 +28,7 @@ Pieces = Sequence[tuple[float, bytes]]
 
 _FRAMES = 10  # that a candidate must read
 _NUMBER = re.compile(rb"\d{1,2}:\d\d:\d\d(?:\.\d+)?|(?:(?<!\w)[-+])?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]\d+)?")
-_WORD = r"[-+.:\w/]+"  # a number, or a word in its place
+_WORD = r"[-+.:\w/]+"  # a number, or a word in its position
 _ASIDE = re.compile(r"(?i)temp.*|.*[_\[(](t|temp.*|°?c|deg.?c)[\])]?|.*humid.*|rssi|.*batt.*|temperature")
 _GUIDE = re.compile(r"(?i)min|max|low|lower|high|upper|zero|ref.*|limit")
 """Names of fields that are not forces, and of lines that keep a plotter from scaling."""
@@ -172,7 +172,7 @@ def _read(adapter: Adapter, pieces: Pieces, data: bytes) -> Proposal:
     return Proposal(adapter, "; ".join(filter(None, words)), decoder.sensors or 0, score, values)
 
 
-def _judge_values(values: np.ndarray, frame_format: Any, most: int = 64) -> float:
+def _judge_values(values: np.ndarray, frame_format: Any, maximum: int = 64) -> float:
     """Return how implausible values (F, S) are.
 
     Raises:
@@ -183,7 +183,7 @@ def _judge_values(values: np.ndarray, frame_format: Any, most: int = 64) -> floa
         raise _ImplausibleError("no value ever changes")
     # Between frames next to each other, readings at rest differ as much as between frames further apart.
     near = _typical_step(moving, 1)
-    for lag in range(2, min(most, len(moving) // 4)):
+    for lag in range(2, min(maximum, len(moving) // 4)):
         if np.mean(near > 3 * _typical_step(moving, lag) + 2 * _resolution(moving)) >= 0.5:
             raise _ImplausibleError(
                 f"every {lag} lines are alike, those between them are not: they are of several sensors; let "
@@ -262,8 +262,11 @@ def _settle(adapter: Adapter, data: bytes) -> tuple[Adapter, list[str], float]:
     roles, left_out = _roles(table, names, text) if adapter.rows is None else ({"counter": None}, {})
     left_out |= dict.fromkeys(text, "is text")
     by_name = bool(names) and len(set(names)) == len(names)
-    described = [names[place] if by_name else place for place in sorted(left_out)]
-    notes = [f"field {names[place] if by_name else place} {why}" for place, why in sorted(left_out.items())]
+    described = [names[position] if by_name else position for position in sorted(left_out)]
+    notes = [
+        f"field {names[position] if by_name else position} {why}"
+        for position, why in sorted(left_out.items())
+    ]
     notes += [f"{count} lines such as {kind!r} are ignored" for kind, count in kinds]
     if by_name and adapter.pattern is None and adapter.number is None:
         roles["names"] = tuple(names)
@@ -291,20 +294,20 @@ def _text_columns(lines: Sequence[Line]) -> list[int]:
     Raises:
         _ImplausibleError: a field is text now and then, or hides a number.
     """
-    strange = Counter(place for line in lines for place in line.strange)
-    columns = [place for place, count in strange.items() if count > 0.9 * len(lines)]
-    for place, count in strange.items():
-        words = {line.strange[place] for line in lines if place in line.strange}
+    strange = Counter(position for line in lines for position in line.strange)
+    columns = [position for position, count in strange.items() if count > 0.9 * len(lines)]
+    for position, count in strange.items():
+        words = {line.strange[position] for line in lines if position in line.strange}
         word = min(words).decode("ascii", "replace")
-        if place not in columns and (count > 2 or re.fullmatch(r"[0-9A-Fa-f]+", word)):
+        if position not in columns and (count > 2 or re.fullmatch(r"[0-9A-Fa-f]+", word)):
             raise _ImplausibleError(
                 f"the word {word!r} stands in place of numbers: give device.adapter.over=[{word}] if that is "
                 f"beyond the range, device.adapter.invalid=[{word}] if it is no value"
             )
         numbers = {tuple(_NUMBER.findall(word)) for word in words}
-        if place in columns and len(numbers - {()}) > 1 and not all(map(_UNIT.fullmatch, words)):
+        if position in columns and len(numbers - {()}) > 1 and not all(map(_UNIT.fullmatch, words)):
             raise FrameError("number")  # with a text beside it
-        column = [line.strange.get(place) for line in lines]
+        column = [line.strange.get(position) for line in lines]
         changes = sum(before != word for before, word in pairwise(column))
         if 2 * changes > len(column) and not all(map(_UNIT.fullmatch, words)):
             raise FrameError("rows")  # it names the line
@@ -343,37 +346,45 @@ def _roles(
     table: np.ndarray, names: Sequence[str], text: Sequence[int]
 ) -> tuple[dict[str, Any], dict[int, str]]:
     """Return the settings of counter and time of fields (L, C), and why other fields are no sensors."""
-    free = [place for place in range(table.shape[1]) if place not in text]
+    free = [position for position in range(table.shape[1]) if position not in text]
     roles, left_out = dict[str, Any](counter=None, time=None), dict[int, str]()
     many = len(table) > 30  # of a few lines, only the first two fields may look like a clock
     for role, behaves in (("counter", partial(counts, wraps=many)), ("time", runs)):
-        rising = [place for place in free if (place < 2 or many or names) and behaves(table[:, place])]
+        rising = [
+            position for position in free if (position < 2 or many or names) and behaves(table[:, position])
+        ]
         if rising and len(free) > 1:
             roles[role] = rising[0]
             free.remove(rising[0])
     counter = roles["counter"]
     if counter is not None and np.count_nonzero(np.diff(table[:, counter]) < 0) > 1:
         roles["modulus"] = int(table[:, counter].max()) + 1
-    if any(cycles(table[:, place]) for place in free):
+    if any(cycles(table[:, position]) for position in free):
         raise FrameError("rows")
-    named = dict.fromkeys(free, "") | {place: names[place] for place in free if names}
+    named = dict.fromkeys(free, "") | {position: names[position] for position in free if names}
     aside = {
-        place for place in free if {*map(_ASIDE.fullmatch, (last_part(named[place]), named[place]))} != {None}
+        position
+        for position in free
+        if {*map(_ASIDE.fullmatch, (last_part(named[position]), named[position]))} != {None}
     }
     left_out |= dict.fromkeys(aside, "is no force, by its name")
-    moving = [place for place in free if np.ptp(table[:, place]) > 0 and place not in aside]
+    moving = [position for position in free if np.ptp(table[:, position]) > 0 and position not in aside]
     low, high = (table[:, moving].min(), table[:, moving].max()) if moving else (0, 0)
-    outside = [place for place in free if np.ptp(table[:, place]) == 0 and not low < table[0, place] < high]
+    outside = [
+        position
+        for position in free
+        if np.ptp(table[:, position]) == 0 and not low < table[0, position] < high
+    ]
     pair = outside == [free[0], free[-1]] and np.count_nonzero(table[0, outside] <= low) == 1
-    guides = [place for place in outside if pair or _GUIDE.fullmatch(last_part(named[place]))]
-    left_out |= {place: f"is always {table[0, place]:g}, a guide of a plotter" for place in guides}
-    rest = [place for place in free if place not in left_out]
-    for place in (rest[-1], rest[0]) if len(rest) > 2 else ():
-        inner, column = table[:, [other for other in rest if other != place]], table[:, place]
+    guides = [position for position in outside if pair or _GUIDE.fullmatch(last_part(named[position]))]
+    left_out |= {position: f"is always {table[0, position]:g}, a guide of a plotter" for position in guides}
+    rest = [position for position in free if position not in left_out]
+    for position in (rest[-1], rest[0]) if len(rest) > 2 else ():
+        inner, column = table[:, [other for other in rest if other != position]], table[:, position]
         # What varies as the others do: quiet sensors at rest are near their mean, too.
         near = [total - column for total in _sums(inner, table, counter) if np.ptp(column) > 0]
         if any(np.mean(np.abs(error) < 0.51) > SAME and error.std() < 0.3 * column.std() for error in near):
-            left_out[place] = "is a sum or mean of the others"
+            left_out[position] = "is a sum or mean of the others"
             break
     return roles, left_out
 
@@ -449,9 +460,9 @@ def _patterns(lines: Sequence[bytes]) -> Iterator[Adapter]:
             continue  # the text is a value that is missing
         index = next(
             (
-                place
-                for place in range(len(columns) - 1)
-                if b"".join(columns[place]).isdigit() and cycles(np.array(columns[place], float))
+                position
+                for position in range(len(columns) - 1)
+                if b"".join(columns[position]).isdigit() and cycles(np.array(columns[position], float))
             ),
             None,
         )
@@ -459,23 +470,23 @@ def _patterns(lines: Sequence[bytes]) -> Iterator[Adapter]:
         while first > 0 and shape[first] == shape[-2] in (b"", b",", b";") and first - 1 != index:
             first -= 1
         parts, used = list[str](), set[str]()
-        for place, column in enumerate(
+        for position, column in enumerate(
             columns[: first if first < len(columns) - 1 or index is not None else None]
         ):
-            parts.append(_literal(literals[place]))
-            if len(set(column)) == 1 and re.search(rb"\w$", literals[place]):
+            parts.append(_literal(literals[position]))
+            if len(set(column)) == 1 and re.search(rb"\w$", literals[position]):
                 parts.append(re.escape(column[0].decode()))  # digits of a word
                 continue
-            word = re.sub(r"\W+", "_", literals[place].decode("ascii", "ignore")).strip("_").lower()
-            name = "row" if place == index else word if word and not word[0].isdigit() else f"f{place}"
-            name = name if name not in (*used, "values", "value", "name") else f"f{place}"
+            word = re.sub(r"\W+", "_", literals[position].decode("ascii", "ignore")).strip("_").lower()
+            name = "row" if position == index else word if word and not word[0].isdigit() else f"f{position}"
+            name = name if name not in (*used, "values", "value", "name") else f"f{position}"
             used.add(name)
-            attached = place != index and index is not None
+            attached = position != index and index is not None
             parts.append(
                 rf"{_WORD}?"
                 if attached
                 else rf"(?P<{name}>\d+)"
-                if place == index
+                if position == index
                 else rf"(?P<{name}>{_WORD})"
             )
         if first < len(columns) - 1 or index is not None:

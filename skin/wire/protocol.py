@@ -167,19 +167,19 @@ def parse_words(
     finite, strange = all(map(isfinite, fields)), dict[int, bytes]()
     if not finite:
         fields = []
-        for place, word in enumerate(words):
+        for position, word in enumerate(words):
             text = word.strip().lower()
             try:
                 value = float(text)
             except ValueError:
                 value = inf if text in over else nan
                 if text not in over and text not in invalid:
-                    strange[place] = word.strip()
+                    strange[position] = word.strip()
             else:
                 value = value if isfinite(value) else nan
             fields.append(value)
     if b"_" in b"".join(words):  # valid in Python's grammar only
-        strange |= {place: word for place, word in enumerate(words) if b"_" in word}
+        strange |= {position: word for position, word in enumerate(words) if b"_" in word}
     return Line(fields, check, finite and not strange, strange)
 
 
@@ -343,11 +343,11 @@ def stuff(data: bytes) -> bytes:
     """Return ``data`` encoded with COBS: without zeros, each replaced by the distance to the next."""
     out = bytearray()
     blocks = data.split(b"\0")
-    for place, block in enumerate(blocks):
+    for position, block in enumerate(blocks):
         while len(block) >= 254:
             out += b"\xff" + block[:254]
             block = block[254:]
-            if not block and place == len(blocks) - 1:
+            if not block and position == len(blocks) - 1:
                 return bytes(out)
         out.append(len(block) + 1)
         out += block
@@ -360,16 +360,16 @@ def unstuff(data: bytes) -> bytes:
     Raises:
         FrameError: ``structure``: an invalid distance.
     """
-    out, place, end = bytearray(), 0, len(data)
-    while place < end:
-        distance = data[place]
-        following = place + distance
+    out, position, end = bytearray(), 0, len(data)
+    while position < end:
+        distance = data[position]
+        following = position + distance
         if distance == 0 or following > end:
             raise FrameError("structure")
-        out += data[place + 1 : following]
+        out += data[position + 1 : following]
         if distance < 255 and following < end:
             out.append(0)
-        place = following
+        position = following
     return bytes(out)
 
 

@@ -57,7 +57,7 @@ def label_plan(names: Sequence[str], repetitions: int, seed: int) -> Iterator[La
     for repetition in range(repetitions):
         order = generator(Stream.SPLIT, 2, seed, repetition).permutation(2 ** len(names))
         for code in order:
-            yield {name: int(code) >> place & 1 for place, name in enumerate(names)}
+            yield {name: int(code) >> position & 1 for position, name in enumerate(names)}
 
 
 def label_text(labels: Labels) -> str:

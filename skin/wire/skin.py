@@ -81,7 +81,7 @@ class Skin:
         self._stats = Stats() if decoder is None else decoder.stats
         self._timeout, self._backoff, self._wait = port.timeout, port.backoff, port.backoff[0]
         self.baseline = baseline
-        self._most, self._reconnect, self.away = queue, reconnect, False
+        self._maximum, self._reconnect, self.away = queue, reconnect, False
         self._error: Exception | None = None  # why the thread ended; EOFError at the end of a recording
         self._frames: deque[Frame] = deque()
         self._times: deque[float] = deque(maxlen=256)  # over which the rate is taken
@@ -254,10 +254,10 @@ class Skin:
                 if frame.after not in ("", "gap"):
                     self._times.clear()
                 self._times.append(frame.t)
-                while self._feed.patient and len(self._frames) >= self._most and not self._stop.is_set():
+                while self._feed.patient and len(self._frames) >= self._maximum and not self._stop.is_set():
                     self._fresh.wait(self._wake)
                 self._frames.append(frame)
-                if len(self._frames) > self._most:
+                if len(self._frames) > self._maximum:
                     dropped = self._frames.popleft()
                     self._frames[0] = self._frames[0].behind(dropped)
                     self._stats.dropped += 1
@@ -478,7 +478,7 @@ class SerialSource:
 
 
 def warm_up(
-    skin: Skin, tare: Tare, rate: float, seconds: float, notify: Callable[[str], None], least: float = 1.0
+    skin: Skin, tare: Tare, rate: float, seconds: float, notify: Callable[[str], None], minimum: float = 1.0
 ) -> tuple[list[Frame], UnitConversion]:
     """Read frames until rate and conversion are known; return all frames read, and the conversion.
 
@@ -488,21 +488,21 @@ def warm_up(
         rate: of the model, Hz: a slower device is refused.
         seconds: of the tare.
         notify: called with each message for the user.
-        least: s over which the rate is measured.
+        minimum: s over which the rate is measured.
 
     Raises:
         InputError: the device is too slow, or the scale is unknown.
         SkinTouched: the skin was still touched after a minute.
     """
     notify("reading the untouched skin: keep off" if seconds else "reading the rate")
-    frames, least, measured = list[Frame](), max(seconds, least), False
+    frames, minimum, measured = list[Frame](), max(seconds, minimum), False
     while True:
         frames += skin.read(1)
         if frames[-1].segment != frames[0].segment:
             del frames[:-1]
         tare.add(frames[-1])
         passed = frames[-1].t - frames[0].t
-        if len(frames) < 3 or passed < least:
+        if len(frames) < 3 or passed < minimum:
             continue
         if not measured:
             # By the device's clock, with lost frames.
@@ -512,5 +512,5 @@ def warm_up(
         if not measured and tare.state in ("touched", "limited"):
             notify("the skin is touched: let go")
         measured = True
-        if passed > least + PATIENCE:
+        if passed > minimum + PATIENCE:
             raise SkinTouched(tare.status)

@@ -62,8 +62,8 @@ def take_baseline(
     changes = {"moved by": (np.abs(values - baseline).max(axis=0), moved, 0.0)}
     if before is not None:
         changes["differs from its old baseline by"] = (np.abs(baseline - before), shifted, touch)
-    for what, (change, (sigmas, counts), least) in changes.items():
-        limit = np.maximum(np.maximum(sigmas * noise, counts * smallest), least)
+    for what, (change, (sigmas, counts), minimum) in changes.items():
+        limit = np.maximum(np.maximum(sigmas * noise, counts * smallest), minimum)
         beyond = np.where(valid.any(axis=0), change - limit, -np.inf)
         channel = int(beyond.argmax())
         if beyond[channel] > 0:
@@ -157,7 +157,7 @@ class Glitches:
     touch of that force would have changed another sensor. Anything else is a reading.
 
     Args:
-        shares: (S, S), reading of each sensor under a touch on another, of whose reading it is a fraction;
+        fractions: (S, S), reading of each sensor under a touch on another, of whose reading it is a fraction;
             None: unknown, and no value is an error.
         longest: s, interval of the frames in which no touch comes and goes.
         seen: times that the constant must have come before.
@@ -165,9 +165,9 @@ class Glitches:
     """
 
     def __init__(
-        self, shares: np.ndarray | None = None, longest: float = 0.02, seen: int = 2, visible: float = 10.0
+        self, fractions: np.ndarray | None = None, longest: float = 0.02, seen: int = 2, visible: float = 10.0
     ) -> None:
-        self.shares, self._longest, self._seen, self._visible = shares, longest, seen, visible
+        self.fractions, self._longest, self._seen, self._visible = fractions, longest, seen, visible
         self._counts = Counter[tuple[int, float]]()
         self._before: tuple[float, np.ndarray, np.ndarray] | None = None  # with newtons
         self._latest: int | None = None  # channel that jumped in the frame before
@@ -180,7 +180,7 @@ class Glitches:
             t: s, time of the stream.
             conversion: of the values to N, always the same; None: unknown, and no value is an error.
         """
-        if self.shares is None or conversion is None:
+        if self.fractions is None or conversion is None:
             return frame
         newtons = conversion.newtons(frame.values)
         before, self._before = self._before, (t, frame.values, newtons)
@@ -189,7 +189,7 @@ class Glitches:
             return frame
         changes = newtons - before[2]
         channel = int(changes.argmax())
-        expected = self.shares[channel] * changes[channel]
+        expected = self.fractions[channel] * changes[channel]
         others = np.arange(len(changes)) != channel
         visible = self._visible * np.abs(changes[others]).mean()
         witnesses = others & frame.valid & (expected > visible) & (np.abs(changes) < expected / 2)
@@ -252,7 +252,7 @@ class Tare:
         warning: message about what the latest baseline lacks; empty if nothing.
         count: number of baselines taken.
         freshness: tells whether the device still works.
-        glitches: finds error values; its ``shares`` may be set later.
+        glitches: finds error values; its ``fractions`` may be set later.
     """
 
     def __init__(
@@ -406,10 +406,10 @@ class Tare:
         self._quiet.clear()
 
 
-def _repeat_probability(frames: np.ndarray, most: int) -> np.ndarray:
+def _repeat_probability(frames: np.ndarray, maximum: int) -> np.ndarray:
     """Return the probability (L,) that one of the frames (F, S) equals that 1, 2, ... frames before."""
     rows = np.array([hash(frame.tobytes()) for frame in frames])
-    lags = range(1, min(len(rows) // 2, most) + 1)
+    lags = range(1, min(len(rows) // 2, maximum) + 1)
     return np.array([((rows[lag:] == rows[:-lag]).sum() + 1) / (len(rows) - lag + 2) for lag in lags])
 
 

@@ -17,7 +17,7 @@ from tests.calibration.test_fit import PROTOCOL, device
 @pytest.fixture(scope="module")
 def rows(tmp_path_factory):
     skin, randomness = device(), np.random.default_rng(0)
-    gauge = PROTOCOL.gauge(PROTOCOL.places(skin, randomness))
+    gauge = PROTOCOL.gauge(PROTOCOL.positions(skin, randomness))
     session = emulate_session(skin, gauge, PROTOCOL, randomness, 12)
     path = write_bench_session(session, tmp_path_factory.mktemp("units") / "bench.csv")
     return path, [line.split(",") for line in path.read_text().splitlines()]
@@ -29,8 +29,8 @@ def changed(rows, tmp_path, **factors):
     table = [list(line) for line in lines]
     for name, factor in factors.items():
         for line in table[1:]:
-            place = names.index(name)
-            line[place] = line[place] and repr(float(line[place]) * factor)
+            position = names.index(name)
+            line[position] = line[position] and repr(float(line[position]) * factor)
     path = tmp_path / "bench.csv"
     path.write_text("\n".join(map(",".join, table)) + "\n")
     path.with_name("bench.csv.json").write_text(source.with_name("bench.csv.json").read_text())

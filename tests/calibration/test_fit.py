@@ -36,7 +36,7 @@ def device(**hidden) -> Simulated:
 
 def session_of(skin: Simulated, bits: int | None = None) -> BenchData:
     randomness = np.random.default_rng(0)
-    rows = PROTOCOL.gauge(PROTOCOL.places(skin, randomness))
+    rows = PROTOCOL.gauge(PROTOCOL.positions(skin, randomness))
     return build_bench_data(skin, emulate_session(skin, rows, PROTOCOL, randomness, bits), None)
 
 
@@ -108,11 +108,11 @@ def test_counts_become_newtons():
 def test_the_press_of_the_report(tmp_path, indenter):
     """40 N on a disc of 20 mm radius over a sensor read 2 N (report 3.1.2): both ways, within 10 %."""
     sensor, plain = 2, device()
-    place = plain.sensors.positions[[sensor], :2]
+    position = plain.sensors.positions[[sensor], :2]
     rows = Gauge(
         np.zeros(1),
         np.full(1, 40.0),
-        place,
+        position,
         np.full(1, 0.02),
         np.zeros(1),
         np.array([indenter]),

@@ -41,7 +41,7 @@ def test_a_gauge_that_drifts_by_30_percent_is_refused(hidden, drift, named):
 
 def test_where_each_sensor_is_pressed_once_only_the_zero_can_be_seen():
     skin, randomness = device(), np.random.default_rng(0)
-    rows = PROTOCOL.gauge(PROTOCOL.places(skin, randomness)[:6])
+    rows = PROTOCOL.gauge(PROTOCOL.positions(skin, randomness)[:6])
     session = emulate_session(skin, rows, PROTOCOL, randomness)
     bench = replace(session_of(skin), session=session, gauge=rows, each=session_of(skin).each[:6])
     check_gauge(drifted(bench, gain=0.3))

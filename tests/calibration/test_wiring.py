@@ -98,7 +98,7 @@ def test_turns_come_back_and_compose(turn):
     size, rng = (0.24, 0.08), np.random.default_rng(0)
     gauge = PROTOCOL.gauge(rng.uniform(0.0, 0.08, (4, 2)))
     back = turn_gauge(in_frame(gauge, turn, size), turn, size)
-    np.testing.assert_allclose(back.place, gauge.place, atol=1e-12)
+    np.testing.assert_allclose(back.position, gauge.position, atol=1e-12)
     np.testing.assert_allclose(np.cos(back.angle), np.cos(gauge.angle), atol=1e-12)
     assert compose_turns(BACK.get(turn, turn), turn) == compose_turns("as_given", "as_given") == "as_given"
     assert compose_turns("as_given", turn) == compose_turns(turn, "as_given") == turn
@@ -147,7 +147,7 @@ def test_turned_places_are_named_even_where_they_are_outside_the_sheet(skins, na
 
 def test_places_that_no_turn_brings_onto_the_sheet_are_refused_with_one(skins):
     skin, session = skins("long")
-    gauge = replace(session.gauge, place=session.gauge.place * 1000)
+    gauge = replace(session.gauge, position=session.gauge.position * 1000)
     assert "is outside the sheet" in refused(skin, replace(session, gauge=gauge))
 
 

@@ -59,9 +59,9 @@ def test_a_session_with_other_axes_is_refused_until_that_is_confirmed(run, tmp_p
     assert "add calibrate.places=as_given" in done.stderr
     assert not out.exists()
     lines = [line.split(",") for line in session.read_text().splitlines()]
-    places = lines[0].index("y_m") if "y_m" in lines[0] else lines[0].index('"y_m"')
+    positions = lines[0].index("y_m") if "y_m" in lines[0] else lines[0].index('"y_m"')
     for line in lines[1:]:
-        line[places] = line[places] and str(0.16 - float(line[places]))
+        line[positions] = line[positions] and str(0.16 - float(line[positions]))
         line[1], line[2] = line[2], line[1]
     session.write_text("\n".join(map(",".join, lines)) + "\n")
     wrong = ["calibrate.places=mirror_y", "calibrate.channels=[1,0,2,3]"]

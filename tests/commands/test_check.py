@@ -30,8 +30,8 @@ def port(configured):
         nonlocal now, sent
         before, sent = sent, monotonic()
         now += min(sent - before, 0.1)  # it stands still while nobody reads
-        place, since = divmod(now - 12, PERIOD)
-        load = expected[int(place)] if 0 <= place < 3 and since < LOAD else np.zeros(4)
+        position, since = divmod(now - 12, PERIOD)
+        load = expected[int(position)] if 0 <= position < 3 and since < LOAD else np.zeros(4)
         header = encode_header(Header(1, 4, 50.0, "adc", 12, "arm-L")) if number % 50 == 0 else b""
         counts = np.round(100 + (load + noise.normal(0, 0.02, 4)) / 0.02).astype(int).tolist()
         return header + encode_line(counts, number, round(1e6 * now))

@@ -29,8 +29,8 @@ def write(folder, persons=6, touches=24):
     """Write touches of persons: a press lasts longer; who pats has neither label of press."""
     random = np.random.default_rng(0)
     for person in range(persons):
-        place = folder / f"p{person}"
-        place.mkdir(parents=True)
+        position = folder / f"p{person}"
+        position.mkdir(parents=True)
         for number in range(touches):
             gesture = ("press", "tap", "pat")[number % 3]
             force, frames = random.uniform(1, 10), 8 if gesture == "press" else 2
@@ -43,7 +43,7 @@ def write(folder, persons=6, touches=24):
                     f"{value * part + error:.3f}" for part, error in zip((1, 0.5, 0.1), noise, strict=True)
                 )
                 rows.append(f"{100 * frame},{readings},{gauge}")
-            (place / f"{gesture}_{number:02d}.csv").write_text("\n".join(rows))
+            (position / f"{gesture}_{number:02d}.csv").write_text("\n".join(rows))
     (folder / "map.yaml").write_text(yaml.safe_dump(MAPPING, sort_keys=False))
 
 

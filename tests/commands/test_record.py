@@ -177,7 +177,7 @@ def test_another_device_at_the_port_is_not_recorded(record, tmp_path):
 
 def test_damaged_lines_are_skipped_and_named(record, recorded):
     lines, whole = recorded.read_bytes().split(b"\n"), len(read_session(recorded).gestures)
-    begins = [place for place, line in enumerate(lines) if b'"event": "begin"' in line]
+    begins = [position for position, line in enumerate(lines) if b'"event": "begin"' in line]
     lines[begins[1] + 5] = b"\xff" + lines[begins[1] + 5]
     lines[begins[2]] = lines[begins[2]][:30]
     recorded.write_bytes(b"\n".join(lines) + b"\0" * 4096 + b"\n")

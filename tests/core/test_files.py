@@ -18,7 +18,7 @@ from skin.device import calibration
 from skin.device.files import write_recording as write_recording
 from skin.device.touches import Recording
 from skin.errors import InputError
-from skin.evaluation.report import write_chances
+from skin.evaluation.report import write_probabilities
 from skin.plot import animation, figures
 from skin.plot.animation import simulate_scene
 from skin.runs.configuration import Tracking
@@ -60,7 +60,7 @@ WRITERS = {
     "gains.yaml": lambda path, device: calibration.write_calibration(
         calibration.Calibration({"gain": 99 * [1.0]}), path
     ),
-    "chances.csv": lambda path, device: write_chances(torch.ones(9, 4), TOUCH, None, path),
+    "chances.csv": lambda path, device: write_probabilities(torch.ones(9, 4), TOUCH, None, path),
 }
 
 

@@ -14,12 +14,12 @@ SHEET = Sheet(SIZE, [24, 12], LAYERS)
 FOOTPRINT = (0.01, 0.01)
 
 
-def places(**settings):
+def positions(**settings):
     return candidate_sites(SHEET, FOOTPRINT, 0.0, **settings).positions[:, :2]
 
 
 def test_sites_are_cells_with_room_for_a_footprint():
-    found = places()
+    found = positions()
     x, y = (np.unique(found[:, axis].round(6)) for axis in (0, 1))
     assert x == pytest.approx(np.arange(0.0075, 0.115, 0.005))
     assert y == pytest.approx(np.arange(0.0075, 0.055, 0.005))
@@ -31,7 +31,7 @@ def test_sites_are_cells_with_room_for_a_footprint():
     ("raster", "counts"), [(0.02, (6, 3)), ((0.03, 0.02), (4, 3)), ([0.05, 0.05], (2, 1))]
 )
 def test_a_raster_is_centred(raster, counts):
-    found = places(raster=raster)
+    found = positions(raster=raster)
     pitches = raster if isinstance(raster, tuple | list) else (raster, raster)
     for axis in (0, 1):
         lines = np.unique(found[:, axis].round(6))
@@ -45,13 +45,13 @@ def test_no_footprint_lies_in_a_polygon():
         [(0.0, 0.0), (0.04, 0.0), (0.0, 0.04)],
         [(0.1, 0.03), (0.12, 0.03), (0.12, 0.06), (0.1, 0.06)],
     )
-    found = places(forbidden=keep_out([triangle, box], SIZE))
+    found = positions(forbidden=keep_out([triangle, box], SIZE))
     upper_left = found - 0.005
     # The corner of the footprint that is nearest to a zone, with 0.5 mm for the pixels of its outline.
     assert (upper_left.sum(axis=1) > 0.04 - 0.002).all()
     lower_right = found + 0.005
     assert not (lower_right > np.array([0.1005, 0.0305])).all(axis=1).any()
-    rest = places()
+    rest = positions()
     free = ((rest - 0.005).sum(axis=1) > 0.04) & ~(rest + 0.005 > np.array([0.1, 0.03]) + 1e-9).all(axis=1)
     assert {tuple(one) for one in rest[free].round(6)} <= {tuple(one) for one in found.round(6)}
 
@@ -60,7 +60,7 @@ def test_dark_pixels_of_a_picture_forbid_sites(tmp_path):
     pixels = np.full((60, 120), 255, dtype=np.uint8)
     pixels[:, :60] = 20
     Image.fromarray(pixels).save(tmp_path / "left.png")
-    found = places(forbidden=keep_out(str(tmp_path / "left.png"), SIZE))
+    found = positions(forbidden=keep_out(str(tmp_path / "left.png"), SIZE))
     assert len(found) == 10 * 10
     assert found[:, 0].min() == pytest.approx(0.0675)
 
@@ -97,6 +97,6 @@ def test_a_polygon_needs_three_corners():
 def test_no_site_left_is_refused():
     everything = [[(-0.01, -0.01), (0.13, -0.01), (0.13, 0.07), (-0.01, 0.07)]]
     with pytest.raises(InputError, match="no site is left"):
-        places(forbidden=keep_out(everything, SIZE))
+        positions(forbidden=keep_out(everything, SIZE))
     with pytest.raises(InputError, match="no site is left"):
-        places(raster=0.2)
+        positions(raster=0.2)

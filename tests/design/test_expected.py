@@ -59,20 +59,20 @@ def monte_carlo(count=300):
     with free():
         estimates = Posterior(solid(), noise, BODY, prior, contacts=1).estimate(readings)
     contacts = [estimate.contacts[0] for estimate in estimates]
-    place = per_axis(np.array([contact.place for contact in contacts]) - discs[:, :2])
+    position = per_axis(np.array([contact.position for contact in contacts]) - discs[:, :2])
     radius = np.abs([contact.radius for contact in contacts] - discs[:, 2])
     relative = np.abs([contact.force for contact in contacts] - force) / force
-    return place, radius, relative, (true > 3 * noise.frame).any(1)
+    return position, radius, relative, (true > 3 * noise.frame).any(1)
 
 
 def test_findings_are_those_of_estimates_of_other_touches():
     (finding,) = design().find(solid(), BODY)
-    place, radius, relative, raised = monte_carlo()
+    position, radius, relative, raised = monte_carlo()
     pairs = [
-        (finding.place_m, place, rms),
-        (finding.place_median_m, place, np.median),
-        (finding.place_90_m, place, lambda values: np.quantile(values, 0.9)),
-        (finding.place_raised_m, place[raised], rms),
+        (finding.place_m, position, rms),
+        (finding.place_median_m, position, np.median),
+        (finding.place_90_m, position, lambda values: np.quantile(values, 0.9)),
+        (finding.place_raised_m, position[raised], rms),
         (finding.radius_m, radius, np.median),
         (finding.force_relative, relative, np.median),
         (finding.blind_share, ~raised, np.mean),

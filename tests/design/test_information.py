@@ -27,9 +27,9 @@ def sheet(layers):
 
 def touches(count, seed, force=1.0):
     """Return touches at least 20 mm from the edges, (count, 4)."""
-    shares = torch.rand(count, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
-    places, radii = 0.02 + 0.08 * shares[:, :2], 0.004 + 0.008 * shares[:, 2:]
-    return torch.cat([places, radii, torch.full((count, 1), force, dtype=torch.float64)], dim=1)
+    fractions = torch.rand(count, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    positions, radii = 0.02 + 0.08 * fractions[:, :2], 0.004 + 0.008 * fractions[:, 2:]
+    return torch.cat([positions, radii, torch.full((count, 1), force, dtype=torch.float64)], dim=1)
 
 
 @pytest.mark.parametrize(
@@ -97,9 +97,9 @@ def estimate(simulator, fingertip, readings, start, noise, centre, priors):
     """Return the most probable parameters (B, 4) for readings (B, S): Levenberg-Marquardt from a start."""
     scale = priors
 
-    def cost(place):
-        missed = (simulator.press(fingertip(place)).readings - readings) / deviation
-        return missed.square().sum(1) + ((place - centre) / scale).square().sum(1)
+    def cost(position):
+        missed = (simulator.press(fingertip(position)).readings - readings) / deviation
+        return missed.square().sum(1) + ((position - centre) / scale).square().sum(1)
 
     deviation = noise.frame / noise.frames**0.5
     found, damping = start.clone(), torch.full((len(start), 1, 1), 1e-2, dtype=torch.float64)
@@ -143,8 +143,8 @@ def test_the_most_probable_place_has_the_local_precision():
     readings = felt.readings.repeat_interleave(draws, 0) + scatter * noise.frame / noise.frames**0.5
     found = estimate(simulator, fingertip, readings, true, noise, centre, priors)
     error = (found - true).square().unflatten(0, (200, draws)).mean(1)
-    place = (error[:, :2].mean(1) / variances[:, :2].mean(1)).sqrt()
+    position = (error[:, :2].mean(1) / variances[:, :2].mean(1)).sqrt()
     # Medians of the root of the mean of eight and of four squared normal values: 0.96 and 0.92, not 1.
     normal = [(chi2(number).median() / number) ** 0.5 for number in (2 * draws, draws)]
-    assert 0.9 < place.median() / normal[0] < 1.3
+    assert 0.9 < position.median() / normal[0] < 1.3
     assert 0.9 < (error[:, 3] / variances[:, 3]).sqrt().median() / normal[1] < 1.3

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from hydra import compose, initialize_config_dir
 from PIL import Image
+from skin.design.position import Place
 
 from skin.body.base import Sheet
 from skin.body.layout import File
 from skin.core.files import CONF
-from skin.design.place import Place
 from skin.errors import InputError
 from skin.runs.build import build_device, build_skin
 from skin.runs.configuration import validate_config
@@ -28,7 +28,7 @@ TOUCHES = 100
 def placed(tmp_path_factory):
     """Return a function that places sensors and returns the folder; settings are those of Place."""
 
-    def place(*overrides, **settings):
+    def position(*overrides, **settings):
         folder = tmp_path_factory.mktemp("placed")
         with initialize_config_dir(str(CONF), version_base="1.3"):
             config = validate_config(compose("train", overrides=[*NAIVE, *overrides]))
@@ -37,7 +37,7 @@ def placed(tmp_path_factory):
         )
         return folder
 
-    return place
+    return position
 
 
 def content(folder):

@@ -14,10 +14,10 @@ SEEDS = range(8)
 def problem(seed, sites=12):
     """Return places (C, 2), m, and a smooth covariance over them in units of the noise."""
     draw = np.random.default_rng(seed)
-    places = draw.uniform(0, 0.1, (sites, 2))
-    apart = np.linalg.norm(places[:, None] - places[None], axis=-1)
+    positions = draw.uniform(0, 0.1, (sites, 2))
+    apart = np.linalg.norm(positions[:, None] - positions[None], axis=-1)
     size = draw.uniform(1, 5, sites)
-    return places, 20 * np.outer(size, size) * np.exp(-((apart / 0.03) ** 2))
+    return positions, 20 * np.outer(size, size) * np.exp(-((apart / 0.03) ** 2))
 
 
 def alone(sites):
@@ -56,8 +56,8 @@ def test_gain_is_the_difference_of_log_determinants(seed):
 @pytest.mark.parametrize("distance", [0.0, 0.02])
 @pytest.mark.parametrize("seed", SEEDS)
 def test_reaches_the_optimum_of_exhaustive_search(seed, distance):
-    places, signal = problem(seed)
-    near = too_near(places, distance)
+    positions, signal = problem(seed)
+    near = too_near(positions, distance)
     chosen = placed(signal, 4, near)
     assert len(set(chosen)) == 4
     assert not any(near[one, two] for one, two in combinations(chosen, 2))
@@ -77,8 +77,8 @@ def test_exchanges_end_where_no_single_move_gains(seed):
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_order_of_candidates_changes_nothing(seed):
-    places, signal = problem(seed, sites=30)
-    near = too_near(places, 0.015)
+    positions, signal = problem(seed, sites=30)
+    near = too_near(positions, 0.015)
     order = np.random.default_rng(100 + seed).permutation(30)
     chosen = placed(signal, 6, near)
     again = placed(signal[np.ix_(order, order)], 6, near[np.ix_(order, order)])
@@ -90,8 +90,8 @@ def test_first_of_equal_sites_is_taken():
 
 
 def test_fixed_sites_stay_and_may_be_near_each_other():
-    places, signal = problem(1)
-    near = too_near(places, 0.02)
+    positions, signal = problem(1)
+    near = too_near(positions, 0.02)
     near[3, 7] = near[7, 3] = True
     chosen = placed(signal, 4, near, [3, 7])
     assert chosen[:2] == [3, 7]
@@ -99,11 +99,11 @@ def test_fixed_sites_stay_and_may_be_near_each_other():
 
 
 def test_says_how_many_fit():
-    places = np.column_stack([np.linspace(0, 0.1, 11), np.zeros(11)])
+    positions = np.column_stack([np.linspace(0, 0.1, 11), np.zeros(11)])
     with pytest.raises(InputError, match=r"only 2 of 4 sensors fit.*design\.distance"):
-        greedy(np.eye(11), 4, too_near(places, 0.06))
+        greedy(np.eye(11), 4, too_near(positions, 0.06))
 
 
 def test_distance_that_is_just_reached_is_enough():
-    places = np.array([[0.0, 0.0], [3 * 0.004, 0.0], [0.0119, 0.0]])
-    assert too_near(places, 0.012)[0].tolist() == [True, False, True]
+    positions = np.array([[0.0, 0.0], [3 * 0.004, 0.0], [0.0119, 0.0]])
+    assert too_near(positions, 0.012)[0].tolist() == [True, False, True]

@@ -38,8 +38,8 @@ def test_the_balance_is_what_the_parameters_say(device):
     assert yes["touches"] == int(big.sum())
     assert yes["area"] == pytest.approx(float(known["area"][big].mean()))
     assert yes["rejected"] == pytest.approx(1 - float(big.sum() / known["draws"][big].sum()))
-    shares = [float((known["shape"][big] == number).float().mean()) for number in range(7)]
-    assert yes["shapes"] == pytest.approx(shares)
+    fractions = [float((known["shape"][big] == number).float().mean()) for number in range(7)]
+    assert yes["shapes"] == pytest.approx(fractions)
     table = balance_table(report)
     assert [line.split()[0] for line in table[2:]] == [
         "big", "small", "dynamic", "static", "press", "tap", "dangerous", "safe"

@@ -60,8 +60,8 @@ def test_contacts_press_sensors_that_are_near():
     """The naive skin reads pressure under a sensor, so a sensor that reads has a contact over it."""
     perfect = {"gain_spread": 0.0, "offset": 0.0, "noise": 0.0, "clip": 1e9}
     touches = device(**perfect).touches("test")
-    places = touches.contacts[:, :, None, :, :2] - touches.positions[None, None, :, None, :2]
-    gap = (places.norm(dim=-1) - touches.contacts[:, :, None, :, 2]).nan_to_num(1.0).amin(3)
+    positions = touches.contacts[:, :, None, :, :2] - touches.positions[None, None, :, None, :2]
+    gap = (positions.norm(dim=-1) - touches.contacts[:, :, None, :, 2]).nan_to_num(1.0).amin(3)
     cell = 0.16 / 32
     assert (touches.readings > 1e-3).any()
     assert gap[touches.readings > 1e-3].max() < 2 * cell

@@ -60,12 +60,12 @@ def test_units_become_si(tmp_path):
 def eflesh(folder: Path) -> None:
     """Write three sessions of ten rows as eFlesh has them: two files without a header, joined by row."""
     for number in range(3):
-        place = folder / f"2025040{number}_probe"
-        place.mkdir(parents=True)
+        position = folder / f"2025040{number}_probe"
+        position.mkdir(parents=True)
         fields = [[1e9 + row, *(10 * row + np.arange(15))] for row in range(10)]
         states = [[1e9 + row, 315, -100, 288, -1 if row % 2 else 300.0 * row] for row in range(10)]
         for name, rows in (("sensor_post_baselines", fields), ("states", states)):
-            (place / f"{name}.csv").write_text("\n".join(",".join(map(str, row)) for row in rows))
+            (position / f"{name}.csv").write_text("\n".join(",".join(map(str, row)) for row in rows))
 
 
 def test_eflesh_has_forces_in_every_other_row(tmp_path):
@@ -97,13 +97,13 @@ def test_unknown_labels_and_targets_are_stored(tmp_path, ending):
 
 
 def test_eflesh_places_begin_at_zero(tmp_path):
-    place = tmp_path / "a"
-    place.mkdir()
+    position = tmp_path / "a"
+    position.mkdir()
     rows = [(274 + 10 * n, -115 + 20 * n) for n in range(3)]
     text = "\n".join(f"{n},{x},{y},142" for n, (x, y) in enumerate(rows))
-    (place / "states.csv").write_text(text)
+    (position / "states.csv").write_text(text)
     fields = "\n".join(",".join(map(str, [n, *range(15)])) for n in range(3))
-    (place / "sensor_post_baselines.csv").write_text(fields)
+    (position / "sensor_post_baselines.csv").write_text(fields)
     recording = convert_files(read_format("eflesh_place"), tmp_path)
     assert recording.parameters["x"].tolist() == pytest.approx([0, 0.01, 0.02])
     assert recording.parameters["y"].tolist() == pytest.approx([0, 0.02, 0.04])

@@ -29,13 +29,13 @@ def budget():
 @pytest.fixture
 def folder(budget, tmp_path) -> Path:
     """Return a data set of shards of 20, 20 and 10 gestures."""
-    place, counts = tmp_path / "touches", [20, 20, 10]
+    position, counts = tmp_path / "touches", [20, 20, 10]
     manifest = Manifest.of(describe_recording(budget), counts, **SOURCE)
-    manifest.write(place)
+    manifest.write(position)
     for number, first in enumerate(manifest.firsts):
         shard = replace(budget[first : first + counts[number]], metadata={"config_hash": "123"})
-        write_recording(shard, manifest.path(place, number), first)
-    return place
+        write_recording(shard, manifest.path(position, number), first)
+    return position
 
 
 def altered(folder: Path, **changes) -> Path:

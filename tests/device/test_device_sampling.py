@@ -33,7 +33,9 @@ def test_the_middle_of_an_interval_is_the_frame(rate):
 def test_between_two_frames_the_force_changes_linearly():
     fine = between_frames(touches(), 10.0, 50.0)[0]
     # From the middle of frame 4, the third of its interval, to that of frame 5.
-    expected = torch.stack([torch.lerp(touches()[0, 4], touches()[0, 5], share / 5) for share in range(6)])
+    expected = torch.stack(
+        [torch.lerp(touches()[0, 4], touches()[0, 5], fraction / 5) for fraction in range(6)]
+    )
     torch.testing.assert_close(fine[22:28], expected)
 
 
@@ -156,8 +158,8 @@ def test_unaligned_readings_are_those_of_the_common_resampler():
         time = 1.2 - (np.arange(round(1.2 * rate + 0.5), 0, -1) - 0.5) / rate
         time = time[time > 0]
         knots, force = ([6, 6.5, 11.5, 12], [0, 1, 1, 0]) if number == 4 else ([6, 6.5, 7], [0, 1, 0])
-        share = np.interp(10 * time - shift, knots, force)
-        values = share[:, None] * [1.0, -3.0]
+        fraction = np.interp(10 * time - shift, knots, force)
+        values = fraction[:, None] * [1.0, -3.0]
         works = np.ones(values.shape, dtype=bool)
         seen = resample(time, values, works, ~works, 1.2, 0.1, 12)
         np.testing.assert_allclose(readings[number].numpy(), seen.values, atol=1e-5)
@@ -269,7 +271,7 @@ def test_the_noise_of_an_interval_is_the_largest_of_its_frames(rate):
     force[:, 2:5] = 0.002  # N, felt by the device, and nothing beside the noise
     readings = measure(device, constants, force, 10.0, np.random.default_rng(1))[0]
     direct = 0.1 * np.random.default_rng(2).standard_normal((20000, round(rate / 10))).max(axis=1)
-    shares = np.linspace(0.02, 0.98, 25)
+    fractions = np.linspace(0.02, 0.98, 25)
     for values in (readings[:, 3], readings[:, 6:]):
-        drawn, expected = (np.quantile(noise, shares) for noise in (values.numpy(), direct))
+        drawn, expected = (np.quantile(noise, fractions) for noise in (values.numpy(), direct))
         np.testing.assert_allclose(drawn, expected, atol=0.008)

@@ -219,12 +219,12 @@ def test_further_sensors_of_a_calibrated_device_may_die():
 def test_a_device_takes_one_share_of_all_its_ranges():
     ranges = {"noise": [0.05, 0.2], "time_constant": (0.0, 0.2), "hysteresis": [0.0, 0.1], "offset": 0.0}
     drawn = Imperfection(**ranges).constants(5, generator(), gestures=2000)
-    share = (drawn.noise - 0.05) / 0.15
-    assert share.shape == (2000, 1, 1)
-    assert 0 <= share.min() < 0.01 < 0.99 < share.max() <= 1
-    assert share.mean() == pytest.approx(0.5, abs=0.03)
-    torch.testing.assert_close(drawn.time_constant, 0.2 * share)
-    torch.testing.assert_close(drawn.hysteresis, 0.1 * share)
+    fraction = (drawn.noise - 0.05) / 0.15
+    assert fraction.shape == (2000, 1, 1)
+    assert 0 <= fraction.min() < 0.01 < 0.99 < fraction.max() <= 1
+    assert fraction.mean() == pytest.approx(0.5, abs=0.03)
+    torch.testing.assert_close(drawn.time_constant, 0.2 * fraction)
+    torch.testing.assert_close(drawn.hysteresis, 0.1 * fraction)
     one = Imperfection(**ranges).constants(5, generator(1))
     assert 0.05 <= one.noise.item() <= 0.2
 
@@ -233,10 +233,10 @@ def test_spreads_grow_with_the_share_of_a_device():
     drawn = Imperfection(noise=[0.0, 1.0], gain_spread=[0.0, 0.4], drift=[0.0, 0.1]).constants(
         25, generator(), gestures=2000
     )
-    share = drawn.noise[:, 0, 0]
-    for value, most in ((drawn.gain.log(), 0.4), (drawn.drift, 0.1)):
+    fraction = drawn.noise[:, 0, 0]
+    for value, maximum in ((drawn.gain.log(), 0.4), (drawn.drift, 0.1)):
         spread = value[:, 0].std(dim=1)
-        assert (spread / (most * share)).median().item() == pytest.approx(1, abs=0.05)
+        assert (spread / (maximum * fraction)).median().item() == pytest.approx(1, abs=0.05)
 
 
 @pytest.mark.parametrize("given", [[0.2, 0.1], [-0.1, 0.1], [0.1], "much"])

@@ -78,8 +78,8 @@ def test_taxels_are_channels_or_spread_evenly(corpus):
     assert np.allclose(part.touches.positions, corners)
     random, every = np.random.default_rng(0), whole.touches.positions.numpy()
 
-    def closest(places: np.ndarray) -> float:
-        return min(float(np.linalg.norm(one - other)) for one, other in combinations(places, 2))
+    def closest(positions: np.ndarray) -> float:
+        return min(float(np.linalg.norm(one - other)) for one, other in combinations(positions, 2))
 
     views = [cost(corpus, taxels=12, taxel_seed=seed, pitch=0.02).touches.positions for seed in (0, 0, 1)]
     assert torch.equal(views[0], views[1])

@@ -174,10 +174,10 @@ def test_classes_and_targets_replace_the_labels(simulated, tmp_path):
     both = Recorded(BODY, LAYOUT, stored, task="regression", test_groups="a")
     assert both.task == Task(("x", "force"), "regression")
     assert both.touches("test").labels[:, 1].isnan().any()
-    place = Recorded(BODY, LAYOUT, stored, task="regression", targets=["x"])
-    torch.testing.assert_close(place.all_touches().labels[:, 0], parameters["x"])
-    assert place.recording().task == place.task
-    again = write_recording(place.recording(), tmp_path / "targets.parquet")
+    position = Recorded(BODY, LAYOUT, stored, task="regression", targets=["x"])
+    torch.testing.assert_close(position.all_touches().labels[:, 0], parameters["x"])
+    assert position.recording().task == position.task
+    again = write_recording(position.recording(), tmp_path / "targets.parquet")
     torch.testing.assert_close(read_recording(again).touches.labels[:, 0], parameters["x"])
     assert Recorded(BODY, LAYOUT, stored, task="labels").task == simulated.task
     with pytest.raises(InputError, match="has no target y, it has x, force"):

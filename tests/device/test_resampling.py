@@ -29,8 +29,8 @@ def by_loop(frames, intervals, rate, period):
     for one in frames:
         back = int((end - one.t) * rate)
         if back < intervals:
-            place = intervals - 1 - back
-            readings[place] = np.maximum(readings[place], one.values)
+            position = intervals - 1 - back
+            readings[position] = np.maximum(readings[position], one.values)
     return readings
 
 
@@ -167,8 +167,8 @@ def test_a_recorded_window_is_the_live_one_at_its_last_frame(rate):
             for one, other in zip(recorded, live, strict=True):
                 np.testing.assert_array_equal(one, other)
             begin, compared = None, compared + 1
-        values, chance = draw.random(SENSORS), draw.random(SENSORS)
-        valid, saturated = chance > 0.1, chance > 0.9
+        values, probability = draw.random(SENSORS), draw.random(SENSORS)
+        valid, saturated = probability > 0.1, probability > 0.9
         window.add(frame(t, values, valid, lost=0 if kept[number - 1] else 1, saturated=saturated))
         live = window.read()
         if begin is None and t > 1.5:

@@ -295,5 +295,5 @@ def test_the_true_footprints_differ_and_the_reported_ones_do_not():
         assert across == pytest.approx(down)
         factors.append(across)
     assert 0.05 < np.log(factors).std() < 0.15
-    shares = [skin.geometry[:, GEOMETRY.index("share")] for skin in (exact, wrong)]
-    torch.testing.assert_close(*shares)
+    fractions = [skin.geometry[:, GEOMETRY.index("share")] for skin in (exact, wrong)]
+    torch.testing.assert_close(*fractions)

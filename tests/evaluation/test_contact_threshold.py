@@ -50,7 +50,7 @@ def test_no_threshold_tells_better_than_the_tuned_one(seed):
     rises = (torch.rand(80, generator=generator) + 0.6 * touched).round(decimals=2)  # with ties
     tuned = ContactThreshold.tuned(rises, touched)
     best = max(balanced_accuracy_score(touched, rises >= cut) for cut in rises.tolist())
-    assert balanced_accuracy_score(touched, rises >= tuned.least) == pytest.approx(best)
+    assert balanced_accuracy_score(touched, rises >= tuned.minimum) == pytest.approx(best)
 
 
 def test_windows_that_are_all_alike_tune_nothing():
@@ -62,7 +62,9 @@ def test_only_a_task_with_a_gate_has_a_learned_one(noisy):
     assert list(gates(ContactThreshold(0.3), TOUCH)) == ["none", "threshold"]
     noisy[3, 5, 1] += 2
     found = gates(ContactThreshold(0.5), TOUCH_OR_NOT)
-    chances = torch.zeros(40, 5)
-    chances[7, 4] = 0.6
-    said = {name: gate(touches(noisy), chances).nonzero().flatten().tolist() for name, gate in found.items()}
+    probabilities = torch.zeros(40, 5)
+    probabilities[7, 4] = 0.6
+    said = {
+        name: gate(touches(noisy), probabilities).nonzero().flatten().tolist() for name, gate in found.items()
+    }
     assert said == {"none": list(range(40)), "threshold": [3], "learned": [7]}

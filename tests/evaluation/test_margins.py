@@ -26,9 +26,9 @@ class Sure:
 
 
 def test_spans_hold_what_is_said_and_what_is_wrong():
-    shares = torch.tensor([0.0, 0.97, 1.0, 1.01, 1.02, 3.0])
+    fractions = torch.tensor([0.0, 0.97, 1.0, 1.01, 1.02, 3.0])
     said = torch.tensor([True, False, True, True, False, True])
-    found = find_spans(said, shares)
+    found = find_spans(said, fractions)
     assert [(one.low, one.high, one.count, one.said, one.wrong) for one in found] == [
         (0, 0.5, 1, 1, 1),
         (0.95, 1, 2, 1, 1),  # a measure that only reaches its threshold does not pass it

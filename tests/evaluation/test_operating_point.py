@@ -98,21 +98,21 @@ def test_one_comparison_in_single_and_double_precision():
     threshold = alarm._lowest_threshold(torch.rand(500, generator=torch.Generator().manual_seed(1)), 0.1)
     assert threshold == float(np.float32(threshold))
     near = np.nextafter(np.float32(threshold), np.float32([0, 0.5, 1]), dtype=np.float32)
-    chances = torch.from_numpy(np.append(near, np.float32(threshold)))
-    said = OperatingPoint(threshold, 0.1, 500, 49, 0).alarm(chances).tolist()
-    assert said == [chance > threshold for chance in chances.tolist()]
+    probabilities = torch.from_numpy(np.append(near, np.float32(threshold)))
+    said = OperatingPoint(threshold, 0.1, 500, 49, 0).alarm(probabilities).tolist()
+    assert said == [probability > threshold for probability in probabilities.tolist()]
     assert not said[-1]
 
 
 def test_reached_rates_are_counted_their_range_is_exact_and_accuracy_is_at_one_half():
-    chances = torch.tensor([[0.0] * 4] * 6)
-    chances[:, 3] = torch.tensor([0.9, 0.25, 0.3, 0.1, 0.2, 0.26])
+    probabilities = torch.tensor([[0.0] * 4] * 6)
+    probabilities[:, 3] = torch.tensor([0.9, 0.25, 0.3, 0.1, 0.2, 0.26])
     labels = torch.zeros(6, 4)
     labels[:2, 3] = 1
-    reached = POINT.reached(chances, labels, TOUCH)
+    reached = POINT.reached(probabilities, labels, TOUCH)
     assert reached == Reached(dangerous=2, found=1, safe=4, raised=2)
     assert (reached.recall, reached.false_alarm_rate) == (0.5, 0.5)
-    found = compute_metrics(chances, labels, TOUCH, POINT)
+    found = compute_metrics(probabilities, labels, TOUCH, POINT)
     assert (found["dangerous/alarm_recall"], found["dangerous/false_alarm_rate"]) == (0.5, 0.5)
     assert found["dangerous/accuracy"] == pytest.approx(5 / 6)
     # None of ten: the upper end p has (1 - p)^10 = 0.025.
@@ -132,8 +132,8 @@ def test_rates_of_no_gesture_are_undefined_and_printed_so():
 def test_a_shut_gate_and_an_exclusive_task_are_counted_right():
     labels = torch.tensor([[0, 0, 0, 1.0, 1], [0, 0, 0, 0, 1], [0, 0, 0, 0, 0]])
     assert POINT.reached(torch.ones(3, 5), labels, TOUCH_OR_NOT) == Reached(1, 1, 1, 1)
-    chances = torch.tensor([[0.1, 0.6, 0.3], [0.7, 0.3, 0.0], [0.1, 0.1, 0.8]])
-    found = compute_metrics(chances, torch.eye(3)[[1, 0, 2]], GESTURES, POINT)
+    probabilities = torch.tensor([[0.1, 0.6, 0.3], [0.7, 0.3, 0.0], [0.1, 0.1, 0.8]])
+    found = compute_metrics(probabilities, torch.eye(3)[[1, 0, 2]], GESTURES, POINT)
     assert found == {
         "overall/accuracy": 1.0,
         "dangerous/alarm_recall": 1.0,
@@ -273,8 +273,8 @@ def engine_windows(drawn, readings, valid, ends, rate):
     times = 100.0 + (np.arange(len(readings)) - ends[0]) / rate
     frames = [Frame(n, t, t, row, valid) for n, (t, row) in enumerate(zip(times, readings, strict=True))]
     verdicts = engine.push([conversion.convert(frame) for frame in frames])
-    place = {round(verdict.t * rate): number for number, verdict in enumerate(verdicts)}
-    chosen = [place[round(times[end] * rate)] for end in ends]
+    position = {round(verdict.t * rate): number for number, verdict in enumerate(verdicts)}
+    chosen = [position[round(times[end] * rate)] for end in ends]
     return np.stack([windows[n] for n in chosen]), [verdicts[n].contact is not None for n in chosen]
 
 
@@ -308,11 +308,11 @@ def test_the_share_of_new_safe_touches_is_the_one_that_was_asked_for(drawn, rate
     assert point.raised <= 40
     labels = balanced(1600, generator(Stream.TEST, 8))
     safe = labels[~labels[:, 3]]
-    share = float(
+    fraction = float(
         point.alarm(touch_scores.touch_scores(Largest(), drawn, watching(rate), safe, 99)).float().mean()
     )
     # Both are counted: three standard deviations of 400 and 800 touches.
-    assert share == pytest.approx(0.1, abs=3 * (0.09 / 400 + 0.09 / 800) ** 0.5)
+    assert fraction == pytest.approx(0.1, abs=3 * (0.09 / 400 + 0.09 / 800) ** 0.5)
 
 
 class Onset(Largest):

@@ -10,7 +10,7 @@ from scipy.stats import poisson
 from skin.errors import InputError
 from skin.evaluation.operating_point import OperatingPoint
 from skin.evaluation.settings import StreamSettings
-from skin.evaluation.streams import Alarms, bin_by_share, count_alarms, evaluate_windows
+from skin.evaluation.streams import Alarms, bin_by_fraction, count_alarms, evaluate_windows
 from skin.runs.build import build_device
 from skin.touch.labels import TOUCH, TOUCH_OR_NOT
 
@@ -87,11 +87,11 @@ def test_the_overall_accuracy_is_the_mean_over_labels(streamed):
 def test_every_test_window_with_touch_is_in_one_bin(streamed, knew):
     found = knew
     recording = streamed.recording("test")
-    share, labels = recording.parameters["share"], recording.touches.labels
+    fraction, labels = recording.parameters["share"], recording.touches.labels
     assert sum(one.count for one in found.bins) == int(labels[:, 4].sum())
-    assert {one.name: one.count for one in found.bins}["whole"] == int((share == 1).sum())
+    assert {one.name: one.count for one in found.bins}["whole"] == int((fraction == 1).sum())
     parts = {one.name: one for one in found.bins}
-    seen = labels[(share > 0.2) & (share <= 0.4), 2].mean().item()
+    seen = labels[(fraction > 0.2) & (fraction <= 0.4), 2].mean().item()
     assert parts["0.2-0.4"].majority["press"] == pytest.approx(max(seen, 1 - seen))
 
 
@@ -128,10 +128,10 @@ def test_other_lengths_are_the_same_touches_begun_elsewhere(device, whole):
 
 
 def test_bins_by_hand():
-    share = torch.tensor([0.0, 0.2, 0.25, 1.0, 1.0])
+    fraction = torch.tensor([0.0, 0.2, 0.25, 1.0, 1.0])
     labels = torch.tensor([[0, 0, 0, 0, 0], *[[1, 0, 1, 0, 1]] * 3, [0, 0, 1, 1, 1]]).float()
-    chances = torch.tensor([[0.9, 0.9, 0.1, 0.1]] * 5)
-    found = bin_by_share(chances, labels, share, TOUCH)
+    probabilities = torch.tensor([[0.9, 0.9, 0.1, 0.1]] * 5)
+    found = bin_by_fraction(probabilities, labels, fraction, TOUCH)
     assert [(one.name, one.count) for one in found] == [("0-0.2", 1), ("0.2-0.4", 1), ("whole", 2)]
     assert found[2].accuracy == {"big": 0.5, "dynamic": 0.0, "press": 0.0, "dangerous": 0.5}
     assert found[2].majority == {"big": 0.5, "dynamic": 1.0, "press": 1.0, "dangerous": 0.5}

@@ -134,9 +134,9 @@ def test_every_command_of_the_plan_composes(line):
     words = [word for word in words if word != "-m"]
     search = []
     if "--config-dir" in words:
-        place = words.index("--config-dir")
-        search = [f"hydra.searchpath=['file://{ROOT / words[place + 1]}']"]
-        del words[place : place + 2]
+        position = words.index("--config-dir")
+        search = [f"hydra.searchpath=['file://{ROOT / words[position + 1]}']"]
+        del words[position : position + 2]
     jobs = [[f"{key}={value}" for key, value in job.items()] for job in sweep_jobs(words, {})]
     with initialize_config_dir(str(CONF), version_base="1.3"):
         for job in (jobs[0], *jobs[1:][-1:]):  # each row, and each setting of a row, is composed elsewhere

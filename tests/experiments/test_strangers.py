@@ -200,8 +200,8 @@ def test_a_recording_makes_no_objects(run, recording, tmp_path, marker):
     kind = {"ARROW:extension:name": "arrow.py_extension_type"}
     kind["ARROW:extension:metadata"] = pickle.dumps(Payload(marker), 0)
     field = pa.field("reading_00", pa.float32(), metadata=kind)
-    place = table.schema.get_field_index("reading_00")
-    pq.write_table(table.cast(table.schema.set(place, field)), tmp_path / "x.parquet")
+    position = table.schema.get_field_index("reading_00")
+    pq.write_table(table.cast(table.schema.set(position, field)), tmp_path / "x.parquet")
     done = run(
         tmp_path, "generate.py", *SKIN, "device=recording", "device.path=x.parquet", "out=y.csv", store=False
     )

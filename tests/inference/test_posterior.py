@@ -66,11 +66,11 @@ def draw(count, seed, number=1, margin=0.0, apart=0.0):
     """Return contacts (count, number, 4) of the default prior: x, y, radius, m, and force, N."""
     rng, touches = np.random.default_rng(seed), []
     while len(touches) < count:
-        places = rng.uniform(margin, 0.16 - margin, (number, 2))
+        positions = rng.uniform(margin, 0.16 - margin, (number, 2))
         radius, force = rng.uniform(0.004, 0.012, number), 5 * np.exp(0.5 * rng.standard_normal(number))
-        distance = np.linalg.norm(places[:, None] - places, axis=2)[np.triu_indices(number, 1)]
+        distance = np.linalg.norm(positions[:, None] - positions, axis=2)[np.triu_indices(number, 1)]
         if (distance >= apart).all():
-            touches.append(np.column_stack([places, radius, force]))
+            touches.append(np.column_stack([positions, radius, force]))
     return np.array(touches)
 
 
@@ -89,8 +89,8 @@ def measure(readings, noise, seed):
 
 
 def moments(contact):
-    mean = [*contact.place, contact.radius, contact.force]
-    spread = [*contact.place_deviation, contact.radius_deviation, contact.force_deviation]
+    mean = [*contact.position, contact.radius, contact.force]
+    spread = [*contact.position_deviation, contact.radius_deviation, contact.force_deviation]
     return np.array(mean), np.array(spread)
 
 
@@ -137,14 +137,14 @@ def _moments(weight, values):
 
 def test_a_region_holds_what_it_says():
     """Boxes are up to 1.8 deviations long; what was uniform over each held 88 % in place of 90."""
-    prior, touches, shares = FingertipPrior(), draw(16, 4, margin=0.03), []
+    prior, touches, fractions = FingertipPrior(), draw(16, 4, margin=0.03), []
     for readings in measure(felt(touches), NOISE, 3):
         estimate = posterior(contacts=1).estimate(readings)
         (contact,) = estimate.contacts
-        spread = 6 * contact.place_deviation
+        spread = 6 * contact.position_deviation
         x, y = (
             np.linspace(mean - away, mean + away, 41)
-            for mean, away in zip(contact.place, spread, strict=True)
+            for mean, away in zip(contact.position, spread, strict=True)
         )
         radii = np.linspace(*prior.radii, 5)
         grid = np.stack(np.meshgrid(x, y, radii, indexing="ij"), -1).reshape(-1, 3)
@@ -156,8 +156,8 @@ def test_a_region_holds_what_it_says():
         mass = np.exp(fit / NOISE.floor - score**2 / 2 - (fit / NOISE.floor - score**2 / 2).max()).sum(1)
         region = contact.region()
         within = np.abs(grid[:, None, :2] - region.cells) <= region.width / 2
-        shares.append(mass[within.all(2).any(1)].sum() / mass.sum())
-    assert np.mean(shares) == pytest.approx(0.9, abs=0.012)
+        fractions.append(mass[within.all(2).any(1)].sum() / mass.sum())
+    assert np.mean(fractions) == pytest.approx(0.9, abs=0.012)
 
 
 @pytest.mark.slow("integrates over all contacts by brute force")
@@ -191,20 +191,20 @@ def test_truth_drawn_from_the_prior_has_uniform_ranks(thin, noise):
         estimate.contacts[0] if estimate.contacts else None
         for estimate in posterior(thin, noise, SINGLE).estimate(readings)
     ]
-    place = np.array(
-        [place_ranks(contact, touch[0]) for contact, touch in zip(contacts, touches, strict=True)]
+    position = np.array(
+        [position_ranks(contact, touch[0]) for contact, touch in zip(contacts, touches, strict=True)]
     )
-    for column in place.T:
+    for column in position.T:
         assert kstest(column, "uniform").pvalue > 0.01
     held = np.mean([c.region().contains(t[0, :2]) for c, t in zip(contacts, touches, strict=True)])
     assert 0.83 <= held <= 0.96  # 90 % of 150, within 3 standard deviations
 
 
-def place_ranks(contact: ContactEstimate, touch):
+def position_ranks(contact: ContactEstimate, touch):
     """Return the probability below the truth along x and y."""
-    low = contact.places - contact.widths / 2
-    share = ((touch[:2] - low) / contact.widths).clip(0, 1)
-    return contact.weights.sum(1) @ share
+    low = contact.positions - contact.widths / 2
+    fraction = ((touch[:2] - low) / contact.widths).clip(0, 1)
+    return contact.weights.sum(1) @ fraction
 
 
 def same(first: FrameEstimate, second: FrameEstimate) -> bool:
@@ -225,7 +225,7 @@ def test_a_contact_is_told_as_one_and_where_it_is():
     estimates = posterior().estimate(measure(true, NOISE, 2)[rows])
     assert np.mean([estimate.number == 1 for estimate in estimates]) >= 0.97
     assert np.mean([estimate.fingertip for estimate in estimates]) >= 0.95
-    error = [e.contacts[0].place - t[0, :2] for e, t in zip(estimates, touches[rows], strict=True)]
+    error = [e.contacts[0].position - t[0, :2] for e, t in zip(estimates, touches[rows], strict=True)]
     assert np.sqrt(np.square(error).mean()) < 2.5e-3
     force = [e.contacts[0].force / t[0, 3] - 1 for e, t in zip(estimates, touches[rows], strict=True)]
     assert np.median(np.abs(force)) < 0.08
@@ -239,10 +239,10 @@ def test_two_contacts_are_told_apart():
     errors = []
     for row in right:
         contacts = estimates[row].contacts
-        places = np.array([contact.place for contact in contacts])
-        errors.append(np.linalg.norm(touches[row][:, None, :2] - places, axis=2).min(1))
+        positions = np.array([contact.position for contact in contacts])
+        errors.append(np.linalg.norm(touches[row][:, None, :2] - positions, axis=2).min(1))
         # Two places that exchange their order would be averaged, half of their distance from either.
-        assert max(contact.place_deviation.max() for contact in contacts) < 0.015
+        assert max(contact.position_deviation.max() for contact in contacts) < 0.015
     assert np.sqrt(np.square(errors).mean() / 2) < 3e-3
 
 
@@ -311,8 +311,8 @@ def test_an_invalid_sensor_counts_for_nothing():
     assert same(clean, spoilt)
     assert same(clean, posterior().estimate(np.where(valid, readings, np.nan)))
     assert (
-        clean.contacts[0].place_deviation.max()
-        > posterior().estimate(readings).contacts[0].place_deviation.max()
+        clean.contacts[0].position_deviation.max()
+        > posterior().estimate(readings).contacts[0].position_deviation.max()
     )
 
 
@@ -324,9 +324,9 @@ def test_a_sensor_that_clips_says_at_least_so_much():
     readings = np.minimum(measure(true, noise, 18), noise.clip)
     (contact,) = posterior(True, noise, prior).estimate(readings).contacts
     blind = posterior(True, noise, prior).estimate(readings, readings < noise.clip).contacts
-    assert np.linalg.norm(contact.place - touch[0, 0, :2]) < 0.006
+    assert np.linalg.norm(contact.position - touch[0, 0, :2]) < 0.006
     assert contact.force > 20
-    assert not blind or blind[0].place_deviation.max() > contact.place_deviation.max()
+    assert not blind or blind[0].position_deviation.max() > contact.position_deviation.max()
 
 
 def test_frames_of_a_touch_tell_more_together():
@@ -336,7 +336,7 @@ def test_frames_of_a_touch_tell_more_together():
     together = posterior(noise=Noise(0.05)).estimate_touch(frames)
     assert together.contacts[0].region().area < 0.5 * alone.contacts[0].region().area
     mean = posterior().estimate(frames.mean(0))
-    np.testing.assert_allclose(together.contacts[0].place, mean.contacts[0].place, rtol=1e-9)
+    np.testing.assert_allclose(together.contacts[0].position, mean.contacts[0].position, rtol=1e-9)
 
 
 def test_two_sensors_say_what_cannot_be_known():
@@ -374,11 +374,11 @@ def test_every_simulator_that_adds_up_and_an_arm_work():
         (Naive(sheet, sensors), sheet, 3),
         (Solid(arm, sensors_of(arm, None, 3)), arm, 3),
     ]
-    for simulator, body, most in skins:
+    for simulator, body, maximum in skins:
         readings = 8 * disc_readings(simulator, body, touch, 0.0015)[0]
-        estimate = Posterior(simulator, NOISE, body, FingertipPrior(large=0.0), most).estimate(readings)
+        estimate = Posterior(simulator, NOISE, body, FingertipPrior(large=0.0), maximum).estimate(readings)
         assert estimate.number == 1
-        assert np.linalg.norm(estimate.contacts[0].place - touch[0, :2]) < 0.012
+        assert np.linalg.norm(estimate.contacts[0].position - touch[0, :2]) < 0.012
 
 
 def test_errors_are_one_sentence():

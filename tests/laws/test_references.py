@@ -130,14 +130,14 @@ def test_half_spaces_are_in_equilibrium(kind):
     plane = np.stack([*np.meshgrid(x, x), np.full((80, 80), 0.02)], axis=-1).reshape(-1, 3)
     force = np.outer(dx, dx).ravel() @ getattr(space, kind)(plane)[1][:, part]
     assert force == pytest.approx(-4e-4, rel=1e-3)
-    place, step = np.array([0.013, 0.004, 0.009]), 1e-6
-    around = np.concatenate([place + step * np.eye(3), place - step * np.eye(3)])
+    position, step = np.array([0.013, 0.004, 0.009]), 1e-6
+    around = np.concatenate([position + step * np.eye(3), position - step * np.eye(3)])
     motion = getattr(space, kind)(around)[0]
     gradient = (motion[:3] - motion[3:]).T / (2 * step)
     lam = 2 * space.shear * 0.3 / 0.4
     zz = lam * np.trace(gradient) + 2 * space.shear * gradient[2, 2]
     xz, yz = (space.shear * (gradient[axis, 2] + gradient[2, axis]) for axis in (0, 1))
-    stress = getattr(space, kind)(place[None])[1][0]
+    stress = getattr(space, kind)(position[None])[1][0]
     assert stress == pytest.approx(np.array([zz, xz, yz]), rel=1e-5)
 
 

@@ -182,7 +182,7 @@ def test_numbers_of_any_unit_are_standardised():
 
 
 @pytest.mark.parametrize(("step", "share"), [(0, 0.04), (19, 1.0), (99, 0.0)])
-def test_the_learning_rate_rises_and_falls(step, share):
+def test_the_learning_rate_rises_and_falls(step, fraction):
     training = Training(classifier(), torch.optim.Adam, warmup=0.2)
     training._trainer = type("Trainer", (), {"estimated_stepping_batches": 100})()
     chosen = training.configure_optimizers()
@@ -191,7 +191,7 @@ def test_the_learning_rate_rises_and_falls(step, share):
         chosen["optimizer"].step()
         chosen["lr_scheduler"]["scheduler"].step()
     # it begins at a 25th of the optimizer's own rate
-    assert chosen["optimizer"].param_groups[0]["lr"] == pytest.approx(1e-3 * share, abs=1e-6)
+    assert chosen["optimizer"].param_groups[0]["lr"] == pytest.approx(1e-3 * fraction, abs=1e-6)
 
 
 def test_what_is_learnt_in_few_batches_holds_in_use_whatever_the_unit():
@@ -238,5 +238,5 @@ def test_unknown_labels_have_no_loss_and_no_gradient(task):
     nothing.backward()
     assert nothing.item() == 0
     assert all(not parameter.grad.any() for parameter in network.parameters())
-    shares = (network.accuracy(network(known), labels[:4]), network.accuracy(network(frames), unknown))
-    torch.testing.assert_close(shares[1], shares[0])
+    fractions = (network.accuracy(network(known), labels[:4]), network.accuracy(network(frames), unknown))
+    torch.testing.assert_close(fractions[1], fractions[0])

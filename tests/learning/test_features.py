@@ -106,9 +106,9 @@ def random_touches(count, seed=3):
 def test_a_window_alone_gives_what_it_gives_in_a_batch():
     touches = random_touches(20)
     together = engineered_features(touches)
-    for place in range(len(touches)):
-        for name, alone in engineered_features(touches[place : place + 1]).items():
-            torch.testing.assert_close(alone[0], together[name][place], rtol=1e-6, atol=1e-6, msg=name)
+    for position in range(len(touches)):
+        for name, alone in engineered_features(touches[position : position + 1]).items():
+            torch.testing.assert_close(alone[0], together[name][position], rtol=1e-6, atol=1e-6, msg=name)
 
 
 def test_runs_and_counts_are_those_that_plain_python_finds():
@@ -116,7 +116,7 @@ def test_runs_and_counts_are_those_that_plain_python_finds():
     found = engineered_features(touches)
     raw, noises = touches.readings.where(touches.valid, 0), estimate_noise(touches)
     idle = raw.quantile(0.2, dim=1, keepdim=True) + 0.8416 * noises[:, None, None]
-    for place, (rows, noise) in enumerate(zip((raw - idle) * touches.valid, noises, strict=True)):
+    for position, (rows, noise) in enumerate(zip((raw - idle) * touches.valid, noises, strict=True)):
         peak, total, more = rows.amax(dim=1), rows.sum(dim=1), 3 * (noise - 0.05).clamp(min=0)
         for series, level, name in (
             (peak, 1.0 + more, "longest run above 1.0 N"),
@@ -128,10 +128,10 @@ def test_runs_and_counts_are_those_that_plain_python_finds():
             ),
         ):
             runs = [len(list(run)) for on, run in groupby((series > level).tolist()) if on]
-            assert found[name][place] == max(runs, default=0), name
+            assert found[name][position] == max(runs, default=0), name
         at_once = max(sum(force > 2.0 + more for force in row) for row in rows)
-        assert found["most sensors above 2.0 N at once"][place] == at_once
-        assert found["frames above 0.6 N"][place] == sum(force > 0.6 + more for force in peak)
+        assert found["most sensors above 2.0 N at once"][position] == at_once
+        assert found["frames above 0.6 N"][position] == sum(force > 0.6 + more for force in peak)
 
 
 @pytest.mark.parametrize("spread", [0.0, 0.02, 0.05, 0.1, 0.2])
@@ -146,13 +146,13 @@ def test_the_noise_of_a_device_is_found_beside_a_touch(spread):
 
 def test_noise_alone_rarely_passes_a_level_of_any_device():
     """However large the noise is, it passes the lowest level in one frame of thirty."""
-    shares = []
+    fractions = []
     for spread in (0.05, 0.1, 0.2):
         readings = spread * torch.randn(500, 30, 25, generator=torch.Generator().manual_seed(7))
         valid = torch.ones_like(readings, dtype=torch.bool)
         found = engineered_features(Touches(readings, valid, torch.rand(25, 3), None, 10.0))
-        shares.append(found["frames above 0.15 N"].float().mean().item())
-    assert shares == pytest.approx([1.0] * 3, abs=0.2)
+        fractions.append(found["frames above 0.15 N"].float().mean().item())
+    assert fractions == pytest.approx([1.0] * 3, abs=0.2)
 
 
 GRID = torch.cartesian_prod(torch.linspace(0.01, 0.15, 8), torch.linspace(0.01, 0.15, 8))
@@ -161,13 +161,13 @@ POSITIONS = torch.cat([GRID, torch.full((64, 1), 0.005)], dim=1)
 
 def slide(angle: float, order: torch.Tensor | None = None) -> Touches:
     """Return a bump of 15 mm that moves 8 mm a frame through the middle for 10 of 20 frames."""
-    places = POSITIONS if order is None else POSITIONS[order]
+    positions = POSITIONS if order is None else POSITIONS[order]
     steps = torch.arange(10) - 4.5
     way = 0.08 + 0.008 * steps[:, None] * torch.tensor([math.cos(angle), math.sin(angle)])
-    distance = torch.cdist(way, places[:, :2])
+    distance = torch.cdist(way, positions[:, :2])
     readings = torch.zeros(1, 20, 64)
     readings[0, 5:15] = 3 * torch.exp(-((distance / 0.015) ** 2))
-    return Touches(readings, torch.ones_like(readings, dtype=torch.bool), places, None, 10.0)
+    return Touches(readings, torch.ones_like(readings, dtype=torch.bool), positions, None, 10.0)
 
 
 @pytest.mark.parametrize("angle", [0.0, 0.7, 2.0, -2.8, -1.2])

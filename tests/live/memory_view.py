@@ -47,9 +47,9 @@ class MemoryView:
         feed = WireFeed(SimpleNamespace, decoder, port.limits)  # opens a stream that nobody reads
         skin = SimpleNamespace(stats=decoder.stats)
         tare = Tare(source.convert, 2.0, engine.rate, lambda: decoder.header)
-        tare.glitches.shares = engine.shares
-        places = np.zeros((engine.sensors, 3))
-        self.display = Display(DisplayInfo("memory", "memory", places, (0.1, 0.1), 4.0))
+        tare.glitches.fractions = engine.fractions
+        positions = np.zeros((engine.sensors, 3))
+        self.display = Display(DisplayInfo("memory", "memory", positions, (0.1, 0.1), 4.0))
         self.display.observers.append(lambda assessment, now: self.said.append((now, *assessment)))
         self.loop = LiveLoop(skin, tare, engine.build(), self.display, verify)
         for arrival, data in stream:

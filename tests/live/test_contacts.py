@@ -127,8 +127,8 @@ def test_the_message_says_where_and_how_hard(posterior, felt):
     region = contact["region"]
     assert region["share"] == pytest.approx(0.9, abs=0.08)
     assert min(region["cell"]) > 0.001
-    places = np.array(region["origin"]) + np.array(region["cells"]) * region["cell"]
-    assert (np.abs(places - TRUTH[0, :2]) <= np.array(region["cell"])).all(axis=1).any()
+    positions = np.array(region["origin"]) + np.array(region["cells"]) * region["cell"]
+    assert (np.abs(positions - TRUTH[0, :2]) <= np.array(region["cell"])).all(axis=1).any()
     head, line = contact_text_lines(message)
     assert head.startswith("1 contact (")
     assert " N, " in line
@@ -147,8 +147,8 @@ def test_few_sensors_that_feel_nothing_show_no_contact_but_a_light_touch():
     mechanics = Mechanics(Naive, body, Grid(3, 4).sensors(body), NOISE)
     posterior, rng = mechanics.posterior(), np.random.default_rng(0)
     # 0.3 N at the first sensor, which reads 0.1 N.
-    place = np.array([[0.0218, 0.025, 0.008]])
-    light = 0.3 * disc_readings(Naive(body, mechanics.sensors), body, place, 0.0015)[0]
+    position = np.array([[0.0218, 0.025, 0.008]])
+    light = 0.3 * disc_readings(Naive(body, mechanics.sensors), body, position, 0.0015)[0]
     works = {"valid": np.ones(count, dtype=bool), "saturated": np.zeros(count, dtype=bool)}
     for _ in range(3):
         noise = rng.normal(scale=NOISE.frame / 10**0.5, size=count)

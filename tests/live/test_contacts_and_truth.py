@@ -73,7 +73,7 @@ class Tap:
         if (gesture := parse_announcement(line)) is not None:
             self._starts[gesture.number] = gesture.seq / RATE
         elif (told := parse_contact_line(line)) is not None:
-            contacts = np.array([told.contacts[place] for place in sorted(told.contacts)])
+            contacts = np.array([told.contacts[position] for position in sorted(told.contacts)])
             begin = self._starts[told.number] + told.frame / told.rate
             with self._lock:
                 self.truth[round(begin * told.rate)] = contacts
@@ -145,9 +145,9 @@ def agree(contacts, truth):
     """Return the errors of the place, m, and of the force, relative; infinite for another number."""
     if contacts["number"] != len(truth):
         return np.inf, np.inf
-    places = np.array([[contact["x"], contact["y"]] for contact in contacts["contacts"]])
+    positions = np.array([[contact["x"], contact["y"]] for contact in contacts["contacts"]])
     forces = np.array([contact["force"] for contact in contacts["contacts"]])
-    distance = np.linalg.norm(places[:, None] - truth[:, :2], axis=2)
+    distance = np.linalg.norm(positions[:, None] - truth[:, :2], axis=2)
     nearest = distance.argmin(axis=1)
     if len(set(nearest.tolist())) < len(truth):
         return np.inf, np.inf
@@ -156,10 +156,10 @@ def agree(contacts, truth):
 
 def check(errors):
     """Check that the number of contacts is usually right, and then place and force."""
-    place, force = np.array(list(errors.values())).T
-    right = np.isfinite(place)
+    position, force = np.array(list(errors.values())).T
+    right = np.isfinite(position)
     assert right.mean() > 0.8
-    assert np.median(place[right]) < 0.004
+    assert np.median(position[right]) < 0.004
     assert np.median(force[right]) < 0.15
 
 

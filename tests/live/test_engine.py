@@ -87,7 +87,9 @@ def test_each_frame_repeated_gives_what_the_window_itself_gives():
         expected = Loud().probabilities(touches)[0].tolist()
         verdict = decisions[10 * number + 10]
         # The baseline drifts by some 1e-5 N.
-        assert list(verdict.chances.values()) == pytest.approx(expected, abs=1e-4 if number < 4 else 1e-7)
+        assert list(verdict.probabilities.values()) == pytest.approx(
+            expected, abs=1e-4 if number < 4 else 1e-7
+        )
 
 
 @pytest.mark.parametrize("rate", [10.0, 20.0, 50.0, 100.0, 500.0])
@@ -131,12 +133,12 @@ def test_without_touch_nothing_is_said():
 def test_words_carry_the_probability_of_what_is_said():
     subject = rested()
     verdict = play(subject, np.full((40, 4), 1.0), start=0.6)[-1]
-    chance = verdict.chances["big"]
-    assert 0.5 < chance < 1
+    probability = verdict.probabilities["big"]
+    assert 0.5 < probability < 1
     assert verdict.words() == [
-        ("big", chance),
-        ("dynamic", chance),
-        ("press", chance),
+        ("big", probability),
+        ("dynamic", probability),
+        ("press", probability),
         ("safe", 1.0),
     ]
 
@@ -157,7 +159,7 @@ def test_what_is_decided_does_not_depend_on_how_the_frames_arrive(burst):
             other.labels,
             other.touched,
         )
-        assert one.chances == pytest.approx(other.chances)
+        assert one.probabilities == pytest.approx(other.probabilities)
     assert subject.loud.asked == pytest.approx(1000 / burst, abs=1) or burst == 1
     assert next(verdict.t for verdict in said if verdict.dangerous) <= 3.05
 
@@ -333,7 +335,7 @@ def test_a_word_does_not_stand_beside_the_probability_of_its_opposite():
     play(subject, np.full((100, 4), 1.0), start=0.6)
     said = play(subject, np.full((30, 4), 0.6), start=1.6)
     for verdict in said:
-        assert all(chance > 0.5 for _, chance in verdict.words())
+        assert all(probability > 0.5 for _, probability in verdict.words())
 
 
 def test_an_answer_that_is_no_number_raises_the_alarm():

@@ -29,7 +29,7 @@ def to_binary(n, row):
 def to_rows(n, row):
     """Return three lines and an empty one, without clock and counter."""
     words = [WORD if value == NUMBER else str(value) for value in row]
-    return "".join(" ".join(words[place : place + 3]) + "\n" for place in (0, 3, 6)).encode() + b"\n"
+    return "".join(" ".join(words[position : position + 3]) + "\n" for position in (0, 3, 6)).encode() + b"\n"
 
 
 BOARDS = {"json": (JSON, to_json), "binary": (BINARY, to_binary), "rows": (ROWS, to_rows)}
@@ -111,8 +111,8 @@ def test_damaged_frames_hide_no_press(board):
     randomness, pieces = np.random.default_rng(5), []
     for piece in frames(board, counts(force(12, (7, 9, 4, 6.0)))):
         if randomness.random() < 0.1:
-            place = int(randomness.integers(len(piece)))
-            piece = piece[:place] + piece[place + 1 :]
+            position = int(randomness.integers(len(piece)))
+            piece = piece[:position] + piece[position + 1 :]
         pieces.append(piece)
     seen = watch(board, iter(pieces))
     assert seen.first(7) <= 7.5 + LATE

@@ -165,60 +165,60 @@ def test_values_that_are_lost_under_a_press(write, length):
 
 
 def test_frames_that_are_lost_at_random_make_no_touch_doubtful():
-    chance = np.random.default_rng(0)
-    kept = [data for data in lines(force(30, (8, 28, 4, 2.0))) if chance.random() > 0.1]
+    probability = np.random.default_rng(0)
+    kept = [data for data in lines(force(30, (8, 28, 4, 2.0))) if probability.random() > 0.1]
     seen = MemoryView(arriving(kept), settings())
     assert "unreadable" not in seen.notes(0, 30)
     assert {look.danger for look in seen.looks if 12 < look.t < 26} == {False}
 
 
-def overlapping(share):
+def overlapping(fraction):
     """Return settings of a skin on whose neighbours a press reads a part."""
     presses = 5.0 * np.eye(SENSORS)
     for sensor in range(SENSORS - 1):
-        presses[sensor, sensor + 1] = presses[sensor + 1, sensor] = 5.0 * share
+        presses[sensor, sensor + 1] = presses[sensor + 1, sensor] = 5.0 * fraction
     return replace(settings(), presses=presses)
 
 
 @pytest.mark.parametrize("share", [0.04, 0.2])
-def test_a_wire_that_breaks_to_its_rest_value(share):
-    touches = [(8, 18, 4, 6.0), (8, 18, 3, 6.0 * share), (8, 18, 5, 6.0 * share)]
+def test_a_wire_that_breaks_to_its_rest_value(fraction):
+    touches = [(8, 18, 4, 6.0), (8, 18, 3, 6.0 * fraction), (8, 18, 5, 6.0 * fraction)]
     values = force(24, *touches)
     values[1200:, 4] -= values[1200:, 4]
     values[1200:, 4] += np.random.default_rng(1).normal(scale=0.02, size=1200)
-    seen = MemoryView(arriving(lines(values)), overlapping(share))
+    seen = MemoryView(arriving(lines(values)), overlapping(fraction))
     assert seen.kept(8.6, 18)
     assert "lost_wire" in seen.notes(12.5, 18)
     assert seen.hidden(8, 18) <= LATE
     assert not seen.kept(20.5, 22)
-    assert "no touch" not in seen.states(20.5, 22) or share == 0.2  # where the neighbours feel a press
+    assert "no touch" not in seen.states(20.5, 22) or fraction == 0.2  # where the neighbours feel a press
 
 
 def test_a_finger_that_slides_or_lifts_breaks_no_wire():
-    share, times = 0.2, np.arange(2400) / RATE
+    fraction, times = 0.2, np.arange(2400) / RATE
     values = force(24)
     position = np.interp(times, [8, 12], [3.0, 5.0])  # one pitch in 2 s
     for sensor in range(SENSORS):
         near = np.clip(1 - np.abs(position - sensor), 0, 1)
-        felt = near + share * np.clip(1 - np.abs(np.abs(position - sensor) - 1), 0, 1)
+        felt = near + fraction * np.clip(1 - np.abs(np.abs(position - sensor) - 1), 0, 1)
         values[:, sensor] += 6.0 * felt * ((times > 7) & (times < 14))
-    seen = MemoryView(arriving(lines(values)), overlapping(share))
+    seen = MemoryView(arriving(lines(values)), overlapping(fraction))
     assert "lost_wire" not in seen.notes(0, 24)
     assert seen.states(18, 24) == {"no touch"}
 
 
-def glitching(values, error=65535, share=0.0):
+def glitching(values, error=65535, fraction=0.0):
     """Return the view of counts of which channel 2 is an error for one frame, every 1.7 s."""
     rows = np.apply_along_axis(counted, 1, values)
     rows[::170, 2] = error
     stream = [(",".join(map(str, row)) + "\n").encode() for row in rows.tolist()]
-    return MemoryView(arriving(stream), overlapping(share) if share else settings(), scale=SCALE)
+    return MemoryView(arriving(stream), overlapping(fraction) if fraction else settings(), scale=SCALE)
 
 
 def test_an_error_value_that_recurs_is_no_touch_where_others_would_feel_one():
     """It neither keeps the baseline from being taken nor raises an alarm; presses do."""
     values = force(20, (14, 15, 2, 6.0), (14, 15, 1, 1.2), (14, 15, 3, 1.2))
-    seen = glitching(values, share=0.2)
+    seen = glitching(values, fraction=0.2)
     assert seen.states(9, 13.9) == {"no touch"}
     assert 14 <= seen.first(5) <= 14.5
     assert not seen.kept(5, 13.9)

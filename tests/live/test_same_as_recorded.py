@@ -60,8 +60,8 @@ def pieces(late=0):
         data = b""
         if number == late:
             data += encode_header(Header(n=6, rate=RATE, unit="adc"))
-        gesture, place = divmod(number - IDLE, LENGTH + 30)
-        if number >= IDLE and place == 0 and gesture < GESTURES:
+        gesture, position = divmod(number - IDLE, LENGTH + 30)
+        if number >= IDLE and position == 0 and gesture < GESTURES:
             data += encode_announcement(
                 Announcement(gesture, number, LENGTH, dict.fromkeys(TOUCH.names, gesture % 2))
             )
@@ -143,14 +143,14 @@ def recorded(learner, path):
 def test_live_and_recorded_are_the_same_to_the_last_bit(learner, tmp_path, sent):
     said = live(learner, pieces())
     sent(pieces())
-    touches, chances = recorded(learner, tmp_path / "s.csv")
+    touches, probabilities = recorded(learner, tmp_path / "s.csv")
     assert len(touches) == GESTURES
     for gesture in range(GESTURES):
         last = IDLE + gesture * (LENGTH + 30) + LENGTH - 1
         window, verdict = said[last]
         assert torch.equal(window.readings[0], touches.readings[gesture])
         assert torch.equal(window.valid[0], touches.valid[gesture])
-        assert list(verdict.chances.values()) == chances[gesture].tolist()
+        assert list(verdict.probabilities.values()) == probabilities[gesture].tolist()
         # The sensor at its limit is valid and says its limit; the dead one is not.
         limit = (LIMIT - 200) * SCALE
         assert touches.readings[gesture, :, gesture].max() == pytest.approx(limit, abs=5 * SCALE)

@@ -29,13 +29,15 @@ def display(calm=2.0):
 
 
 def logged(dangerous):
-    return replace(verdict(dangerous), chances={"dangerous": 0.9}, labels={"dangerous": dangerous}, masked=())
+    return replace(
+        verdict(dangerous), probabilities={"dangerous": 0.9}, labels={"dangerous": dangerous}, masked=()
+    )
 
 
-def verdict(dangerous=False, chance=0.25):
+def verdict(dangerous=False, probability=0.25):
     labels = {"big": True, "dangerous": dangerous}
-    chances = {"big": chance, "dangerous": float(dangerous)}
-    return Verdict(1.5, monotonic(), chances, True, labels, dangerous, False, (2,), 0.4)
+    probabilities = {"big": probability, "dangerous": float(dangerous)}
+    return Verdict(1.5, monotonic(), probabilities, True, labels, dangerous, False, (2,), 0.4)
 
 
 @contextmanager
@@ -69,7 +71,7 @@ def wait_for(take, accepted):
 def test_a_verdict_is_a_line():
     shown = display()
     with connected(shown) as take:
-        shown.set_verdict(verdict(dangerous=True, chance=float("nan")), monotonic())
+        shown.set_verdict(verdict(dangerous=True, probability=float("nan")), monotonic())
         found = wait_for(take, lambda message: message["event"] == "verdict")
     assert found["schema"] == 1
     assert (found["alarm"], found["stale"], found["touched"], found["reason"]) == (True, False, True, "")
@@ -126,10 +128,10 @@ def test_each_line_is_there_at_once():
     """A reader that waits for a full buffer would show an alarm seconds late."""
     shown = display()
     with connected(shown) as take:
-        for chance in (0.25, 0.5, 0.75):
-            shown.set_verdict(verdict(chance=chance), monotonic())
+        for probability in (0.25, 0.5, 0.75):
+            shown.set_verdict(verdict(probability=probability), monotonic())
             found = wait_for(take, lambda message: message["event"] == "verdict")
-            assert found["probabilities"]["big"] == chance
+            assert found["probabilities"]["big"] == probability
 
 
 def test_a_reader_that_is_slow_delays_nothing_and_misses_the_oldest():

@@ -385,7 +385,9 @@ def test_the_page_draws_what_it_is_sent(browser):
             assert monotonic() < deadline
             sleep(0.1)
         text = browser.run("return document.body.innerText")
-        colour = browser.run(AT.format(*(place / size for place, size in zip(PLACES[2], SIZE, strict=False))))
+        colour = browser.run(
+            AT.format(*(position / size for position, size in zip(PLACES[2], SIZE, strict=False)))
+        )
         assert browser.run("return document.body.dataset.state") == "danger"
         shows(browser, "document.documentElement.scrollHeight <= innerHeight", True)
     for said in ("DANGEROUS", "80 %", "90 %", "about the last 3 s", "99.9 Hz", "/dev/skin"):
@@ -443,8 +445,8 @@ def test_the_page_goes_on_after_a_restart_with_more_sensors(browser):
     with web.serve_page(subject, 0) as address:
         browser.open(address)
         shows(browser, CROSSED, "5 of 5 on /dev/skin")
-    places = np.concatenate([PLACES, PLACES + np.array([0.01, 0.01, 0])])
-    other = Display(DisplayInfo("any_skin", "/dev/other", places, SIZE, 4.0))
+    positions = np.concatenate([PLACES, PLACES + np.array([0.01, 0.01, 0])])
+    other = Display(DisplayInfo("any_skin", "/dev/other", positions, SIZE, 4.0))
     verdict = replace(PRESSED, touched=False, dangerous=False, unknown=(7, 9), masked=(7, 9))
     with web.serve_page(other, int(address.rsplit(":", 1)[1])), repeated(other, verdict):
         shows(browser, CROSSED, "10 of 10 on /dev/other")

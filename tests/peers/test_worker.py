@@ -23,7 +23,7 @@ class Scores(ClassifierMixin, BaseEstimator):
         return (x[:, 0] > 0).astype(int)
 
 
-def chance(curve, score):
+def probability(curve, score):
     return 1 / (1 + np.exp(-(curve[0] * score + curve[1])))
 
 
@@ -35,11 +35,11 @@ def test_scores_become_probabilities_by_platt_scaling():
     theirs.fit(score[:, None], truth)
     # Both search for the minimum of the same smooth loss.
     expected = theirs.predict_proba(score[:, None])[:, 1]
-    assert chance(platt(score, truth), score) == pytest.approx(expected, abs=2e-3)
+    assert probability(platt(score, truth), score) == pytest.approx(expected, abs=2e-3)
 
 
 def test_scores_that_separate_the_classes_stay_finite_and_in_order():
     score = np.linspace(-1, 1, 40)
-    found = chance(platt(score, (score > 0).astype(int)), score)
+    found = probability(platt(score, (score > 0).astype(int)), score)
     assert (np.diff(found) > 0).all()
     assert 0 < found[0] < 0.1 < 0.9 < found[-1] < 1

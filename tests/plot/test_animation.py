@@ -16,8 +16,8 @@ def made(frames=6, sensors=7, rate=10.0, **more):
     """Return a scene in which sensor 0 is pressed in frame 2."""
     readings = np.zeros((frames, sensors))
     readings[2, 0] = 3.0
-    places = np.random.default_rng(0).uniform(0.01, 0.09, (sensors, 3)) * (1, 0.6, 0)
-    positions = np.broadcast_to(places, (frames, sensors, 3))
+    sites = np.random.default_rng(0).uniform(0.01, 0.09, (sensors, 3)) * (1, 0.6, 0)
+    positions = np.broadcast_to(sites, (frames, sensors, 3))
     return Scene(readings, positions, (0.1, 0.06), rate, "a touch", **more)
 
 

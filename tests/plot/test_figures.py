@@ -10,7 +10,7 @@ from skin.plot.figures import (
     force_and_reading,
     images,
     misclassified,
-    misclassified_shares,
+    misclassified_fractions,
     save_figure,
     traces,
 )
@@ -30,9 +30,9 @@ def test_a_class_that_never_occurs_divides_by_nothing():
 def test_static_touches_stand_on_their_own_and_slides_in_their_bin():
     speeds = np.array([0, 0, 0.03, 0.09, 0.11, 0.20])
     wrong, bins = np.array([True, False, False, True, True, True]), np.array([0.03, 0.10, 0.20])
-    shares, errors = misclassified_shares(speeds, wrong, bins)
+    fractions, errors = misclassified_fractions(speeds, wrong, bins)
     assert errors == pytest.approx([0.5 / 2**0.5, 0.5 / 2**0.5, 0])
-    figure = misclassified({"row": (shares, errors)}, "big", bins)
+    figure = misclassified({"row": (fractions, errors)}, "big", bins)
     x, y = figure.axes[0].containers[0].lines[0].get_data()
     assert x == pytest.approx([0, 65, 150])
     assert y == pytest.approx([0.5, 0.5, 1.0])

@@ -49,10 +49,10 @@ def test_the_surface_of_a_solid_moves_as_sensors_on_it_do(tmp_path):
     pressure = torch.zeros(2, 8, 16)
     pressure[0, 3:5, 10:12] = 40e3
     steps = np.arange(-1, 2) * 0.01
-    places = np.stack([*np.meshgrid(0.11 + steps, 0.04 + steps), np.zeros((3, 3))], axis=-1).reshape(-1, 3)
+    positions = np.stack([*np.meshgrid(0.11 + steps, 0.04 + steps), np.zeros((3, 3))], axis=-1).reshape(-1, 3)
     nu = {"Dragon Skin 10 Medium": 0.45, "EcoFlex 00-30": 0.45}
     # With one element a cell there is one mesh, on which both are read.
-    solid = Solid(body, Sensors(places, (0.01, 0.01)), 1, nu, tmp_path, refinement=1)
+    solid = Solid(body, Sensors(positions, (0.01, 0.01)), 1, nu, tmp_path, refinement=1)
     moved = surface_motion(solid, body, solid.loads(pressure))
     assert moved.shape == (2, 9, 17)
     assert (moved[1] == 0).all()

@@ -50,10 +50,10 @@ def session(device, path, labels):
     for one, gesture in enumerate(islice(emulated_gestures(device), COUNT)):
         rows = 500 + GAIN * upsample(gesture.force, device.model_rate, RATE) / 0.01
         gesture = RecordedGesture(one, gesture.labels, number / RATE, 0)
-        for place, row in enumerate(rows):
+        for position, row in enumerate(rows):
             t = number / RATE
             frame = Frame(number, t, now + t, row, np.ones(9, dtype=bool))
-            if not place:
+            if not position:
                 log.begin(gesture, frame)
             log.frame(frame)
             number += 1
@@ -131,7 +131,7 @@ def test_a_bench_session_marks_no_gestures(tmp_path):
 def test_presses_are_compared_as_gestures_are(device, tmp_path):
     """A skin reads 80 % of what the device does; a lost frame and a silent channel do not count."""
     protocol, randomness = Protocol(rate=50.0), np.random.default_rng(0)
-    rows = protocol.gauge(protocol.places(device, randomness))
+    rows = protocol.gauge(protocol.positions(device, randomness))
     session = emulate_session(device, rows, protocol, randomness, None)
     raw = GAIN * session.raw
     force, press = rows.at(session.time)

@@ -63,9 +63,9 @@ def test_lines_bring_the_contacts_back_to_single_precision(played):
 def test_a_changed_byte_is_noticed(played):
     line = encode_contact_line(contact_lines(0, played[0].contacts, 10.0)[0]).rstrip(b"\n")
     assert line.startswith(b"# contacts {")
-    for place in range(len(line)):
+    for position in range(len(line)):
         changed = bytearray(line)
-        changed[place] ^= 1
+        changed[position] ^= 1
         assert parse_contact_line(bytes(changed)) is None
 
 
@@ -124,11 +124,11 @@ def test_a_session_without_them_is_read_as_before(recorded, played):
     lines = path.read_text().splitlines(keepends=True)
     from skin.record.session import decode_event, encode_event
 
-    for place, line in enumerate(lines):
+    for position, line in enumerate(lines):
         if '"event": "begin"' in line:
             content, _ = decode_event(line.rstrip("\n"))
             del content["contacts"]
-            lines[place] = encode_event(content.pop("event"), **content)[0] + "\n"
+            lines[position] = encode_event(content.pop("event"), **content)[0] + "\n"
     path.write_text("".join(lines))
     stored = read_session(path)
     assert sorted(stored.gestures) == list(range(COUNT))
@@ -144,12 +144,12 @@ def test_contacts_that_cannot_be_are_a_damaged_line(recorded, old, new):
 
     _, path = recorded()
     lines = path.read_text().splitlines()
-    place = next(number for number, line in enumerate(lines) if '"event": "begin"' in line)
-    text = lines[place].replace(old, new).rpartition(', "sum": "')[0]
-    lines[place] = f'{text}, "sum": "{line_sum(text + "}")}"}}'
+    position = next(number for number, line in enumerate(lines) if '"event": "begin"' in line)
+    text = lines[position].replace(old, new).rpartition(', "sum": "')[0]
+    lines[position] = f'{text}, "sum": "{line_sum(text + "}")}"}}'
     path.write_text("\n".join(lines) + "\n")
     stored = read_session(path)
-    assert stored.damaged == [place + 1]
+    assert stored.damaged == [position + 1]
     assert 0 not in stored.gestures
 
 

@@ -81,9 +81,9 @@ def recorded(tmp_path, monkeypatch, capfd):
 def refused(said):
     """Return the prompts for what was not felt; the same prompt follows each."""
     prompts = [line for line in said if line.startswith(("next: ", "no touch was detected"))]
-    places = [place for place, line in enumerate(prompts) if line.startswith("no touch was")]
-    assert all(prompts[place - 1] == prompts[place + 1] for place in places)
-    return [prompts[place - 1] for place in places]
+    positions = [position for position, line in enumerate(prompts) if line.startswith("no touch was")]
+    assert all(prompts[position - 1] == prompts[position + 1] for position in positions)
+    return [prompts[position - 1] for position in positions]
 
 
 def test_a_gesture_that_nobody_made_is_asked_for_again(recorded, tmp_path):

@@ -48,11 +48,11 @@ def session(tmp_path_factory):
     for conversion, numbers in ((MEANING, (0, 1, 2)), (OTHER, (3, 4, 5))):
         log = SessionLog(path, ABOUT, 2)
         log.conversion(conversion)
-        for place, number in enumerate(numbers):
+        for position, number in enumerate(numbers):
             if number == 4:
                 gesture(log, 4, 900, broken=True)
-            gesture(log, number, 20 * place, after="reset" * (number == 4))
-            log.frame(frame(20 * place + 15, segment=int(number == 4)))
+            gesture(log, number, 20 * position, after="reset" * (number == 4))
+            log.frame(frame(20 * position + 15, segment=int(number == 4)))
         log.close()
     return path
 
@@ -136,52 +136,56 @@ def test_an_intact_session_has_nothing_to_warn_of(lines, stored, caplog):
 
 @pytest.mark.parametrize("damage", [cut, garbled, lambda line: line[:4] + b"x" + line[5:]])
 def test_a_damaged_frame_is_lost_and_named(lines, stored, caplog, damage):
-    whole, place = stored(lines), inside(lines, 1)
+    whole, position = stored(lines), inside(lines, 1)
     caplog.set_level(logging.WARNING, "skin.record")
-    lines[place] = damage(lines[place])
+    lines[position] = damage(lines[position])
     found = stored(lines)
     assert sorted(found.gestures) == list(range(WHOLE))
     assert [gesture.lost for gesture, _ in found.gestures.values()] == [0, 1, 0, 0, 0, 0]
     assert (len(found.gestures[1][0].frames), found.frames) == (9, whole.frames - 1)
     assert [entry.message.split(": ", 1)[1] for entry in caplog.records] == [
-        f"1 damaged line skipped: {place + 1}"
+        f"1 damaged line skipped: {position + 1}"
     ]
 
 
 def test_two_frames_that_have_become_one_line_are_two_lost_ones(lines, stored):
-    place = inside(lines, 1)
-    found = stored([*lines[:place], lines[place] + b"\xff" + lines[place + 1], *lines[place + 2 :]])
+    position = inside(lines, 1)
+    found = stored(
+        [*lines[:position], lines[position] + b"\xff" + lines[position + 1], *lines[position + 2 :]]
+    )
     assert found.gestures[1][0].lost == 2
 
 
 @pytest.mark.parametrize("wrong", ["9", "-9"])
 def test_a_frame_whose_time_is_wrong_is_lost_and_no_other(lines, stored, wrong):
-    place = inside(lines, 1)
-    lines[place] = wrong.encode() + lines[place]
+    position = inside(lines, 1)
+    lines[position] = wrong.encode() + lines[position]
     found = stored(lines)
-    assert found.damaged == [place + 1]
+    assert found.damaged == [position + 1]
     assert (len(found.gestures[1][0].frames), found.gestures[1][0].lost) == (9, 1)
 
 
 @pytest.mark.parametrize("damage", [cut, garbled, nulls, altered, empty])
 def test_a_gesture_never_gets_another_meaning(lines, stored, damage, request):
     whole = {number: told(*one) for number, one in stored(lines).gestures.items()}
-    events = [place for place, line in enumerate(lines) if line.startswith(b"#")]
+    events = [position for position, line in enumerate(lines) if line.startswith(b"#")]
     old, missing = b'"sum"' not in lines[1], set()
     assert len(events) > 20
-    for place in events:
+    for position in events:
         # Sessions of old have no checksums, so another digit is not seen.
         if old and damage is altered:
             continue
-        found = stored([*lines[:place], damage(lines[place]), *lines[place + 1 :]])
+        found = stored([*lines[:position], damage(lines[position]), *lines[position + 1 :]])
         kept = {number: told(*one) for number, one in found.gestures.items()}
-        assert kept == {number: whole[number] for number in kept}, lines[place]
-        assert found.damaged == [place + 1]
+        assert kept == {number: whole[number] for number in kept}, lines[position]
+        assert found.damaged == [position + 1]
         lost = set(whole) - set(kept)
         missing |= lost
         # A lost baseline costs what was recorded on it, another event one gesture.
-        most = 3 if b"meaning" in lines[place] and b"begin" not in lines[place] else WHOLE if old else 1
-        assert len(lost) <= most, lines[place]
+        maximum = (
+            3 if b"meaning" in lines[position] and b"begin" not in lines[position] else WHOLE if old else 1
+        )
+        assert len(lost) <= maximum, lines[position]
     assert missing or (old and damage is altered)
 
 
@@ -190,9 +194,9 @@ def test_nulls_where_the_power_was_cut_are_skipped(lines, stored):
     for tail in (b"\0" * 4096, b"\0" * 4096 + b"\n", lines[-1][:7] + b"\0" * 999):
         found = stored(lines, tail)
         assert {number: told(*one) for number, one in found.gestures.items()} == whole
-    for place in range(2, len(lines) - 9, 7):
-        hole = lines[place][:3] + b"\0" * 500 + lines[place + 9][2:]
-        found = stored([*lines[:place], hole, *lines[place + 10 :]])
+    for position in range(2, len(lines) - 9, 7):
+        hole = lines[position][:3] + b"\0" * 500 + lines[position + 9][2:]
+        found = stored([*lines[:position], hole, *lines[position + 10 :]])
         assert len(found.gestures) >= 2
         for number, one in found.gestures.items():
             assert told(*one) == whole[number]
@@ -202,10 +206,10 @@ def test_a_byte_anywhere_costs_two_gestures_at_most(session, stored):
     data, rng = session.read_bytes(), np.random.default_rng(0)
     labels = {number: gesture.labels for number, (gesture, _) in stored(data.splitlines()).gestures.items()}
     for _ in range(300):
-        place = int(rng.integers(len(data)))
-        spoilt = data[:place] + rng.bytes(1) + data[place + 1 :]
+        position = int(rng.integers(len(data)))
+        spoilt = data[:position] + rng.bytes(1) + data[position + 1 :]
         found = stored(spoilt.split(b"\n")[:-1])
-        line = data[data.rfind(b"\n", 0, place) + 1 :].split(b"\n")[0]
+        line = data[data.rfind(b"\n", 0, position) + 1 :].split(b"\n")[0]
         assert len(found.gestures) >= WHOLE - (3 if b'"event": "meaning"' in line else 2)
         for number, (gesture, conversion) in found.gestures.items():
             assert gesture.labels == labels[number]
@@ -214,8 +218,8 @@ def test_a_byte_anywhere_costs_two_gestures_at_most(session, stored):
 
 
 def test_a_gesture_without_frames_is_left_out_and_said(lines, stored):
-    place = inside(lines, 1) - 4
-    frames = [n for n, line in enumerate(lines) if place < n < place + 12 and not line.startswith(b"#")]
+    position = inside(lines, 1) - 4
+    frames = [n for n, line in enumerate(lines) if position < n < position + 12 and not line.startswith(b"#")]
     found = stored([line for n, line in enumerate(lines) if n not in frames])
     assert sorted(found.gestures) == [0, 2, 3, 4, 5]
     assert found.warnings == ["gesture 1 left out: it has no frames"]

@@ -213,12 +213,12 @@ def test_help_and_mistakes_wait_for_no_heavy_import(argument, code):
 
 
 @pytest.mark.parametrize(("verb", "least"), [("listen", 1), ("emulate", 7), ("evaluate", 11)])
-def test_a_verb_composes_only_what_it_needs(verb, least):
+def test_a_verb_composes_only_what_it_needs(verb, minimum):
     with initialize_config_dir(str(CONF), version_base="1.3"):
         config = compose(verb)
     groups = {"touch", "body", "layout", "simulator", "contact", "device", "data", "representation", "model"}
     groups |= {"fusion", "learner"}
-    assert len(groups & set(config)) == least
+    assert len(groups & set(config)) == minimum
 
 
 ODD = [

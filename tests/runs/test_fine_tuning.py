@@ -76,7 +76,7 @@ def test_what_is_not_better_leaves_the_network_as_it_was(trained):
     candidates, best, judged = adapted(learner, data, data.touches("validation"), replace(SMALL, lr=[1e3]))
     assert best is candidates[0]
     assert best.name == ""
-    assert judged is best.chances
+    assert judged is best.probabilities
     assert equal(learner.network.state_dict(), before)
 
 
@@ -88,7 +88,9 @@ def test_a_fold_is_judged_by_the_choice_of_the_others(trained):
     right, held = touches.known_labels.numpy() * 0.96 + 0.02, (fold == 0).numpy()[:, None]
     first = np.where(held, 1 - right, right)
     lucky = np.where(held, right, 0.9 * right + 0.05)
-    candidates = [Candidate(name, chances, None) for name, chances in (("", first), ("lucky", lucky))]
+    candidates = [
+        Candidate(name, probabilities, None) for name, probabilities in (("", first), ("lucky", lucky))
+    ]
     assert choose_candidate(candidates, touches, data.task, SMALL)[0].name == ""
 
 
@@ -100,11 +102,11 @@ def test_gestures_are_held_out_of_what_predicts_them(trained):
     long = replace(SMALL, epochs=20, patience=20, lr=[1e-2])
     candidates = fine_tune(learner, data, touches, long)
     assert len(candidates) == 21
-    assert ((candidates[-1].chances > 0.5) == (labels.numpy() > 0.5)).mean() < 0.65
+    assert ((candidates[-1].probabilities > 0.5) == (labels.numpy() > 0.5)).mean() < 0.65
     (scratch,) = learn_from_scratch(
         touches, data.task, long, {"kernel_ridge": default_option("learner", "kernel_ridge")}
     )
-    assert ((scratch.chances > 0.5) == (labels.numpy() > 0.5)).mean() < 0.65
+    assert ((scratch.probabilities > 0.5) == (labels.numpy() > 0.5)).mean() < 0.65
 
 
 def test_learners_from_scratch_need_each_label_outside_of_each_fold(trained, capsys):

@@ -91,13 +91,13 @@ def test_the_weights_reproduce_the_card_on_400_touches(name, tmp_path):
     assert check["touches"] == 400
     assert check["tolerance"] <= 2
     touches = trained.device.touches("test")[slice(400)]
-    chances = trained.predict(touches)
+    probabilities = trained.predict(touches)
     differ = set()
     for label, expected in check["predictions"].items():
-        place = trained.labels.index(LABEL if label == "alarm" else label)
-        found = chances[:, place] > (trained.point.threshold if label == "alarm" else 0.5)
+        position = trained.labels.index(LABEL if label == "alarm" else label)
+        found = probabilities[:, position] > (trained.point.threshold if label == "alarm" else 0.5)
         differ |= {number for number, bit in enumerate(expected) if bool(found[number]) != (bit == "1")}
-        correct = int((found == (touches.labels[:, place] > 0.5)).sum())
+        correct = int((found == (touches.labels[:, position] > 0.5)).sum())
         assert abs(correct - check["correct"][label]) <= check["tolerance"], label
     assert len(differ) <= check["tolerance"], differ
 
@@ -115,8 +115,8 @@ def copied(tmp_path, monkeypatch):
 @pytest.mark.parametrize("name", ["weights.pt", CONFIG, RECORD, CARD])
 def test_an_altered_file_is_refused_by_name(name, copied):
     content = bytearray((copied / name).read_bytes())
-    place = content.index(b"0") if name == RECORD else len(content) // 2
-    content[place] = ord("1") if content[place] != ord("1") else ord("2")
+    position = content.index(b"0") if name == RECORD else len(content) // 2
+    content[position] = ord("1") if content[position] != ord("1") else ord("2")
     (copied / name).write_bytes(content)
     with pytest.raises(InputError, match=rf"^{name} in .*copy differs from {SUMS}: "):
         find_pretrained("copy")

@@ -12,10 +12,10 @@ def write_barometers(path, x, readings, rise=6):
     """Write presses (P, 4), Pa, at positions (P,), mm, in the form of the robot, over drifting offsets."""
     lines = ["Sensor_0,Sensor_1,Sensor_2,Sensor_3,x,z,time"]
     offset, time = np.array([98000.0, 101000, 99000, 100000]), 0.0
-    for place, top in zip(x, readings, strict=True):
+    for position, top in zip(x, readings, strict=True):
         for depth in [0.0] * 6 + list(np.linspace(0, 1, rise + 1)[1:]) + [1.0] * 6 + [0.5]:
             values = ",".join(f"{value:.2f}" for value in offset + depth**2 * top)
-            lines.append(f"{values},{1e3 * place:.0f},{480 * 4 * depth:.0f},{time:.2f}")
+            lines.append(f"{values},{1e3 * position:.0f},{480 * 4 * depth:.0f},{time:.2f}")
             time += 0.06
         offset = offset + 50
     path.write_text("\n".join(lines))

@@ -20,9 +20,9 @@ def found(configured):
 
 def test_an_svm_reads_what_is_there_and_no_more():
     generator = np.random.default_rng(0)
-    vectors, chance = generator.standard_normal((400, 4)), generator.integers(0, 2, 400)
+    vectors, probability = generator.standard_normal((400, 4)), generator.integers(0, 2, 400)
     assert svm_accuracy(vectors, (vectors[:, 0] ** 2 + vectors[:, 1] ** 2 > 1.4).astype(int), 300) > 0.85
-    assert abs(svm_accuracy(vectors, chance, 300) - 0.5) < 0.15  # three standard errors
+    assert abs(svm_accuracy(vectors, probability, 300) - 0.5) < 0.15  # three standard errors
     assert np.isnan(svm_accuracy(vectors, np.zeros(400, dtype=int), 300))
 
 

@@ -38,8 +38,8 @@ def subject(configured, tmp_path, monkeypatch):
 def test_a_function_is_scored(subject):
     (row,) = Frozen("guesses:safe", subject[1])(subject[0]).to_dict("records")
     assert (row["set"], row["gestures"]) == ("small", 64)
-    shares = [row[f"{name}/accuracy"] for name in ("big", "dynamic", "press", "dangerous", "overall")]
-    assert shares == pytest.approx([50.0] * 5)
+    fractions = [row[f"{name}/accuracy"] for name in ("big", "dynamic", "press", "dangerous", "overall")]
+    assert fractions == pytest.approx([50.0] * 5)
 
 
 @pytest.mark.parametrize(

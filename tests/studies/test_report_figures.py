@@ -14,10 +14,10 @@ from skin.touch.labels import TOUCH
 def outcomes(called, dangerous):
     """Return the outcomes of a run that calls each gesture dangerous or not, and is right about the rest."""
     labels = torch.zeros(len(dangerous), len(TOUCH))
-    place = TOUCH.names.index("dangerous")
-    labels[:, place] = torch.tensor(dangerous)
+    position = TOUCH.names.index("dangerous")
+    labels[:, position] = torch.tensor(dangerous)
     said = labels.clone()
-    said[:, place] = torch.tensor(called)
+    said[:, position] = torch.tensor(called)
     return encode(said, labels, TOUCH)
 
 

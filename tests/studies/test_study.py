@@ -22,7 +22,7 @@ LABELS = ("overall", "big", "dynamic", "press", "dangerous")
 KINDS = ("accuracy", "balanced_accuracy", "ece", "alarm_recall", "false_alarm_rate", "degrees")
 SENSORS = "study=sensors", "study.part=sensors_other", "study.seeds=[0]"
 SHARES = ("0-0.2", "0.2-0.4", "0.4-0.6", "0.6-0.8", "0.8-1", "whole")
-STREAMS = {f"share/{share}/overall/accuracy" for share in SHARES} | {
+STREAMS = {f"share/{fraction}/overall/accuracy" for fraction in SHARES} | {
     f"gate/{gate}/accuracy" for gate in ("threshold", "learned")
 }
 OTHER = {"train_accuracy", "seconds_per_epoch", "parameters", "same/any/disagreement"} | STREAMS

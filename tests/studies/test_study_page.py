@@ -152,8 +152,8 @@ def test_files_and_terminal_say_the_same(tmp_path, capsys):
 def test_an_axis_draws_lines_over_the_numbers_in_the_names(single):
     numbers = {4: 0.9, 25: 0.97, 9: 0.95}
     found = [
-        trial("any", "0", share, condition=f"grid {n}") if single else trial(f"grid {n}", "0", share)
-        for n, share in numbers.items()
+        trial("any", "0", fraction, condition=f"grid {n}") if single else trial(f"grid {n}", "0", fraction)
+        for n, fraction in numbers.items()
     ]
     for name in ("other", "equation 10"):  # no number, and a single one
         found += [trial("any" if single else name, "0", 0.5, condition=name if single else "")]

@@ -78,8 +78,8 @@ def test_stretched_frames_have_the_area_of_unstretched_ones():
     """Seen on the cells: a disc that is stretched is an ellipse of the same area, axes as asked."""
     body = Sheet((0.24, 0.24), (240, 240), LAYER)
     shapes = Shapes(["disc"], body)
-    zero, scale, place = np.zeros(2, int), np.full(2, 0.2), np.full((2, 2), 0.12)
-    frames = shapes.render(zero, np.zeros(2), scale, place, np.array([1.0, 3.0])).numpy()
+    zero, scale, position = np.zeros(2, int), np.full(2, 0.2), np.full((2, 2), 0.12)
+    frames = shapes.render(zero, np.zeros(2), scale, position, np.array([1.0, 3.0])).numpy()
     inside = frames > 0.02 * frames.max((1, 2), keepdims=True)
     round_, long = inside.sum((1, 2))
     assert long == pytest.approx(round_, rel=0.03)

@@ -48,9 +48,9 @@ def test_the_pressure_is_that_of_the_contacts(sampled):
     )
     along, down = (centre.double() for centre in centres)
     touched = force.sum(2) > 0
-    for moments, places in ((pressure.sum(2) @ along, x), (pressure.sum(3) @ down, y)):
+    for moments, positions in ((pressure.sum(2) @ along, x), (pressure.sum(3) @ down, y)):
         middle = moments * width * height / force.sum(2)
-        expected = (places * force).sum(2) / force.sum(2)
+        expected = (positions * force).sum(2) / force.sum(2)
         assert (middle - expected)[touched].abs().max() < 0.1 * max(width, height)
 
 
@@ -95,8 +95,8 @@ def test_fingertips_are_apart(sampled):
 def test_fingertips_of_a_touch_slide_together(sampled):
     _, movie, _, _ = sampled
     for contacts, dynamic in zip(movie.contacts, movie.labels[:, 1], strict=True):
-        places = contacts[~contacts[:, 0, 0].isnan()][:, ~contacts[:, :, 0].isnan().all(0), :2]
-        steps = places.diff(dim=0)
+        positions = contacts[~contacts[:, 0, 0].isnan()][:, ~contacts[:, :, 0].isnan().all(0), :2]
+        steps = positions.diff(dim=0)
         assert (steps.abs().sum() > 1e-3) == bool(dynamic)
         if len(steps):
             assert (steps - steps[:, :1]).abs().max() < 1e-6

@@ -118,12 +118,12 @@ def test_a_window_that_no_model_has_is_refused(given, message):
 
 def test_fold_is_a_ball_between_two_walls():
     """Against a ball stepped along and turned round at each wall."""
-    room, step, place, ways = 7.0, 0.3, 2.0, []
+    room, step, position, ways = 7.0, 0.3, 2.0, []
     for _ in range(200):
-        ways.append(place)
-        place += step
-        if not 0 <= place <= room:
-            place, step = (2 * room - place if place > room else -place), -step
+        ways.append(position)
+        position += step
+        if not 0 <= position <= room:
+            position, step = (2 * room - position if position > room else -position), -step
     straight = 2.0 + 0.3 * np.arange(200)
     np.testing.assert_allclose(fold(straight, np.full(200, room)), ways, atol=1e-9)
 

@@ -36,7 +36,9 @@ def test_a_touch_without_a_direction_counts_in_the_other_labels_only():
     given = torch.tensor([[1.0, 1.0, 0.0, 1.0, 0.6, -0.8], [0.0, 1.0, 1.0, 0.0, 0.0, 0.0]])
     assert TOUCH_SLIDING.counts(given).tolist() == [[True] * 6, [True] * 4 + [False] * 2]
     assert TOUCH_SLIDING.binary == TOUCH_SLIDING.gated == TOUCH.names
-    torch.testing.assert_close(TOUCH_SLIDING.shares(given)[0], torch.tensor([1.0, 1.0, 0.0, 1.0, 0.8, 0.1]))
+    torch.testing.assert_close(
+        TOUCH_SLIDING.fractions(given)[0], torch.tensor([1.0, 1.0, 0.0, 1.0, 0.8, 0.1])
+    )
 
 
 def test_a_direction_stands_behind_binary_labels():

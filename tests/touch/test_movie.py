@@ -20,9 +20,9 @@ SENSORS = Grid(5, 5).sensors(BODY)
 def content(movie):
     """Return a hash of movies, of whole numbers and of places to a micrometre: alike on every processor."""
     known = movie.parameters
-    places = torch.stack([known[name] for name in ("x", "y", "net_x", "net_y")]).double().numpy()
+    positions = torch.stack([known[name] for name in ("x", "y", "net_x", "net_y")]).double().numpy()
     whole = (movie.labels, movie.index, known["shape"], known["duration"], known["onset"], known["frames"])
-    values = [values.numpy() for values in whole] + [np.round(1e6 * places)]
+    values = [values.numpy() for values in whole] + [np.round(1e6 * positions)]
     return hashlib.sha256(b"".join(one.astype(np.int64).tobytes() for one in values)).hexdigest()[:16]
 
 

@@ -104,8 +104,8 @@ def test_contact_lasts_from_the_onset_for_the_duration(sampled):
 
 def test_force_rises_over_a_third_and_falls_over_a_third(sampled):
     _, movie, _ = sampled
-    for share, duration in zip(movie.scale, movie.parameters["duration"].int().tolist(), strict=True):
-        profile = share[share > 0]
+    for fraction, duration in zip(movie.scale, movie.parameters["duration"].int().tolist(), strict=True):
+        profile = fraction[fraction > 0]
         ramp = duration // 3
         assert len(profile) == duration
         assert (profile[ramp : duration - ramp] == 1).all()
@@ -134,7 +134,7 @@ def test_sliding_is_straight_and_as_fast_as_drawn():
     centre = torch.stack([(weight.sum(1) * middle).sum(1), (weight.sum(2) * middle).sum(1)], 1)[movie.index]
     speed, direction = movie.parameters["speed"], movie.parameters["direction"]
     step = speed[:, None] * torch.stack([direction.cos(), direction.sin()], 1)
-    moved = [one[share > 0].diff(dim=0) for one, share in zip(centre, movie.scale, strict=True)]
+    moved = [one[fraction > 0].diff(dim=0) for one, fraction in zip(centre, movie.scale, strict=True)]
     inner = [(one - way).abs().max() < 1e-3 for one, way in zip(moved, step, strict=True)]
     assert sum(inner) >= 30
 

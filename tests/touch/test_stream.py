@@ -65,18 +65,20 @@ def test_labels_and_shares_are_those_of_the_dense_movie(dense, window):
     windows = strip.cut(starts, window)
     touched = stream.flatten(1).amax(1) > 0
     seen_parts = 0
-    for start, labels, share in zip(starts, windows.touches.labels, windows.parameters["share"], strict=True):
+    for start, labels, fraction in zip(
+        starts, windows.touches.labels, windows.parameters["share"], strict=True
+    ):
         shown = owner[start : start + window]
         if not touched[start : start + window].any():
             assert labels.tolist() == [0] * 5
-            assert share == 0
+            assert fraction == 0
             continue
         frames = torch.bincount(shown[shown >= 0])
-        most = int(frames.argmax())
-        assert labels.tolist() == [*whole[most].tolist(), 1]
-        duration = int((movie.pressure()[most].flatten(1).amax(1) > 0).sum())
-        assert share.item() == pytest.approx(int(frames[most]) / duration)
-        seen_parts += share < 1
+        maximum = int(frames.argmax())
+        assert labels.tolist() == [*whole[maximum].tolist(), 1]
+        duration = int((movie.pressure()[maximum].flatten(1).amax(1) > 0).sum())
+        assert fraction.item() == pytest.approx(int(frames[maximum]) / duration)
+        seen_parts += fraction < 1
     assert seen_parts > 20
 
 
@@ -96,8 +98,8 @@ def test_what_else_is_known_of_a_window(dense):
     assert windows.task == TOUCH_OR_NOT
     assert known["peak"][touched].min() > 0
     assert known["peak"][~touched].eq(0).all()
-    for start, onset, share in zip(range(0, 470, 7), known["onset"], known["share"], strict=True):
-        if share == 1:
+    for start, onset, fraction in zip(range(0, 470, 7), known["onset"], known["share"], strict=True):
+        if fraction == 1:
             assert owner[start + int(onset)] >= 0
             assert owner[start + int(onset) - 1] != owner[start + int(onset)]
 

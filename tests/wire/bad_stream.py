@@ -199,9 +199,11 @@ class _Oracle:
         if number is None or (frame.values != self.stream.values(number))[frame.valid].any():
             self.wrong += 1
             return
-        place = next((place for place, one in enumerate(islice(expected, _AHEAD)) if one == number), None)
-        if place is not None:
-            for _ in range(place + 1):
+        position = next(
+            (position for position, one in enumerate(islice(expected, _AHEAD)) if one == number), None
+        )
+        if position is not None:
+            for _ in range(position + 1):
                 expected.popleft()
-            self.missed += place
+            self.missed += position
             self.recovered += 1

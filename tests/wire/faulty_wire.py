@@ -79,7 +79,7 @@ class _Tally:
     after: float
     wrong: int = 0
     memory: list[int] = field(default_factory=list)
-    core_share: float = 0.0
+    core_fraction: float = 0.0
 
     def __post_init__(self) -> None:
         self.right = np.zeros(self.count, dtype=bool)
@@ -97,7 +97,7 @@ class _Tally:
                 self._take(frame)
             if not self.memory and time.monotonic() - start >= self.after:
                 self.memory.append(self._resident().rss)
-        self.core_share = (time.process_time() - began) / (time.monotonic() - start)
+        self.core_fraction = (time.process_time() - began) / (time.monotonic() - start)
         self.memory.append(self._resident().rss)
 
     def _take(self, frame: Frame) -> None:
@@ -128,7 +128,7 @@ class _Tally:
             "resets": stats.resets,
             "memory_early_bytes": self.memory[0],
             "memory_end_bytes": self.memory[-1],
-            "reader_core_share": self.core_share,
+            "reader_core_share": self.core_fraction,
         }
 
 
@@ -168,8 +168,8 @@ def _spoil(number: int, line: bytes) -> bytes:
     kind, draw = _kind(number)
     data, first, run = bytearray(line[:-1]), int(draw.integers(len(line) - 1)), int(draw.integers(2, _BURST))
     if kind == 0:
-        for place in draw.integers(len(data), size=2).tolist():
-            data[place] ^= 1 << int(draw.integers(8))
+        for position in draw.integers(len(data), size=2).tolist():
+            data[position] ^= 1 << int(draw.integers(8))
     elif kind == 1:
         for _ in range(2):
             del data[int(draw.integers(len(data)))]
@@ -201,5 +201,5 @@ def _send(master: int, seconds: float, check: Check, rate: float) -> None:
         while piece:
             piece = piece[os.write(master, piece) :]
     passed = time.monotonic() - began
-    share = (time.process_time() - worked) / passed
-    print(json.dumps({"rate_hz": count / passed, "late": late, "sender_core_share": share}), flush=True)
+    fraction = (time.process_time() - worked) / passed
+    print(json.dumps({"rate_hz": count / passed, "late": late, "sender_core_share": fraction}), flush=True)

@@ -87,7 +87,7 @@ def test_lines_that_do_not_match_are_shown_with_the_field_that_failed():
 @pytest.mark.parametrize(("frames", "rate", "witness"), [(200, None, "host"), (20, 100.0, "rate")])
 def test_the_unit_of_a_clock_follows_from_the_host_or_the_header(frames, rate, witness):
     clock = FrameClock()
-    placed = [clock.place(n, 10 * n, n / 100, rate=rate) for n in range(frames)]
+    placed = [clock.position(n, 10 * n, n / 100, rate=rate) for n in range(frames)]
     assert [position.after for position in placed].count("reset") == 1
     assert (clock.unit, clock.witness) == (1e-3, witness)
     assert np.diff([position.t for position in placed[-5:]]) == pytest.approx(0.01)
@@ -98,7 +98,7 @@ def test_where_the_unit_contradicts_the_hosts_clock_that_rules(fixed, arrival, r
     """The user set the unit; or the header says 100 Hz, but the host sees 0.1 Hz of the same clock."""
     clock, stopped = FrameClock(1e-6, fixed), []
     for n in range(400):
-        clock.place(n, 10 * n, arrival * n, rate=rate)
+        clock.position(n, 10 * n, arrival * n, rate=rate)
         stopped.append(clock.judge(arrival * n))
     assert not fixed or clock.unit == 1e-6
     assert stopped.count(True) == 1
@@ -111,10 +111,10 @@ def test_where_the_unit_contradicts_the_hosts_clock_that_rules(fixed, arrival, r
 def test_a_counter_wraps_at_any_modulus_and_losses_are_counted(modulus, clocked):
     clock = FrameClock()
     sent = [n for n in range(5 * modulus) if n % 91 != 17]
-    placed = [clock.place(n % modulus, 10_000 * n if clocked else None, n / 100) for n in sent]
-    resets = sum(place.after == "reset" for place in placed)
+    placed = [clock.position(n % modulus, 10_000 * n if clocked else None, n / 100) for n in sent]
+    resets = sum(position.after == "reset" for position in placed)
     if clocked:
-        lost = sum(place.lost for place in placed)
+        lost = sum(position.lost for position in placed)
         assert (resets, lost) == (0, sent[-1] + 1 - sent[0] - len(sent))
     else:
         assert resets <= 1 + (modulus == 37)
@@ -124,14 +124,14 @@ def test_a_counter_wraps_at_any_modulus_and_losses_are_counted(modulus, clocked)
 def test_a_restart_is_no_wrap():
     clock = FrameClock()
     for n in range(300):
-        clock.place(n, 10_000.0 * n, n / 100)
-    assert clock.place(0, 10_000.0 * 400, 4.0).after == "reset"  # the counter after a pause
-    assert clock.place(1, 0.0, 4.1).after == "reset"  # the clock
+        clock.position(n, 10_000.0 * n, n / 100)
+    assert clock.position(0, 10_000.0 * 400, 4.0).after == "reset"  # the counter after a pause
+    assert clock.position(1, 0.0, 4.1).after == "reset"  # the clock
 
 
 def cut(data, cuts):
-    places = sorted({0, len(data), *(place % (len(data) + 1) for place in cuts)})
-    return [data[first:last] for first, last in pairwise(places)]
+    positions = sorted({0, len(data), *(position % (len(data) + 1) for position in cuts)})
+    return [data[first:last] for first, last in pairwise(positions)]
 
 
 TEXTS = st.one_of(
@@ -206,9 +206,9 @@ def test_a_lost_byte_of_a_frame_without_a_checksum_is_not_two_wrong_frames(name)
     decoder = Decoder(3, adapter=ALL[name])
     for n, row in enumerate(rows):
         frame = encoded(name, n, row)
-        place = int(rng.integers(len(frame)))
+        position = int(rng.integers(len(frame)))
         spoilt = n > 100 and n % 10 == 0
-        for decoded in decoder.feed(frame[:place] + frame[place + spoilt :]):
+        for decoded in decoder.feed(frame[:position] + frame[position + spoilt :]):
             wrong += decoded.values.tolist() not in rows
     assert wrong <= 50  # at most the spoilt ones, of which a digit is lost
     assert decoder.stats.frames > 480

@@ -217,10 +217,12 @@ def check_frames(decoder, pieces, rows):
     numbers, following = [], 0
     for frame in frames:
         assert frame.valid.all()
-        place = next((n for n in range(following, len(rows)) if np.array_equal(frame.values, rows[n])), None)
-        assert place is not None, f"{frame.values} was never sent"
-        numbers.append(place)
-        following = place + 1
+        position = next(
+            (n for n in range(following, len(rows)) if np.array_equal(frame.values, rows[n])), None
+        )
+        assert position is not None, f"{frame.values} was never sent"
+        numbers.append(position)
+        following = position + 1
     return frames
 
 
@@ -426,10 +428,10 @@ def test_the_time_for_a_long_line_grows_with_its_length(adapter):
 
     def seconds(line):
         decoder = Decoder(adapter=read_adapter(adapter))
-        decoder.feed(b"".join(SHIPPED[adapter] % (place % 9) for place in range(40)))
+        decoder.feed(b"".join(SHIPPED[adapter] % (position % 9) for position in range(40)))
         start = process_time()
-        for place in range(0, len(line), 1024):
-            decoder.feed(line[place : place + 1024])
+        for position in range(0, len(line), 1024):
+            decoder.feed(line[position : position + 1024])
         return process_time() - start
 
     for begin in (b"a", b"a:", b"a:1", b"a:1,b:2", b"1.25", b"25.0"):

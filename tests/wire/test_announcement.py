@@ -13,9 +13,9 @@ def test_it_comes_back():
 
 
 @pytest.mark.parametrize("place", range(len(encode_announcement(SAID)) - 1))
-def test_a_changed_byte_is_noticed(place):
+def test_a_changed_byte_is_noticed(position):
     line = bytearray(encode_announcement(SAID).rstrip(b"\n"))
-    line[place] ^= 1
+    line[position] ^= 1
     assert parse_announcement(bytes(line)) is None
 
 

@@ -60,9 +60,9 @@ def test_every_frame_of_the_sketch_is_read(said):
 
 def test_the_header_comes_each_second(said):
     lines = said.splitlines()
-    places = [place for place, line in enumerate(lines) if line.startswith(b"# skin ")]
-    assert places[0] == 0
-    assert max(np.diff([*places, len(lines)])) <= 102
+    positions = [position for position, line in enumerate(lines) if line.startswith(b"# skin ")]
+    assert positions[0] == 0
+    assert max(np.diff([*positions, len(lines)])) <= 102
 
 
 def test_without_a_layout_the_number_of_sensors_is_learnt(said):

@@ -25,8 +25,8 @@ def good(spoken, first, count):
 
 
 def cut(data, cuts):
-    places = sorted({0, len(data), *(place % (len(data) + 1) for place in cuts)})
-    return [data[first:last] for first, last in pairwise(places)]
+    positions = sorted({0, len(data), *(position % (len(data) + 1) for position in cuts)})
+    return [data[first:last] for first, last in pairwise(positions)]
 
 
 @pytest.mark.parametrize("format", ["auto", "text", "binary"])
@@ -72,16 +72,16 @@ def corrupted(line, rng):
     """Flip two bits, or lose two bytes."""
     data = bytearray(line[:-1])
     for _ in range(2):
-        place = int(rng.integers(len(data)))
+        position = int(rng.integers(len(data)))
         if rng.random() < 0.5:
-            data[place] ^= 1 << int(rng.integers(8))
+            data[position] ^= 1 << int(rng.integers(8))
         else:
-            del data[place]
+            del data[position]
     return bytes(data) + b"\n"
 
 
 @pytest.mark.parametrize(("check", "most"), [("crc16", 0.001), ("xor", 0.1), ("none", 0.9)])
-def test_how_many_wrong_values_pass_each_checksum(check, most):
+def test_how_many_wrong_values_pass_each_checksum(check, maximum):
     rng, wrong, count = np.random.default_rng(5), 0, 3000
     decoder = Decoder(16)
     decoder.feed(b"".join(encode_line([500] * 16, number, number, check) for number in range(3)))
@@ -89,7 +89,7 @@ def test_how_many_wrong_values_pass_each_checksum(check, most):
         values = rng.integers(0, 1024, 16).tolist()
         for frame in decoder.feed(corrupted(encode_line(values, number, number * 1000, check), rng)):
             wrong += frame.values.tolist() != values
-    assert wrong / count <= most
+    assert wrong / count <= maximum
     assert wrong > 0 or check == "crc16"  # the test can see them
 
 

@@ -11,7 +11,7 @@ OK, SATURATED, STUCK, DEAD = 0, Reason.SATURATED, Reason.STUCK, Reason.DEAD
 def check(health, frames, start=0.0):
     """Return the masks (F, S) of frames."""
     frames = np.asarray(frames, dtype=float)
-    return np.array([health.check(row, start + place * 0.01) for place, row in enumerate(frames)])
+    return np.array([health.check(row, start + position * 0.01) for position, row in enumerate(frames)])
 
 
 def noisy(count, sensors=5):

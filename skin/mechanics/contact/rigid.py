@@ -163,8 +163,8 @@ class _State:
         moves = inside.abs().amax(1) > self.rest * self.deflection.amax(1)
         inside = inside.where(moves[:, None], 0)
         square = (inside * inside).sum(1)
-        share = torch.where(self.carried > 0, square / self.carried, 0)
-        along = (inside + share[:, None] * self.direction).where(self.touches, 0)
+        fraction = torch.where(self.carried > 0, square / self.carried, 0)
+        along = (inside + fraction[:, None] * self.direction).where(self.touches, 0)
         # Cells that have left took their part of the sum with them.
         along = (along - (along.sum(1) / self.count)[:, None]).where(self.touches & moves[:, None], 0)
         answer = along @ self.compliance
@@ -287,8 +287,8 @@ class _Search:
 
     Attributes:
         wanted: (B, 2), bool: big, dangerous.
-        least: (B,), Pa, lower end of the range of the peak pressure.
-        most: (B,), Pa, its upper end.
+        minimum: (B,), Pa, lower end of the range of the peak pressure.
+        maximum: (B,), Pa, its upper end.
         target: (B,), Pa, peak pressure to find.
         load: (B,), N, next load to try.
         pressure: (B, N), Pa, last solution.
@@ -298,8 +298,8 @@ class _Search:
     """
 
     wanted: np.ndarray
-    least: np.ndarray
-    most: np.ndarray
+    minimum: np.ndarray
+    maximum: np.ndarray
     target: np.ndarray
     load: np.ndarray
     pressure: torch.Tensor
@@ -316,15 +316,15 @@ class _Search:
         """Return a search that begins at the drawn peaks (B,), Pa, clipped to their ranges."""
         settings, cell = problem.settings, problem.shapes.body.cell
         ends = np.where(labels[:, 1:], settings.dangerous_peak, settings.safe_peak)
-        least, most = ends[:, 0] * _NEAR, np.maximum(ends[:, 1] / _NEAR, ends[:, 0] * _NEAR)
-        target = np.clip(peak, least, most)
-        share = torch.from_numpy(target / begin.amax(1).double().numpy()).to(begin)
-        pressure = begin * share[:, None]
+        minimum, maximum = ends[:, 0] * _NEAR, np.maximum(ends[:, 1] / _NEAR, ends[:, 0] * _NEAR)
+        target = np.clip(peak, minimum, maximum)
+        fraction = torch.from_numpy(target / begin.amax(1).double().numpy()).to(begin)
+        pressure = begin * fraction[:, None]
         load = pressure.sum(1).double().numpy() * (cell[0] * cell[1])
         count = len(peak)
         power, last = np.full(count, 1.5), np.full((2, count), np.nan)
         result = np.full(count, np.nan), np.zeros(count, bool), np.zeros(count, bool)
-        return cls(labels, least, most, target, load, pressure, power, last, *result)
+        return cls(labels, minimum, maximum, target, load, pressure, power, last, *result)
 
     def judge(self, rows: np.ndarray, peak: np.ndarray, wrong: np.ndarray, lost: np.ndarray) -> np.ndarray:
         """Store finished searches, and move the target where the classes at it are wrong.
@@ -338,18 +338,18 @@ class _Search:
         Returns:
             (b,), bool, which searches continue.
         """
-        target, least, most = self.target[rows], self.least[rows], self.most[rows]
+        target, minimum, maximum = self.target[rows], self.minimum[rows], self.maximum[rows]
         up, down = ((wrong & side).any(1) for side in (self.wanted[rows], ~self.wanted[rows]))
         away = np.abs(np.log(peak / target))
         met = away < np.log(_NEAR)
         done = met & ~up & ~down
         self.result[rows[done]] = self.load[rows[done]]
         # The classes ask for both directions, or the target is already at the end.
-        at_end = (away < np.log(_END)) & ((up & (target >= most)) | (down & (target <= least)))
+        at_end = (away < np.log(_END)) & ((up & (target >= maximum)) | (down & (target <= minimum)))
         over = met & up & down | at_end
         self.area[rows[over]] = wrong[over, 0]
         self.failed[rows[lost]] = True
-        for side, end in ((met & up, most), (met & down, least)):
+        for side, end in ((met & up, maximum), (met & down, minimum)):
             self.target[rows[side]] = _halfway(self.target[rows[side]], end[side])
         return ~done & ~over & ~lost
 
@@ -440,7 +440,7 @@ class Rigid(AbstractContact):
         cell = body.cell[0] * body.cell[1]
         gap = self.gap(trajectories, problem)
         full = np.zeros(len(trajectories.peak))
-        np.maximum.at(full, trajectories.owner, trajectories.share)
+        np.maximum.at(full, trajectories.owner, trajectories.fraction)
         reference = _reference_frames(trajectories, full, gap, problem.footprints)
         forces, lost = self._search_forces(trajectories, gap, reference, problem)
         force = forces.load / full
@@ -448,11 +448,11 @@ class Rigid(AbstractContact):
 
         solved = np.flatnonzero(~refused[trajectories.owner])
         rows, owner = torch.from_numpy(solved), torch.from_numpy(trajectories.owner[solved])
-        totals = torch.from_numpy(force[trajectories.owner[solved]] * trajectories.share[solved] / cell)
+        totals = torch.from_numpy(force[trajectories.owner[solved]] * trajectories.fraction[solved] / cell)
         # A static touch starts from its solution at the largest force.
         stands = (
-            trajectories.poses.place[solved]
-            == trajectories.poses.place[reference][trajectories.owner[solved]]
+            trajectories.poses.position[solved]
+            == trajectories.poses.position[reference][trajectories.owner[solved]]
         ).all(axis=1)
         start = forces.pressure[owner] * torch.from_numpy(stands)[:, None]
         states = solve_contact(self.compliance, gap[rows], totals, start, self.tolerance, self.iterations)
@@ -460,11 +460,11 @@ class Rigid(AbstractContact):
         lost += np.bincount(missed, minlength=len(force))
 
         frames = gap.isfinite().float()
-        shares = torch.from_numpy(trajectories.share).float()[:, None]
+        fractions = torch.from_numpy(trajectories.fraction).float()[:, None]
         frames[rows] = states.pressure
         peak = np.zeros(len(force))
         np.maximum.at(peak, trajectories.owner[solved], states.pressure.amax(1).double().numpy())
-        frames = (frames / shares).view(-1, *body.shape)
+        frames = (frames / fractions).view(-1, *body.shape)
         # At other positions of a path, or under a small object, the peak may exceed its range.
         settings = problem.settings
         dangerous = trajectories.wanted[:, 3]
@@ -524,7 +524,7 @@ def _sag(body: AbstractBody, inside: Tensor) -> Tensor:
     cover = inside.double().numpy()
     middle = cover @ cells / np.maximum(cover.sum(axis=1, keepdims=True), 1)
     inward = body.frame(middle)[:, 2]
-    below = inward @ body.place(cells).T - (inward * body.place(middle)).sum(axis=1, keepdims=True)
+    below = inward @ body.position(cells).T - (inward * body.position(middle)).sum(axis=1, keepdims=True)
     return torch.from_numpy(below).float()
 
 
@@ -533,6 +533,6 @@ def _reference_frames(
 ) -> np.ndarray:
     """Return the frame of each gesture with the largest cover of a sensor, at its largest force, (B,)."""
     cover = (gap.isfinite().float() @ footprints.T).amax(1).double().numpy()
-    strongest = trajectories.share >= full[trajectories.owner] * (1 - 1e-9)
+    strongest = trajectories.fraction >= full[trajectories.owner] * (1 - 1e-9)
     order = np.lexsort((-cover, ~strongest, trajectories.owner))
     return order[np.searchsorted(trajectories.owner[order], np.arange(len(full)))]

@@ -1,9 +1,9 @@
 """Cholesky factors of a grid's stiffness: nested dissection of its plan, with dense fronts.
 
 The grid is thin: its plan has many more nodes along each side than lie above each other. All unknowns above a
-place of the plan are therefore eliminated together. The plan is halved by lines of places until its parts
-have a few places a side; a part is eliminated before the lines around it (George, 1973). What remains of a
-part is a dense matrix over the places next to it, its front (Duff and Reid, 1983).
+place of the plan are therefore eliminated together. The plan is halved by lines of positions until its parts
+have a few positions a side; a part is eliminated before the lines around it (George, 1973). What remains of a
+part is a dense matrix over the positions next to it, its front (Duff and Reid, 1983).
 """
 
 from collections.abc import Iterator
@@ -19,12 +19,12 @@ Part = tuple[slice, slice]  # of the plan: rows, columns
 
 
 class Cholesky:
-    """The factors of a symmetric and positive definite matrix over the places of a plan.
+    """The factors of a symmetric and positive definite matrix over the positions of a plan.
 
     Args:
         stiffness: (layers * places * 3, the same); unknowns are layer by layer, each row by row, three to a
             place. A place touches its eight neighbours only.
-        plan: rows and columns of places.
+        plan: rows and columns of positions.
 
     Raises:
         numpy.linalg.LinAlgError: the matrix is not positive definite.
@@ -49,7 +49,7 @@ class Cholesky:
         """
         deep = self._order.shape[1]
         local = np.full(stiffness.shape[0], -1)  # where an unknown is in the front at hand
-        waiting: list[tuple[np.ndarray, np.ndarray]] = []  # what is left of parts, and the ranks of places
+        waiting: list[tuple[np.ndarray, np.ndarray]] = []  # what is left of parts, and the ranks of positions
         for own, part in parts:
             grown = tuple(slice(max(side.start - 1, 0), side.stop + 1) for side in part)
             ranks = np.concatenate([rank[own].ravel(), np.setdiff1d(rank[grown], rank[part])])
@@ -60,8 +60,8 @@ class Cholesky:
             into, column = local[rows.indices], np.repeat(np.arange(inner), np.diff(rows.indptr))
             front[into[into >= 0], column[into >= 0]] = rows.data[into >= 0]
             local[unknowns] = -1
-            for child, places in [waiting.pop() for _ in range(2 * (own != part))]:
-                _add(front, child, np.searchsorted(ranks, places), deep)
+            for child, positions in [waiting.pop() for _ in range(2 * (own != part))]:
+                _add(front, child, np.searchsorted(ranks, positions), deep)
             diagonal = cholesky(front[:inner, :inner], lower=True, check_finite=False)
             below, rest = (
                 np.asfortranarray(front[inner:, part]) for part in (slice(inner), slice(inner, None))
@@ -106,12 +106,12 @@ def _dissected(part: Part) -> Iterator[tuple[Part, Part]]:
     yield line, part
 
 
-def _add(front: np.ndarray, child: np.ndarray, places: np.ndarray, deep: int) -> None:
-    """Add the lower triangle of a matrix over some places of a front, ascending, to it; by runs of places."""
-    starts = np.flatnonzero(np.diff(places, prepend=-2) != 1)
+def _add(front: np.ndarray, child: np.ndarray, positions: np.ndarray, deep: int) -> None:
+    """Add the lower triangle of a matrix over some positions of a front, ascending, to it, run by run."""
+    starts = np.flatnonzero(np.diff(positions, prepend=-2) != 1)
     runs = [
-        (slice(deep * start, deep * stop), slice(deep * places[start], deep * (places[stop - 1] + 1)))
-        for start, stop in zip(starts, [*starts[1:], len(places)], strict=True)
+        (slice(deep * start, deep * stop), slice(deep * positions[start], deep * (positions[stop - 1] + 1)))
+        for start, stop in zip(starts, [*starts[1:], len(positions)], strict=True)
     ]
     for number, (rows, into) in enumerate(runs):
         for columns, across in runs[: number + 1]:

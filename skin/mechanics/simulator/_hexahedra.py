@@ -29,14 +29,14 @@ class Hexahedra:
         lines: where the elements' faces are along the chart's x, y and depth, m, each ascending from 0.
         young: (K,), Pa, of each row of elements from the surface down.
         poisson: (K,), of each row.
-        place: chart points (..., 3) to space (..., 3), m.
+        position: chart points (..., 3) to space (..., 3), m.
         frame: chart points (..., 3) to unit vectors (..., 3, 3) along x, along y and into the body.
     """
 
     lines: tuple[np.ndarray, np.ndarray, np.ndarray]
     young: np.ndarray
     poisson: np.ndarray
-    place: Callable[[np.ndarray], np.ndarray]
+    position: Callable[[np.ndarray], np.ndarray]
     frame: Callable[[np.ndarray], np.ndarray]
 
     @property
@@ -59,7 +59,7 @@ class Hexahedra:
         """Where the nodes are in space, (N, 3), m."""
         x, y, z = self.lines
         k, j, i = np.meshgrid(z, y, x, indexing="ij")
-        return self.place(np.stack([i, j, k], axis=-1).reshape(-1, 3))
+        return self.position(np.stack([i, j, k], axis=-1).reshape(-1, 3))
 
     @cached_property
     def held(self) -> np.ndarray:
@@ -159,9 +159,11 @@ class Hexahedra:
         )
         count = len(x) * len(y)
         forces = -row.stiffness()[3 * count :] if plane else row.stiffness()[: 3 * count]
-        places = np.stack([*np.meshgrid(x, y), np.full((len(y), len(x)), z[plane])], axis=-1).reshape(-1, 3)
+        positions = np.stack([*np.meshgrid(x, y), np.full((len(y), len(x)), z[plane])], axis=-1).reshape(
+            -1, 3
+        )
         ends = 3 * np.arange(count + 1)
-        felt = sp.csr_array((self.frame(places)[:, 2].ravel(), np.arange(3 * count), ends)) @ forces
+        felt = sp.csr_array((self.frame(positions)[:, 2].ravel(), np.arange(3 * count), ends)) @ forces
         return sp.csr_array(
             (felt.data, felt.indices + 3 * layer * count, felt.indptr), shape=(count, 3 * len(self.nodes))
         )
@@ -210,10 +212,10 @@ class Hexahedra:
         nearest two; in depth it does not extrapolate.
         """
         stencils = []
-        for axis, (line, most) in enumerate(zip(self.lines, (4, 4, 2), strict=True)):
+        for axis, (line, maximum) in enumerate(zip(self.lines, (4, 4, 2), strict=True)):
             middles = (line[1:] + line[:-1]) / 2
             at = points[:, axis] if axis < 2 else np.clip(points[:, axis], middles[0], middles[-1])
-            stencils.append(lagrange(middles, at, min(most, len(middles))))
+            stencils.append(lagrange(middles, at, min(maximum, len(middles))))
         (x, u), (y, v), (z, w) = stencils
         columns, rows, _ = self.counts
         element = (z[:, :, None, None] * rows + y[:, None, :, None]) * columns + x[:, None, None]
@@ -281,13 +283,13 @@ class Hexahedra:
 
     def _locate(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the elements (P,) that hold points, and the local coordinates there, (P, 3), 0 to 1."""
-        place, local = [], np.empty(points.shape)
+        position, local = [], np.empty(points.shape)
         for axis, (line, count) in enumerate(zip(self.lines, self.counts, strict=True)):
             at = np.clip(np.searchsorted(line, points[:, axis], side="right") - 1, 0, count - 1)
             local[:, axis] = np.clip((points[:, axis] - line[at]) / (line[at + 1] - line[at]), 0, 1)
-            place.append(at)
+            position.append(at)
         columns, rows, _ = self.counts
-        return (place[2] * rows + place[1]) * columns + place[0], local
+        return (position[2] * rows + position[1]) * columns + position[0], local
 
     def _rows(self, element: np.ndarray, values: np.ndarray) -> sp.csr_matrix:
         """Return rows (P, 3 N) with values (P, 8, 3) at the elements' corners."""
@@ -297,14 +299,14 @@ class Hexahedra:
         return sp.csr_matrix((values.ravel(), (row.ravel(), unknown.ravel())), shape=shape)
 
 
-def lagrange(knots: np.ndarray, places: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+def lagrange(knots: np.ndarray, positions: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the ``count`` knots nearest to places (P,), (P, count), and their weights in a polynomial."""
-    first = np.clip(np.searchsorted(knots, places) - count // 2, 0, len(knots) - count)
+    first = np.clip(np.searchsorted(knots, positions) - count // 2, 0, len(knots) - count)
     near = first[:, None] + np.arange(count)
     weights = np.ones(near.shape)
     for number, other in np.argwhere(~np.eye(count, dtype=bool)):
         apart = knots[near[:, number]] - knots[near[:, other]]
-        weights[:, number] *= (places - knots[near[:, other]]) / apart
+        weights[:, number] *= (positions - knots[near[:, other]]) / apart
     return near, weights
 
 

@@ -23,11 +23,11 @@ def reading_rows(mesh: Hexahedra, sensors: Sensors) -> sp.csr_array:
     """
     tilted = sensors.tilted
     near, weights = lagrange(mesh.lines[2], sensors.positions[:, 2], min(4, len(mesh.lines[2])))
-    shares = np.zeros((len(sensors), len(mesh.lines[2])))
-    np.put_along_axis(shares, near, weights * ~tilted[:, None], axis=1)
+    fractions = np.zeros((len(sensors), len(mesh.lines[2])))
+    np.put_along_axis(fractions, near, weights * ~tilted[:, None], axis=1)
     rows = sp.csr_array((len(sensors), 3 * len(mesh.nodes)))
-    for plane in np.flatnonzero(np.abs(shares).max(axis=0) > 1e-9).tolist():
-        rows = rows + sp.diags_array(shares[:, plane]) @ _pressed(mesh, sensors, plane)
+    for plane in np.flatnonzero(np.abs(fractions).max(axis=0) > 1e-9).tolist():
+        rows = rows + sp.diags_array(fractions[:, plane]) @ _pressed(mesh, sensors, plane)
     return rows + _stressed(mesh, sensors) if tilted.any() else rows
 
 
@@ -46,10 +46,10 @@ def _pressed(mesh: Hexahedra, sensors: Sensors, plane: int) -> sp.csr_array:
 def _overlaps(line: np.ndarray, middle: np.ndarray, extent: float) -> np.ndarray:
     """Return the integrals of the nodes' hat functions over lengths about some middles, (S, nodes), m."""
     low, high = ((middle + side * extent / 2)[:, None].clip(line[:-1], line[1:]) for side in (-1, 1))
-    share = ((low + high) / 2 - line[:-1]) / np.diff(line)
+    fraction = ((low + high) / 2 - line[:-1]) / np.diff(line)
     weights = np.zeros((len(middle), len(line)))
-    weights[:, :-1] += (high - low) * (1 - share)
-    weights[:, 1:] += (high - low) * share
+    weights[:, :-1] += (high - low) * (1 - fraction)
+    weights[:, 1:] += (high - low) * fraction
     return weights
 
 

@@ -37,14 +37,17 @@ def solid_rows(mesh: Hexahedra, top: float, refinement: int) -> list[sp.csr_matr
         sp.kron(sp.eye_array(len(line) // refinement), np.full((1, refinement), 1 / refinement))
         for line in (x, y)
     ]
-    mean, places = sp.kron(along[1], along[0]).tocsr(), np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    mean, positions = sp.kron(along[1], along[0]).tocsr(), np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
     halves = [half for half in np.array_split(z[z < top], 2) if len(half)]
     return [
         sp.vstack(
             [
                 sum(mean @ part for part in parts) / len(half)
                 for parts in zip(
-                    *(mesh.strain(np.column_stack([places, np.full(len(places), depth)])) for depth in half),
+                    *(
+                        mesh.strain(np.column_stack([positions, np.full(len(positions), depth)]))
+                        for depth in half
+                    ),
                     strict=True,
                 )
             ]
@@ -62,10 +65,10 @@ def largest(cells: Tensor, rows: Tensor) -> Tensor:
         cells: (F, cells), Pa.
         rows: (C, places, cells), 1/Pa, with C = 1, or 6 for xx, yy, zz, yz, xz, xy.
     """
-    components, places, _ = rows.shape
+    components, positions, _ = rows.shape
     strains = []
-    for part in cells.split(max(1, _NUMBERS_AT_ONCE // (components * places))):
-        strain = (part @ rows.flatten(0, 1).T).unflatten(-1, (components, places))
+    for part in cells.split(max(1, _NUMBERS_AT_ONCE // (components * positions))):
+        strain = (part @ rows.flatten(0, 1).T).unflatten(-1, (components, positions))
         if components == 1:
             strains.append(strain.abs().amax((1, 2)))
             continue

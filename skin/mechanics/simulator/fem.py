@@ -103,17 +103,17 @@ def _bytes(structure: Structure, sensors: int) -> float:
     """Estimate the memory that ``build`` takes, bytes.
 
     The factors' filling was measured on sheets of 16 to 128 cells a side and 6 to 15 unknowns per place: L
-    has about (7.5 log2(side) - 17) entries per unknown and unknown of the place. The sum came out 1.1 to 1.4
-    times the memory then measured.
+    has about (7.5 log2(side) - 17) entries per unknown and unknown of the position. The sum came out 1.1 to
+    1.4 times the memory then measured.
     """
     free_dofs = len(structure.free)
     layers, rows, columns = structure.grid
-    places = float(rows * columns)
-    per_place = free_dofs * layers
-    filling = max(7.5 * np.log2(places**0.5) - 17, 7.0)
-    factors = 16 * places * per_place**2 * filling
-    elements = 32 * places * layers * ((4 * free_dofs) ** 2 + (2 * free_dofs) ** 2)
-    return factors + elements + 16 * 5 * sensors * (places * per_place + places)
+    positions = float(rows * columns)
+    per_position = free_dofs * layers
+    filling = max(7.5 * np.log2(positions**0.5) - 17, 7.0)
+    factors = 16 * positions * per_position**2 * filling
+    elements = 32 * positions * layers * ((4 * free_dofs) ** 2 + (2 * free_dofs) ** 2)
+    return factors + elements + 16 * 5 * sensors * (positions * per_position + positions)
 
 
 Reading = Literal["equation10", "interface"]
@@ -198,8 +198,8 @@ class PlatesAndBeams(AbstractSimulator):
         # Where nothing moves the share is 0; dividing by 1 there keeps the gradient finite too. Subnormal
         # motion counts as none: its quotient could overflow.
         moves = surface.abs() > torch.finfo(surface.dtype).tiny
-        share = torch.where(moves, sensor / torch.where(moves, surface, 1), 0)
-        return Response(share * force, displacement)
+        fraction = torch.where(moves, sensor / torch.where(moves, surface, 1), 0)
+        return Response(fraction * force, displacement)
 
     def strain(self, loads: Tensor, shear: Tensor | None = None) -> Tensor:
         """Return the largest compressive strain of the top layer, (U,)."""

@@ -165,10 +165,10 @@ def _strain(x: float, y: float, a: float, b: float) -> np.ndarray:
     """Return the strains (u_x, v_y, u_y + v_x) per membrane degree of freedom, (3, 8)."""
     matrix = np.zeros((3, 8))
     for node, (corner_x, corner_y) in enumerate(_CORNERS):
-        share_x, share_y = (x if corner_x else 1 - x), (y if corner_y else 1 - y)
+        fraction_x, fraction_y = (x if corner_x else 1 - x), (y if corner_y else 1 - y)
         slope_x, slope_y = (2 * corner_x - 1) / a, (2 * corner_y - 1) / b
-        matrix[0, 2 * node] = matrix[2, 2 * node + 1] = slope_x * share_y
-        matrix[1, 2 * node + 1] = matrix[2, 2 * node] = slope_y * share_x
+        matrix[0, 2 * node] = matrix[2, 2 * node + 1] = slope_x * fraction_y
+        matrix[1, 2 * node + 1] = matrix[2, 2 * node] = slope_y * fraction_x
     return matrix
 
 

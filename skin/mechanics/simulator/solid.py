@@ -103,8 +103,8 @@ class Elastic:
     def _directions(self, axis: int) -> np.ndarray:
         """Return an axis of the chart at the nodes of the surface, (rows + 1, columns + 1, 3), in space."""
         x, y, _ = self.mesh.lines
-        places = np.stack([*np.meshgrid(x, y), np.zeros((len(y), len(x)))], axis=-1)
-        return self.mesh.frame(places.reshape(-1, 3))[:, axis].reshape(len(y), len(x), 3)
+        positions = np.stack([*np.meshgrid(x, y), np.zeros((len(y), len(x)))], axis=-1)
+        return self.mesh.frame(positions.reshape(-1, 3))[:, axis].reshape(len(y), len(x), 3)
 
     def transfer(self, rows: sp.csr_matrix, axes: Sequence[int] = (0, 1, 2)) -> np.ndarray:
         """Return what rows (R, 3 N) read of a moment of 1 Pa of each cell along each axis: (axes, R, cells).
@@ -133,8 +133,8 @@ def _bytes(columns: int, rows: int, deep: int) -> float:
     257 places a side; the last fronts have 4 times the squared unknowns of a side. The stiffness has 81
     entries per unknown, which the assembly holds four times at 12 bytes.
     """
-    places, unknowns = float((columns + 1) * (rows + 1)), 3 * deep
-    return 8 * places * unknowns**2 * (3 * np.log2(places) + 4) + 4 * 12 * 81 * places * unknowns
+    positions, unknowns = float((columns + 1) * (rows + 1)), 3 * deep
+    return 8 * positions * unknowns**2 * (3 * np.log2(positions) + 4) + 4 * 12 * 81 * positions * unknowns
 
 
 _HERE = Path(__file__).parent
@@ -374,12 +374,12 @@ class Solid(AbstractSimulator):
 
 def _motions(mesh: Hexahedra, sensors: Sensors) -> list[sp.csr_matrix]:
     """Return rows (S, 3 N) that give D_s, D_t and the displacements of each sensor along x and y, m."""
-    places = sensors.positions
-    above = places * np.array([1.0, 1.0, 0.0])
-    x, y, inwards = (np.tile(axis, (len(places), 1)) for axis in np.eye(3))
+    positions = sensors.positions
+    above = positions * np.array([1.0, 1.0, 0.0])
+    x, y, inwards = (np.tile(axis, (len(positions), 1)) for axis in np.eye(3))
     return [
         mesh.motion(*motion_axes)
-        for motion_axes in ((places, inwards), (above, inwards), (places, x), (places, y))
+        for motion_axes in ((positions, inwards), (above, inwards), (positions, x), (positions, y))
     ]
 
 
@@ -387,5 +387,5 @@ def _corners(elastic: Elastic) -> sp.csr_matrix:
     """Return rows that read how far the corners of the cells move into the skin, m."""
     lines = zip(elastic.mesh.lines, elastic.cells, strict=False)
     x, y = (np.linspace(0, line[-1], count + 1) for line, count in lines)
-    places = np.stack([*np.meshgrid(x, y), np.zeros((len(y), len(x)))], axis=-1).reshape(-1, 3)
-    return elastic.mesh.motion(places, np.tile(np.eye(3)[_INWARDS], (len(places), 1)))
+    positions = np.stack([*np.meshgrid(x, y), np.zeros((len(y), len(x)))], axis=-1).reshape(-1, 3)
+    return elastic.mesh.motion(positions, np.tile(np.eye(3)[_INWARDS], (len(positions), 1)))

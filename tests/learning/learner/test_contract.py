@@ -137,14 +137,14 @@ class Sliding(AbstractDevice):
         angle = 2 * torch.pi * torch.rand(count, generator=generator)
         goes = (torch.arange(count) % 4 > 0).float()
         cosines = torch.stack([angle.cos(), angle.sin()], dim=1) * goes[:, None]
-        places = torch.cartesian_prod(torch.linspace(0.02, 0.14, 4), torch.linspace(0.02, 0.14, 4))
+        sites = torch.cartesian_prod(torch.linspace(0.02, 0.14, 4), torch.linspace(0.02, 0.14, 4))
         middle = 0.08 + 0.02 * torch.randn(count, 1, 2, generator=generator)
         way = middle + 0.006 * (torch.arange(10) - 4.5)[:, None] * cosines[:, None]
-        readings = 3 * torch.exp(-((torch.cdist(way, places[None]) / 0.03) ** 2))
+        readings = 3 * torch.exp(-((torch.cdist(way, sites[None]) / 0.03) ** 2))
         readings[:, :2] = readings[:, -2:] = 0
         labels = torch.rand(count, 4, generator=generator).round()
         labels[:, 1] = goes
-        positions = torch.cat([places, torch.full((16, 1), 0.005)], dim=1)
+        positions = torch.cat([sites, torch.full((16, 1), 0.005)], dim=1)
         labels = torch.cat([labels, cosines], dim=1)
         return Touches(readings, torch.ones_like(readings, dtype=torch.bool), positions, labels, self.rate)
 

@@ -60,8 +60,8 @@ def test_the_weights_of_the_best_validation_loss_are_kept(build, made_up_device,
     validation, _ = curve(tmp_path)
     assert min(validation) < validation[-1]  # a rate so high that the last epoch is not the best
     touches = made_up_device.touches("validation")
-    chance = learner.probabilities(touches)
-    loss = torch.nn.functional.binary_cross_entropy(chance, touches.labels)
+    probability = learner.probabilities(touches)
+    loss = torch.nn.functional.binary_cross_entropy(probability, touches.labels)
     assert loss.item() == pytest.approx(min(validation), rel=1e-4)
 
 

@@ -44,7 +44,7 @@ class Presses(AbstractDevice):
         source = torch.Generator().manual_seed(sum(map(ord, split)))
         count = 100 if split == "train" else 40
         x, force = 0.04 * torch.rand(count, generator=source), 1 + 4 * torch.rand(count, generator=source)
-        places = 0.01 * (torch.arange(4) + 0.5)
+        sites = 0.01 * (torch.arange(4) + 0.5)
         gesture = torch.arange(count) % 3
         time = torch.arange(30)
         course = torch.stack([(time % 6 < 2).float(), torch.ones(30), (time == 9).float()])[gesture]
@@ -52,12 +52,12 @@ class Presses(AbstractDevice):
         readings = (
             force[:, None, None]
             * course[..., None]
-            * torch.exp(-(((x[:, None] - places) / 0.01) ** 2))[:, None]
+            * torch.exp(-(((x[:, None] - sites) / 0.01) ** 2))[:, None]
         )
         readings = readings + 0.01 * torch.randn(readings.shape, generator=source)
         labels = torch.stack([x, force], dim=1) if self.task == PLACE else one_hot(gesture.float(), 3)
         labels[::10] = torch.nan
-        positions = torch.stack([places, torch.full((4,), 0.005), torch.zeros(4)], dim=1)
+        positions = torch.stack([sites, torch.full((4,), 0.005), torch.zeros(4)], dim=1)
         return Touches(readings, torch.ones_like(readings).bool(), positions, labels, 10.0)
 
 
@@ -215,8 +215,10 @@ def test_losses_leave_out_what_is_unknown():
     labels = np.array([[1.0, 0, 0, np.nan], [np.nan] * 4])
     losses = touch_losses(np.full((2, 4), 0.5), labels, TOUCH)
     assert losses.tolist() == pytest.approx([np.log(2), 0])
-    place = np.array([[0.0, 1.0], [2.0, np.nan], [4.0, 3.0]])
-    assert touch_losses(np.nan_to_num(place) + 1, place, PLACE)[1] == pytest.approx(1 / np.var([0, 2, 4]))
+    position = np.array([[0.0, 1.0], [2.0, np.nan], [4.0, 3.0]])
+    assert touch_losses(np.nan_to_num(position) + 1, position, PLACE)[1] == pytest.approx(
+        1 / np.var([0, 2, 4])
+    )
 
 
 def test_a_touch_from_the_first_frame_on_has_its_idle_level_at_its_end():

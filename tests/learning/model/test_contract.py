@@ -77,8 +77,8 @@ def test_a_gradient_reaches_every_parameter(given, request):
     model, x, adjacency = given
     model.double().train()
     model(x.double(), None if adjacency is None else adjacency.double()).square().sum().backward()
-    most = {name: one.grad.abs().max().item() for name, one in model.named_parameters()}
-    idle = {name for name, size in most.items() if size < 1e-12 * max(most.values())}
+    maximum = {name: one.grad.abs().max().item() for name, one in model.named_parameters()}
+    idle = {name for name, size in maximum.items() if size < 1e-12 * max(maximum.values())}
     normed = re.search("^efficientnet|batch|instance", request.node.callspec.id)
     known = WITHOUT_EFFECT if normed else WITHOUT_EFFECT[:1]
     assert all(any(re.search(one, name) for one in known) for name in idle), idle

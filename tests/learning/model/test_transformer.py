@@ -25,9 +25,9 @@ def layer_by_hand(layer, x, heads):
     parts = []
     for head in range(heads):
         mine = slice(head * width, (head + 1) * width)
-        share = torch.einsum("nsd,ntd->nst", query[..., mine], key[..., mine]) / math.sqrt(width)
-        share = share.exp() / share.exp().sum(dim=-1, keepdim=True)
-        parts.append(torch.einsum("nst,ntd->nsd", share, value[..., mine]))
+        fraction = torch.einsum("nsd,ntd->nst", query[..., mine], key[..., mine]) / math.sqrt(width)
+        fraction = fraction.exp() / fraction.exp().sum(dim=-1, keepdim=True)
+        parts.append(torch.einsum("nst,ntd->nsd", fraction, value[..., mine]))
     x = x + layer.self_attn.out_proj(torch.cat(parts, dim=-1))
     return x + layer.linear2(F.gelu(layer.linear1(layer.norm2(x))))
 

@@ -109,18 +109,18 @@ BODY = Sheet([0.16, 0.16], [32, 32], LAYERS)
 
 
 def test_stiffness_of_a_uniform_skin_falls_as_one_over_distance():
-    places = Scattered(seed=3).sensors(BODY).positions
-    linked = neighbours(places, "knn", 6)
-    weights = adjacency(places, linked, "stiffness")
-    np.testing.assert_allclose(weights[linked], 1 / adjacency(places, linked, "distance")[linked])
+    positions = Scattered(seed=3).sensors(BODY).positions
+    linked = neighbours(positions, "knn", 6)
+    weights = adjacency(positions, linked, "stiffness")
+    np.testing.assert_allclose(weights[linked], 1 / adjacency(positions, linked, "distance")[linked])
     assert not weights[~linked].any()
 
 
 def test_coordinates_are_the_last_two_features():
-    places = torch.tensor([[0.04, 0.03, 0.005], [0.16, 0.12, 0.005], [0.0, 0.06, 0.005]])
+    positions = torch.tensor([[0.04, 0.03, 0.005], [0.16, 0.12, 0.005], [0.0, 0.06, 0.005]])
     readings = torch.rand(2, 4, 3, generator=torch.Generator().manual_seed(0))
     valid = torch.ones_like(readings, dtype=torch.bool)
-    x = Graph(places, (0.16, 0.12), coordinates=True, mask=True)(readings, valid).x
+    x = Graph(positions, (0.16, 0.12), coordinates=True, mask=True)(readings, valid).x
     assert x.shape == (2, 4, 3, 4)
     torch.testing.assert_close(x[..., 0], readings / 10)
     torch.testing.assert_close(x[..., 2:], torch.tensor([[0.25, 0.25], [1, 1], [0, 0.5]]).expand(2, 4, 3, 2))
@@ -129,10 +129,10 @@ def test_coordinates_are_the_last_two_features():
 PLACES = torch.from_numpy(Grid(3, 3).sensors(BODY).positions).float()
 
 
-def touches(motion=None, places=PLACES):
+def touches(motion=None, positions=PLACES):
     generator = torch.Generator().manual_seed(0)
-    readings = torch.rand(2, 5, len(places), generator=generator)
-    return Touches(readings, readings >= 0, places, torch.zeros(2, 4), 10.0, motion)
+    readings = torch.rand(2, 5, len(positions), generator=generator)
+    return Touches(readings, readings >= 0, positions, torch.zeros(2, 4), 10.0, motion)
 
 
 def moves(scale=0.004):
@@ -151,8 +151,8 @@ def test_a_frame_whose_sensors_moved_has_the_graph_of_where_they_are(weight):
     linked, unit = neighbours(rest, "knn", 3), typical_distance(rest)
     for gesture in range(2):
         for frame in range(5):
-            places = rest + motion[gesture, frame].double().numpy()
-            distance = np.linalg.norm(places[:, None] - places[None], axis=-1)
+            positions = rest + motion[gesture, frame].double().numpy()
+            distance = np.linalg.norm(positions[:, None] - positions[None], axis=-1)
             stiff = np.divide(unit, distance, out=np.zeros_like(distance), where=linked)
             law = {"exp": np.exp(-distance / unit), "distance": distance / unit, "stiffness": stiff}
             expected = normalised(linked * law[weight])

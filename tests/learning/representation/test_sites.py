@@ -16,13 +16,13 @@ def touches():
     """Five touches of nine sensors on a skin of 0.2 x 0.1 m; one sensor is dead in the first touch."""
     generator = torch.Generator().manual_seed(0)
     readings = torch.rand(5, 12, 9, generator=generator)
-    places = torch.rand(9, 2, generator=generator) * torch.tensor([0.2, 0.1])
+    sites = torch.rand(9, 2, generator=generator) * torch.tensor([0.2, 0.1])
     geometry = torch.rand(9, len(GEOMETRY), generator=generator)
-    geometry[:, :2] = places
+    geometry[:, :2] = sites
     geometry[:, GEOMETRY.index("width")], geometry[:, GEOMETRY.index("height")] = 0.2, 0.1
     valid = torch.ones(5, 12, 9, dtype=torch.bool)
     valid[0, :, 3] = False
-    positions = torch.cat([places, torch.full((9, 1), 0.005)], dim=1)
+    positions = torch.cat([sites, torch.full((9, 1), 0.005)], dim=1)
     return Touches(readings, valid, positions, None, 10.0, geometry=geometry, saturated=readings > 0.98)
 
 

@@ -20,7 +20,7 @@ def love(shape: tuple[int, int], cell: tuple[float, float], modulus: float) -> n
         return u * np.log(v + distance) + v * np.log(u + distance)
 
     kernel = (corner(1, 1) - corner(1, -1) - corner(-1, 1) + corner(-1, -1)) / (np.pi * modulus)
-    row, column = (places.ravel() for places in np.indices(shape))
+    row, column = (positions.ravel() for positions in np.indices(shape))
     return kernel[
         row[:, None] - row[None] + height - 1,
         column[:, None] - column[None] + width - 1,

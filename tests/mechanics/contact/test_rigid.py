@@ -56,22 +56,22 @@ def problem(**settings) -> ContactProblem:
 
 
 def still(
-    scale: float, place=(0.08, 0.08), peak: float = 50e3, shares=(1.0,), wanted=(0, 0, 0, 0)
+    scale: float, position=(0.08, 0.08), peak: float = 50e3, fractions=(1.0,), wanted=(0, 0, 0, 0)
 ) -> Trajectories:
     """Return one gesture of the first shape that stands still, at several shares of its force."""
-    count = len(shares)
+    count = len(fractions)
     return Trajectories(
         np.zeros(count, int),
         Pose(
             np.zeros(count, int),
             np.zeros(count),
             np.full(count, scale),
-            np.tile(place, (count, 1)),
+            np.tile(position, (count, 1)),
             np.ones(count),
         ),
-        np.array(shares),
+        np.array(fractions),
         torch.arange(count)[None],
-        torch.tensor([shares]),
+        torch.tensor([fractions]),
         np.array([peak]),
         np.array([wanted], bool),
     )
@@ -106,15 +106,15 @@ def test_the_peak_is_the_highest_cell_and_within_its_range(sampled):
     torch.testing.assert_close(movie.parameters["peak"], peak, rtol=1e-5, atol=0)
     dangerous = movie.labels[:, 3] > 0.5
     settings = source.settings
-    for rows, (least, most) in ((dangerous, settings.dangerous_peak), (~dangerous, settings.safe_peak)):
-        assert (peak[rows] <= most).all()
-        assert (peak[rows] >= least).all()
+    for rows, (minimum, maximum) in ((dangerous, settings.dangerous_peak), (~dangerous, settings.safe_peak)):
+        assert (peak[rows] <= maximum).all()
+        assert (peak[rows] >= minimum).all()
 
 
 def test_every_frame_of_a_movie_is_at_rest(sampled):
     """The surface under pressure follows the object: gaps differ from the picture's by one number."""
     contact = sampled[0].contact
-    trajectories = still(0.05, shares=(1.0, 0.5, 0.2))
+    trajectories = still(0.05, fractions=(1.0, 0.5, 0.2))
     gap = contact.gap(trajectories, problem()).double()
     surface = contact.compliance.double()
     pressed = contact.press(trajectories, problem())
@@ -129,17 +129,17 @@ def test_every_frame_of_a_movie_is_at_rest(sampled):
 
 
 def test_a_flat_stamp_is_proportional_and_a_relief_is_not():
-    shares = (1.0, 0.25)
+    fractions = (1.0, 0.25)
     for contact, proportional in ((rigid(relief=0.0, fillet=0.0), True), (rigid(relief=0.01), False)):
-        frames = contact.press(still(0.03, shares=shares), problem(shapes=["fist"])).frames
+        frames = contact.press(still(0.03, fractions=fractions), problem(shapes=["fist"])).frames
         assert torch.allclose(frames[0], frames[1], rtol=1e-2, atol=50) == proportional
         assert (frames[1] > 0).sum() <= (frames[0] > 0).sum()
 
 
 def test_edges_of_a_flat_stamp_press_hardest_and_fillets_take_that_away():
-    place = problem(shapes=["disc"])
+    position = problem(shapes=["disc"])
     sharp, round_ = (
-        rigid(relief=0.0, fillet=fillet).press(still(0.045), place).frames[0] for fillet in (0, 0.02)
+        rigid(relief=0.0, fillet=fillet).press(still(0.045), position).frames[0] for fillet in (0, 0.02)
     )
     middle = sharp[8:12, 8:12].mean()
     assert sharp.max() > 1.8 * middle
@@ -209,10 +209,10 @@ def test_rounding_decides_nothing(wanted):
 
 
 @pytest.mark.parametrize("most", [82.7e3, 83.2e3, 83.4e3])
-def test_the_end_of_a_range_is_tried_itself(most):
+def test_the_end_of_a_range_is_tried_itself(maximum):
     """The ball is big from 82.5 kPa on: wherever the search begins, it must not stop a little below that."""
     where, contact = problem(shapes=["blurred_disc"]), rigid(relief=0.002)
-    settings = replace(where.settings, safe_peak=(10e3, 1.03 * most))
+    settings = replace(where.settings, safe_peak=(10e3, 1.03 * maximum))
     for peak in np.linspace(10e3, 80e3, 9):
         stroke = still(0.065, peak=peak, wanted=(1, 0, 0, 0))
         assert not contact.press(stroke, where._replace(settings=settings)).refused.any(), peak
@@ -223,7 +223,7 @@ def test_what_no_force_can_make_big_is_hopeless():
     pressed = rigid(relief=0.05).press(still(0.06, wanted=(1, 0, 0, 0)), where)
     assert pressed.refused.all()
     assert pressed.hopeless.all()
-    far = rigid().press(still(0.008, place=(0.096, 0.096), peak=120e3, wanted=(0, 0, 0, 1)), where)
+    far = rigid().press(still(0.008, position=(0.096, 0.096), peak=120e3, wanted=(0, 0, 0, 1)), where)
     assert far.refused.all()
     assert not far.hopeless.any()
 

@@ -48,8 +48,8 @@ def gaussian(body: Sheet, width: float = 0.015) -> np.ndarray:
     return 90.5e3 * np.outer(along[1], along[0]).ravel()
 
 
-def at(*places: tuple[float, float, float], footprint=(0.01, 0.01)) -> Sensors:
-    return Sensors(np.array(places), footprint)
+def at(*positions: tuple[float, float, float], footprint=(0.01, 0.01)) -> Sensors:
+    return Sensors(np.array(positions), footprint)
 
 
 @pytest.mark.parametrize("constraint", ["vertical", "free"])
@@ -74,8 +74,8 @@ def test_a_square_sheet_does_not_tell_x_from_y(cache):
 def test_the_table_carries_the_whole_load(constraint):
     """A footprint as large as the sheet reads the load at every interface: no force is lost on the way."""
     body = Sheet([0.16, 0.12], [10, 7], THREE)
-    places = [(0.08, 0.06, depth) for depth in body.interfaces[:2]]
-    operator = build(Structure(body, constraint), at(*places, footprint=(0.4, 0.4)))
+    positions = [(0.08, 0.06, depth) for depth in body.interfaces[:2]]
+    operator = build(Structure(body, constraint), at(*positions, footprint=(0.4, 0.4)))
     force_per_cell = np.prod(body.cell)
     np.testing.assert_allclose(operator.carried[0], force_per_cell, rtol=1e-8)
     np.testing.assert_allclose(operator.applied, force_per_cell, rtol=1e-12)
@@ -112,9 +112,9 @@ def test_uniform_pressure_deviates_at_free_edges_as_known():
     structure = Structure(Sheet([0.16, 0.16], [32, 32], LAYERS))
     motion = spsolve(structure.stiffness(), structure.load().sum(axis=1))
     surface = -motion.reshape(*structure.grid, -1)[-1, ..., 0]
-    share = surface / (0.010 / 560e3 + 0.005 / 170e3)
-    assert share.min() == pytest.approx(0.889, abs=0.002)
-    assert share.max() == pytest.approx(1.027, abs=0.002)
+    fraction = surface / (0.010 / 560e3 + 0.005 / 170e3)
+    assert fraction.min() == pytest.approx(0.889, abs=0.002)
+    assert fraction.max() == pytest.approx(1.027, abs=0.002)
 
 
 def touches(body: Sheet, count: int) -> torch.Tensor:
@@ -146,10 +146,10 @@ def test_equation_10_is_what_it_says(default):
 def test_the_share_that_reaches_a_sensor_lies_in_its_known_range(default):
     response = default(touches(Sheet([0.16, 0.16], [32, 32], LAYERS), 500))
     sensor, surface = response.displacement[response.readings > 0].T
-    share = sensor / surface
-    assert len(share) > 1000
-    assert 0.19 < share.min() < 0.25
-    assert 0.60 < share.max() < 0.80
+    fraction = sensor / surface
+    assert len(fraction) > 1000
+    assert 0.19 < fraction.min() < 0.25
+    assert 0.60 < fraction.max() < 0.80
 
 
 def test_interface_reading_feels_a_neighbour_and_equation_10_does_not(cache):

@@ -61,10 +61,10 @@ def test_pynite_agrees_on_every_displacement_and_on_the_table(case):
     structure, pressure, model, expected = case
     motion = spsolve(structure.stiffness(), structure.load() @ pressure.ravel())
     ours = motion.reshape(*structure.grid, -1)
-    for place, dof in enumerate(structure.free):
+    for position, dof in enumerate(structure.free):
         largest = np.abs(expected[..., dof]).max()
         assert largest > 0
-        np.testing.assert_allclose(ours[..., place], expected[..., dof], rtol=0, atol=1e-6 * largest)
+        np.testing.assert_allclose(ours[..., position], expected[..., dof], rtol=0, atol=1e-6 * largest)
     table = sum(node.RxnFZ["Combo 1"] for name, node in model.nodes.items() if name.startswith("0,"))
     force = pressure.sum() * np.prod(structure.body.cell)
     assert table == pytest.approx(force, rel=1e-6)
@@ -83,7 +83,9 @@ def test_pynite_agrees_with_the_cached_operator_on_sensors_at_every_interface(ca
 
     def moved(dof: int, sign: int, levels: np.ndarray) -> np.ndarray:
         into = [RegularGridInterpolator(lines, sign * layer[..., dof]) for layer in expected]
-        return np.array([into[level](place[[1, 0]])[0] for level, place in zip(levels, where, strict=True)])
+        return np.array(
+            [into[level](position[[1, 0]])[0] for level, position in zip(levels, where, strict=True)]
+        )
 
     top = np.full(count, len(body.layers) - 1)
     at_sensor, at_surface = moved(2, -1, levels), moved(2, -1, top)

@@ -12,10 +12,10 @@ SIDE = 0.006
 WAYS = [(0, 0, 1), (0, 0, -1), (1, 0, 0), (0, 1, 0), (0.6, 0.8, 0), (0.6, 0, 0.8), (0.3, -0.2, 0.933)]
 
 
-def sampled(way, place=(0.071, 0.052, 0.0075)):
+def sampled(way, position=(0.071, 0.052, 0.0075)):
     normal = np.array(way, dtype=float)
     normal /= np.linalg.norm(normal)
-    points, inside = sample(Sensors(np.array([place]), (SIDE, SIDE), normal), EXTENT)
+    points, inside = sample(Sensors(np.array([position]), (SIDE, SIDE), normal), EXTENT)
     return points[0], inside[0], normal
 
 
@@ -38,7 +38,7 @@ def test_what_passes_the_surface_is_cut_off():
 def test_a_cut_footprint_is_said_with_its_share():
     """Leaning by 45 degrees 0.5 mm above the base, 3.5 mm of 10 mm reach into the base: with 0.5 mm, 43 %."""
     body = Sheet([0.08, 0.08], [8, 8], [{"material": "EcoFlex 00-30", "thickness": 0.012}])
-    places = np.array([[0.03, 0.03, 0.0115], [0.05, 0.05, 0.006], [0.0, 0.04, 0.006]])
+    positions = np.array([[0.03, 0.03, 0.0115], [0.05, 0.05, 0.006], [0.0, 0.04, 0.006]])
     lean = np.array([[0, 0.6, 0.8], [0, 0.6, 0.8], [0, 0, 1.0]])
     with pytest.warns(UserWarning, match=r"of 1 tilted sensors.*sensor 1 loses 4[0-4] % of its footprint"):
-        Solid(body, Sensors(places, (0.01, 0.01), lean), divisions=1)
+        Solid(body, Sensors(positions, (0.01, 0.01), lean), divisions=1)

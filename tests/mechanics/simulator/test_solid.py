@@ -24,8 +24,8 @@ ARM = Arm(cells=(6, 6), layers=LAYERS, radius=0.05, length=0.16, angle=3.0)
 FOOTPRINT = (0.01, 0.01)
 
 
-def sensors(*places, normals=(0.0, 0.0, 1.0)):
-    return Sensors(np.array(places, dtype=float), FOOTPRINT, np.array(normals, dtype=float))
+def sensors(*positions, normals=(0.0, 0.0, 1.0)):
+    return Sensors(np.array(positions, dtype=float), FOOTPRINT, np.array(normals, dtype=float))
 
 
 MIDDLE = sensors((0.04, 0.04, 0.005))
@@ -147,9 +147,9 @@ def test_forces_are_mutual():
 def wide():
     """Return a wide sheet and how much pushes across a leaning, a flat and an upright plane in its middle."""
     sheet, angle = Sheet([0.2, 0.2], [20, 20], LAYERS), np.deg2rad(30)
-    places = np.array([(0.1, 0.1, 0.0025), (0.1, 0.1, 0.0025), (0.1, 0.1, 0.0075)])
+    positions = np.array([(0.1, 0.1, 0.0025), (0.1, 0.1, 0.0025), (0.1, 0.1, 0.0075)])
     normals = np.array([(np.sin(angle), 0, np.cos(angle)), (0, 0, 1), (1, 0, 0)])
-    return sheet, solid(Sensors(places, FOOTPRINT, normals), sheet)
+    return sheet, solid(Sensors(positions, FOOTPRINT, normals), sheet)
 
 
 def test_a_tilted_sensor_feels_shear(wide):
@@ -191,9 +191,9 @@ def test_sensors_move_as_the_skin_does():
 def test_sensors_at_many_depths_read_between_planes_of_nodes():
     """Each as it does in a body with a plane of nodes at its depth, but for the interpolation."""
     depths = np.linspace(0.0035, 0.0075, 6)
-    places = [(0.01 + 0.02 * number, 0.06, depth) for number, depth in enumerate(depths)]
-    together, frame = Solid(SHEET, sensors(*places)), torch.full(SHEET.shape, 1e3)
-    apart = [Solid(SHEET, sensors(place))(frame).readings.item() for place in places]
+    positions = [(0.01 + 0.02 * number, 0.06, depth) for number, depth in enumerate(depths)]
+    together, frame = Solid(SHEET, sensors(*positions)), torch.full(SHEET.shape, 1e3)
+    apart = [Solid(SHEET, sensors(position))(frame).readings.item() for position in positions]
     assert together(frame).readings.numpy() == pytest.approx(np.array(apart), rel=0.01)
 
 

@@ -34,18 +34,18 @@ LAYERS = [
 @pytest.mark.parametrize(("seed", "shear"), [(0, 0.0), (1, 0.5)])
 def test_the_operator_agrees_with_scikit_fem_on_single_frames(seed, shear):
     body = Sheet((0.12, 0.12), (8, 8), LAYERS)
-    place = np.array([3 * body.cell[0], 4 * body.cell[1], 0.005])
+    position = np.array([3 * body.cell[0], 4 * body.cell[1], 0.005])
     mesh, extent = build_mesh(body, 2, {}), 2 * body.cell[0]
-    down, above = np.array([[0.0, 0, 1]]), place * [1, 1, 0]
+    down, above = np.array([[0.0, 0, 1]]), position * [1, 1, 0]
     # Stress in the middles of the 2 x 2 elements under the footprint, between the rows next to the place.
     weights = np.zeros((4, 8, 8))
     weights[1:3, 3:5, 2:4] = -np.prod(body.cell) * np.array([2 / 3, 1 / 3])[:, None, None]
     stress = mesh.mean_stress(sp.csr_matrix(weights.reshape(1, -1)), down)
-    rows = sp.vstack([stress, mesh.motion(place[None], down), mesh.motion(above[None], down)])
+    rows = sp.vstack([stress, mesh.motion(position[None], down), mesh.motion(above[None], down)])
     adjoint = Elastic(mesh).solve(rows.T.toarray())
     along, inwards = ((mesh.loads(axis).T @ adjoint).T for axis in (0, 2))
     pressure = 1e4 * np.random.default_rng(seed).random(body.shape)
-    theirs = solve_frame(mesh, pressure, shear, place, extent)
+    theirs = solve_frame(mesh, pressure, shear, position, extent)
     ours = (inwards + shear * along) @ pressure.ravel()
     assert ours == pytest.approx([theirs.reading, theirs.sensor, theirs.surface], rel=1e-8)
 
@@ -69,7 +69,7 @@ class FrameSolution:
 
 
 def solve_frame(
-    mesh: Hexahedra, pressure: np.ndarray, shear: float, place: np.ndarray, extent: float
+    mesh: Hexahedra, pressure: np.ndarray, shear: float, position: np.ndarray, extent: float
 ) -> FrameSolution:
     """Solve a flat skin under one frame in the mixed form, with one pressure unknown per element.
 
@@ -105,11 +105,11 @@ def solve_frame(
     table = basis.get_dofs(lambda x: np.abs(x[2] + mesh.lines[2][-1]) < 1e-12).all()
     solution = _solve(*condense(whole, load, D=table))
     moved, squeeze = solution[: basis.N], solution[basis.N :]
-    below = np.array([place[0], place[1], -place[2]])
-    above = np.array([place[0], place[1], 0.0])
+    below = np.array([position[0], position[1], -position[2]])
+    above = np.array([position[0], position[1], 0.0])
     sensor, surface = (-_at(points, basis, moved, spot)[2] for spot in (below, above))
     return FrameSolution(
-        _reading(points, basis, moved, squeeze, fields["mu"], mesh, place, extent), sensor, surface
+        _reading(points, basis, moved, squeeze, fields["mu"], mesh, position, extent), sensor, surface
     )
 
 
@@ -128,12 +128,12 @@ def _at(points: MeshHex, basis: CellBasis, moved: np.ndarray, spot: np.ndarray) 
     return moved[basis.nodal_dofs[:, node]]
 
 
-def _reading(points, basis, moved, squeeze, mu, mesh: Hexahedra, place, extent: float) -> float:
+def _reading(points, basis, moved, squeeze, mu, mesh: Hexahedra, position, extent: float) -> float:
     """Integrate -sigma_zz over the footprint in the rows above and below, and interpolate linearly."""
     x, y, z = points.p[:, points.t].mean(axis=1)
-    within = (np.abs(x - place[0]) < extent / 2) & (np.abs(y - place[1]) < extent / 2)
+    within = (np.abs(x - position[0]) < extent / 2) & (np.abs(y - position[1]) < extent / 2)
     lines = mesh.lines[2]
-    row = int(np.searchsorted(lines, place[2] - 1e-9))
+    row = int(np.searchsorted(lines, position[2] - 1e-9))
     upper, lower = (lines[row - 1] + lines[row]) / 2, (lines[row] + lines[row + 1]) / 2
     s, t = np.meshgrid(_GAUSS, _GAUSS)
     half_way = np.stack([s.ravel(), t.ravel(), np.full(4, 0.5)])
@@ -150,5 +150,5 @@ def _reading(points, basis, moved, squeeze, mu, mesh: Hexahedra, place, extent: 
                 high=np.full(shape, 2 * abs(lines[row] - middle)),
             )
         )  # fmt: skip
-    share = (place[2] - upper) / (lower - upper)
-    return float((1 - share) * felt[0] + share * felt[1])
+    fraction = (position[2] - upper) / (lower - upper)
+    return float((1 - fraction) * felt[0] + fraction * felt[1])

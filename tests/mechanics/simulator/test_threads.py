@@ -41,8 +41,8 @@ def write_results(threads: int, path: str) -> None:
     """Write an operator, readings of random frames and the pressure under a sphere to an .npz file."""
     torch.set_num_threads(threads)
     body = Sheet((0.16, 0.16), (CELLS, CELLS), LAYERS)
-    places = np.random.default_rng(0).uniform(0.02, 0.14, (25, 2))
-    sensors = Sensors(np.column_stack([places, np.full(25, 0.005)]), (0.01, 0.01))
+    positions = np.random.default_rng(0).uniform(0.02, 0.14, (25, 2))
+    sensors = Sensors(np.column_stack([positions, np.full(25, 0.005)]), (0.01, 0.01))
     mesh = build_mesh(body, 2, {})
     operator = Elastic(mesh).transfer(reading_rows(mesh, sensors))
     frames = torch.rand(20000, *body.shape, generator=torch.Generator().manual_seed(0))

@@ -26,7 +26,7 @@ def model(untrained, configured, tmp_path_factory):
     of = untrained("representation=readings", "model=mlp", "fusion=early")
     skin = describe_skin(settings_of(configured("simulator=naive", *SIZES)), of.positions)
     path = tmp_path_factory.mktemp("identity") / "skin.onnx"
-    module = of.learner.pipeline(of.places)
+    module = of.learner.pipeline(of.positions)
     metadata = replace(of.describe(), skin=skin)
     write_model(module, metadata, of.device.touches("train")[:20], path)
     return path
@@ -66,7 +66,7 @@ def test_what_agrees_or_belongs_to_the_command_is_accepted(model, overrides):
 
 def test_the_same_positions_are_accepted_from_a_file(model, tmp_path, untrained):
     positions = untrained("representation=readings", "model=mlp", "fusion=early").positions
-    lines = [",".join(f"{value:.9f}" for value in place) for place in positions.tolist()]
+    lines = [",".join(f"{value:.9f}" for value in position) for position in positions.tolist()]
     path = tmp_path / "six.csv"
     path.write_text("\n".join(["x_m,y_m,depth_m", *lines]))
     with initialize_config_dir(str(CONF), version_base="1.3"):

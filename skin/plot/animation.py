@@ -29,7 +29,7 @@ from skin.plot.plot3d import (
     beside_traces,
     draw_surface,
     draw_traces,
-    positions,
+    sensor_points,
     sensors_in_space,
     skin_in_space,
     surface_motion,
@@ -136,7 +136,7 @@ def _flat(figure: Figure, scene: Scene) -> Draw:
     )
     figure.colorbar(picture, ax=left, label=what, shrink=0.8)
     dots = left.scatter(
-        *positions(scene, 0),
+        *sensor_points(scene, 0),
         s=60,
         cmap=FORCE,
         norm=Normalize(0, scene.strongest),
@@ -151,7 +151,7 @@ def _flat(figure: Figure, scene: Scene) -> Draw:
     def draw(frame: int) -> None:
         picture.set_data(movie[frame])
         dots.set_array(scene.readings[frame])
-        where = positions(scene, frame)
+        where = sensor_points(scene, frame)
         dots.set_offsets(where.T)
         for number, x, y, reading in zip(numbers, *where, scene.readings[frame], strict=False):
             number.set_position((x, y - 0.03 * scene.extent[2]))
@@ -178,7 +178,7 @@ def _bars(axis: Axes3D, scene: Scene) -> Draw:
 
     def draw(frame: int) -> None:
         height = np.maximum(scene.readings[frame], 0)
-        x, y = positions(scene, frame)
+        x, y = sensor_points(scene, frame)
         colours = colormaps[FORCE](colour(height))
         axis.bar3d(x - width / 2, y - width / 2, 0, width, width, height, color=colours)
 

@@ -92,7 +92,7 @@ def draw_traces(axis: Axes, scene: Scene) -> Draw:
     return draw
 
 
-def positions(scene: Scene, frame: int) -> np.ndarray:
+def sensor_points(scene: Scene, frame: int) -> np.ndarray:
     """Return where the sensors are, x and y, (2, S), mm."""
     return 1e3 * scene.positions[frame, :, :2].T
 

@@ -88,7 +88,7 @@ def test_names_are_resolved_only_inside_the_package(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("value", ["${oc.env:HOME}", "x${row}", "\\${row}"])
-@pytest.mark.parametrize("place", [lambda value: {"a": [{"b": value}]}, lambda value: {"a": {value: 1}}])
+@pytest.mark.parametrize("position", [lambda value: {"a": [{"b": value}]}, lambda value: {"a": {value: 1}}])
 def test_values_are_final(position, value):
     with pytest.raises(InputError, match="interpolation"):
         check_targets(position(value), "a run")

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from hydra import compose, initialize_config_dir
 from PIL import Image
-from skin.design.position import Place
 
 from skin.body.base import Sheet
 from skin.body.layout import File
 from skin.core.files import CONF
+from skin.design.place import Place
 from skin.errors import InputError
 from skin.runs.build import build_device, build_skin
 from skin.runs.configuration import validate_config

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 import torch
-from skin.design.position import reading_covariance
 
 from skin.body.base import Sensors
 from skin.core.rng import Stream, generator
+from skin.design.place import reading_covariance
 from skin.runs.build import build_device
 from skin.touch.sampler import balanced
 

@@ -181,7 +181,7 @@ def test_numbers_of_any_unit_are_standardised():
     torch.testing.assert_close(scaled, network(Frames(x, None, summary)), rtol=1e-3, atol=1e-3)
 
 
-@pytest.mark.parametrize(("step", "share"), [(0, 0.04), (19, 1.0), (99, 0.0)])
+@pytest.mark.parametrize(("step", "fraction"), [(0, 0.04), (19, 1.0), (99, 0.0)])
 def test_the_learning_rate_rises_and_falls(step, fraction):
     training = Training(classifier(), torch.optim.Adam, warmup=0.2)
     training._trainer = type("Trainer", (), {"estimated_stepping_batches": 100})()

@@ -180,7 +180,7 @@ def overlapping(fraction):
     return replace(settings(), presses=presses)
 
 
-@pytest.mark.parametrize("share", [0.04, 0.2])
+@pytest.mark.parametrize("fraction", [0.04, 0.2])
 def test_a_wire_that_breaks_to_its_rest_value(fraction):
     touches = [(8, 18, 4, 6.0), (8, 18, 3, 6.0 * fraction), (8, 18, 5, 6.0 * fraction)]
     values = force(24, *touches)

@@ -212,7 +212,7 @@ def test_help_and_mistakes_wait_for_no_heavy_import(argument, code):
     assert train(argument, code=LIGHT).stdout.splitlines()[-1] == f"exit {code}"
 
 
-@pytest.mark.parametrize(("verb", "least"), [("listen", 1), ("emulate", 7), ("evaluate", 11)])
+@pytest.mark.parametrize(("verb", "minimum"), [("listen", 1), ("emulate", 7), ("evaluate", 11)])
 def test_a_verb_composes_only_what_it_needs(verb, minimum):
     with initialize_config_dir(str(CONF), version_base="1.3"):
         config = compose(verb)

@@ -12,7 +12,7 @@ def test_it_comes_back():
     assert parse_announcement(encode_announcement(SAID).rstrip(b"\n")) == SAID
 
 
-@pytest.mark.parametrize("place", range(len(encode_announcement(SAID)) - 1))
+@pytest.mark.parametrize("position", range(len(encode_announcement(SAID)) - 1))
 def test_a_changed_byte_is_noticed(position):
     line = bytearray(encode_announcement(SAID).rstrip(b"\n"))
     line[position] ^= 1

@@ -80,7 +80,7 @@ def corrupted(line, rng):
     return bytes(data) + b"\n"
 
 
-@pytest.mark.parametrize(("check", "most"), [("crc16", 0.001), ("xor", 0.1), ("none", 0.9)])
+@pytest.mark.parametrize(("check", "maximum"), [("crc16", 0.001), ("xor", 0.1), ("none", 0.9)])
 def test_how_many_wrong_values_pass_each_checksum(check, maximum):
     rng, wrong, count = np.random.default_rng(5), 0, 3000
     decoder = Decoder(16)

@@ -208,7 +208,7 @@ def test_rounding_decides_nothing(wanted):
     assert forces[4:] == pytest.approx([forces[-1]] * 12, rel=1e-4)
 
 
-@pytest.mark.parametrize("most", [82.7e3, 83.2e3, 83.4e3])
+@pytest.mark.parametrize("maximum", [82.7e3, 83.2e3, 83.4e3])
 def test_the_end_of_a_range_is_tried_itself(maximum):
     """The ball is big from 82.5 kPa on: wherever the search begins, it must not stop a little below that."""
     where, contact = problem(shapes=["blurred_disc"]), rigid(relief=0.002)

@@ -85,7 +85,7 @@ def test_without_its_environment_it_says_what_builds_it(monkeypatch, data, tmp_p
 
 
 def test_labels_that_it_cannot_learn_are_refused(own_python, data, monkeypatch):
-    monkeypatch.setattr(data.device, "task", TOUCH_SLIDING)
+    monkeypatch.setattr(data, "task", TOUCH_SLIDING)
     with pytest.raises(InputError, match="leave out"):
         Rocket().check(data)
 

@@ -41,7 +41,7 @@ def test_the_settings_build_the_same_skin(body, layout):
 
 def test_names_and_files_are_options():
     config = with_skin(Config(), "arm", "sensors.csv")
-    assert config.body["_target_"] == "skin.body.base.Arm"
+    assert config.body["_target_"] == "skin.body.arm.Arm"
     assert config.layout == {
         "_target_": "skin.body.layout.File", "_convert_": "all", "path": "sensors.csv",
         "footprint": [0.01, 0.01], "depth": None,

@@ -19,7 +19,7 @@ class Thing:
         self,
         made: Callable[..., Any],
         count: Annotated[int, Ge(1)] = 1,
-        fraction: float = 0.5,
+        share: float = 0.5,
         width: Annotated[float, Gt(0)] | None = None,
         kind: Literal["a", "b"] = "a",
         widths: Sequence[int] = (),

@@ -194,7 +194,7 @@ def test_one_window_a_list_and_touches_give_the_same(example):
     np.testing.assert_allclose(run.predict(readings[0]), probabilities[0], atol=1e-5)
     np.testing.assert_allclose(run.predict(readings.tolist()), probabilities, atol=1e-5)
     values = torch.from_numpy(readings).float()
-    touches = Touches(values.nan_to_num(), ~values.isnan(), run.positions, None, run.rate)
+    touches = Touches(values.nan_to_num(), ~values.isnan(), run.sites, None, run.rate)
     tensor = run.predict(touches)
     assert isinstance(tensor, torch.Tensor)
     np.testing.assert_allclose(tensor.numpy(), probabilities, atol=1e-5)

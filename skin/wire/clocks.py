@@ -91,7 +91,7 @@ class FrameClock:
         self._frames = self._steps = 0
         self._doubtful_since: float | None = None
 
-    def position(
+    def place(
         self, seq: int | None, ticks: float | None, now: float, missing: int = 0, rate: float | None = None
     ) -> FramePosition:
         """Return the position of a frame.

@@ -301,7 +301,7 @@ class Decoder:
         stats, clock, header = self.stats, self._clock, self.stats.header
         rate = None if header is None else header.rate
         self._clocked = raw.ticks is not None and clock.trusted
-        t, t_host, segment, lost, after = clock.position(raw.seq, raw.ticks, now, self._missing, rate)
+        t, t_host, segment, lost, after = clock.place(raw.seq, raw.ticks, now, self._missing, rate)
         stats.frames += 1
         stats.resyncs += self._missing > 0
         stats.lost += lost

@@ -58,7 +58,7 @@ def skins(tmp_path_factory):
 
 def session_of(skin: Simulated, places: np.ndarray | None = None, bits: int | None = None) -> BenchSession:
     randomness = np.random.default_rng(0)
-    places = PROTOCOL.places(skin, randomness) if places is None else places
+    places = PROTOCOL.positions(skin, randomness) if places is None else places
     return emulate_session(skin, PROTOCOL.gauge(places), PROTOCOL, randomness, bits)
 
 

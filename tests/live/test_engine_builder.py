@@ -62,7 +62,7 @@ def model(trained, tmp_path_factory):
     """Return the file of the network."""
     of, known = trained
     path = tmp_path_factory.mktemp("model") / "skin.onnx"
-    write_model(of.learner.pipeline(of.positions), of.describe(), known, path)
+    write_model(of.learner.pipeline(of.sites), of.describe(), known, path)
     return path
 
 
@@ -126,7 +126,7 @@ def with_thresholds(request, trained, tmp_path_factory):
     """Return the file of a network with thresholds for rates or without, and the one at 100 Hz."""
     of, touches = trained
     path = tmp_path_factory.mktemp("thresholds") / "skin.onnx"
-    write_model(of.learner.pipeline(of.positions), of.describe(request.param), touches, path)
+    write_model(of.learner.pipeline(of.sites), of.describe(request.param), touches, path)
     return path, (request.param or {"100": 0.25})["100"]
 
 

@@ -39,6 +39,6 @@ def exported(untrained, shared) -> tuple[TorchModel, Path]:
         if not path.exists():
             path.parent.mkdir(exist_ok=True)
             new = path.with_name("new.onnx")
-            write_model(of.learner.pipeline(of.positions), of.describe(), of.device.touches("train"), new)
+            write_model(of.learner.pipeline(of.sites), of.describe(), of.device.touches("train"), new)
             new.rename(path)
     return of, path

@@ -26,7 +26,7 @@ def model(untrained, configured, tmp_path_factory):
     of = untrained("representation=readings", "model=mlp", "fusion=early")
     skin = describe_skin(settings_of(configured("simulator=naive", *SIZES)), of.positions)
     path = tmp_path_factory.mktemp("identity") / "skin.onnx"
-    module = of.learner.pipeline(of.positions)
+    module = of.learner.pipeline(of.sites)
     metadata = replace(of.describe(), skin=skin)
     write_model(module, metadata, of.device.touches("train")[:20], path)
     return path

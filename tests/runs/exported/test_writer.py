@@ -15,7 +15,7 @@ from skin.runs.onnx_writer import TOLERANCE, write_model
 
 
 def difference(of, path, readings, valid):
-    expected = of.learner.probabilities(Touches(readings, valid, of.positions, None, of.rate))
+    expected = of.learner.probabilities(Touches(readings, valid, of.sites, None, of.rate))
     found = OnnxModel(path).probabilities(readings.numpy(), valid.numpy())
     assert found.shape == tuple(expected.shape)
     return float(np.abs(found - expected.numpy()).max())
@@ -66,7 +66,7 @@ def test_other_networks(untrained, tmp_path, overrides):
     of = untrained(*overrides)
     described = of.describe()
     touches = of.device.touches("train")
-    found = write_model(of.learner.pipeline(of.positions), described, touches, tmp_path / "skin.onnx")
+    found = write_model(of.learner.pipeline(of.sites), described, touches, tmp_path / "skin.onnx")
     assert found <= TOLERANCE
 
 
@@ -78,8 +78,8 @@ def test_a_learner_that_is_no_network_is_refused():
 def test_a_graph_per_frame_is_refused_and_nothing_is_written(untrained, tmp_path):
     of = untrained("experiment=sequence_graph")
     described, touches = of.describe(), of.device.touches("test")[:9]
-    pipeline = of.learner.pipeline(of.positions)
-    pipeline.representation = Graph(of.positions, of.device.size, positions="deformed")
+    pipeline = of.learner.pipeline(of.sites)
+    pipeline.representation = Graph(of.sites, of.device.size, positions="deformed")
     with pytest.raises(InputError, match="needs touches with displacements"):
         write_model(pipeline, described, touches, tmp_path / "x.onnx")
     assert not list(tmp_path.iterdir())

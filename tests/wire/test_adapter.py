@@ -87,7 +87,7 @@ def test_lines_that_do_not_match_are_shown_with_the_field_that_failed():
 @pytest.mark.parametrize(("frames", "rate", "witness"), [(200, None, "host"), (20, 100.0, "rate")])
 def test_the_unit_of_a_clock_follows_from_the_host_or_the_header(frames, rate, witness):
     clock = FrameClock()
-    placed = [clock.position(n, 10 * n, n / 100, rate=rate) for n in range(frames)]
+    placed = [clock.place(n, 10 * n, n / 100, rate=rate) for n in range(frames)]
     assert [position.after for position in placed].count("reset") == 1
     assert (clock.unit, clock.witness) == (1e-3, witness)
     assert np.diff([position.t for position in placed[-5:]]) == pytest.approx(0.01)
@@ -98,7 +98,7 @@ def test_where_the_unit_contradicts_the_hosts_clock_that_rules(fixed, arrival, r
     """The user set the unit; or the header says 100 Hz, but the host sees 0.1 Hz of the same clock."""
     clock, stopped = FrameClock(1e-6, fixed), []
     for n in range(400):
-        clock.position(n, 10 * n, arrival * n, rate=rate)
+        clock.place(n, 10 * n, arrival * n, rate=rate)
         stopped.append(clock.judge(arrival * n))
     assert not fixed or clock.unit == 1e-6
     assert stopped.count(True) == 1
@@ -111,7 +111,7 @@ def test_where_the_unit_contradicts_the_hosts_clock_that_rules(fixed, arrival, r
 def test_a_counter_wraps_at_any_modulus_and_losses_are_counted(modulus, clocked):
     clock = FrameClock()
     sent = [n for n in range(5 * modulus) if n % 91 != 17]
-    placed = [clock.position(n % modulus, 10_000 * n if clocked else None, n / 100) for n in sent]
+    placed = [clock.place(n % modulus, 10_000 * n if clocked else None, n / 100) for n in sent]
     resets = sum(position.after == "reset" for position in placed)
     if clocked:
         lost = sum(position.lost for position in placed)
@@ -124,9 +124,9 @@ def test_a_counter_wraps_at_any_modulus_and_losses_are_counted(modulus, clocked)
 def test_a_restart_is_no_wrap():
     clock = FrameClock()
     for n in range(300):
-        clock.position(n, 10_000.0 * n, n / 100)
-    assert clock.position(0, 10_000.0 * 400, 4.0).after == "reset"  # the counter after a pause
-    assert clock.position(1, 0.0, 4.1).after == "reset"  # the clock
+        clock.place(n, 10_000.0 * n, n / 100)
+    assert clock.place(0, 10_000.0 * 400, 4.0).after == "reset"  # the counter after a pause
+    assert clock.place(1, 0.0, 4.1).after == "reset"  # the clock
 
 
 def cut(data, cuts):

@@ -1,4 +1,4 @@
-"""The threshold of the alarm "dangerous": the one position where it is chosen.
+"""The threshold of the alarm "dangerous": the one place where it is chosen.
 
 :func:`choose_alarm_threshold` is called once by each command. torch is imported only where touches decide.
 

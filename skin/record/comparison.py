@@ -4,7 +4,6 @@ A session of ``skin record`` holds gestures, one of a bench holds presses. Both 
 simulated and what was measured, with one page and one figure.
 """
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
@@ -32,8 +31,7 @@ from skin.device.resampling import resample
 from skin.device.touches import Touches
 from skin.errors import InputError
 from skin.plot.figures import COLOURS, save_figure
-from skin.record.recorder import check_session
-from skin.record.session import read_session
+from skin.record.session import check_session, read_session
 from skin.touch.labels import TOUCH
 from skin.wire.emulator import Gesture, emulated_gestures, gestures_with_labels
 from skin.wire.segmentation import label_text
@@ -156,7 +154,7 @@ def compare_session(
     Raises:
         InputError: files that cannot be used, or that do not fit each other.
     """
-    if presses is None and holds_gestures(path):
+    if presses is None and Path(path).expanduser().is_dir():
         return compare_gestures(device, path, settings["seed"])
     shape = settings["indenter"], settings["radius"]
     scales = {name: settings[name] for name in ("force_scale", "time_scale")}
@@ -171,16 +169,6 @@ def compare_session(
     return compare_presses(device, build_bench_data(device, session, rows), settings["scale"])
 
 
-def holds_gestures(path: str) -> bool:
-    """Return whether a session marks gestures, as those of skin record do."""
-    beside = Path(path).expanduser().with_name(Path(path).name + ".json")
-    try:
-        about = json.loads(beside.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError):
-        return False
-    return isinstance(about, dict) and "window" in about
-
-
 def compare_gestures(device: AbstractSimulated, path: str, seed: int) -> SessionComparison:
     """Return the gestures of a session beside their simulation.
 
@@ -189,7 +177,7 @@ def compare_gestures(device: AbstractSimulated, path: str, seed: int) -> Session
 
     Args:
         device: with its imperfections, or its calibration.
-        path: x.csv of skin record.
+        path: folder of skin record.
         seed: of the emulator, or of the gestures of the same labels.
 
     Raises:
@@ -197,11 +185,11 @@ def compare_gestures(device: AbstractSimulated, path: str, seed: int) -> Session
     """
     stored = read_session(Path(path).expanduser())
     now = {"positions": device.sensors.positions.tolist(), "window": device.window, "rate": device.model_rate}
-    check_session(Path(path), stored.about, now)
+    check_session(Path(path), stored.metadata, now)
     takes = [entry for _, entry in sorted(stored.gestures.items()) if entry[0].labels is not None]
     if not takes:
         raise InputError(f"{path} has no gesture with labels: record it with device.labels=prompted")
-    same = stored.about.get("labels") == "announced"
+    same = stored.metadata.get("labels") == "announced"
     numbers, labels = [take.number for take, _ in takes], [dict(take.labels or {}) for take, _ in takes]
     if same:
         played = list(islice(emulated_gestures(device, seed), max(numbers) + 1))

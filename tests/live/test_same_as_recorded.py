@@ -175,7 +175,7 @@ def recorded(learner, stream, path):
 def test_live_and_recorded_are_the_same_to_the_last_bit(learner, tmp_path, monkeypatch):
     monkeypatch.setattr(ClockWatch, "_SPAN", np.inf)  # the stream comes as fast as it is read
     said = live(learner, pieces())
-    touches, chances = recorded(learner, pieces(), tmp_path / "s.csv")
+    touches, chances = recorded(learner, pieces(), tmp_path / "s")
     assert len(touches) == GESTURES
     for gesture in range(GESTURES):
         last = IDLE + gesture * (LENGTH + 30) + LENGTH - 1

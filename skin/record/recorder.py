@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from skin.core.safe_loading import parse_json, read_file
+from skin.core.safe_loading import json_sum, parse_json, read_file
 from skin.device.files import write_recording
 from skin.device.resampling import After, Frame, Window
 from skin.device.touches import concatenate
@@ -174,8 +174,8 @@ def convert_old_session(path: Path, folder: Path) -> str:
     try:
         metadata = parse_json(read_file(path.with_name(path.name + ".json")))
         lines = read_file(path).decode("ascii", "replace").split("\n")[1:-1]
-        if metadata.pop("sum") and metadata["format"] != 2:
-            raise ValueError("its format is not 2")
+        if metadata.pop("sum") != json_sum(metadata) or metadata["format"] != 2:
+            raise ValueError("checksum or format beside it are others")
         with TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent) as parent:
             old = _OldSession(SessionLog(Path(parent) / folder.name, metadata | {"format": _FORMAT}))
             for line in lines:
@@ -250,9 +250,9 @@ class _OldSession:
                 self.begun.add(number)
                 gesture = RecordedGesture(number, content["labels"], content["time"], 0)
                 self._taken = gesture, self._conversions[content["meaning"]]
-                if "contacts" in content:
-                    gesture.contacts = np.full((self._window.frames, content["contacts"]["most"], 5), nan)
-                    for frame, place, *values in content["contacts"]["rows"]:
+                if contacts := content.get("contacts"):
+                    gesture.contacts = np.full((self._window.frames, contacts["most"], 5), nan)
+                    for frame, place, *values in contacts["rows"]:
                         gesture.contacts[frame, place] = values
             case "end":
                 taken, self._taken = self._taken, None

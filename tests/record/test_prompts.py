@@ -94,6 +94,16 @@ def test_a_gesture_that_nobody_made_is_asked_for_again(recorded, tmp_path):
     assert sorted(read_session(tmp_path / "s").gestures) == [0, 1, 2]
 
 
+def test_frames_between_two_gestures_are_kept_however_many(recorded, tmp_path, monkeypatch):
+    monkeypatch.setattr("skin.record.recorder._MOST", 50)
+    recorded(2)
+    tables = read_session(tmp_path / "s").tables
+    rows = sorted((row for table in tables for row in table.to_pylist()), key=lambda row: row["time"])
+    assert len(tables) > 3
+    assert [row["seq"] for row in rows] == list(range(rows[0]["seq"], rows[0]["seq"] + len(rows)))
+    assert [sum(row["gesture"] == number for row in rows) for number in (0, 1)] == [100, 100]
+
+
 def test_a_prompt_for_no_touch_needs_none(recorded):
     plan = [list(one.values()) for one in label_plan(TOUCH_OR_NOT.names, 1, 0)]
     touches, said = recorded(16, stream=True)

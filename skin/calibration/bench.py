@@ -2,7 +2,7 @@
 
 import json
 import logging
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -17,6 +17,7 @@ from annotated_types import Ge, Le
 
 from skin.body.base import AbstractBody, require_memory
 from skin.core.files import tabular, whole, write
+from skin.core.safe_loading import read_parts
 from skin.core.settings import checked
 from skin.device.base import AbstractSimulated
 from skin.errors import InputError
@@ -25,8 +26,6 @@ from skin.touch.fingertips import half_extents, peak_per_newton
 from skin.touch.shapes import Shapes
 
 _KEY = b"skin_session"
-_RECORDED = b"time,seq,raw_"  # of skin record: all its columns are numbers
-_NUMBERS = b"0123456789+-.e,"
 _log = logging.getLogger(__name__)
 GAUGE = ("force", "x_m", "y_m", "indenter", "radius_m", "angle", "press")
 """Columns besides ``time``; the first three are required."""
@@ -34,34 +33,43 @@ _PAUSE = 1.0  # s without a row end a press
 _SLOWEST, _FASTEST = 1.0, 5000.0  # Hz of a bench's files
 _UNITS = {"ms": 1e-3, "microseconds": 1e-6, "minutes": 60.0, "ms in place of microseconds": 1e3}
 """Units that a time may have by mistake, in s."""
-_OTHER = ("time", "t_us", "seq", *GAUGE)
+_OTHER = ("time", "t_us", "seq", "gesture", *GAUGE)
 
 
 def load_table(path: str | Path, what: str) -> tuple[pa.Table, dict[str, Any]]:
     """Return a table and its metadata: JSON in the Parquet schema, or in ``x.csv.json`` beside a CSV.
 
-    Lines of a CSV that start with ``#`` are comments. Damaged lines of a session of skin record are
-    skipped, with a warning.
+    Lines of a CSV that start with ``#`` are comments. The folder of a session of skin record becomes the
+    table of its frames; damaged files are left out, with a warning.
 
     Raises:
-        InputError: no such file, another ending, unreadable, or no rows.
+        InputError: no such file, another ending, unreadable, no rows, or a session of an earlier version.
     """
-    path = tabular(path, f"a {what}")
-    if not path.is_file():
+    path = Path(path).expanduser()
+    if not path.is_dir():
+        path = tabular(path, f"a {what}")
+    if not path.exists():
         raise InputError(f"no {what} {path}")
     try:
-        if path.suffix == ".parquet":
+        if path.is_dir():
+            about, parts = read_parts(path)
+            table = _join(path, parts)
+        elif path.suffix == ".parquet":
             with pa.parquet.ParquetFile(path) as file:
                 size = 16.0 * file.metadata.num_rows * file.metadata.num_columns
                 require_memory(size, f"the {what} {path}", "give fewer rows")
                 table = file.read()
             about = json.loads((table.schema.metadata or {}).get(_KEY, b"{}"))
         else:
-            table = pa.csv.read_csv(pa.py_buffer(_rows(path)))
+            lines = path.read_bytes().removeprefix(b"\xef\xbb\xbf").splitlines()
+            rows = b"".join(line + b"\n" for line in lines if not line.startswith(b"#"))
+            table = pa.csv.read_csv(pa.py_buffer(rows))
             sidecar = path.with_name(path.name + ".json")
             about = json.loads(sidecar.read_text(encoding="utf-8")) if sidecar.is_file() else {}
         if not isinstance(about, dict):
             raise ValueError(f"its metadata are {about!r}, and must be an object, as in {{}}")
+        if path.suffix == ".csv" and "started_unix" in about:
+            raise ValueError(f"of an earlier version: skin convert from={path} out=FOLDER converts it")
         if not len(table):
             raise ValueError("it has no rows below its header")
     except InputError:
@@ -71,20 +79,12 @@ def load_table(path: str | Path, what: str) -> tuple[pa.Table, dict[str, Any]]:
     return table.rename_columns([name.strip() for name in table.column_names]), about
 
 
-def _rows(path: Path) -> bytes:
-    """Return a CSV without comments and, for sessions of skin record, without damaged lines."""
-    lines = path.read_bytes().removeprefix(b"\xef\xbb\xbf").splitlines()
-    rows = [(number, line) for number, line in enumerate(lines, 1) if not line.startswith(b"#")]
-    header = rows[0][1] if rows else b""
-    if header.startswith(_RECORDED):
-        columns = header.count(b",")
-        good = [
-            row for row in rows[1:] if not row[1].translate(None, _NUMBERS) and row[1].count(b",") == columns
-        ]
-        if damaged := [number for number, _ in sorted(set(rows[1:]) - set(good))]:
-            _log.warning("%s: %d damaged lines skipped, the first is line %d", path, len(damaged), damaged[0])
-        rows = [rows[0], *good]
-    return b"".join(line + b"\n" for _, line in rows)
+def _join(folder: Path, parts: Mapping[Path, pa.Table | None]) -> pa.Table:
+    """Return the frames in all intact files of a session of skin record."""
+    if damaged := [path.name for path, part in parts.items() if part is None]:
+        _log.warning("%s: damaged files are left out: %s", folder, ", ".join(damaged))
+    table = pa.concat_tables([part for part in parts.values() if part is not None]).sort_by("time")
+    return table.select([name for name in table.column_names if name in _OTHER or name.startswith("raw_")])
 
 
 def numbers(table: pa.Table, name: str, where: str) -> np.ndarray:
@@ -357,7 +357,7 @@ def read_bench_session(
     and bits may stand in the Parquet schema or in ``x.csv.json``: ``{"unit": "adc", "bits": 10}``.
 
     Args:
-        path: .csv or .parquet.
+        path: .csv or .parquet, or the folder of a session of skin record.
         indenter: of gauge rows without one.
         radius: m, of gauge rows without one.
         unit: ``N`` or ``adc``; None: the unit in the file, else N.

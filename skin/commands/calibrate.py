@@ -33,7 +33,7 @@ def main(
     if session is None:
         raise InputError("which session? add session=bench.csv, or try session=demo.csv calibrate.demo=true")
     files = [presses, None if calibrate["demo"] else session]
-    if missing := [name for name in files if name and not Path(name).expanduser().is_file()]:
+    if missing := [name for name in files if name and not Path(name).expanduser().exists()]:
         raise InputError(f"no file {missing[0]}: calibrate.demo=true makes a session without hardware")
     by_load = weight is not None or base is not None
     if by_load and presses is not None:

@@ -1,6 +1,6 @@
 """Compare a recorded session with its simulation.
 
-    skin compare session=session.csv
+    skin compare session=session
     skin compare session=bench.csv presses=gauge.csv run=latest
 
 The session holds gestures (of `skin record`) or presses of a bench. Writes compare.md and compare.png into
@@ -27,7 +27,7 @@ def main(
 ) -> None:
     """Simulate a session, compare readings and, with ``run=``, predictions; write a page."""
     if session is None:
-        raise InputError("which session? add session=session.csv, of skin record or a bench")
+        raise InputError("which session? add session=FOLDER of skin record, or bench.csv")
 
     from skin.record.comparison import compare_predictions, compare_session, publish_comparison
     from skin.runs.build import build_device

@@ -1,11 +1,14 @@
-"""Convert recordings of others, such as CSV files and spreadsheets, to a recording of this program.
+"""Convert recordings of others, such as CSV files and spreadsheets, to a recording; or a session to a table.
 
     skin convert from=map.yaml out=x.parquet
     skin convert reader=package.function path=FOLDER out=x.parquet
+    skin convert from=session out=x.csv
+    skin convert from=session.csv out=session
 
 A mapping file says what the columns are; a Python function reads everything else (docs/recordings.md).
 device=recording device.path=x.parquet trains on the result. The skin of the configuration matters only for a
-mapping with positions: layout.
+mapping with positions: layout. The third form writes time, number, raw values and gesture of the frames of a
+session (skin record) for a spreadsheet; the last one converts a session of an earlier version.
 """
 
 from collections.abc import Mapping
@@ -27,9 +30,22 @@ def main(
     path: str | None,
     out: str | None,
 ) -> None:
-    """Read the files of a mapping or by a function, and write one recording."""
+    """Read the files of a mapping or by a function, or a session, and write one file."""
     if (from_ is None) == (reader is None) or out is None:
         raise InputError("skin convert needs from= or reader=, and out=, as in from=map.yaml out=x.parquet")
+    session, target = Path(from_ or "map.yaml").expanduser(), Path(out).expanduser()
+    if (session / "about.json").is_file():
+        from skin.record.session import write_table
+
+        if target.suffix != ".csv":
+            raise InputError(f"the table of a session is a .csv file, got {out}: give out=x.csv")
+        print(f"{target}: {write_table(session, target)} frames")
+        return
+    if session.suffix == ".csv":
+        from skin.record.recorder import convert_old_session
+
+        print(convert_old_session(session, target))
+        return
     file = tabular(out, "a recording")
 
     from skin.device.conversion import convert_files, read_by_function, summarise_conversion

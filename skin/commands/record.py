@@ -1,9 +1,9 @@
 """Record touches of a skin at a port.
 
-    skin record out=session.csv device.port=/dev/ttyACM0 device.scale=0.039
+    skin record out=session device.port=/dev/ttyACM0 device.scale=0.039
 
-Prompts for each gesture. Ctrl-C stops; the same command resumes. Writes session.parquet for device=recording;
-record.finish=true writes only that.
+Prompts for each gesture. Ctrl-C stops; the same command resumes. Writes a folder, and session.parquet for
+device=recording; record.finish=true writes only that.
 """
 
 from contextlib import suppress
@@ -18,8 +18,11 @@ from skin.runs.configuration import Config
 @command("record")
 def main(config: Config, out: str | None, seconds: float | None, record: dict[str, Any]) -> None:
     """Record raw frames to a session, then convert its gestures to a recording."""
-    if out is None or not out.endswith(".csv"):
-        raise InputError(f"a session is a .csv file, got {out}: add out=session.csv")
+    if out is None or Path(out).suffix in (".csv", ".parquet") or not Path(out).name:
+        raise InputError(
+            f"a session is a folder, got out={out}: give out=session, or convert a session of an earlier "
+            "version with skin convert from=session.csv out=session"
+        )
     if unknown := sorted(set(record) - {"free", "finish"}):
         raise InputError(f"record has no {unknown[0]}: it takes free, finish")
 

@@ -7,7 +7,7 @@ import re
 import stat
 import zipfile
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +16,8 @@ import psutil
 import yaml
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
+
+from skin.core.files import json_line
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -230,6 +232,39 @@ def write_parquet(table: "pa.Table", path: Path, **settings: Any) -> None:
         writer.write_table(table)
         writer.add_key_value_metadata({KEY: BLANK})
     seal(path)
+
+
+def json_sum(content: Any) -> str:
+    """Return the checksum of JSON data, whatever their spacing and order."""
+    return sha256(json_line(content, sort_keys=True).encode())
+
+
+def read_parts(folder: Path) -> "tuple[dict[str, Any], dict[Path, pa.Table | None]]":
+    """Read a folder of Parquet files of :func:`write_parquet`, in the order of their names.
+
+    Returns:
+        Metadata of ``about.json``, and the table of each file; None where the file is damaged, unreadable or
+        has no checksum.
+
+    Raises:
+        ValueError: ``about.json``, which has its :func:`json_sum` under ``sum``, is damaged.
+        OSError: it cannot be read.
+    """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    metadata = parse_json(read_file(folder / "about.json"))
+    if not isinstance(metadata, dict) or metadata.pop("sum", "") != json_sum(metadata):
+        raise ValueError("the checksum of about.json is not that of its content")
+    parts: dict[Path, pa.Table | None] = {}
+    for path in sorted(folder.glob("[!.]*.parquet")):
+        parts[path] = None
+        with suppress(OSError, ValueError):
+            content = read_file(path)
+            if KEY.encode() in content:
+                check_content(content)
+                parts[path] = pq.read_table(pa.BufferReader(content), page_checksum_verification=True)
+    return metadata, parts
 
 
 def seal(path: Path) -> None:

@@ -4,7 +4,6 @@ A session of ``skin record`` holds gestures, one of a bench holds presses. Both 
 simulated and what was measured, with one page and one figure.
 """
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
@@ -32,8 +31,7 @@ from skin.device.resampling import resample
 from skin.device.touches import Touches
 from skin.errors import InputError
 from skin.plot.figures import COLOURS, save_figure
-from skin.record.recorder import check_session
-from skin.record.session import read_session
+from skin.record.session import check_session, read_session
 from skin.runs.configuration import Config
 from skin.touch.labels import TOUCH
 from skin.wire.emulator import Gesture, emulated_gestures, gestures_with_labels
@@ -79,9 +77,8 @@ class Pair:
     @property
     def peaks(self) -> tuple[float, float]:
         """Largest reading, simulated and measured, N: of ``sensor`` for a press, else of any sensor."""
-        answering = self.valid.copy()
-        if self.labels is None:
-            answering[:, np.arange(answering.shape[1]) != self.sensor] = False
+        others = self.labels is not None or np.arange(self.valid.shape[1]) == self.sensor
+        answering = self.valid & others
         return float(self.simulated[answering].max()), float(self.measured[answering].max())
 
     @property
@@ -92,8 +89,7 @@ class Pair:
     @property
     def slope(self) -> float:
         """Measured over simulated readings of ``sensor``, through 0."""
-        frames = self.valid[:, self.sensor]
-        x, y = self.simulated[frames, self.sensor], self.measured[frames, self.sensor]
+        x, y = (side[:, self.sensor][self.valid[:, self.sensor]] for side in (self.simulated, self.measured))
         return float(x @ y / (x @ x))
 
 
@@ -132,14 +128,13 @@ class Agreement:
     def lines(self, things: str) -> list[str]:
         """Return how often the run says the same of both sides, and how often what is true."""
         lines = []
-        for number, name in enumerate(self.names):
-            sides = self.simulated[:, number], self.measured[:, number]
-            same = int((sides[0] == sides[1]).sum())
-            line = f"- the run says the same of `{name}` on {same} of {len(sides[0])} {things}"
-            if self.truth is not None:
-                right = [int((side == self.truth[:, number]).sum()) for side in sides]
-                line += f", and is right on {right[0]} simulated and {right[1]} recorded ones"
-            lines.append(line)
+        truth = [None] * len(self.names) if self.truth is None else self.truth.T
+        for name, *sides, right in zip(self.names, self.simulated.T, self.measured.T, truth, strict=True):
+            same = (sides[0] == sides[1]).sum()
+            lines.append(f"- the run says the same of `{name}` on {same} of {len(sides[0])} {things}")
+            if right is not None:
+                first, second = ((side == right).sum() for side in sides)
+                lines[-1] += f", and is right on {first} simulated and {second} recorded ones"
         return lines
 
 
@@ -157,11 +152,10 @@ def compare_session(
     Raises:
         InputError: files that cannot be used, or that do not fit each other.
     """
-    if presses is None and holds_gestures(path):
+    if presses is None and Path(path).expanduser().is_dir():
         return compare_gestures(device, path, settings["seed"])
-    shape = settings["indenter"], settings["radius"]
-    scales = {name: settings[name] for name in ("force_scale", "time_scale")}
-    units = configured(Units, scales | {"command": "compare"}, "compare")
+    shape, scales = (settings["indenter"], settings["radius"]), ("force_scale", "time_scale")
+    units = configured(Units, {name: settings[name] for name in scales} | {"command": "compare"}, "compare")
     session = read_bench_session(path, *shape, settings["unit"], units)
     calibration = device.imperfection.calibration
     if calibration is not None and calibration.channels and session.channels is None:
@@ -201,16 +195,6 @@ def compare_predictions(
     return Agreement(device.task.names, simulated, measured, truth if labels else None)
 
 
-def holds_gestures(path: str) -> bool:
-    """Return whether a session marks gestures, as those of skin record do."""
-    beside = Path(path).expanduser().with_name(Path(path).name + ".json")
-    try:
-        about = json.loads(beside.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError):
-        return False
-    return isinstance(about, dict) and "window" in about
-
-
 def compare_gestures(device: AbstractSimulated, path: str, seed: int) -> SessionComparison:
     """Return the gestures of a session beside their simulation.
 
@@ -219,7 +203,7 @@ def compare_gestures(device: AbstractSimulated, path: str, seed: int) -> Session
 
     Args:
         device: with its imperfections, or its calibration.
-        path: x.csv of skin record.
+        path: folder of skin record.
         seed: of the emulator, or of the gestures of the same labels.
 
     Raises:
@@ -227,11 +211,11 @@ def compare_gestures(device: AbstractSimulated, path: str, seed: int) -> Session
     """
     stored = read_session(Path(path).expanduser())
     now = {"positions": device.sensors.positions.tolist(), "window": device.window, "rate": device.model_rate}
-    check_session(Path(path), stored.about, now)
+    check_session(Path(path), stored.metadata, now)
     takes = [entry for _, entry in sorted(stored.gestures.items()) if entry[0].labels is not None]
     if not takes:
         raise InputError(f"{path} has no gesture with labels: record it with device.labels=prompted")
-    same = stored.about.get("labels") == "announced"
+    same = stored.metadata.get("labels") == "announced"
     numbers, labels = [take.number for take, _ in takes], [dict(take.labels or {}) for take, _ in takes]
     if same:
         played = list(islice(emulated_gestures(device, seed), max(numbers) + 1))
@@ -246,33 +230,29 @@ def compare_gestures(device: AbstractSimulated, path: str, seed: int) -> Session
     else:
         rows = np.array([[row[name] for name in TOUCH.names] for row in labels])
         gestures = gestures_with_labels(device, rows, seed)
-    working = ~device.constants.dead.numpy()
-    pairs = []
+    working, pairs = ~device.constants.dead.numpy(), []
     for simulated, gesture, (take, conversion) in zip(
         _simulate_readings(device, gestures), gestures, takes, strict=True
     ):
-        if take.resampled is None:
-            continue
-        values, valid = conversion(take.resampled.values, take.resampled.valid)
-        valid = valid & working
+        assert take.resampled is not None  # of a stored gesture
+        values, valid = conversion(take.resampled.values, take.resampled.valid & working)
         if valid.any() and simulated.any():
             time = np.arange(len(simulated)) / device.model_rate
             measured = np.where(valid, values.astype(float), np.nan)
-            prompt = dict(take.labels or {})
-            pairs.append(Pair(take.number, prompt, time, gesture.applied, simulated, measured, valid))
+            pairs.append(Pair(take.number, take.labels, time, gesture.applied, simulated, measured, valid))
     if not pairs:
         raise InputError(f"{path} has no gesture with a sensor response: record more, or check the wiring")
     simulated, measured, valid = (
         np.stack([getattr(pair, name) for pair in pairs]) for name in ("simulated", "measured", "valid")
     )
-    touches = _touches(device, simulated, valid), _touches(device, measured, valid)
-    return SessionComparison("gestures", same, pairs, touches)
+    sides = _touches(device, simulated, valid), _touches(device, measured, valid)
+    return SessionComparison("gestures", same, pairs, sides)
 
 
 def _simulate_readings(device: AbstractSimulated, gestures: Sequence[Gesture]) -> np.ndarray:
     """Return what a device reads in gestures above what it reads before them, (B, T, S), N."""
-    true = torch.from_numpy(np.stack([gesture.force for gesture in gestures])).float()
-    true = torch.nn.functional.pad(true, (0, 0, _IDLE, 0))
+    force = np.stack([gesture.force for gesture in gestures])
+    true = torch.from_numpy(np.pad(force, ((0, 0), (_IDLE, 0), (0, 0)))).float()
     noise = generator(Stream.NOISE, device.seed, Stream.TEST, 6)
     readings = device.imperfection.raw(true, device.constants, noise).double()
     return (readings[:, _IDLE:] - readings[:, :_IDLE].median(dim=1, keepdim=True).values).numpy()
@@ -290,42 +270,33 @@ def compare_presses(device: AbstractSimulated, bench: BenchData, scale: float | 
         InputError: nobody knows what a count is worth, or no press has frames.
     """
     session, calibration = bench.session, device.imperfection.calibration
-    if scale is None and calibration is not None and session.unit != "N":
-        scale = calibration.scale
-    if scale is None and session.unit != "N":
+    if scale is None:
+        scale = 1.0 if session.unit == "N" else getattr(calibration, "scale", None)
+    if scale is None:
         raise InputError(
             "the session is in counts: give device.calibration=FILE.yaml, or compare.scale=0.039"
         )
     noise = generator(Stream.NOISE, device.seed, Stream.TEST, 4)
     true, time = torch.from_numpy(bench.true)[None].float(), torch.from_numpy(session.time).float()
     simulated = device.imperfection.raw(true, device.constants, noise, time)[0].double().numpy()
-    signs = 1.0 if calibration is None else calibration.signs
-    measured = session.raw * ((1.0 if scale is None else scale) * signs)
+    measured = session.raw * (scale * (1.0 if calibration is None else calibration.signs))
     working = ~device.constants.dead.numpy() & np.isfinite(measured[bench.idle]).any(axis=0)
     simulated, measured = (_subtract_idle(side, bench.idle) for side in (simulated, measured))
     valid = np.isfinite(measured) & working
-    pairs = [
-        pair
-        for number in range(len(bench.gauge))
-        if (pair := _cut_press(bench, simulated, measured, valid, number))
-    ]
+    cut = [_cut_press(bench, simulated, measured, valid, number) for number in range(len(bench.gauge))]
+    pairs = [pair for pair in cut if pair is not None]
     if not pairs:
         raise InputError("no press has frames in the session: check the clocks, see compare.delay")
     begins = [bench.gauge.time[bench.gauge.first[pair.number]] for pair in pairs]
-    contacts = torch.from_numpy(_contacts(device, bench, begins)).float()
-    sides = (
-        _resample(device, session.time, simulated, np.isfinite(simulated) & working, begins),
-        _resample(device, session.time, measured, valid, begins),
-    )
-    simulation, recording = (replace(side, contacts=contacts) for side in sides)
-    return SessionComparison("presses", True, pairs, (simulation, recording))
-
-
-def _contacts(device: AbstractSimulated, bench: BenchData, begins: list[float]) -> np.ndarray:
-    """Return the contacts in the middle of each frame of the model, from the beginning of each press."""
+    # In the middle of each frame of the model.
     middles = (np.arange(device.window) + 0.5) / device.model_rate
     peaks = pressed_peaks(device.body, bench.gauge)
-    return np.stack([bench.gauge.contacts(begin + middles, peaks) for begin in begins])
+    rows = np.stack([bench.gauge.contacts(begin + middles, peaks) for begin in begins])
+    simulation, recording = (
+        replace(_resample(device, session.time, side, mask, begins), contacts=torch.from_numpy(rows).float())
+        for side, mask in ((simulated, np.isfinite(simulated) & working), (measured, valid))
+    )
+    return SessionComparison("presses", True, pairs, (simulation, recording))
 
 
 def _subtract_idle(values: np.ndarray, idle: np.ndarray) -> np.ndarray:
@@ -361,9 +332,8 @@ def _resample(
 
 def _touches(device: AbstractSimulated, readings: np.ndarray, valid: np.ndarray) -> Touches:
     """Return readings (B, T, S), N, as a model sees them: 0 where not valid."""
-    clean = torch.from_numpy(np.where(valid, readings, 0.0)).float()
-    positions = torch.from_numpy(device.sensors.positions).float()
-    return Touches(clean, torch.from_numpy(valid), positions, None, device.model_rate)
+    clean, positions = map(torch.from_numpy, (np.where(valid, readings, 0.0), device.sensors.positions))
+    return Touches(clean.float(), torch.from_numpy(valid), positions.float(), None, device.model_rate)
 
 
 def comparison_markdown(comparison: SessionComparison, agreement: Agreement | None, about: str) -> str:
@@ -378,8 +348,13 @@ def comparison_markdown(comparison: SessionComparison, agreement: Agreement | No
     ratios = [pair.slope if same else pair.peaks[1] / pair.peaks[0] for pair in pairs]
     low, middle, high = np.percentile(ratios, [25, 50, 75])
     title = f"The same {things}" if same else f"{things.capitalize()} of the same labels"
-    lines = [f"# {title}, simulated and recorded", "", about, "", "![force and reading](compare.png)", ""]
-    lines += [
+    lines = [
+        f"# {title}, simulated and recorded",
+        "",
+        about,
+        "",
+        "![force and reading](compare.png)",
+        "",
         f"- {things}: {len(pairs)}",
         f"- gain ratio of {'readings' if same else 'largest readings'} (recorded over simulated), median: "
         f"{middle:.3f}, middle half {low:.3f} to {high:.3f}",

@@ -1,288 +1,42 @@
 """Record a session gesture by gesture, and convert it to a recording."""
 
 import logging
-import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+import zlib
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
+from math import nan
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from time import monotonic, time
 from typing import Any
 
 import numpy as np
-from filelock import FileLock, Timeout
 
-from skin.core import files
-from skin.core.files import unwritable
+from skin.core.safe_loading import json_sum, parse_json, read_file
 from skin.device.files import write_recording
-from skin.device.resampling import Frame
+from skin.device.resampling import After, Frame, Window
 from skin.device.touches import concatenate
 from skin.errors import InputError
 from skin.record.serial import Serial, warn_of_contacts
 from skin.record.session import (
+    BAD,
+    SessionLog,
     StoredSession,
-    describe_contacts,
-    encode_event,
-    line_sum,
+    Taken,
+    check_session,
+    decode_conversion,
+    locked,
     read_session,
-    write_about,
 )
 from skin.wire.channels import UnitConversion
 from skin.wire.protocol import Header
 from skin.wire.reader import SkinDisconnected, SkinTimeout
 from skin.wire.segmentation import ContinuousSegmenter, RecordedGesture
 
-try:
-    import fcntl
-except ModuleNotFoundError:  # Windows
-    fcntl = None  # type: ignore[assignment]
-
-
-class LineWriter:
-    """Appends lines to a file. A line that does not fit on the disk is removed completely.
-
-    The file itself is locked (not on Windows), because it may have another name, a hard link.
-
-    Args:
-        path: of an existing file.
-
-    Raises:
-        InputError: the file cannot be written, or another writer has it, whatever it calls it.
-    """
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        with _input_error(path):
-            # Windows would write two bytes for the end of a line.
-            self._file = os.open(path, os.O_WRONLY | os.O_APPEND | getattr(os, "O_BINARY", 0))
-            self._size = os.fstat(self._file).st_size
-        if fcntl is not None:
-            try:
-                fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError as error:
-                os.close(self._file)
-                raise _busy(path) from error
-
-    def cut(self, size: int) -> None:
-        """Remove what is after the first ``size`` bytes; InputError as below."""
-        with _input_error(self._path):
-            os.ftruncate(self._file, size)
-        self._size = size
-
-    def add(self, text: str) -> None:
-        """Add a line.
-
-        Raises:
-            InputError: the disk is full or fails; the file then ends with the previous line.
-        """
-        unwritten = data = text.encode() + b"\n"
-        with _input_error(self._path):
-            try:
-                # Usually one call, so that a killed program has written all of a line or nothing. A nearly
-                # full disk accepts a part.
-                while unwritten:
-                    unwritten = unwritten[os.write(self._file, unwritten) :]
-            except OSError:
-                with suppress(OSError):
-                    os.ftruncate(self._file, self._size)
-                raise
-        self._size += len(data)
-
-    def sync(self) -> None:
-        """Flush all lines to the disk; InputError as above."""
-        with _input_error(self._path):
-            os.fsync(self._file)
-
-    def close(self) -> None:
-        """Close the file; InputError as above."""
-        with _input_error(self._path):
-            os.close(self._file)
-
-
-@contextmanager
-def _input_error(path: Path) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        raise InputError(
-            f"cannot write {path}: {error.strerror}; its content is kept; make room and run the same "
-            "command again"
-        ) from error
-
-
-def _busy(path: Path) -> InputError:
-    return InputError(f"{path} is being recorded by another process: end that, or give another out=")
-
-
-@contextmanager
-def locked(path: Path) -> Iterator[None]:
-    """Keep other programs from recording to a file. The lock ends with the process.
-
-    The empty file ``.NAME.lock`` that carries the lock stays beside it.
-
-    Raises:
-        InputError: another program records to it, or its folder cannot be written.
-    """
-    target = path.resolve()
-    lock = FileLock(target.with_name(f".{target.name}.lock"))
-    try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-        lock.acquire(timeout=0)
-        if path.is_file():
-            LineWriter(path).close()  # refuses at once a file that is being recorded under another name
-    except Timeout as error:
-        raise _busy(path) from error
-    except OSError as error:
-        raise unwritable(path, error, "out=FILE.csv") from error
-    try:
-        yield
-    finally:
-        lock.release()
-
-
-class SessionLog:
-    """Writes a session; an existing one is resumed.
-
-    Args:
-        path: x.csv.
-        about: metadata; a resumed session keeps its own.
-        sensors: S.
-
-    Attributes:
-        done: numbers of the complete gestures.
-        time: of the last frame, s since the start of the session.
-
-    Raises:
-        InputError: the file cannot be written, or is not a session of this device, layout, window and rate.
-    """
-
-    def __init__(self, path: Path, about: Mapping[str, Any], sensors: int) -> None:
-        self._marked: dict[str, list[int]] = {"invalid": [], "saturated": []}
-        self._segment, self._anchor = -1, 0.0
-        self._sums: list[str] = []  # of the frames since the last beginning of a gesture
-        self._conversion_checksum: str | None = None
-        header = ",".join(["time", "seq", *(f"raw_{number:02d}" for number in range(sensors))]) + "\n"
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            begun = _is_begun(path, header)
-            if not begun:
-                self._about = dict(about) | {"started_unix": time()}
-                write_about(self._about, path)
-                files.write(header, path)
-        except OSError as error:
-            raise files.unwritable(path, error, "out=FILE.csv") from error
-        self._lines = LineWriter(path)
-        self.done, self.time = set[int](), -1.0
-        if not begun:
-            return
-        try:
-            stored = read_session(path)
-            check_session(path, stored.about, about)
-            # An incomplete last line, after a power cut, would damage the next one.
-            self._lines.cut(path.read_bytes().rfind(b"\n") + 1)
-        except BaseException:
-            self._lines.close()
-            raise
-        self._about, self.done, self.time = stored.about, set(stored.gestures), stored.end
-
-    def mark(self, event: str, **what: Any) -> None:
-        """Write an event before the next frame."""
-        self._lines.add(encode_event(event, **what)[0])
-
-    def conversion(self, conversion: UnitConversion) -> None:
-        """Write the conversion of the following values to N; its ``zero`` is the baseline."""
-        # The noise of a tare is only shown.
-        arrays = {name: getattr(conversion, name).tolist() for name in ("scale", "zero", "broken")}
-        if conversion.curves is not None:
-            arrays["curves"] = conversion.curves.to_json()
-        line, self._conversion_checksum = encode_event("meaning", **arrays)
-        self._lines.add(line)
-
-    def begin(self, gesture: RecordedGesture, frame: Frame) -> None:
-        """Write that the window of a gesture begins at or just before a frame."""
-        begin = round(self._time(frame) - (frame.t - gesture.begin), 9)
-        about = {"number": gesture.number, "time": begin, "labels": gesture.labels}
-        contacts = {} if gesture.contacts is None else {"contacts": describe_contacts(gesture.contacts)}
-        self.mark("begin", **about, **contacts, meaning=self._conversion_checksum, **self._marked)
-        self._sums = []
-
-    def end(self, gesture: RecordedGesture) -> None:
-        """Write that a gesture is over, and flush the file to the disk."""
-        event, sums = "broken" if gesture.broken else "end", "".join(self._sums)
-        self.mark(event, number=gesture.number, lost=gesture.lost, frames=sums)
-        self._lines.sync()
-        if not gesture.broken:
-            self.done.add(gesture.number)
-
-    def frame(self, frame: Frame) -> None:
-        """Write a raw frame."""
-        if frame.after:
-            self.mark("gap", after=frame.after, lost=frame.lost)
-        none = np.zeros(len(frame.values), dtype=bool)
-        marks = {"invalid": ~frame.valid, "saturated": none if frame.saturated is None else frame.saturated}
-        for event, mask in marks.items():
-            channels = np.flatnonzero(mask).tolist()
-            if channels != self._marked[event]:
-                self.mark(event, channels=channels)
-                self._marked[event] = channels
-        self.time = self._time(frame)
-        values = ",".join(f"{value:.9g}" for value in frame.values.tolist())
-        line = f"{self.time:.9f},{'' if frame.seq is None else frame.seq},{values}"
-        self._sums.append(line_sum(line))
-        self._lines.add(line)
-
-    def close(self) -> None:
-        """Close the file."""
-        self._lines.close()
-
-    def _time(self, frame: Frame) -> float:
-        """Return s since the start of the session, by the device's clock within a segment."""
-        if frame.segment != self._segment:
-            ago = monotonic() - frame.t_host
-            self._segment = frame.segment
-            self._anchor = time() - ago - self._about["started_unix"] - frame.t
-            self._anchor = max(self._anchor, self.time + 1e-3 - frame.t)
-        return frame.t + self._anchor
-
-
-def _is_begun(path: Path, header: str) -> bool:
-    """Return whether a file has more than a header."""
-    if not path.exists():
-        return False
-    if not path.is_file():
-        raise InputError(f"{path} is not a regular file: give another out=")
-    with path.open("rb") as file:
-        return not header.encode().startswith(file.read(len(header) + 1))
-
-
-_SAME = {
-    "id": "from the device {}, this is {}",
-    "unit": "in {}, the device sends {}",
-    "bits": "with {} bits, the device sends {}",
-}
-
-
-def check_session(path: Path, about: Mapping[str, Any], now: Mapping[str, Any]) -> None:
-    """Raise InputError if a session does not match the configuration or the device."""
-    differ = {
-        name: (about[name], value) for name, value in now.items() if name in about and about[name] != value
-    }
-    if "positions" in differ:
-        raise InputError(f"{path} was recorded with another layout: give it, as in layout.path=FILE.csv")
-    for name, words in _SAME.items():
-        stored, found = differ.get(name, (None, None))
-        if stored is not None:
-            differs = words.format(stored, found or "unknown (header missing or incomplete)")
-            raise InputError(f"{path} was recorded {differs}: give another out=")
-    if {"window", "rate"} & set(differ):
-        window, rate = about["window"], about["rate"]
-        raise InputError(
-            f"{path} has windows of {window} frames at {rate:g} Hz, the configuration has {now['window']} at "
-            f"{now['rate']:g} Hz: give touch.window={window / rate:g} touch.rate={rate:g}"
-        )
-
-
+_FORMAT = 3
+_SUM = ', "sum": "'  # before the checksum of a line of format 2
+_MOST = 6000  # frames without a gesture in memory, a minute at 100 Hz: a killed program loses no more
 _log = logging.getLogger(__name__)
 
 
@@ -293,58 +47,62 @@ def record_session(
 
     Args:
         device: source of the frames, with the planned gestures.
-        path: x.csv; an existing session is resumed.
+        path: folder; an existing session is resumed.
         seconds: duration of the session, with disconnections; None: no limit.
         free: record consecutive windows without labels.
         notify: called with each message for the user.
 
     Raises:
-        InputError: another process records to the file, or it cannot be written; its content is kept.
+        InputError: another process records to the folder, or it cannot be written; its content is kept.
     """
     with locked(path):
         skin, listener = device.wire.open(reconnect=True)
         with skin:
             first, conversion = device.wire.warm_up(skin, notify)
-            log = SessionLog(path, _about(device, skin.header), len(device.sensors))
+            log = SessionLog(path, _describe(device, skin.header))
+            for frame in first:
+                _add(log, frame)
+            # In time of the session, because the device's clock restarts with each session.
+            begin = log.frames[0][0]
+            if log.done:
+                notify(f"{path} has {len(log.done)} gestures: going on")
+            segmenter = device.segmenter(listener, conversion, first, log.done)
+            if free:
+                segmenter = ContinuousSegmenter(segmenter.window, max(log.done, default=-1) + 1)
+            number = None if free else device.gestures
             try:
-                log.conversion(conversion)
-                for frame in first:
-                    log.frame(frame)
-                # In time of the session, because the device's clock restarts with each session.
-                begin = log.time - (first[-1].t - first[0].t)
-                if log.done:
-                    notify(f"{path} has {len(log.done)} gestures: going on")
-                segmenter = device.segmenter(listener, conversion, first, log.done)
-                if free:
-                    segmenter = ContinuousSegmenter(segmenter.window, max(log.done, default=-1) + 1)
-                number = None if free else device.gestures
                 for frame in skin:
-                    gesture, before = segmenter.gesture, len(log.done)
-                    if (done := segmenter.add(frame)) is not None:
-                        log.end(done)
-                    if len(log.done) > before:
+                    done = segmenter.add(frame)
+                    if done is not None and not done.broken and done.number not in log.done:
+                        log.write((done, conversion))
                         notify(f"{len(log.done)} of {number or 'any'} gestures")
-                    if segmenter.gesture is not None and segmenter.gesture is not gesture:
-                        log.begin(segmenter.gesture, frame)
-                    log.frame(frame)
+                    elif segmenter.gesture is None and len(log.frames) >= _MOST:
+                        log.write()
+                    _add(log, frame)
                     late = seconds is not None and log.time - begin >= seconds
                     if late or segmenter.over or (number is not None and len(log.done) >= number):
                         return
             except (SkinTimeout, SkinDisconnected) as end:
                 notify(str(end))
             finally:
-                log.close()
+                log.write()
 
 
-def _about(device: Serial, header: Header | None) -> dict[str, Any]:
-    """Return the metadata of a session."""
+def _add(log: SessionLog, frame: Frame) -> None:
+    """Add a frame that arrived by the host's clock."""
+    log.add(frame, time() - (monotonic() - frame.t_host) - log.metadata["started_unix"])
+
+
+def _describe(device: Serial, header: Header | None) -> dict[str, Any]:
+    """Return the metadata of a session that begins now."""
     channels = list(device.wire.channels)
     return {
-        "format": 2,
+        "format": _FORMAT,
         "unit": header.unit if header and header.unit else "adc",
         "bits": header.bits if header else None,
         "id": header.id if header else None,
         "started": datetime.now(UTC).isoformat(),
+        "started_unix": time(),
         "positions": device.sensors.positions.tolist(),
         "footprint": list(device.sensors.footprint),
         "size": list(device.size),
@@ -363,39 +121,30 @@ def convert_session(device: Serial, path: Path) -> tuple[Path, int]:
     """
     stored = read_session(path)
     now = {"positions": device.sensors.positions.tolist(), "window": device.window, "rate": device.model_rate}
-    check_session(path, stored.about, now)
+    check_session(path, stored.metadata, now)
     gestures = _same_labels(device.task.names, path, stored)
     warn_of_contacts([gesture for gesture, _ in gestures])
     whole = concatenate([device.to_recording([gesture], conversion) for gesture, conversion in gestures])
-    about = stored.about | {
+    metadata = stored.metadata | {
         "source": "session",
         "session": path.name,
         "lost": [gesture.lost for gesture, _ in gestures],
     }
-    return write_recording(replace(whole, metadata=about), path.with_suffix(".parquet")), len(gestures)
+    target = path.with_name(path.name + ".parquet")
+    return write_recording(replace(whole, metadata=metadata), target), len(gestures)
 
 
-def _same_labels(
-    names: Sequence[str], path: Path, stored: StoredSession
-) -> list[tuple[RecordedGesture, UnitConversion]]:
+def _same_labels(names: Sequence[str], path: Path, stored: StoredSession) -> list[Taken]:
     """Return the complete gestures with the labels; if no gesture has them, those without labels."""
     gestures = [stored.gestures[number] for number in sorted(stored.gestures)]
     if not gestures:
-        raise InputError(
-            "; ".join(
-                [
-                    f"{path} has {stored.frames} frames and no complete gesture: record some more",
-                    *stored.warnings,
-                ]
-            )
-        )
-    free = [(gesture, conversion) for gesture, conversion in gestures if gesture.labels is None]
-    labelled = [
+        frames = sum(map(len, stored.tables))
+        raise InputError(f"{path} has {frames} frames and no complete gesture: record some more")
+    usable = [
         (replace(gesture, labels={name: gesture.labels[name] for name in names}), conversion)
         for gesture, conversion in gestures
         if gesture.labels is not None and set(gesture.labels) == set(names)
-    ]
-    usable = labelled or free
+    ] or [(gesture, conversion) for gesture, conversion in gestures if gesture.labels is None]
     if not usable:
         labels = gestures[0][0].labels or {}
         raise InputError(
@@ -405,3 +154,120 @@ def _same_labels(
     if others := len(gestures) - len(usable):
         _log.warning("%s: %d gestures without these labels left out", path, others)
     return usable
+
+
+# Sessions of earlier versions: x.csv, whose lines with # are JSON with a checksum, and x.csv.json.
+
+
+def convert_old_session(path: Path, folder: Path) -> str:
+    """Convert a session of an earlier version to a folder; return what became of it.
+
+    Args:
+        path: x.csv, with x.csv.json beside it.
+        folder: to be made.
+
+    Raises:
+        InputError: not such a session, or the folder exists or cannot be written.
+    """
+    if folder.exists():
+        raise InputError(f"{folder} exists: give another out=")
+    try:
+        metadata = parse_json(read_file(path.with_name(path.name + ".json")))
+        lines = read_file(path).decode("ascii", "replace").split("\n")[1:-1]
+        if metadata.pop("sum") != json_sum(metadata) or metadata["format"] != 2:
+            raise ValueError("checksum or format beside it are others")
+        with TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent) as parent:
+            old = _OldSession(SessionLog(Path(parent) / folder.name, metadata | {"format": _FORMAT}))
+            for line in lines:
+                old.take(line)
+            old.log.write()
+            (Path(parent) / folder.name).rename(folder)
+    except (OSError, *BAD) as error:
+        raise InputError(f"cannot convert {path}, as of an earlier version: {error}") from error
+    left = ", ".join(map(str, sorted(old.begun - old.log.done)))
+    without = f", without {left}, which are incomplete or damaged" if left else ""
+    return f"{folder}: {len(old.log.done)} gestures{without}"
+
+
+class _OldSession:
+    """Goes through the lines of a session; leaves out gestures of which a line is damaged.
+
+    Attributes:
+        log: of the new session.
+        begun: numbers of all gestures, complete or not.
+    """
+
+    def __init__(self, log: SessionLog) -> None:
+        self.log, self.begun = log, set[int]()
+        about = log.metadata
+        self._window = Window(about["window"], about["rate"], len(about["positions"]))
+        self._conversions = dict[str, UnitConversion]()  # by the checksums of their lines
+        self._marks: dict[str, list[int]] = {"invalid": [], "saturated": []}
+        self._taken: Taken | None = None  # the gesture that is going on
+        self._after: After = ""
+        self._sums, self._segment, self._lost, self._time = "", 0, 0, 0.0
+
+    def take(self, line: str) -> None:
+        """Process a line."""
+        try:
+            if not line.startswith("#"):
+                self._frame(line)
+            elif line[-10:-2] == _line_sum(line[: -len(_SUM) - 10] + "}"):
+                self._event(parse_json(line[1:]))
+            else:
+                raise ValueError("wrong checksum")
+        except InputError:  # of the disk
+            raise
+        except BAD:
+            self._lost, self._taken = self._lost + 1, None
+
+    def _frame(self, line: str) -> None:
+        moment, number, *texts = line.split(",")
+        t, values = float(moment), np.array(texts, dtype=float)
+        if len(values) != self._window.sensors or not np.isfinite([t, *values]).all():
+            raise ValueError("no frame")
+        invalid, saturated = np.zeros((2, len(values)), dtype=bool)
+        invalid[self._marks["invalid"]] = saturated[self._marks["saturated"]] = True
+        self._segment, self._time = self._segment + int(t < self._time), t  # of which one is damaged
+        polarity = None if self._taken is None else np.where(self._taken[1].scale < 0, -1.0, 1.0)
+        frame = Frame(int(number) if number else None, t, t, values, ~invalid, self._segment, self._lost)
+        frame = frame._replace(after=self._after, saturated=saturated, polarity=polarity)
+        self._lost, self._after = 0, ""
+        self._window.add(frame)
+        self.log.add(frame, frame.t)
+        if self._taken is not None:
+            self._taken[0].frames.append(frame)
+            self._sums += _line_sum(line)
+
+    def _event(self, content: dict[str, Any]) -> None:
+        match content["event"]:
+            case "meaning":
+                self._conversions[content["sum"]] = decode_conversion(content, self._window.sensors)
+                self._segment += 1
+            case "begin":
+                self._marks |= {name: content[name] for name in self._marks}
+                self._sums, number = "", content["number"]
+                self.begun.add(number)
+                gesture = RecordedGesture(number, content["labels"], content["time"], 0)
+                self._taken = gesture, self._conversions[content["meaning"]]
+                if contacts := content.get("contacts"):
+                    gesture.contacts = np.full((self._window.frames, contacts["most"], 5), nan)
+                    for frame, position, *values in contacts["rows"]:
+                        gesture.contacts[frame, position] = values
+            case "end":
+                taken, self._taken = self._taken, None
+                stored = content["number"], content["frames"]
+                if taken and (taken[0].number, self._sums) == stored and stored[0] not in self.log.done:
+                    taken[0].lost, taken[0].resampled = content["lost"], self._window.since(taken[0].begin)
+                    self.log.write(taken)
+            case "broken":
+                self._taken = None
+            case "gap":
+                self._after, self._lost = content["after"], self._lost + content["lost"]
+                self._segment += int(self._after != "gap")
+            case mark:
+                self._marks[mark] = content["channels"]
+
+
+def _line_sum(text: str) -> str:
+    return f"{zlib.crc32(text.encode()):08x}"

@@ -1,385 +1,277 @@
-"""A session: raw frames as they arrived, and events; and how it is read.
+"""A session: a folder with the raw frames as they arrived, one Parquet file per gesture.
 
-A session is a CSV file that skin calibrate reads too: ``time`` (s since the start), ``seq`` and a column of
-raw values per sensor. Lines that start with # are JSON: unit conversion, beginning and end of gestures, gaps,
-invalid channels. Unit, layout and start time are in ``x.csv.json``. Whole lines are appended, so the file is
-valid up to its last complete frame if the program is interrupted.
+``about.json`` has unit, layout, rate, window and start. ``gesture_00012.parquet`` has the frames since the
+file before it, up to the end of gesture 12; ``frames_000003500.parquet`` has frames, from 3500 ms on, that no
+gesture followed. Every frame is in exactly one file.
 
-The reader skips damaged lines. Events have checksums, and that which ends a gesture has those of its frames.
-The line that begins a gesture repeats the invalid and saturated channels, and refers to the unit conversion
-by the checksum of its line, so that a lost line never gives a gesture the baseline of another.
+Columns: ``time`` (s since the start of the session), ``seq``, ``lost``, ``after`` and ``segment`` as in
+:class:`skin.device.resampling.Frame`, ``gesture`` (the number, in the frames of its window), ``raw_00`` ...
+in the device's unit, and ``state_00`` ..., the sum of ``INVALID`` and ``SATURATED``. JSON in the schema has
+number, labels, begin, contacts and unit conversion of the gesture, and its window at the model's rate.
+
+Each file is written whole, with checksums. A damaged one is left out, with the gesture in it.
 """
 
 import logging
-import zlib
-from collections import deque
+from collections.abc import Mapping
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
-from functools import partial
-from math import inf, isfinite
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.csv
+from filelock import FileLock, Timeout
 
-from skin.body.base import MOST
 from skin.core import files
-from skin.core.files import json_line
-from skin.core.safe_loading import parse_json, read_file, regular, sha256
+from skin.core.safe_loading import json_sum, parse_json, read_parts, write_parquet
 from skin.device.curves import Curves
-from skin.device.resampling import Frame, Window
+from skin.device.files import numbered
+from skin.device.resampling import Frame, Resampled
 from skin.errors import InputError
-from skin.touch.labels import CONTACT
 from skin.wire.channels import UnitConversion
-from skin.wire.contact_lines import MOST_CONTACTS
 from skin.wire.segmentation import RecordedGesture
 
-_SUM = ', "sum": "'
+INVALID, SATURATED = 1, 2
+"""States of a channel in a frame, which are added; 0: neither."""
+BAD = (ValueError, LookupError, TypeError, AttributeError)
+"""Errors of content that is damaged."""
+
+_KEY = b"skin_gesture"
+_STEP = 1e-3  # s at least between the clocks of two segments
+_log = logging.getLogger(__name__)
+Taken = tuple[RecordedGesture, UnitConversion]
+"""A complete gesture, and the conversion of its values to N, whose ``zero`` is the baseline."""
 
 
-_NAMED = 5  # lines or gestures, in a sentence
-
-
-@dataclass
+@dataclass(frozen=True)
 class StoredSession:
     """Content of a session.
 
     Attributes:
-        about: metadata in the JSON file beside it.
-        gestures: complete gestures by number, each with its unit conversion; the last one of a number counts.
-        frames: number of frames.
-        end: time of the last frame, s.
-        damaged: numbers of the lines that cannot be read; the header is line 1.
-        left_out: number of a gesture -> reason why it cannot be used.
+        metadata: of ``about.json``.
+        gestures: by number.
+        tables: frames of each file.
+        damaged: names of the files that cannot be used.
     """
 
-    about: dict[str, Any]
-    gestures: dict[int, tuple[RecordedGesture, UnitConversion]] = field(default_factory=dict)
-    frames: int = 0
-    end: float = -1.0
-    damaged: list[int] = field(default_factory=list)
-    left_out: dict[int, str] = field(default_factory=dict)
-
-    @property
-    def warnings(self) -> list[str]:
-        """Warnings about damaged lines and omitted gestures."""
-        warnings = []
-        if count := len(self.damaged):
-            warnings.append(f"{count} damaged line{'s' * (count > 1)} skipped: {_some(self.damaged)}")
-        for reason in dict.fromkeys(self.left_out.values()):
-            numbers = [number for number, why in self.left_out.items() if why == reason]
-            warnings.append(f"gesture {_some(numbers)} left out: {reason}")
-        return warnings
+    metadata: dict[str, Any]
+    gestures: dict[int, Taken] = field(default_factory=dict)
+    tables: list[pa.Table] = field(default_factory=list)
+    damaged: list[str] = field(default_factory=list)
 
 
-def _some(numbers: list[int]) -> str:
-    omitted = f" and {len(numbers) - _NAMED} more" if len(numbers) > _NAMED else ""
-    return ", ".join(map(str, numbers[:_NAMED])) + omitted
-
-
-_log = logging.getLogger(__name__)
-
-_IN_FRAMES = b"0123456789+-.e,\r"
-_IN_EVENTS = b' #"[]{}:\0'  # not in frames; after a power cut any line may consist of NUL
-_SPOILT = 2  # damaged bytes in a line that still counts as a frame
-_SLACK = 1e-6  # s: times are rounded
-_BEFORE = 512  # frames
-_DIGITS = 8  # of the checksum of a line
-_LINE = 1 << 20  # bytes: a frame of the most sensors has a fifth of it
-_LONGEST = 100_000  # frames of a window
-_STARTS = ("cut", "reset", "reconnect")
-_BAD = (ValueError, LookupError, TypeError, AttributeError, OverflowError, RecursionError)
-
-
-def read_session(path: Path) -> StoredSession:
-    """Read a session; warn of damaged lines and gestures.
-
-    An incomplete line at the end and incomplete gestures are left out. A damaged line is skipped and counted.
-    Within a gesture, a damaged frame counts as lost, also one that only its checksum shows. If the line may
-    have been an event, or if the line with the unit conversion is damaged, the gesture is left out.
+def read_session(folder: Path) -> StoredSession:
+    """Read a session; warn of damaged files, which are left out.
 
     Raises:
-        InputError: no such file, or not a session of skin record.
+        InputError: no such folder, or not a session of skin record.
     """
-    beside = path.with_name(path.name + ".json")
-    if path.exists() and not beside.exists():
-        raise InputError(f"{path} is not a session of skin record: no {beside.name} is beside it")
     try:
-        reading = _Reading(_about(beside))
-        regular(path)
-        with path.open("rb") as file:
-            for number, line in enumerate(iter(partial(file.readline, _LINE), b""), 1):
-                if line.endswith(b"\n"):
-                    reading.line(number, line[:-1])
-    except FileNotFoundError as error:
-        raise InputError(f"no session {path}: skin record out={path} makes one") from error
-    except OSError as error:
-        raise InputError(f"cannot read {path}: {error.strerror}") from error
-    except _BAD as error:
-        raise InputError(f"{beside.name} is damaged or no session's: {error}") from error
-    stored = reading.stored
-    if stored.damaged and not stored.frames:
-        raise InputError(f"{path} is damaged or no session of skin record: {reading.first}")
-    for warning in stored.warnings:
-        _log.warning("%s: %s", path, warning)
+        metadata, parts = read_parts(folder)
+    except (OSError, ValueError) as error:
+        raise InputError(
+            f"cannot read the session {folder}: {error}: skin record out=FOLDER makes one, skin convert "
+            "from=x.csv out=FOLDER converts one of an earlier version"
+        ) from error
+    stored = StoredSession(metadata)
+    for path, table in parts.items():
+        try:
+            stored.gestures.update(_decode(table, path.name, len(metadata["positions"])))
+            stored.tables.append(table)
+        except BAD:
+            stored.damaged.append(path.name)
+    if stored.damaged:
+        _log.warning("%s: damaged files are left out: %s", folder, ", ".join(stored.damaged))
     return stored
 
 
-def _about(beside: Path) -> dict[str, Any]:
-    """Return the metadata of a session; an error of _BAD if they are invalid."""
-    about = parse_json(read_file(beside))
-    if isinstance(about, dict) and about.pop("sum", None) not in (None, _about_sum(about)):
-        raise ValueError("its checksum is not that of its content")
-    if not isinstance(about, dict) or not {"positions", "started_unix"} <= set(about):
-        raise ValueError("it has no positions or no started_unix")
-    positions = np.array(about["positions"], dtype=float)
-    numbers = [about["started_unix"], *(about[name] for name in ("window", "rate") if name in about)]
-    if positions.ndim != 2 or not 1 <= len(positions) <= MOST or not np.isfinite(positions).all():
-        raise ValueError(f"positions are not 1 to {MOST} rows of numbers")
-    if not all(isinstance(value, int | float) and 0 < value < inf for value in numbers):
-        raise ValueError("started_unix, window and rate must be numbers above 0")
-    if "window" in about and not (isinstance(about["window"], int) and about["window"] <= _LONGEST):
-        raise ValueError(f"window must be a whole number of at most {_LONGEST} frames")
-    return about
+def _decode(table: Any, name: str, sensors: int) -> dict[int, Taken]:
+    """Return the gesture in a file by its number, if there is one; an error of BAD if it is damaged."""
+    content = parse_json(table.schema.metadata[_KEY])
+    if content["file"] != name or not set(numbered("raw", sensors)) <= set(table.column_names):
+        raise ValueError("it was renamed, or is of another session")
+    if content["number"] is None:
+        return {}
+    state, contacts = np.array(content["states"]), content["contacts"]
+    window = Resampled(np.array(content["values"]), state & INVALID == 0, state & SATURATED > 0)
+    gesture = RecordedGesture(
+        content["number"],
+        content["labels"],
+        content["begin"],
+        segment=0,
+        lost=content["lost"],
+        resampled=window,
+        contacts=None if contacts is None else np.array(contacts, dtype=float),
+    )
+    return {gesture.number: (gesture, decode_conversion(content["conversion"], sensors))}
 
 
-def write_about(about: dict[str, Any], path: Path) -> None:
-    """Write the metadata of a session beside it, with their checksum.
+def decode_conversion(content: Mapping[str, Any], sensors: int) -> UnitConversion:
+    """Return the unit conversion in JSON data; an error of BAD if there is none."""
+    curves = None if content.get("curves") is None else Curves.of_json(content["curves"], sensors)
+    scale, zero = (np.array(content[name], dtype=float) for name in ("scale", "zero"))
+    return UnitConversion(scale, zero, np.array(content["broken"]), curves=curves)
+
+
+_SAME = {
+    "positions": "with another layout: give it, as in layout.path=FILE.csv",
+    "id": "from the device {}, this is {}: give another out=",
+    "unit": "in {}, the device sends {}: give another out=",
+    "bits": "with {} bits, the device sends {}: give another out=",
+}
+_UNKNOWN = "unknown (header missing or incomplete)"
+
+
+def check_session(path: Path, stored: Mapping[str, Any], now: Mapping[str, Any]) -> None:
+    """Raise InputError if the metadata of a session do not match the configuration or the device."""
+    for name, words in _SAME.items():
+        if name in now and stored[name] not in (None, now[name]):
+            raise InputError(f"{path} was recorded {words.format(stored[name], now[name] or _UNKNOWN)}")
+    window, rate = stored["window"], stored["rate"]
+    if (window, rate) != (now["window"], now["rate"]):
+        raise InputError(
+            f"{path} has windows of {window} frames at {rate:g} Hz, the configuration has {now['window']} at "
+            f"{now['rate']:g} Hz: give touch.window={window / rate:g} touch.rate={rate:g}"
+        )
+
+
+def locked(folder: Path) -> AbstractContextManager[Any]:
+    """Keep other programs from recording to a folder, within a ``with`` statement and until the process ends.
+
+    The empty file ``.NAME.lock`` that carries the lock stays beside the folder.
+
+    Raises:
+        InputError: another program records to it, or the folder around it cannot be written.
+    """
+    target = folder.resolve()
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        return FileLock(target.with_name(f".{target.name}.lock")).acquire(timeout=0)
+    except Timeout as error:
+        raise InputError(
+            f"{folder} is being recorded by another process: end that, or give another out="
+        ) from error
+    except OSError as error:
+        raise files.unwritable(folder, error, "out=FOLDER") from error
+
+
+class SessionLog:
+    """Writes a session, which the caller has locked; an existing one is resumed.
 
     Args:
-        about: JSON data.
-        path: of the session.
-
-    Raises:
-        InputError: the file cannot be written.
-    """
-    files.write(
-        files.json_line(about | {"sum": _about_sum(about)}) + "\n", path.with_name(path.name + ".json")
-    )
-
-
-def _about_sum(about: dict[str, Any]) -> str:
-    return sha256(files.json_line(about, sort_keys=True).encode())
-
-
-class _Reading:
-    """Goes through the lines of a session.
+        folder: of the session.
+        metadata: for ``about.json``; a resumed session keeps its own.
 
     Attributes:
-        stored: what they held.
-        first: what was wrong with the first damaged one.
-    """
-
-    def __init__(self, about: dict[str, Any]) -> None:
-        self.stored, self.first = StoredSession(about), ""
-        self._sensors = len(about["positions"])
-        self._length = about["window"] / about["rate"] if {"window", "rate"} <= set(about) else inf
-        # Older sessions called a channel at its limit invalid.
-        old = about.get("format") == 1 and about.get("bits")
-        self._limit = 2 ** min(int(about["bits"]), 64) - 1 if old else None
-        self._gesture: RecordedGesture | None = None
-        self._conversion: tuple[str, UnitConversion] | None = None
-        self._marked: dict[str, list[int]] = {"invalid": [], "saturated": []}
-        # Frames before the gesture determine the device's rate, as in the live view.
-        self._before: deque[Frame] = deque(maxlen=_BEFORE)
-        self._missing = 0
-        self._spoilt, self._doubtful = 0, False
-        self._sums: dict[int, str] = {}  # id of a frame of the gesture -> checksum of its line
-        # The last two frames, each with the number of its line, to check that time increases.
-        self._last: list[tuple[int, Frame]] = []
-
-    def line(self, number: int, data: bytes) -> None:
-        """Process a line without its end."""
-        try:
-            text = data.decode("ascii")
-            if number == 1:
-                if text.split(",")[:2] != ["time", "seq"]:
-                    raise ValueError("no header")
-            elif text.startswith("#"):
-                self._event(*decode_event(text))
-            else:
-                self._frame(number, text)
-        except _BAD as error:
-            self.first = self.first or f"line {number}: {error}"
-            self.stored.damaged.append(number)
-            self._damaged(data)
-
-    def _damaged(self, data: bytes) -> None:
-        strange = data.translate(None, _IN_FRAMES)
-        if data and len(strange) <= _SPOILT and not set(strange) & set(_IN_EVENTS):
-            count = max(1, round(data.count(b",") / (self._sensors + 1)))
-            self._spoilt, self._missing = self._spoilt + count, self._missing + count
-            return
-        self._doubtful = True
-        self._leave_out("a damaged line in it may have changed what its frames mean")
-
-    def _leave_out(self, reason: str) -> None:
-        if self._gesture is not None:
-            self.stored.left_out[self._gesture.number] = reason
-            self._gesture = None
-
-    def _frame(self, number: int, text: str) -> None:
-        t, seq, *values = text.split(",")
-        row = np.array([float(value) for value in values])
-        if len(row) != self._sensors:
-            raise ValueError(f"{len(row)} values, {self._sensors} sensors")
-        if not isfinite(float(t)) or not np.isfinite(row).all() or "_" in text:
-            raise ValueError("no number")
-        valid, saturated = np.ones(len(row), dtype=bool), np.zeros(len(row), dtype=bool)
-        valid[self._marked["invalid"]] = False
-        saturated[self._marked["saturated"]] = True
-        if self._limit is not None:
-            saturated = row >= self._limit
-            valid |= saturated
-        number_of = int(seq) if seq else None
-        frame = Frame(number_of, float(t), float(t), row, valid, 0, self._missing, "", saturated)
-        self._check_time(frame)
-        self._missing = 0
-        self._last = [*self._last[-1:], (number, frame)]
-        self.stored.frames, self.stored.end = self.stored.frames + 1, frame.t
-        (self._before if self._gesture is None else self._gesture.frames).append(frame)
-        if self._gesture is not None:
-            self._sums[id(frame)] = line_sum(text)
-
-    def _check_time(self, frame: Frame) -> None:
-        """Check that time increases; of two contradicting frames, drop the one that does not fit."""
-        if not self._last or frame.t >= self._last[-1][1].t:
-            return
-        if len(self._last) == 2 and frame.t < self._last[0][1].t:
-            raise ValueError("time goes backwards")
-        number, wrong = self._last.pop()
-        self.stored.damaged.append(number)
-        self.stored.frames -= 1
-        self._spoilt += 1
-        held = self._before if self._gesture is None else self._gesture.frames
-        if held and held[-1] is wrong:
-            held.pop()
-
-    def _event(self, content: dict[str, Any], token: str) -> None:
-        match content.pop("event"):
-            case "meaning":
-                bent = content.pop("curves", None)
-                curves = None if bent is None else Curves.of_json(bent, self._sensors)
-                arrays = {name: np.array(value) for name, value in content.items()}
-                if any(
-                    len(array) != self._sensors or not np.isfinite(array).all() for array in arrays.values()
-                ):
-                    raise ValueError("a conversion of other sensors")
-                self._conversion = token, UnitConversion(**arrays, curves=curves)
-                self._marked = {"invalid": [], "saturated": []}
-                self._gesture, self._doubtful = None, False
-            case "begin":
-                self._begin(content)
-            case "end":
-                self._end(int(content["number"]), int(content["lost"]), content.get("frames"))
-            case "gap":
-                # The device's clock restarts; a gesture may begin with the next frame.
-                if content["after"] in _STARTS:
-                    self._before.clear()
-                    if self._gesture is not None and self._gesture.frames:
-                        self._gesture = None
-                self._missing += max(1, int(content["lost"]))
-            case ("invalid" | "saturated") as event:
-                self._marked[event] = self._channels(content["channels"])
-            case "broken":
-                self._gesture = None
-            case other:
-                raise ValueError(f"unknown event {other}")
-
-    def _channels(self, channels: list[int]) -> list[int]:
-        if not all(0 <= channel < self._sensors for channel in channels):
-            raise ValueError(f"no channels {channels}")
-        return channels
-
-    def _begin(self, content: dict[str, Any]) -> None:
-        number, labels = int(content["number"]), content["labels"]
-        if not isfinite(content["time"]) or not set((labels or {}).values()) <= {0, 1}:
-            raise ValueError("no gesture")
-        contacts = content.get("contacts")  # sessions of earlier versions and of people have none
-        if contacts is not None:
-            contacts = _decode_contacts(contacts, self.stored.about.get("window", 30))
-        self._gesture = RecordedGesture(number, labels, float(content["time"]), 0, contacts=contacts)
-        self._spoilt = 0
-        self._sums = {}
-        # Older sessions do not refer to a conversion.
-        meant = content.get("meaning")
-        if self._conversion is None or (self._doubtful if meant is None else meant != self._conversion[0]):
-            self._leave_out("the line with its unit conversion is damaged")
-        for event, channels in self._marked.items():
-            self._marked[event] = self._channels(content.get(event, channels))
-
-    def _end(self, number: int, lost: int, frames: str | None) -> None:
-        gesture, self._gesture = self._gesture, None
-        # Another number: the line of an end or a beginning is damaged.
-        if gesture is None or gesture.number != number or self._conversion is None:
-            return
-        if frames is not None:  # older sessions have none
-            # Frames that look whole but are not those that were recorded count as lost.
-            written = {frames[start : start + _DIGITS] for start in range(0, len(frames), _DIGITS)}
-            same = [frame for frame in gesture.frames if self._sums[id(frame)] in written]
-            self._spoilt += len(gesture.frames) - len(same)
-            gesture.frames[:] = same
-        inside = [
-            frame.t
-            for frame in gesture.frames
-            if gesture.begin - _SLACK <= frame.t < gesture.begin + self._length
-        ]
-        if not inside:
-            self.stored.left_out[number] = "it has no frames"
-        elif len(inside) > 1 and inside[0] == inside[-1]:
-            self.stored.left_out[number] = "the device's clock stood still, all its frames have the same time"
-        else:
-            gesture.lost = lost + self._spoilt
-            about, conversion = self.stored.about, self._conversion[1]
-            window = Window(about.get("window", 30), about.get("rate", 10.0), self._sensors)
-            polarity = np.sign(conversion.scale) if (conversion.scale < 0).any() else None
-            for frame in (*self._before, *gesture.frames):
-                window.add(frame._replace(polarity=polarity))
-            self._before.extend(gesture.frames)
-            gesture.resampled = window.since(gesture.begin)
-            self.stored.left_out.pop(number, None)
-            self.stored.gestures[number] = gesture, conversion
-
-
-def describe_contacts(contacts: np.ndarray) -> dict[str, Any]:
-    """Return contacts (T, K, 5), NaN where there is none, as JSON data: each that is there in a row."""
-    positions = np.argwhere(np.isfinite(contacts).all(axis=2))
-    rows = [[*position, *contacts[tuple(position)].tolist()] for position in positions.tolist()]
-    return {"most": contacts.shape[1], "rows": rows}
-
-
-def _decode_contacts(content: dict[str, Any], frames: int) -> np.ndarray:
-    """Return the contacts (T, K, 5) of a window of T ``frames``; an error of _BAD if they are invalid."""
-    maximum = content["most"]
-    if not isinstance(maximum, int) or not 1 <= maximum <= MOST_CONTACTS:
-        raise ValueError("no number of contacts")
-    contacts = np.full((frames, maximum, len(CONTACT)), np.nan)
-    for frame, position, *values in content["rows"]:
-        if not (0 <= frame < frames and 0 <= position < maximum and len(values) == len(CONTACT)):
-            raise ValueError("no contact of the window")
-        contacts[frame, position] = values
-    return contacts
-
-
-def line_sum(text: str) -> str:
-    """Return the checksum of a line, 8 hexadecimal digits."""
-    return f"{zlib.crc32(text.encode()):08x}"
-
-
-def encode_event(event: str, **what: Any) -> tuple[str, str]:
-    """Return an event as a line of JSON after #, with its checksum, and the checksum."""
-    text = "# " + json_line({"event": event, **what})
-    token = line_sum(text)
-    return f'{text[:-1]}{_SUM}{token}"}}', token
-
-
-def decode_event(line: str) -> tuple[dict[str, Any], str]:
-    """Decode a line of :func:`encode_event`; return event and checksum, which is empty in older sessions.
+        metadata: of the session.
+        done: numbers of the complete gestures.
+        time: of the last frame, s since the start of the session.
+        frames: since the last file, each with its time.
 
     Raises:
-        ValueError: no JSON, or a wrong checksum.
+        InputError: the folder cannot be written, or is not a session of this device, layout, window and rate.
     """
-    content = parse_json(line[1:])
-    token = content.pop("sum", "")
-    if token and line_sum(line.rpartition(_SUM)[0] + "}") != token:
-        raise ValueError("wrong checksum")
-    return content, token
+
+    def __init__(self, folder: Path, metadata: Mapping[str, Any]) -> None:
+        self._folder = folder
+        self.frames: list[tuple[float, Frame]] = []
+        if not folder.exists() or not any(folder.glob("*")):
+            text = files.json_line({**metadata, "sum": json_sum(metadata)})
+            files.write(text + "\n", folder / "about.json")
+        stored = read_session(folder)
+        check_session(folder, stored.metadata, metadata)
+        self.metadata, self.done = stored.metadata, set(stored.gestures)
+        ends = [(table["time"][-1].as_py(), table["segment"][-1].as_py()) for table in stored.tables]
+        last = max(ends, default=(-1.0, -1))
+        self.time: float = last[0]
+        self._first, self._segment, self._anchor = last[1] + 1, -1, 0.0
+
+    def add(self, frame: Frame, now: float) -> None:
+        """Add a frame, which is written with the next gesture.
+
+        Args:
+            frame: as the device sent it.
+            now: when it arrived, s since the start of the session; its clock counts within a segment.
+        """
+        if frame.segment != self._segment:
+            self._segment, self._anchor = frame.segment, max(now, self.time + _STEP) - frame.t
+        self.time = round(frame.t + self._anchor, 9)
+        self.frames.append((self.time, frame))
+
+    def write(self, taken: Taken | None = None) -> None:
+        """Write the frames since the last file; the last ones are those of a gesture, if one is given.
+
+        Raises:
+            InputError: the disk is full or fails; what was written before is kept.
+        """
+        if not self.frames:
+            return
+        begin = f"frames_{1000 * self.frames[0][0]:09.0f}"
+        name = f"{begin if taken is None else f'gesture_{taken[0].number:05d}'}.parquet"
+        content = {"file": name, "number": None} | ({} if taken is None else self._describe(*taken))
+        table = self._table(content["number"], 0 if taken is None else len(taken[0].frames))
+        path = self._folder / name
+        with files.whole(path, "out=FOLDER; the gestures before are kept") as partial:
+            table = table.replace_schema_metadata({_KEY: files.json_line(content)})
+            write_parquet(table, partial, compression="zstd")
+            if path.exists():  # damaged: its gesture was asked for again
+                path.replace(path.with_suffix(".damaged"))
+        self.frames.clear()
+        self.done.update([] if taken is None else [taken[0].number])
+
+    def _describe(self, gesture: RecordedGesture, conversion: UnitConversion) -> dict[str, Any]:
+        """Return everything about a gesture but its frames."""
+        window, curves, contacts = gesture.resampled, conversion.curves, gesture.contacts
+        assert window is not None  # of a complete gesture
+        arrays = {name: getattr(conversion, name).tolist() for name in ("scale", "zero", "broken")}
+        return {
+            "number": gesture.number,
+            "labels": gesture.labels,
+            "begin": round(self.frames[-len(gesture.frames)][0] + gesture.begin - gesture.frames[0].t, 9),
+            "lost": gesture.lost,
+            "contacts": None if contacts is None else contacts.tolist(),
+            "conversion": arrays | {"curves": None if curves is None else curves.to_json()},
+            "values": window.values.tolist(),
+            "states": _states(window.valid, window.saturated).tolist(),
+        }
+
+    def _table(self, number: int | None, inside: int) -> pa.Table:
+        """Return the frames; ``number`` is that of the gesture whose the last ``inside`` ones are."""
+        time, frames = [t for t, _ in self.frames], [frame for _, frame in self.frames]
+        values, valid = (np.stack([getattr(frame, name) for frame in frames]) for name in ("values", "valid"))
+        none = np.zeros(values.shape[1], dtype=bool)
+        limited = np.stack([none if frame.saturated is None else frame.saturated for frame in frames])
+        columns = {
+            "time": time,
+            "seq": pa.array([frame.seq for frame in frames], pa.int64()),
+            "lost": [frame.lost for frame in frames],
+            "after": [frame.after for frame in frames],
+            "segment": [self._first + frame.segment for frame in frames],
+            "gesture": pa.array([None] * (len(frames) - inside) + [number] * inside, pa.int64()),
+        }
+        for name, rows in (("raw", values), ("state", _states(valid, limited))):
+            columns |= zip(numbered(name, len(none)), rows.T, strict=True)
+        return pa.table(columns)
+
+
+def _states(valid: np.ndarray, saturated: np.ndarray) -> np.ndarray:
+    """Return the states of values, int8."""
+    return (INVALID * ~valid + SATURATED * saturated).astype(np.int8)
+
+
+def write_table(folder: Path, path: Path) -> int:
+    """Write time, number, raw values and gesture of all frames to a CSV file; return how many there are.
+
+    Raises:
+        InputError: no session, no frames, or a file that cannot be written.
+    """
+    stored = read_session(folder)
+    if not stored.tables:
+        raise InputError(f"{folder} has no frames: record some with skin record out={folder}")
+    columns = ["time", "seq", *numbered("raw", len(stored.metadata["positions"])), "gesture"]
+    table = pa.concat_tables(stored.tables).sort_by("time").select(columns)
+    with files.whole(path, "out=FILE.csv") as partial:
+        pa.csv.write_csv(table, partial)
+    return len(table)

@@ -107,21 +107,11 @@ def test_a_log_of_a_microcontroller_is_a_session(tmp_path):
     assert found.gauge is None
 
 
-def test_a_recorded_session_is_read_without_its_damaged_lines(tmp_path, caplog):
-    path = tmp_path / "s.csv"
-    frames = [b"%.2f,%d,5,%d" % (number / 100, number, number % 9) for number in range(100)]
-    for number, damage in (
-        (10, b"0.1\xff,10,5,1"),
-        (20, b"0.20,2"),
-        (30, b"0.30,30,5,x"),
-        (40, b"\0" * 4096),
-    ):
-        frames[number] = damage
-    path.write_bytes(b"\n".join([b"time,seq,raw_00,raw_01", b"# {\xff", *frames, b"\0" * 99]))
-    found = bench.read_bench_session(path, "disc", 0.01, "adc")
-    assert len(found.time) == 96
-    np.testing.assert_array_equal(found.raw[10], [5, 2])
-    assert caplog.messages == [f"{path}: 5 damaged lines skipped, the first is line 13"]
+def test_a_session_of_an_earlier_version_is_refused(tmp_path):
+    (tmp_path / "s.csv").write_text("time,seq,raw_00\n0,0,5\n")
+    (tmp_path / "s.csv.json").write_text('{"format": 2, "started_unix": 1}')
+    with pytest.raises(InputError, match=r"of an earlier version: skin convert from=\S+s\.csv out=FOLDER"):
+        bench.read_bench_session(tmp_path / "s.csv", "disc", 0.01)
 
 
 @pytest.mark.parametrize(

@@ -200,9 +200,7 @@ def emulated(begin, folder, seed):
 def test_gestures_recorded_at_a_port_make_the_run_better_on_others(run, begin, folder, adapted):
     for name, seed, count in (("few", 0, 48), ("others", 1, 96)):
         with emulated(begin, folder, seed) as port:
-            done = run(
-                folder, "record", *SKIN, *port, f"out={name}.csv", f"device.gestures={count}", store=False
-            )
+            done = run(folder, "record", *SKIN, *port, f"out={name}", f"device.gestures={count}", store=False)
         assert f"{count} gestures" in done.stdout
     recorded = ["device=recording", "device.path=few.parquet", "adapt.gestures=48"]
     done = run(folder, "adapt", f"run={adapted[0]}", *recorded, *QUICK)

@@ -48,9 +48,9 @@ PORT = "device.port=/dev/ttyACM77"
             (f"{verb} seconds=-1", "seconds=-1 is below 0")
             for verb in ("live", "record", "listen", "emulate")
         ),
-        ("record", "a session is a .csv file, got None: add out=session.csv"),
-        ("record out=x.csv device.silence=-1", "device.silence=-1 must be greater than or equal to 0"),
-        ("record out=x.csv +record.x=1", "record has no x: it takes free, finish"),
+        ("record", "a session is a folder, got out=None: give out=session"),
+        ("record out=x device.silence=-1", "device.silence=-1 must be greater than or equal to 0"),
+        ("record out=x +record.x=1", "record has no x: it takes free, finish"),
         ("train trainer.max_epochs=0.5", "trainer.max_epochs=0.5 must be a whole number from 1 up"),
     ],
 )

@@ -80,7 +80,7 @@ def ended(person):
 
 @pytest.mark.slow("waits for prompts and recordings")
 def test_recording_with_enter_s_q_and_going_on_after_a_kill(person_at, address, tmp_path):
-    command = ["record.py", *SKIN, "out=s.csv", f"device.port={address}", "device.gestures=6"]
+    command = ["record.py", *SKIN, "out=s", f"device.port={address}", "device.gestures=6"]
     asked = re.compile(r"next: (big|small), (dynamic|static), (press|tap), (dangerous|safe) - press Enter")
     with person_at(tmp_path, *command) as person:
         person.until("keep off")
@@ -100,14 +100,14 @@ def test_recording_with_enter_s_q_and_going_on_after_a_kill(person_at, address, 
         person.until("next: ")
         person.process.kill()
     with person_at(tmp_path, *command) as person:
-        person.until("s.csv has 2 gestures: going on")
+        person.until("s has 2 gestures: going on")
         assert person.until("next: ") == skipped
         person.types("")
         person.until("3 of 6 gestures")
         person.until("next: ")
         person.types("q")
         assert ended(person) == (0, "s.parquet: 3 gestures\n")
-    gestures = read_session(tmp_path / "s.csv").gestures
+    gestures = read_session(tmp_path / "s").gestures
     assert sorted(gestures) == [0, 1, 2]
     stored = read_recording(tmp_path / "s.parquet")
     words = [re.split(r"[ ,]+", line)[1:5] for line in (first, skipped, third)]
@@ -117,7 +117,7 @@ def test_recording_with_enter_s_q_and_going_on_after_a_kill(person_at, address, 
 
 @pytest.mark.slow("waits for prompts and recordings")
 def test_ctrl_c_at_a_prompt_keeps_what_there_is(person_at, address, tmp_path):
-    with person_at(tmp_path, "record.py", *SKIN, "out=s.csv", f"device.port={address}") as person:
+    with person_at(tmp_path, "record.py", *SKIN, "out=s", f"device.port={address}") as person:
         person.until("next: ")
         person.types("")
         person.until("1 of 48 gestures")
@@ -128,11 +128,11 @@ def test_ctrl_c_at_a_prompt_keeps_what_there_is(person_at, address, tmp_path):
 
 @pytest.mark.slow("waits for prompts and recordings")
 def test_free_recording_asks_for_nothing_and_goes_on_after_a_kill(person_at, address, tmp_path):
-    command = ["record.py", *SKIN, "out=f.csv", f"device.port={address}", "record.free=true"]
+    command = ["record.py", *SKIN, "out=f", f"device.port={address}", "record.free=true"]
     with person_at(tmp_path, *command) as person:
         person.until("2 of any gestures")
         person.process.kill()
-    done = len(read_session(tmp_path / "f.csv").gestures)
+    done = len(read_session(tmp_path / "f").gestures)
     assert done >= 2
     with person_at(tmp_path, *command, "seconds=5") as person:
         code, said = ended(person)

@@ -6,6 +6,7 @@ import shutil
 import socket
 from contextlib import contextmanager
 from itertools import count
+from pathlib import Path
 from threading import Event, Thread
 
 import numpy as np
@@ -14,12 +15,12 @@ import pytest
 pytest.importorskip("fcntl", reason="file limits need a POSIX system")
 
 from skin.device.files import read_recording
-from skin.record.recorder import locked
-from skin.record.session import read_session
+from skin.record.session import locked, read_session
 from skin.wire.protocol import Header, encode_header, encode_line
 
 SKIN = ["layout=grid", "layout.rows=2", "layout.columns=2", "simulator=naive", "touch.window=0.5"]
 FREE = [*SKIN, "record.free=true", "device.tare=1", "device.backoff=[0.05,0.1]"]
+OLD = Path(__file__).parents[1] / "record"
 PACE = 0.001  # s of the wall for 10 ms of the device
 
 
@@ -68,7 +69,7 @@ def skin(*lives):
 @pytest.fixture
 def record(run, tmp_path):
     """Run record.py in a folder of its own."""
-    return lambda *words, **code: run(tmp_path, "record.py", "out=s.csv", *words, store=False, **code)
+    return lambda *words, **code: run(tmp_path, "record.py", "out=s", *words, store=False, **code)
 
 
 @pytest.fixture(scope="module")
@@ -76,16 +77,23 @@ def once(run, tmp_path_factory):
     """Record a few gestures; give the folder."""
     folder = tmp_path_factory.mktemp("once")
     with skin({}) as port:
-        run(folder, "record.py", "out=s.csv", *FREE, port, "seconds=6", store=False)
+        run(folder, "record.py", "out=s", *FREE, port, "seconds=6", store=False)
     return folder
 
 
 @pytest.fixture
 def recorded(once, tmp_path):
     """Return the path of a session of a few gestures, with nothing made of it."""
-    for name in ("s.csv", "s.csv.json"):
-        shutil.copy(once / name, tmp_path)
-    return tmp_path / "s.csv"
+    return shutil.copytree(once / "s", tmp_path / "s")
+
+
+def content(folder):
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+def interruptions(folder):
+    rows = [row for table in read_session(folder).tables for row in table.to_pylist()]
+    return [row["after"] for row in rows if row["after"]]
 
 
 def refused(done, reason):
@@ -97,35 +105,35 @@ def refused(done, reason):
 
 @pytest.mark.slow("records until a file is full, and again")
 def test_a_full_disk_is_one_sentence_and_there_is_room_again(record, begin, tmp_path):
-    path = tmp_path / "s.csv"
+    path = tmp_path / "s"
     with skin({}) as port:
-        with begin(tmp_path, "record.py", "out=s.csv", *FREE, port, "seconds=60") as full:
-            resource.prlimit(full.pid, resource.RLIMIT_FSIZE, (15_001, resource.RLIM_INFINITY))
-            refused(full.completed(), r"^cannot write s\.csv: File too large; its content is kept")
-        before = path.read_bytes()
-        assert 14_800 < len(before) <= 15_001
-        assert before.endswith(b"\n")
-        done = len(read_session(path).gestures)
+        with begin(tmp_path, "record.py", "out=s", *FREE, port, "seconds=60") as full:
+            next(line for line in full.lines(errors=True) if line.startswith("2 of"))
+            resource.prlimit(full.pid, resource.RLIMIT_FSIZE, (2001, resource.RLIM_INFINITY))
+            refused(
+                full.completed(), r"^cannot write s/\S+: File too large: .*; the gestures before are kept$"
+            )
+        done, before = len(read_session(path).gestures), content(path)
         assert done >= 2
+        assert len(before) == done + 1
         assert not (tmp_path / "s.parquet").exists()
         again = record(*FREE, port, "seconds=3")
-    assert f"s.csv has {done} gestures: going on" in again.stderr
-    assert path.read_bytes().startswith(before)
+    assert f"s has {done} gestures: going on" in again.stderr
+    assert before.items() <= content(path).items()
     assert len(read_recording(tmp_path / "s.parquet")) > done
 
 
 def test_a_session_that_is_being_recorded_is_left_alone(record, tmp_path):
-    with locked(tmp_path / "s.csv"), skin({}) as port:
+    with locked(tmp_path / "s"), skin({}) as port:
         refused(
-            record(*FREE, port, code=2),
-            r"^s\.csv is being recorded by another process: end that, or give another",
+            record(*FREE, port, code=2), r"^s is being recorded by another process: end that, or give another"
         )
-    assert not (tmp_path / "s.csv").exists()
+    assert not (tmp_path / "s").exists()
 
 
 @pytest.mark.slow("two processes that record")
 def test_two_recordings_at_once_do_not_mix_and_kill_9_unlocks(record, begin, tmp_path):
-    with skin({}) as port, begin(tmp_path, "record.py", "out=s.csv", *FREE, port) as first:
+    with skin({}) as port, begin(tmp_path, "record.py", "out=s", *FREE, port) as first:
         next(line for line in first.lines(errors=True) if line.startswith("2 of"))
         refused(record(*FREE, port, code=2), "being recorded by another process")
     with skin({}) as port:
@@ -144,22 +152,22 @@ def test_two_recordings_at_once_do_not_mix_and_kill_9_unlocks(record, begin, tmp
     ],
 )
 def test_another_window_or_rate_is_refused_in_finishing_and_going_on(record, recorded, change, reason):
-    before = recorded.read_bytes()
+    before = content(recorded)
     refused(record(*SKIN, change, "record.finish=true", code=2), reason)
     with skin({}) as port:
         refused(record(*FREE, change, port, "device.tare=2", "seconds=6", code=2), reason)
-    assert recorded.read_bytes() == before
-    assert not recorded.with_suffix(".parquet").exists()
+    assert content(recorded) == before
+    assert not recorded.with_name("s.parquet").exists()
 
 
 def test_another_device_is_refused_however_late_its_header_comes(record, recorded):
-    before = recorded.read_bytes()
+    before = content(recorded)
     with skin({"id": "arm-R", "header": 500}) as port:
         refused(
             record(*FREE, port, "device.scale=1", "seconds=30", code=2),
             "from the device arm-L, this is arm-R",
         )
-    assert recorded.read_bytes() == before
+    assert content(recorded) == before
 
 
 def test_the_device_itself_goes_on_however_late_its_header_comes(record, recorded):
@@ -172,30 +180,50 @@ def test_another_device_at_the_port_is_not_recorded(record, tmp_path):
     with skin({"frames": 400}, {"id": "arm-R", "header": 100}) as port:
         done = record(*FREE, port, "seconds=30", "device.timeout=1", "device.silence=0.3")
     assert re.search(r"another device is connected: proto=1 n=4 rate=100 unit=N id=arm-R\n", done.stderr)
-    assert "reconnect" not in (tmp_path / "s.csv").read_text()
+    assert not interruptions(tmp_path / "s")
 
 
-def test_damaged_lines_are_skipped_and_named(record, recorded):
-    lines, whole = recorded.read_bytes().split(b"\n"), len(read_session(recorded).gestures)
-    begins = [position for position, line in enumerate(lines) if b'"event": "begin"' in line]
-    lines[begins[1] + 5] = b"\xff" + lines[begins[1] + 5]
-    lines[begins[2]] = lines[begins[2]][:30]
-    recorded.write_bytes(b"\n".join(lines) + b"\0" * 4096 + b"\n")
+def test_a_damaged_file_is_named_and_the_others_become_a_recording(record, recorded):
+    whole = len(read_session(recorded).gestures)
+    data = (recorded / "gesture_00001.parquet").read_bytes()
+    (recorded / "gesture_00001.parquet").write_bytes(data[:500] + b"\xff\xff" + data[502:])
     done = record(*SKIN, "record.finish=true")
     assert (done.returncode, done.stdout) == (0, f"s.parquet: {whole - 1} gestures\n"), done.stderr
-    named = f"{begins[1] + 6}, {begins[2] + 1}, {len(lines)}"
-    assert done.stderr.splitlines()[0] == f"s.csv: 3 damaged lines skipped: {named}"
-    assert read_recording(recorded.with_suffix(".parquet")).metadata["lost"][1] == 1
+    assert done.stderr.splitlines() == ["s: damaged files are left out: gesture_00001.parquet"]
+    readings = read_recording(recorded.with_name("s.parquet")).touches.readings
+    (recorded / "gesture_00001.parquet").write_bytes(data)
+    assert record(*SKIN, "record.finish=true").stderr == ""
+    again = read_recording(recorded.with_name("s.parquet")).touches.readings
+    assert again[[0, *range(2, whole)]].equal(readings)
+
+
+def test_a_session_becomes_a_table_and_one_of_an_earlier_version_a_session(run, recorded, tmp_path):
+    done = run(tmp_path, "convert", "from=s", "out=t.csv", store=False)
+    lines = (tmp_path / "t.csv").read_text().splitlines()
+    assert (done.returncode, done.stdout) == (0, f"t.csv: {len(lines) - 1} frames\n"), done.stderr
+    refused(
+        run(tmp_path, "convert", "from=s", "out=t.xlsx", store=False, code=2), r"a \.csv file, got t\.xlsx"
+    )
+    for name in ("old_session.csv", "old_session.csv.json"):
+        shutil.copy(OLD / name, tmp_path)
+    done = run(tmp_path, "convert", "from=old_session.csv", "out=old", store=False)
+    assert (done.returncode, done.stdout) == (0, "old: 6 gestures\n"), done.stderr
+
+
+@pytest.mark.parametrize("out", ["out=s.csv", "out=null", "out=."])
+def test_a_session_is_a_folder(record, out):
+    refused(
+        record(*FREE, out, code=2),
+        r"a session is a folder, got .*skin convert from=session\.csv out=session$",
+    )
 
 
 def test_a_half_open_socket_is_opened_anew(record, tmp_path):
     with skin({"frames": 400}, {}) as port:
         done = record(*FREE, port, "seconds=8", "device.silence=0.5")
     assert "the skin was unplugged (nothing received for 0.5 s); trying again" in done.stderr
-    text = (tmp_path / "s.csv").read_text()
-    assert text.count('"event": "gap", "after": "reconnect"') == 1
-    whole = len(read_recording(tmp_path / "s.parquet"))
-    assert text.count('"event": "end"') == whole >= 8
+    assert interruptions(tmp_path / "s") == ["reconnect"]
+    assert len(read_session(tmp_path / "s").gestures) == len(read_recording(tmp_path / "s.parquet")) >= 8
 
 
 @pytest.mark.parametrize(
@@ -209,5 +237,11 @@ def test_what_cannot_be_recorded_is_one_sentence(record, tmp_path, lives, reason
     with skin(*lives) as port:
         refused(record(*FREE, port, "seconds=30", "device.timeout=1", "device.silence=0.3", code=2), reason)
     assert not (tmp_path / "s.parquet").exists()
-    if (tmp_path / "s.csv").exists():
-        assert not read_session(tmp_path / "s.csv").warnings
+    assert not (tmp_path / "s").exists() or read_session(tmp_path / "s").tables
+
+
+def test_a_silence_that_is_none_is_refused(record):
+    refused(
+        record(*FREE, "device.port=socket://127.0.0.1:1", "device.silence=-1", code=2),
+        r"device\.silence=-1 must be greater than or equal to 0",
+    )

@@ -18,7 +18,7 @@ MOMENTS = ["skin.core.interrupt", "torch._C"]
 @pytest.mark.slow("imports anew up to every moment")
 @pytest.mark.parametrize("moment", MOMENTS)
 @pytest.mark.parametrize(
-    "command", [["emulate"], ["train"], ["record", "out=x.csv"], ["evaluate"]], ids=lambda c: c[0]
+    "command", [["emulate"], ["train"], ["record", "out=x"], ["evaluate"]], ids=lambda c: c[0]
 )
 def test_ctrl_c_among_imports(tmp_path, command, moment):
     script, *rest = command

@@ -54,7 +54,7 @@ def test_a_skin_at_a_port_and_its_recording_are_judged_alike(run, begin, played,
     port = played(lambda reader, stop: reader.sendall(data))
     there = [f"device.port={port}", f"device.scale={scale}", f"device.gestures={COUNT}"]
     live = answers(tmp_path, tell("evaluate.py", "device=serial", *there, f"out={tmp_path}/live"))
-    said = tell("record.py", *SKIN, "out=s.csv", "device.labels=announced", *there)
+    said = tell("record.py", *SKIN, "out=s", "device.labels=announced", *there)
     assert said == f"s.parquet: {COUNT} gestures\n"
     sheet = Sheet((0.16, 0.16), (32, 32), [{"material": "EcoFlex 00-30", "thickness": 0.005}])
     direct = Serial(body=sheet, layout=Grid(3, 3), port=port, scale=float(scale), gestures=COUNT)
@@ -67,7 +67,7 @@ def test_a_skin_at_a_port_and_its_recording_are_judged_alike(run, begin, played,
     again = answers(tmp_path, tell("evaluate.py", *file, f"out={tmp_path}/played"))
     assert len(next(iter(live.values()))) == COUNT
     assert again == live
-    text = tell("compare", *SKIN, "session=s.csv", "run=latest", f"out={tmp_path}")
+    text = tell("compare", *SKIN, "session=s", "run=latest", f"out={tmp_path}")
     assert text.startswith("# The same gestures, simulated and recorded")
     ratio = float(re.search(r"median: (\d\.\d+)", text)[1])
     assert ratio == pytest.approx(1.0, abs=0.1)

@@ -143,7 +143,7 @@ def recorded(learner, path):
 def test_live_and_recorded_are_the_same_to_the_last_bit(learner, tmp_path, sent):
     said = live(learner, pieces())
     sent(pieces())
-    touches, probabilities = recorded(learner, tmp_path / "s.csv")
+    touches, probabilities = recorded(learner, tmp_path / "s")
     assert len(touches) == GESTURES
     for gesture in range(GESTURES):
         last = IDLE + gesture * (LENGTH + 30) + LENGTH - 1

@@ -1,6 +1,5 @@
 """Touches of a session beside their simulation: what was put in comes out."""
 
-import time
 from dataclasses import replace
 from itertools import islice
 
@@ -13,7 +12,7 @@ from skin.calibration.bench import write_bench_session
 from skin.calibration.bench_protocol import Protocol, emulate_session
 from skin.core.files import CONF
 from skin.core.safe_loading import load_yaml
-from skin.device.resampling import Frame
+from skin.device.resampling import Frame, Window
 from skin.device.simulated import Simulated
 from skin.errors import InputError
 from skin.mechanics.simulator.naive import Naive
@@ -22,14 +21,13 @@ from skin.record.comparison import (
     compare_gestures,
     compare_session,
     comparison_markdown,
-    holds_gestures,
     publish_comparison,
 )
-from skin.record.recorder import SessionLog
+from skin.record.session import SessionLog
 from skin.touch.labels import TOUCH
 from skin.wire.channels import UnitConversion
 from skin.wire.emulator import emulated_gestures, upsample
-from skin.wire.segmentation import RecordedGesture
+from skin.wire.segmentation import ContinuousSegmenter
 
 SHEET = Sheet((0.16, 0.16), (32, 32), [{"material": "EcoFlex 00-30", "thickness": 0.005}])
 RATE, COUNT, GAIN = 50.0, 6, 0.8
@@ -41,30 +39,27 @@ def device():
     return Simulated(body=SHEET, layout=Grid(3, 3), simulator=Naive, gestures=10, **perfect)
 
 
-def session(device, path, labels):
+def session(device, path, labels, known=True):
     """Write what a skin of another gain says of the emulator's gestures, in counts above 500."""
-    about = {"positions": device.sensors.positions.tolist(), "unit": "adc", "labels": labels}
-    log = SessionLog(path, about | {"window": device.window, "rate": device.model_rate}, 9)
-    log.conversion(UnitConversion(np.full(9, 0.01), np.full(9, 500.0), np.zeros(9, dtype=bool)))
-    number, now = 0, time.monotonic()
-    for one, gesture in enumerate(islice(emulated_gestures(device), COUNT)):
-        rows = 500 + GAIN * upsample(gesture.force, device.model_rate, RATE) / 0.01
-        gesture = RecordedGesture(one, gesture.labels, number / RATE, 0)
-        for position, row in enumerate(rows):
-            t = number / RATE
-            frame = Frame(number, t, now + t, row, np.ones(9, dtype=bool))
-            if not position:
-                log.begin(gesture, frame)
-            log.frame(frame)
-            number += 1
-        log.end(gesture)
-    log.close()
+    positions = device.sensors.positions.tolist()
+    about = {"positions": positions, "unit": "adc", "bits": 10, "id": None, "labels": labels}
+    log = SessionLog(path, about | {"window": device.window, "rate": device.model_rate})
+    conversion = UnitConversion(np.full(9, 0.01), np.full(9, 500.0), np.zeros(9, dtype=bool))
+    gestures = list(islice(emulated_gestures(device), COUNT))
+    force = [upsample(gesture.force, device.model_rate, RATE) for gesture in gestures]
+    segmenter = ContinuousSegmenter(Window(device.window, device.model_rate, 9))
+    for number, row in enumerate(500 + GAIN * np.concatenate([*force, np.zeros((1, 9))]) / 0.01):
+        frame = Frame(number, number / RATE, number / RATE, row, np.ones(9, dtype=bool))
+        if done := segmenter.add(frame):
+            done.labels = gestures[done.number].labels if known else None
+            log.write((done, conversion))
+        log.add(frame, frame.t)
+    log.write()
     return str(path)
 
 
 def test_a_gain_between_session_and_simulation_is_found(device, tmp_path):
-    path = session(device, tmp_path / "s.csv", "announced")
-    assert holds_gestures(path)
+    path = session(device, tmp_path / "s", "announced")
     comparison = compare_gestures(device, path, 0)
     assert (comparison.same, len(comparison.pairs)) == (True, COUNT)
     for pair, played in zip(comparison.pairs, emulated_gestures(device), strict=False):
@@ -82,7 +77,7 @@ def test_a_gain_between_session_and_simulation_is_found(device, tmp_path):
 
 
 def test_agreements_are_counted(device, tmp_path):
-    comparison = compare_gestures(device, session(device, tmp_path / "s.csv", "announced"), 0)
+    comparison = compare_gestures(device, session(device, tmp_path / "s", "announced"), 0)
     truth = np.array([[bool(pair.labels[name]) for name in TOUCH.names] for pair in comparison.pairs])
     wrong = truth.copy()
     wrong[:2, 1] ^= True
@@ -92,7 +87,7 @@ def test_agreements_are_counted(device, tmp_path):
 
 
 def test_what_a_person_did_is_compared_with_gestures_of_the_same_labels(device, tmp_path):
-    comparison = compare_gestures(device, session(device, tmp_path / "s.csv", "prompted"), 0)
+    comparison = compare_gestures(device, session(device, tmp_path / "s", "prompted"), 0)
     assert not comparison.same
     played = list(islice(emulated_gestures(device), COUNT))
     assert [pair.labels for pair in comparison.pairs] == [one.labels for one in played]
@@ -104,7 +99,7 @@ def test_what_a_person_did_is_compared_with_gestures_of_the_same_labels(device, 
 
 
 def test_other_gestures_layouts_and_windows_are_refused(device, tmp_path):
-    path = session(device, tmp_path / "s.csv", "announced")
+    path = session(device, tmp_path / "s", "announced")
     with pytest.raises(InputError, match=r"emulate\.seed as compare\.seed"):
         compare_gestures(device, path, 1)
     with pytest.raises(InputError, match="another layout"):
@@ -114,18 +109,9 @@ def test_other_gestures_layouts_and_windows_are_refused(device, tmp_path):
 
 
 def test_gestures_without_labels_are_refused(device, tmp_path):
-    path = session(device, tmp_path / "s.csv", "none")
-    lines = (tmp_path / "s.csv").read_text().splitlines()
-    kept = [line.split(', "labels"')[0] + ', "labels": null}' if "begin" in line else line for line in lines]
-    (tmp_path / "s.csv").write_text("\n".join(kept) + "\n")
+    path = session(device, tmp_path / "s", "none", known=False)
     with pytest.raises(InputError, match=r"no gesture with labels.*device\.labels=prompted"):
         compare_gestures(device, path, 0)
-
-
-def test_a_bench_session_marks_no_gestures(tmp_path):
-    (tmp_path / "bench.csv.json").write_text('{"unit": "adc", "bits": 10}')
-    assert not holds_gestures(str(tmp_path / "bench.csv"))
-    assert not holds_gestures(str(tmp_path / "nothing.csv"))
 
 
 def test_presses_are_compared_as_gestures_are(device, tmp_path):

@@ -92,12 +92,12 @@ def recorded(device, tmp_path):
             body=SHEET, layout=Grid(3, 3), port=port.address, gestures=COUNT, timeout=20.0, **settings
         )
         try:
-            record_session(reader, tmp_path / "s.csv", None, False, lambda text: None)
+            record_session(reader, tmp_path / "s", None, False, lambda text: None)
         finally:
             emulator.stop()
             thread.join(20)
             port.unplug()
-        return reader, tmp_path / "s.csv"
+        return reader, tmp_path / "s"
 
     return record
 
@@ -116,41 +116,6 @@ def test_a_recorded_session_has_them(recorded, played):
     force = touches.readings.amax(2)
     assert force[absent].max() < 0.5
     assert force[~absent].max() > 1.0
-
-
-def test_a_session_without_them_is_read_as_before(recorded, played):
-    """As of a device without contacts, of a person, or of an earlier version."""
-    reader, path = recorded()
-    lines = path.read_text().splitlines(keepends=True)
-    from skin.record.session import decode_event, encode_event
-
-    for position, line in enumerate(lines):
-        if '"event": "begin"' in line:
-            content, _ = decode_event(line.rstrip("\n"))
-            del content["contacts"]
-            lines[position] = encode_event(content.pop("event"), **content)[0] + "\n"
-    path.write_text("".join(lines))
-    stored = read_session(path)
-    assert sorted(stored.gestures) == list(range(COUNT))
-    assert all(gesture.contacts is None for gesture, _ in stored.gestures.values())
-    assert read_recording(convert_session(reader, path)[0]).touches.contacts is None
-
-
-@pytest.mark.parametrize(
-    ("old", "new"), [('"most": 3', '"most": 0'), ('"rows": [[', '"rows": [[99, 0, 0, 0, 0, 0, 0], [')]
-)
-def test_contacts_that_cannot_be_are_a_damaged_line(recorded, old, new):
-    from skin.record.session import line_sum
-
-    _, path = recorded()
-    lines = path.read_text().splitlines()
-    position = next(number for number, line in enumerate(lines) if '"event": "begin"' in line)
-    text = lines[position].replace(old, new).rpartition(', "sum": "')[0]
-    lines[position] = f'{text}, "sum": "{line_sum(text + "}")}"}}'
-    path.write_text("\n".join(lines) + "\n")
-    stored = read_session(path)
-    assert stored.damaged == [position + 1]
-    assert 0 not in stored.gestures
 
 
 def test_a_gauge_tells_its_contacts():

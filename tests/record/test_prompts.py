@@ -66,13 +66,13 @@ def recorded(tmp_path, monkeypatch, capfd):
         try:
             with os.fdopen(typed) as lines:
                 monkeypatch.setattr("sys.stdin", lines)
-                record_session(reader, tmp_path / "s.csv", None, False, lambda text: None)
+                record_session(reader, tmp_path / "s", None, False, lambda text: None)
                 os.close(keyboard)
         finally:
             emulator.stop()
             thread.join(20)
             port.unplug()
-        recording = read_recording(convert_session(reader, tmp_path / "s.csv")[0])
+        recording = read_recording(convert_session(reader, tmp_path / "s")[0])
         return recording.touches, capfd.readouterr().err.splitlines()
 
     return record
@@ -91,7 +91,17 @@ def test_a_gesture_that_nobody_made_is_asked_for_again(recorded, tmp_path):
     assert touches.readings.amax(dim=(1, 2)).min() > LEAST
     assert touches.labels.int().tolist() == [list(one.values()) for one in label_plan(TOUCH.names, 1, 0)][:3]
     assert refused(said)
-    assert sorted(read_session(tmp_path / "s.csv").gestures) == [0, 1, 2]
+    assert sorted(read_session(tmp_path / "s").gestures) == [0, 1, 2]
+
+
+def test_frames_between_two_gestures_are_kept_however_many(recorded, tmp_path, monkeypatch):
+    monkeypatch.setattr("skin.record.recorder._MOST", 50)
+    recorded(2)
+    tables = read_session(tmp_path / "s").tables
+    rows = sorted((row for table in tables for row in table.to_pylist()), key=lambda row: row["time"])
+    assert len(tables) > 3
+    assert [row["seq"] for row in rows] == list(range(rows[0]["seq"], rows[0]["seq"] + len(rows)))
+    assert [sum(row["gesture"] == number for row in rows) for number in (0, 1)] == [100, 100]
 
 
 def test_a_prompt_for_no_touch_needs_none(recorded):

@@ -16,7 +16,7 @@ from skin.record.session import read_session
 from skin.wire.protocol import Header, encode_header, encode_line
 
 SKIN = ["layout=grid", "layout.rows=2", "layout.columns=2", "simulator=naive", "touch.window=0.5"]
-PACE = 0.002  # s of the wall for 10 ms of the device
+PACE = 0.006  # s of the wall for 10 ms of the device, whose clock is not trusted at twice the speed
 
 
 @pytest.fixture

@@ -6,6 +6,7 @@ Types are checked for every parameter that has one, ranges where it is ``Annotat
 
 import inspect
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from difflib import get_close_matches
 from functools import cache, wraps
 from importlib import import_module
@@ -296,15 +297,14 @@ def _is_allowed(name: Any) -> bool:
     The name's package is checked first, because to resolve a name imports modules, and then the class.
     """
     package = next((prefix for prefix in _BASES if str(name).startswith(f"{prefix}.")), None)
-    if package is None or not isinstance(name, str):
+    if package is None:
         return False
-    try:
+    with suppress(Exception):  # any error means that there is no such class
         kind = _locate(name)
-    except Exception:  # any error means that there is no such class
-        return False
-    bases = tuple(getattr(import_module(module), base) for module, base in _BASES[package])
-    concrete = inspect.isclass(kind) and not inspect.isabstract(kind) and issubclass(kind, bases)
-    return concrete and f"{kind.__module__}.".startswith(f"{package}.")
+        bases = tuple(getattr(import_module(module), base) for module, base in _BASES[package])
+        concrete = inspect.isclass(kind) and not inspect.isabstract(kind) and issubclass(kind, bases)
+        return concrete and f"{kind.__module__}.".startswith(f"{package}.")
+    return False
 
 
 # The name of an option: of a simulator, device, model, ...

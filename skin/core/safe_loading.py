@@ -262,11 +262,8 @@ def _checksum(content: bytes) -> tuple[slice, bytes]:
     match = _ENTRY.match(content, max(content.rfind(KEY.encode()), 0))
     if match is None:
         raise ChecksumError
-    view = memoryview(content)
-    result = hashlib.sha256(view[: match.start(1)])
-    result.update(BLANK.encode())
-    result.update(view[match.end(1) :])
-    return slice(*match.span(1)), result.hexdigest().encode()
+    start, end = match.span(1)
+    return slice(start, end), sha256(content[:start] + BLANK.encode() + content[end:]).encode()
 
 
 def text_sum(text: str) -> str:

@@ -135,8 +135,6 @@ def check_groups(config: Mapping[str, Any]) -> None:
             continue
         # The model is inside the learner, but is set by the name of its group.
         name = path[-1] if path[-1] in _INNER else ".".join(path)
-        if not isinstance(part.get("_partial_", False), bool):
-            raise InputError(f"{name}._partial_={part['_partial_']} must be true or false")
         if (target := part.get("_target_")) is None and name in _INNER:
             raise InputError(f"{name} chooses no option: leave it out, or give one that --help lists")
         if target is not None and not str(target).startswith(_LIBRARIES):

@@ -9,13 +9,7 @@ from skin.body.layout import Grid
 from skin.device.touches import Touches
 from skin.errors import InputError
 from skin.learning.fusion import Early, Late, Linked
-from skin.learning.graph import (
-    Graph,
-    adjacency,
-    neighbours,
-    normalised,
-    typical_distance,
-)
+from skin.learning.graph import Graph, adjacency, neighbours, normalised, typical_distance
 from skin.learning.model import Gcn
 
 # a square of side 1, a point to its right, and one far away
@@ -26,34 +20,26 @@ POINTS = np.array([[0, 0], [1, 0], [0, 1], [1, 1], [1.9, 0.6], [5, 1.1]]) * 0.01
 POINTS = np.hstack([POINTS, np.zeros((6, 1))])
 
 
-def pairs(linked):
-    return {(int(i), int(j)) for i, j in np.argwhere(linked) if i < j}
+# 3-4 is shorter than 1-4 and 2-3 than 0-2; point 5 is nobody's neighbour, but has one
+TIE_FREE = POINTS + 1e-4 * np.array([[0, 0, 0], [1, 0, 0], [0, 2, 0], [1, 3, 0], [0, 0, 0], [0, 0, 0]])
+TILTED = POINTS + 1e-3 * np.array(
+    [[0, 0, 0]] * 3 + [[1, 1, 0]] + [[0, 0, 0]] * 2
+)  # 1-2 is then a Delaunay edge
 
 
-def test_the_nearest_neighbour_of_each():
-    # 3-4 is shorter than 1-4 and 2-3 than 0-2; point 5 is nobody's neighbour, but has one
-    tie_free = POINTS + 1e-4 * np.array([[0, 0, 0], [1, 0, 0], [0, 2, 0], [1, 3, 0], [0, 0, 0], [0, 0, 0]])
-    assert pairs(neighbours(tie_free, "knn", 1)) == {(0, 1), (2, 3), (3, 4), (4, 5)}
-
-
-def test_the_two_nearest_neighbours_of_each():
-    assert pairs(neighbours(POINTS, "knn", 2)) == {
-        (0, 1), (0, 2), (1, 3), (2, 3), (3, 4), (1, 4), (4, 5), (3, 5),
-    }  # fmt: skip
-
-
-def test_delaunay_edges():
-    tilted = POINTS.copy()
-    tilted[3, :2] += 0.001  # the diagonal 1-2 is then the Delaunay one
-    assert pairs(neighbours(tilted, "delaunay")) == {
-        (0, 1), (0, 2), (1, 2), (1, 3), (2, 3), (1, 4), (3, 4), (3, 5), (4, 5), (1, 5),
-    }  # fmt: skip
-
-
-def test_more_neighbours_than_sensors_link_all():
-    linked = neighbours(POINTS, "knn", 6)
-    assert linked.sum() == 30
-    assert not linked.diagonal().any()
+@pytest.mark.parametrize(
+    ("points", "edges", "count", "expected"),
+    [
+        (TIE_FREE, "knn", 1, "01 23 34 45"),
+        (POINTS, "knn", 2, "01 02 13 23 34 14 45 35"),
+        (POINTS, "knn", 6, "01 02 03 04 05 12 13 14 15 23 24 25 34 35 45"),
+        (TILTED, "delaunay", 6, "01 02 12 13 23 14 34 35 45 15"),
+    ],
+)
+def test_neighbours(points, edges, count, expected):
+    linked = neighbours(points, edges, count)
+    assert {f"{i}{j}" for i, j in np.argwhere(linked) if i <= j} == set(expected.split())
+    assert (linked == linked.T).all()
 
 
 def test_weights_of_edges():

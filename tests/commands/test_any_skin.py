@@ -35,14 +35,6 @@ def test_it_is_evaluated_on_a_layout_from_a_file_and_says_what_is_new_to_it(run,
 
 
 @pytest.mark.slow("trains and evaluates a run")
-def test_a_recording_gets_the_geometry_of_the_configured_skin(run, folder):
-    run(folder, "generate", "n=200", "out=own.parquet", *OWN, store=False)
-    own = ["device.path=own.parquet", "device.test=all"]
-    run(folder, "evaluate", "device=recording", *own, *OWN)
-    assert 0 < metrics(folder)[-1]["same/overall/accuracy"] < 1
-
-
-@pytest.mark.slow("trains and evaluates a run")
 def test_a_recording_with_one_of_the_labels_is_judged_by_it(run, folder):
     done = run(folder, "generate", "n=40", "out=four.parquet", *OWN, store=False)
     four = read_recording(folder / "four.parquet")

@@ -63,13 +63,10 @@ class Budget:
 
     Attributes:
         limit: s of processor time.
-        unexplained: names of slow cases that do not say why they are.
     """
 
     def __init__(self, limit: float = LIMIT) -> None:
-        self.limit = limit
-        self.unexplained: list[str] = []
-        self._begin = 0.0
+        self.limit, self._begin = limit, 0.0
 
     def pytest_sessionstart(self) -> None:
         """Let imports be free."""
@@ -82,9 +79,10 @@ class Budget:
         SourceFileLoader.exec_module = exec_module  # type: ignore[method-assign]
 
     def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
-        """Note the slow cases that do not say why: ``@pytest.mark.slow("trains three models")``."""
-        marks = [(item.nodeid, mark) for item in items for mark in item.iter_markers("slow")]
-        self.unexplained = [name for name, mark in marks if not any((*mark.args, *mark.kwargs.values()))]
+        """Refuse slow cases that do not say why."""
+        for item in items:
+            if any(not any((*mark.args, *mark.kwargs.values())) for mark in item.iter_markers("slow")):
+                raise pytest.UsageError(f"{item.nodeid}: give a reason, as slow('trains three models')")
 
     @pytest.hookimpl(wrapper=True)
     def pytest_fixture_setup(self, fixturedef):

@@ -2,14 +2,14 @@
 
 import subprocess
 import sys
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from importlib import import_module
 from time import process_time
 from types import SimpleNamespace
 
 import pytest
 
-from tests.budget import Budget, free, slowness
+from tests.budget import Budget, slowness
 
 WORK = "sum(range(10_000_000))"
 
@@ -42,10 +42,6 @@ def spend():
         pass
 
 
-def test_every_slow_case_says_why(pytestconfig):
-    assert pytestconfig.pluginmanager.get_plugin("budget").unexplained == []
-
-
 def test_a_case_that_takes_long_fails_unless_it_is_slow(case):
     case()
     case(spend, slow=True)
@@ -73,14 +69,6 @@ def test_what_others_share_is_free(case, tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path)
     case(lambda: import_module("imported_for_the_budget"))
 
-    def nested():
-        with free():
-            spend()
-            with free():
-                spend()
-
-    case(nested)
-
 
 def test_a_busy_machine_gets_more(case, monkeypatch):
     assert slowness() >= 1
@@ -88,13 +76,8 @@ def test_a_busy_machine_gets_more(case, monkeypatch):
     case(spend)
 
 
-def test_slow_cases_without_a_reason_are_found():
-    budget, marks = (
-        Budget(),
-        (pytest.mark.slow, pytest.mark.slow("trains"), pytest.mark.slow(reason="trains")),
-    )
-    items = [
-        SimpleNamespace(nodeid=f"{n}", iter_markers=lambda _, m=m: [m.mark]) for n, m in enumerate(marks)
-    ]
-    budget.pytest_collection_modifyitems(items)
-    assert budget.unexplained == ["0"]
+@pytest.mark.parametrize(("mark", "refused"), [(pytest.mark.slow, True), (pytest.mark.slow("trains"), False)])
+def test_a_slow_case_without_a_reason_is_refused(mark, refused):
+    item = SimpleNamespace(nodeid="test_x", iter_markers=lambda name: [mark.mark])
+    with pytest.raises(pytest.UsageError, match="test_x: give a reason") if refused else nullcontext():
+        Budget().pytest_collection_modifyitems([item])

@@ -49,5 +49,5 @@ matrix = figures.confusions({"features": counts}, ("safe", "dangerous"))
 column = run.labels.index("big")
 speeds = recording.parameters["speed"].numpy() * run.device.model_rate
 edges = np.linspace(0.03, 0.20, 5)  # m/s
-shares = figures.misclassified_shares(speeds, (true != predicted)[:, column].astype(float), edges)
-course = figures.misclassified({"features": shares}, "big", edges)
+fractions = figures.misclassified_fractions(speeds, (true != predicted)[:, column].astype(float), edges)
+course = figures.misclassified({"features": fractions}, "big", edges)

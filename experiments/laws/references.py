@@ -285,7 +285,7 @@ def block(
         poisson: nu, of all or of each row (K,).
     """
     young, poisson = (np.broadcast_to(values, len(lines[2]) - 1).astype(float) for values in (young, poisson))
-    return Hexahedra(lines, young, poisson, _FLAT.position, _FLAT.frame)
+    return Hexahedra(lines, young, poisson, _FLAT.locate, _FLAT.frame)
 
 
 def graded(fine: float, count: int, far: float, growth: float) -> np.ndarray:

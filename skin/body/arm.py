@@ -54,7 +54,7 @@ class Arm(AbstractBody):
         """Return the overrides that give the sleeve an extent (x, y), m."""
         return f"body.angle={size[0] / self.radius:g} body.length={size[1]:g}"
 
-    def position(self, points: np.ndarray) -> np.ndarray:
+    def locate(self, points: np.ndarray) -> np.ndarray:
         """Return where points (..., 3) of the chart, m, are in space, (..., 3), m."""
         x, y, depth = np.moveaxis(np.asarray(points, dtype=float), -1, 0)
         turn, radius = self._turn(x), self.radius - depth

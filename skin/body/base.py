@@ -141,7 +141,7 @@ class AbstractBody(ABC):
         return f"body.size=[{size[0]:g},{size[1]:g}]"
 
     @abstractmethod
-    def position(self, points: np.ndarray) -> np.ndarray:
+    def locate(self, points: np.ndarray) -> np.ndarray:
         """Return where points (..., 3) of the chart, m, are in space, (..., 3), m."""
 
     @abstractmethod

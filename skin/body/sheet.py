@@ -19,7 +19,7 @@ class Sheet(AbstractBody):
 
     flat: ClassVar[bool] = True
 
-    def position(self, points: np.ndarray) -> np.ndarray:
+    def locate(self, points: np.ndarray) -> np.ndarray:
         """Return where points (..., 3) of the chart, m, are in space: (x, y, -depth), m."""
         return np.asarray(points) * np.array([1.0, 1.0, -1.0])
 

@@ -82,7 +82,7 @@ class LoadResult:
     Attributes:
         calibration: of the skin.
         placements: number of placements of every sensor, (S,).
-        differ: median difference between placements of the same sensor, share; NaN where every sensor has
+        differ: median difference between placements of the same sensor, fraction; NaN where every sensor has
             one.
         never: sensors that were never loaded: their gain is the median.
     """

@@ -182,8 +182,8 @@ def match_channels(responses: Responses, per_newton: np.ndarray) -> Match:
     for limit in _LIMITS:
         clipped = np.clip(limit * shape, -1.0, 1.0)
         size = np.sqrt((clipped**2).sum(axis=0))
-        likeness = unit.T @ clipped / np.where(size > 0, size, 1.0)
-        best = np.where(np.abs(likeness) > np.abs(best), likeness, best)
+        similarity = unit.T @ clipped / np.where(size > 0, size, 1.0)
+        best = np.where(np.abs(similarity) > np.abs(best), similarity, best)
     noise = len(responses.measured) * responses.error**2 / np.where(energy > 0, energy, np.inf)
     residual = np.clip((1 - best**2 - noise[:, None]) / np.clip(1 - noise[:, None], 0.1, 1.0), 0.0, 1.0)
     strength = np.abs(responses.measured).max(axis=0)

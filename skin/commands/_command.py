@@ -35,7 +35,7 @@ from skin.runs.configuration import (
     validate_config,
     verb_settings,
 )
-from skin.runs.sweep import left_out
+from skin.runs.sweep import belongs_to_other_shard
 
 _VERSION = "1.3"  # of Hydra, whose defaults hold
 
@@ -178,7 +178,7 @@ def command(name: str = "train") -> Callable[[Callable[..., Any]], Callable[...,
         @wraps(task)
         def job(config: DictConfig) -> Any:
             started.append(True)
-            if HydraConfig.get().mode == RunMode.MULTIRUN and left_out():
+            if HydraConfig.get().mode == RunMode.MULTIRUN and belongs_to_other_shard():
                 return None
             try:
                 own, checked = verb_settings(config, task), validate_config(config)

@@ -2,8 +2,8 @@
 
 import hashlib
 import json
-import math
 import os
+import sys
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
@@ -16,8 +16,6 @@ import platformdirs
 from skin.core.files import whole
 from skin.core.safe_loading import load_npz
 from skin.errors import InputError
-
-_HEADER = 512  # bytes of the header of an array in a file of numpy, at most; it usually takes 128
 
 
 def folder(path: str | Path | None) -> Path:
@@ -54,16 +52,16 @@ def kept(
             with whole(path) as partial:
                 np.savez(partial, allow_pickle=False, **({"key": np.array(key)} | stored))
         except InputError as error:
-            text = f"the operator cannot be kept in {path.parent}: {error}"
-            warnings.warn(text, RuntimeWarning, stacklevel=3)
+            warnings.warn(
+                f"the operator cannot be kept in {path.parent}: {error}", RuntimeWarning, stacklevel=3
+            )
     return stored
 
 
 def _load(path: Path, key: str, shapes: Mapping[str, Sequence[int]]) -> dict[str, np.ndarray] | None:
     """Return the arrays of a file, or None if there is no file or anything in it is wrong."""
-    expected = sum(8 * math.prod(shape) + _HEADER for shape in shapes.values())
     with suppress(Exception):  # any error of a broken archive: build the arrays again
-        arrays = load_npz(path, maximum=expected + 4 * len(key) + _HEADER)
+        arrays = load_npz(path, maximum=sys.maxsize)  # an operator may be large, and the file is our own
         if str(arrays.pop("key")) == key and all(
             array.shape == tuple(shapes[name]) and array.dtype == np.float64 and np.isfinite(array).all()
             for name, array in arrays.items()

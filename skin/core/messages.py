@@ -2,7 +2,6 @@
 
 import errno
 import logging
-import math
 import os
 import re
 import sqlite3
@@ -120,10 +119,3 @@ def _rephrase(record: logging.LogRecord) -> bool:
     if "/mlflow" in str(record.args):
         record.msg, record.args = "the tracking server does not answer: trying again", ()
     return True
-
-
-def format_duration(duration: float) -> str:
-    """Return a duration in s as text."""
-    if duration > 2 * 3600:
-        return f"{duration / 3600:.1f} h"
-    return f"{duration:.0f} s" if duration < 90 else f"{math.ceil(duration / 60)} min"

@@ -6,22 +6,24 @@ import numpy as np
 
 from skin.errors import InputError
 
-
-class Stream(IntEnum):
-    """What randomness is for; the test gestures have a stream that takes no seed of a training."""
-
-    BUDGET = 1
-    FRESH = 2
-    TEST = 3
-    SPLIT = 4
-    CONSTANTS = 5
-    NOISE = 6
-    POSITION = 7
-    ALARM = 10
-    PLACEMENT = 11
-    SKIN = 12
-    SKIN_ORDER = 13
-    DESIGN = 14
+Stream = IntEnum(
+    "Stream",
+    {
+        "BUDGET": 1,
+        "FRESH": 2,
+        "TEST": 3,
+        "SPLIT": 4,
+        "CONSTANTS": 5,
+        "NOISE": 6,
+        "POSITION": 7,
+        "ALARM": 10,
+        "PLACEMENT": 11,
+        "SKIN": 12,
+        "SKIN_ORDER": 13,
+        "DESIGN": 14,
+    },
+)
+"""What randomness is for; the test gestures have a stream that takes no seed of a training."""
 
 
 def generator(stream: Stream, *key: int) -> np.random.Generator:

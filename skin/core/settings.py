@@ -6,6 +6,7 @@ Types are checked for every parameter that has one, ranges where it is ``Annotat
 
 import inspect
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from difflib import get_close_matches
 from functools import cache, wraps
 from importlib import import_module
@@ -134,8 +135,6 @@ def check_groups(config: Mapping[str, Any]) -> None:
             continue
         # The model is inside the learner, but is set by the name of its group.
         name = path[-1] if path[-1] in _INNER else ".".join(path)
-        if not isinstance(part.get("_partial_", False), bool):
-            raise InputError(f"{name}._partial_={part['_partial_']} must be true or false")
         if (target := part.get("_target_")) is None and name in _INNER:
             raise InputError(f"{name} chooses no option: leave it out, or give one that --help lists")
         if target is not None and not str(target).startswith(_LIBRARIES):
@@ -296,15 +295,14 @@ def _is_allowed(name: Any) -> bool:
     The name's package is checked first, because to resolve a name imports modules, and then the class.
     """
     package = next((prefix for prefix in _BASES if str(name).startswith(f"{prefix}.")), None)
-    if package is None or not isinstance(name, str):
+    if package is None:
         return False
-    try:
+    with suppress(Exception):  # any error means that there is no such class
         kind = _locate(name)
-    except Exception:  # any error means that there is no such class
-        return False
-    bases = tuple(getattr(import_module(module), base) for module, base in _BASES[package])
-    concrete = inspect.isclass(kind) and not inspect.isabstract(kind) and issubclass(kind, bases)
-    return concrete and f"{kind.__module__}.".startswith(f"{package}.")
+        bases = tuple(getattr(import_module(module), base) for module, base in _BASES[package])
+        concrete = inspect.isclass(kind) and not inspect.isabstract(kind) and issubclass(kind, bases)
+        return concrete and f"{kind.__module__}.".startswith(f"{package}.")
+    return False
 
 
 # The name of an option: of a simulator, device, model, ...

@@ -116,7 +116,7 @@ def try_touches(
     valid = np.ones(readings.shape[1], bool)
     frames = (Observation.of(frame, valid, frame >= noise.clip, noise) for frame in measured)
     moments = [_moments(one_contact(candidates, prior, frame, first)) for frame in frames]
-    raised = noise.felt(torch.from_numpy(readings)).numpy()
+    raised = noise.exceeds(torch.from_numpy(readings)).numpy()
     return Trials(touches, raised, *(np.array(part) for part in zip(*moments, strict=True)))
 
 

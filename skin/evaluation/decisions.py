@@ -65,7 +65,7 @@ def longest_shown(held: int, recent: int, window: int) -> int:
     return min(held + recent + 1, max(1, window - 2))
 
 
-def as_press(idle: np.ndarray, present: np.ndarray, held: int) -> np.ndarray:
+def present_as_press(idle: np.ndarray, present: np.ndarray, held: int) -> np.ndarray:
     """Return a window in which a contact that lasts too long appears as a press.
 
     A constant load would otherwise look like an untouched skin.
@@ -137,7 +137,7 @@ class ContactDetector:
         rate: of the readings, Hz.
         threshold: N.
         drift: N/s.
-        fractions: (S, S), reading of each sensor under a touch on another, of whose reading it is a share;
+        fractions: (S, S), reading of each sensor under a touch on another, as a fraction of its reading;
             None: no sensor feels what is on another.
 
     Attributes:
@@ -148,7 +148,7 @@ class ContactDetector:
         void: (S,), bool, sensors that read below the baseline, faster than it may drift: something touched
             them when it was taken, or the device has changed it. They stay void until the next tare.
         beyond: (S,), bool, sensors that became invalid while their reading was high.
-        lost: (S,), bool, sensors that fell to rest at once, though none of the others fell by its share,
+        lost: (S,), bool, sensors that fell to rest at once, though none of the others fell in proportion,
             until they rise again.
     """
 

@@ -47,7 +47,7 @@ class Span:
 
     @property
     def range(self) -> tuple[float, float]:
-        """95 % confidence interval of the predicted share, exact (Clopper and Pearson, 1934)."""
+        """95 % confidence interval of the predicted fraction, exact (Clopper and Pearson, 1934)."""
         low, high = binomtest(self.said, self.count).proportion_ci(0.95)
         return float(low), float(high)
 

@@ -33,12 +33,12 @@ def compute_metrics(
         this. Accuracies use a threshold of 0.5. An operating point adds ``dangerous/alarm_recall`` and
         ``dangerous/false_alarm_rate`` at its threshold. Where the task has a gate, the other labels are
         evaluated on the touches for which it is true, and the gate does not count in the overall values. A
-        direction adds ``direction/degrees``, the mean absolute error, and ``direction/accuracy``, the share
-        of errors up to 45 degrees, on the touches that have one (random guesses: 90 and .25); both do not
-        count in the overall values. A regression has ``<target>/rms_mm``, ``/rms_N`` or ``/rms``, the root
-        of the mean square error, the same of ``place`` for x and y together, and ``overall/r2``, the mean
-        over the targets of the fraction of the variance that is predicted. Values are NaN where the touches
-        do not define them: a recall needs touches with and without the label.
+        direction adds ``direction/degrees``, the mean absolute error, and ``direction/accuracy``, the
+        fraction of errors up to 45 degrees, on the touches that have one (random guesses: 90 and .25); both
+        do not count in the overall values. A regression has ``<target>/rms_mm``, ``/rms_N`` or ``/rms``, the
+        root of the mean square error, the same of ``place`` for x and y together, and ``overall/r2``, the
+        mean over the targets of the fraction of the variance that is predicted. Values are NaN where the
+        touches do not define them: a recall needs touches with and without the label.
     """
     alarm: dict[str, float] = {}
     if point is not None:

@@ -46,12 +46,12 @@ class Reached:
 
     @property
     def recall(self) -> float:
-        """Share of the dangerous gestures that raise the alarm; NaN if there are none."""
+        """Fraction of the dangerous gestures that raise the alarm; NaN if there are none."""
         return self.found / self.dangerous if self.dangerous else math.nan
 
     @property
     def false_alarm_rate(self) -> float:
-        """Share of the safe gestures that raise the alarm; NaN if there are none."""
+        """Fraction of the safe gestures that raise the alarm; NaN if there are none."""
         return self.raised / self.safe if self.safe else math.nan
 
     @property

@@ -41,7 +41,7 @@ class Report:
             (test gestures on the device of the training), ``holdout`` (the last tenth of the training
             budget), ``device_shift`` and ``unseen_layout`` (the test gestures, shared out among unseen
             devices and layouts).
-        cannot: column, or metric that is not defined -> why there is no value.
+        unavailable: column, or metric that is not defined -> why there is no value.
         confusion: (L, 2, 2), of ``same``; None where the labels are exclusive.
         predictions: a row per test gesture: labels, probabilities (``p_<label>``) and drawn parameters.
         point: where the alarm is raised; None where the task has no label ``dangerous``.
@@ -52,7 +52,7 @@ class Report:
     """
 
     metrics: dict[str, float]
-    cannot: dict[str, str]
+    unavailable: dict[str, str]
     confusion: Tensor | None
     predictions: pa.Table
     point: OperatingPoint | None = None
@@ -65,7 +65,7 @@ class Report:
         """How the alarm was raised, and why values are missing."""
         point, reached = self.point, self.reached
         alarm = [f"{point.sentence()}; {reached.sentence()}"] if point and reached else []
-        return [*alarm, *(f"{column}: {reason}" for column, reason in self.cannot.items())]
+        return [*alarm, *(f"{column}: {reason}" for column, reason in self.unavailable.items())]
 
 
 def touch_sets(device: AbstractDevice, settings: Evaluation) -> dict[str, Iterator[Touches]]:

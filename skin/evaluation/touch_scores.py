@@ -13,7 +13,7 @@ from skin.core.rng import Stream, generator
 from skin.device.base import AbstractSimulated
 from skin.device.sampling import between_frames, draw_constants
 from skin.device.touches import Touches
-from skin.evaluation.decisions import DECISIONS, LiveConditions, as_press, held_frames, longest_shown
+from skin.evaluation.decisions import DECISIONS, LiveConditions, held_frames, longest_shown, present_as_press
 from skin.evaluation.operating_point import Predictor
 from skin.touch.labels import RELEASE
 from skin.touch.movie import Movie
@@ -88,7 +88,7 @@ def _decision_windows(
     begun = torch.where(contact, end, torch.iinfo(end.dtype).max).amin(dim=1, keepdim=True)
     lasted = (end - begun) / ratio + 1
     for touch, decision in (contact & (lasted > longest_shown(held, recent, window))).nonzero().tolist():
-        press = as_press(windows[touch, 0].numpy(), windows[touch, decision].numpy(), held)
+        press = present_as_press(windows[touch, 0].numpy(), windows[touch, decision].numpy(), held)
         windows[touch, decision] = torch.from_numpy(press)
     return windows * valid[:, None, None], valid, contact
 

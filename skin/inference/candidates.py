@@ -187,8 +187,8 @@ class CandidateReadings:
         wide = (positions[:, 2] - self.radii[0]) / half - 1
         scales = (2 / self._patch[0], 2 / self._patch[1], 1 / half)
         powers = _monomials(across, down, wide, scales)
-        felt = np.matmul(powers, self._coefficients[patch[:, 1] * self._counts[0] + patch[:, 0]])
-        return felt[:, 0], felt[:, 1:]
+        predicted = np.matmul(powers, self._coefficients[patch[:, 1] * self._counts[0] + patch[:, 0]])
+        return predicted[:, 0], predicted[:, 1:]
 
 
 def _monomials(

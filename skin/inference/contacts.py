@@ -38,7 +38,7 @@ class Mixture:
         evidence: log of the likelihood integrated over the prior.
         misfit: posterior mean of the squared misfit in variances.
         mode: (n, 4), the most probable contacts, with scores of radius and force.
-        felt: (S,), readings at the mode, N.
+        predicted: (S,), readings at the mode, N.
     """
 
     samples: np.ndarray
@@ -46,7 +46,7 @@ class Mixture:
     evidence: float
     misfit: float
     mode: np.ndarray
-    felt: np.ndarray
+    predicted: np.ndarray
 
 
 class Addition(NamedTuple):
@@ -93,17 +93,17 @@ class Search:
         """What makes normal points those of Student's distribution, (2^10,)."""
         return np.sqrt(_FREEDOM / np.random.default_rng(1).chisquare(_FREEDOM, 2**_SAMPLES))
 
-    def felt(self, guess: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def predict(self, guess: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return readings (M, S), N, and their derivatives (M, 4 n, S) by position, radius and log force."""
         count, number, _ = guess.shape
         positions, force, stretch = self._positions_of(guess.reshape(-1, 4))
         readings, slopes = self.candidates.at(positions)
-        felt = force[:, None] * readings
-        columns = np.empty((len(positions), 4, felt.shape[1]))
+        predicted = force[:, None] * readings
+        columns = np.empty((len(positions), 4, predicted.shape[1]))
         np.multiply(force[:, None, None], slopes, out=columns[:, :3])
         columns[:, 2] *= stretch[:, None]
-        columns[:, 3] = self.prior.spread * felt
-        return felt.reshape(count, number, -1).sum(1), columns.reshape(count, 4 * number, -1)
+        columns[:, 3] = self.prior.spread * predicted
+        return predicted.reshape(count, number, -1).sum(1), columns.reshape(count, 4 * number, -1)
 
     def _positions_of(self, guess: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return positions and radii (N, 3), m, forces (N,), N, and m of radius per score (N,)."""
@@ -117,9 +117,9 @@ class Search:
         fraction = ((radius - self._minimum) / self._range).clip(0.02, 0.98)
         return ndtri(fraction), np.log(force / self.prior.force) / self.prior.spread
 
-    def variance(self, frame: Observation, felt: np.ndarray, columns: np.ndarray) -> np.ndarray:
-        """Return the variance (M, S), N^2, of readings as of :meth:`felt`."""
-        variance = frame.noise.floor + (frame.noise.gain * felt) ** 2
+    def variance(self, frame: Observation, predicted: np.ndarray, columns: np.ndarray) -> np.ndarray:
+        """Return the variance (M, S), N^2, of readings as of :meth:`predict`."""
+        variance = frame.noise.floor + (frame.noise.gain * predicted) ** 2
         if frame.noise.position:
             for axis in (0, 1):
                 variance = variance + (frame.noise.position * columns[:, axis::4].sum(1)) ** 2
@@ -152,14 +152,14 @@ class Search:
 
     def _expand(self, frame: Observation, guess: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the log posterior (M,), its gradient (M, 4 n) and information (M, 4 n, 4 n)."""
-        felt, columns = self.felt(guess)
-        variance = self.variance(frame, felt, columns)
-        misfit = frame.readings - felt
-        counts = np.broadcast_to(frame.counts, felt.shape)
+        predicted, columns = self.predict(guess)
+        variance = self.variance(frame, predicted, columns)
+        misfit = frame.readings - predicted
+        counts = np.broadcast_to(frame.counts, predicted.shape)
         if len(frame.clipped):
             # A sensor that clips pulls upwards until it is predicted to do so.
             misfit, counts = misfit.copy(), counts.copy()
-            short = frame.noise.clip - felt[:, frame.clipped]
+            short = frame.noise.clip - predicted[:, frame.clipped]
             misfit[:, frame.clipped], counts[:, frame.clipped] = short, short > 0
         weight = counts / variance
         distance = guess * [0, 0, 1, 1]
@@ -167,19 +167,19 @@ class Search:
         information = np.matmul(columns * weight[:, None], columns.transpose(0, 2, 1))
         information = information + np.diag(np.tile(self._scale**-2, guess.shape[1]))
         penalty = 0.5 * (distance**2).sum((1, 2))
-        return frame.likelihood(felt, variance - frame.noise.floor) - penalty, pull, information
+        return frame.likelihood(predicted, variance - frame.noise.floor) - penalty, pull, information
 
     def add(self, frame: Observation, guess: np.ndarray) -> "Addition":
         """Return what a further contact, beside a guess (n, 4), would explain.
 
         The contacts of the guess may move, to first order.
         """
-        felt, columns = self.felt(guess[None])
-        weight = frame.counts / self.variance(frame, felt, columns)[0]
+        predicted, columns = self.predict(guess[None])
+        weight = frame.counts / self.variance(frame, predicted, columns)[0]
         scaled = columns[0] * weight
         information = scaled @ columns[0].T + np.diag(np.tile(self._scale**-2, len(guess)))
         projected = np.diag(weight) - scaled.T @ np.linalg.solve(information, scaled)
-        left = (frame.readings - felt[0]) * frame.counts
+        left = (frame.readings - predicted[0]) * frame.counts
         mode, ratio = fit_residual(self.prior, self._lattice, left, projected)
         top = ratio.max()
         factor = float(top + np.log(np.exp(ratio - top).mean())) + math.log(len(guess) + 1)
@@ -202,9 +202,9 @@ class Search:
                 chosen.append(int(index))
         return chosen
 
-    def pairs(self, frame: Observation, felt: np.ndarray) -> np.ndarray:
+    def pairs(self, frame: Observation, predicted: np.ndarray) -> np.ndarray:
         """Return the pairs (M, 2, 4) that explain best what contacts with readings (S,), N, leave over."""
-        left = (frame.readings - felt).astype(np.float32)
+        left = (frame.readings - predicted).astype(np.float32)
         weight = frame.counts / (frame.noise.floor + (_TOLERANCE * left) ** 2).astype(np.float32)
         scaled = self._lattice * weight
         along, gram = scaled @ left, scaled @ self._lattice.T
@@ -272,7 +272,9 @@ class Search:
         weight = np.exp(logs - highest)
         evidence = float(highest + math.log(weight.mean()))
         weight /= weight.sum()
-        return Mixture(guess, weight, evidence, float(weight @ misfit), modes[0], self.felt(modes[:1])[0][0])
+        return Mixture(
+            guess, weight, evidence, float(weight @ misfit), modes[0], self.predict(modes[:1])[0][0]
+        )
 
     @staticmethod
     def _tail_constant(size: int) -> float:
@@ -293,11 +295,11 @@ class Search:
     def _weigh(self, frame: Observation, guess: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the log posterior (M,) but for constants, and the squared misfit in variances."""
         inside = self._inside(guess)
-        felt, columns = self.felt(inside)
-        variance = self.variance(frame, felt, columns)
+        predicted, columns = self.predict(inside)
+        variance = self.variance(frame, predicted, columns)
         density = -0.5 * (guess[..., 2:] ** 2).sum((1, 2))
-        likelihood = frame.likelihood(felt, variance - frame.noise.floor)
-        misfit = ((frame.readings - felt) ** 2 / variance) @ frame.counts
+        likelihood = frame.likelihood(predicted, variance - frame.noise.floor)
+        misfit = ((frame.readings - predicted) ** 2 / variance) @ frame.counts
         return np.where((inside == guess).all((1, 2)), likelihood + density, -np.inf), misfit
 
     def walk(self, frame: Observation, mixture: Mixture) -> Mixture:

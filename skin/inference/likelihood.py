@@ -48,23 +48,23 @@ class Observation:
         """Return the squared misfit of no contact, in variances."""
         return float(self.readings**2 @ self.counts / self.noise.floor)
 
-    def likelihood(self, felt: np.ndarray, spread: np.ndarray) -> np.ndarray:
+    def likelihood(self, predicted: np.ndarray, spread: np.ndarray) -> np.ndarray:
         """Return the log likelihood (...,) of true readings (..., S), N, with further variances, N^2."""
         variance = spread + np.float32(self.noise.floor)
-        terms = self.readings - felt
+        terms = self.readings - predicted
         terms *= terms
         terms /= variance
         fit = terms @ self.counts
         fit += np.log(np.float32(2 * math.pi) * variance) @ self.counts
         fit *= np.float32(-0.5)
         if len(self.clipped):
-            fit += self.clipping(felt[..., self.clipped], variance)
+            fit += self.clipping(predicted[..., self.clipped], variance)
         return fit
 
-    def clipping(self, felt: np.ndarray, variance: np.ndarray) -> np.ndarray:
+    def clipping(self, predicted: np.ndarray, variance: np.ndarray) -> np.ndarray:
         """Return the log probability (...,) that those sensors clip, from their readings (..., C), N."""
         deviation = np.sqrt(variance[..., self.clipped] if variance.ndim else variance)
-        return log_ndtr((felt - np.float32(self.noise.clip)) / deviation).sum(-1)
+        return log_ndtr((predicted - np.float32(self.noise.clip)) / deviation).sum(-1)
 
 
 def relative_variance(noise: Noise, readings: np.ndarray, slopes: np.ndarray) -> np.ndarray | None:
@@ -177,8 +177,11 @@ def integrate_force(
     if spread is None:
         likelihood = _quadratic(frame, readings, force)
     else:
-        felt, further = force[..., None] * readings[:, None], (force * force)[..., None] * spread[:, None]
-        likelihood = frame.likelihood(felt, further)
+        predicted, further = (
+            force[..., None] * readings[:, None],
+            (force * force)[..., None] * spread[:, None],
+        )
+        likelihood = frame.likelihood(predicted, further)
     factor = np.log(weights / math.sqrt(2 * math.pi)) + nodes**2 / 2 + np.log(deviation)[:, None]
     return force, likelihood + _density(prior, logarithm) + factor
 

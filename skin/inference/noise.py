@@ -59,6 +59,6 @@ class Noise:
         variance = self.floor + (self.gain * readings).square()
         return variance.masked_fill(readings >= self.clip, torch.inf)
 
-    def felt(self, readings: Tensor, sigmas: float = 3.0) -> Tensor:
+    def exceeds(self, readings: Tensor, sigmas: float = 3.0) -> Tensor:
         """Return which readings (B, S), N, exceed the noise of one frame, bool."""
         return readings > sigmas * self.frame

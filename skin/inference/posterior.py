@@ -282,7 +282,7 @@ class Posterior:
             [single.mode[:, :2], *self._search.scores(single.mode[:, 2], single.mode[:, 3])]
         )
         sensors = max(frame.counts.sum(), 1) / 2
-        felt = self._search.felt(mode[None])[0][0]
+        predicted = self._search.predict(mode[None])[0][0]
         for number in range(2, maximum + 1):
             addition = self._search.add(frame, mode)
             # It explains no more than the first contact: where no sensor responds, both are hidden.
@@ -291,18 +291,20 @@ class Posterior:
             if gammaincc(sensors, misfit / 2) > _POOR and odds < math.log(_LIKELY):
                 evidence.append(evidence[-1] + factor)
                 continue
-            mixture = self._refine(frame, self._search.extend(mode, addition), mode, felt)
+            mixture = self._refine(frame, self._search.extend(mode, addition), mode, predicted)
             evidence.append(max(evidence[-1] + factor, mixture.evidence))
             mixtures[number] = mixture
-            mode, felt, misfit = mixture.mode, mixture.felt, mixture.misfit
+            mode, predicted, misfit = mixture.mode, mixture.predicted, mixture.misfit
         return evidence, mixtures
 
-    def _refine(self, frame: Observation, guesses: np.ndarray, mode: np.ndarray, felt: np.ndarray) -> Mixture:
+    def _refine(
+        self, frame: Observation, guesses: np.ndarray, mode: np.ndarray, predicted: np.ndarray
+    ) -> Mixture:
         """Return the best contacts, one more than a mode (n, 4), from several starts."""
         starts = [guesses]
         for index in range(len(mode)):
             others = np.delete(mode, index, 0)
-            left = felt * 0 if not len(others) else self._search.felt(others[None])[0][0]
+            left = predicted * 0 if not len(others) else self._search.predict(others[None])[0][0]
             pairs = self._search.pairs(frame, left)
             starts.append(np.concatenate([np.repeat(others[None], len(pairs), 0), pairs], axis=1))
         modes, score = self._search.refine(frame, np.concatenate(starts))

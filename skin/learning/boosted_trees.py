@@ -45,9 +45,9 @@ class FeatureLearner(AbstractLearner):
 
     _features = staticmethod(feature_matrix)
 
-    @abstractmethod
     def _predict(self, model: Any, matrix: np.ndarray) -> np.ndarray:
         """Return what a model predicts of features (B, D): (B,) or (B, K)."""
+        return model.predict(matrix)
 
     @abstractmethod
     def _kinds(self, task: Task) -> Sequence[Any]:
@@ -57,9 +57,9 @@ class FeatureLearner(AbstractLearner):
     def _check(self, model: Any) -> None:
         """Raise a ValueError if predictions of a stored model could crash or never end."""
 
-    @abstractmethod
     def _size(self, model: Any) -> int:
         """Return the number of fitted numbers."""
+        return model.size
 
     def _set(self, models: list[Any], task: Task) -> None:
         self._learned = models, task
@@ -228,9 +228,9 @@ class BoostedTrees(FeatureLearner):
         return result / result.sum(dim=1, keepdim=True) if self.learned[1].kind == "exclusive" else result
 
     def _predict(self, model: Trees, matrix: np.ndarray) -> np.ndarray:
-        if isinstance(model, HistGradientBoostingRegressor):
-            return model.predict(matrix)
-        return model.predict_proba(matrix)[:, 1]
+        if isinstance(model, HistGradientBoostingClassifier):
+            return model.predict_proba(matrix)[:, 1]
+        return super()._predict(model, matrix)
 
     def _kinds(self, task: Task) -> "list[type[Trees]]":
         kinds = HistGradientBoostingRegressor, HistGradientBoostingClassifier

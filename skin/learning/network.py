@@ -298,7 +298,7 @@ class Network(AbstractLearner):
             if data.task.kind == "regression":
                 classifier.targets.scale(torch.cat([part.known_labels for part in data.parts("train")]))
             self._begin(classifier)
-            training = Training(classifier, self._optimizer, self._warmup)
+            training = Training(classifier, data, self._optimizer, self._warmup)
             folder = self.unfinished or Path(temporary)
             self.seconds_per_epoch = train_network(
                 training, data, self._trainer, logger, folder, self.unfinished is not None

@@ -87,9 +87,6 @@ class SmallDataLearner(FeatureLearner):
         self._set(models, task)
         return self
 
-    def _predict(self, model: "Kernel | Forest", matrix: np.ndarray) -> np.ndarray:
-        return model.predict(matrix)
-
     def _kinds(self, task: Task) -> Sequence[Any]:
         return [self._kind] * len(_columns(task))
 
@@ -97,9 +94,6 @@ class SmallDataLearner(FeatureLearner):
         if isinstance(model, Forest):
             leaves = model.feature < 0
             check_trees(leaves, model.feature, model.children, model.values, model.n_features_in_)
-
-    def _size(self, model: "Kernel | Forest") -> int:
-        return model.size
 
 
 def _columns(task: Task) -> list[list[int]]:

@@ -8,13 +8,13 @@ import math
 import os
 import time
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from statistics import median
 from typing import Any
 
 import torch
-from pytorch_lightning import Callback, LightningDataModule, LightningModule, Trainer
+from pytorch_lightning import Callback, LightningModule, Trainer
 from pytorch_lightning.callbacks import ModelCheckpoint
 from pytorch_lightning.loggers import Logger
 from pytorch_lightning.strategies.launchers import _MultiProcessingLauncher, _SubprocessScriptLauncher
@@ -29,38 +29,6 @@ from skin.learning.data import Batch, TouchData
 from skin.learning.network import LAST, MakeOptimizer, TouchClassifier
 
 
-class TouchDataModule(LightningDataModule):
-    """Touches as frames for a Trainer, with any LightningModule.
-
-    Args:
-        data: gives the batches, and their frames where the network is.
-    """
-
-    def __init__(self, data: TouchData) -> None:
-        super().__init__()
-        self.data = data
-
-    def setup(self, stage: str) -> None:
-        """Let the data know the Trainer, for its epoch and its processes."""
-        self.data.trainer = self.trainer
-
-    def teardown(self, stage: str) -> None:
-        """Let the data forget the Trainer, which has ended."""
-        self.data.trainer = None
-
-    def train_dataloader(self) -> Iterable[Touches | Batch]:
-        """Return the batches of the training split, in another order each epoch."""
-        return self.data.train_dataloader()
-
-    def val_dataloader(self) -> Iterable[Touches | Batch]:
-        """Return the batches of the validation split."""
-        return self.data.val_dataloader()
-
-    def on_after_batch_transfer(self, batch: Touches, dataloader_idx: int) -> Batch:
-        """Return the frames and labels of a batch that has arrived where the network is."""
-        return self.data.frames(batch) if isinstance(batch, Touches) else batch
-
-
 class Training(LightningModule):
     """Trains a network.
 
@@ -69,6 +37,7 @@ class Training(LightningModule):
 
     Args:
         network: what is trained, in place.
+        data: gives the batches, and their frames where the network is.
         optimizer: partial; takes the parameters.
         warmup: fraction of the steps in which the learning rate rises to the optimizer's; it then falls to
             nothing along a cosine (Smith and Topin, 2018). None keeps it constant.
@@ -77,13 +46,18 @@ class Training(LightningModule):
     def __init__(
         self,
         network: TouchClassifier,
+        data: TouchData,
         optimizer: MakeOptimizer,
         warmup: float | None = None,
     ) -> None:
         super().__init__()
         self.network = network
-        self._make_optimizer, self._warmup = optimizer, warmup
+        self._data, self._make_optimizer, self._warmup = data, optimizer, warmup
         self._batches: dict[str, list[tuple[int, dict[str, Tensor]]]] = {"train": [], "val": []}
+
+    def on_after_batch_transfer(self, batch: Touches | Batch, dataloader_idx: int) -> Batch:
+        """Return the frames and labels of a batch that has arrived where the network is."""
+        return self._data.frames(batch) if isinstance(batch, Touches) else batch
 
     def _step(self, batch: Batch, stage: str) -> Tensor:
         frames, labels = batch
@@ -169,11 +143,14 @@ def train_network(
         # Behind `best`, whose state it saves; several processes would have to save together.
         every = ModelCheckpoint(folder, last.stem, enable_version_counter=False)
         trainer.callbacks.append(every)  # type: ignore[attr-defined]
-    module, begun = TouchDataModule(data), last if alone and last.is_file() else None
+    begun = last if alone and last.is_file() else None
+    data.trainer = trainer  # for its epoch and its processes
     with warnings.catch_warnings():
         # Lightning 2.6 asks torch 2.13 for a deprecated class
         warnings.filterwarnings("ignore", ".*treespec, LeafSpec", FutureWarning)
-        trainer.fit(training, datamodule=module, ckpt_path=begun, weights_only=True)
+        loaders = data.train_dataloader(), data.val_dataloader()
+        trainer.fit(training, *loaders, ckpt_path=begun, weights_only=True)
+    data.trainer = None
     if not trainer.is_global_zero:
         return math.nan
     checkpoint = torch.load(best.best_model_path, weights_only=True, map_location="cpu")

@@ -16,9 +16,9 @@ from skin.evaluation.decisions import (
     DECISIONS,
     DRIFT,
     ContactDetector,
-    as_press,
     held_frames,
     longest_shown,
+    present_as_press,
 )
 from skin.live.verdict import LASTING, Note, Verdict, order_notes
 from skin.touch.labels import RELEASE, Task
@@ -305,7 +305,10 @@ class Engine:
         )
         if (lasted or 0.0) * self.rate > self._shown:
             idle, idle_valid = self._idle
-            readings, valid = (as_press(idle, readings, self._held), as_press(idle_valid, valid, self._held))
+            readings, valid = (
+                present_as_press(idle, readings, self._held),
+                present_as_press(idle_valid, valid, self._held),
+            )
         yield _Decision(draft, t, readings, valid, risen, last)
 
     def _fill_window(

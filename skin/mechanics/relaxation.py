@@ -194,12 +194,12 @@ class Relaxing(AbstractSimulator):
         """Return the response to movies with a skin that is initially at rest."""
         parts = [model.linear(frames, shear)[index] * scale[..., None] for model in self.models]  # type: ignore[operator]
         time = torch.arange(index.shape[1], device=scale.device) / self.rate
-        felt = parts[-1]
-        # A difference of operators that are alike; in float32 the lags' shares would magnify its rounding.
-        slow = torch.stack(parts[:-1]).double() - felt.double()
+        motion = parts[-1]
+        # A difference of operators that are alike; in float32 the lags' fractions would magnify its rounding.
+        slow = torch.stack(parts[:-1]).double() - motion.double()
         for lag, fraction in zip(self.lags, self.fractions, strict=True):
             term = torch.einsum("i,i...->...", fraction, slow)
             constant = torch.full_like(term[:, 0], lag)
-            felt = felt + first_order_lag(term, constant, time).to(felt)
-        response = self._relaxed.read(felt)
+            motion = motion + first_order_lag(term, constant, time).to(motion)
+        response = self._relaxed.read(motion)
         return response if displacement else Response(response.readings, None)

@@ -106,7 +106,7 @@ def misclassified(
     Bars are two standard errors.
 
     Args:
-        courses: row -> shares and standard errors (:func:`misclassified_shares`).
+        courses: row -> fractions and standard errors (:func:`misclassified_fractions`).
         label: which label.
         bins: ascending edges, m/s; static touches stand at 0 on their own.
     """

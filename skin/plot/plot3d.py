@@ -242,14 +242,14 @@ class _Shell:
 
     def surface(self, depth: np.ndarray) -> np.ndarray:
         """Return where the surface is, (ny + 1, nx + 1, 3), mm, pushed in by a depth (ny + 1, nx + 1), m."""
-        return 1e3 * self.body.position(np.stack([*self.lines, depth], axis=-1))
+        return 1e3 * self.body.locate(np.stack([*self.lines, depth], axis=-1))
 
     def rims(self) -> list[np.ndarray]:
         """Return the layers' faces where y ends, from the core outwards, (2, nx + 1, 3) each, mm."""
         depths = (self.body.thickness, *self.body.interfaces)
         x, y = (line[-1] for line in self.lines)
         return [
-            1e3 * self.body.position(np.stack([np.stack([x, y, 0 * x + depth], axis=-1) for depth in pair]))
+            1e3 * self.body.locate(np.stack([np.stack([x, y, 0 * x + depth], axis=-1) for depth in pair]))
             for pair in pairwise(depths)
         ]
 
@@ -293,7 +293,7 @@ def sensors_in_space(axis: Axes3D, scene: Scene, body: AbstractBody) -> Draw:
         height = np.maximum(scene.readings[frame], 0)
         foot = scene.positions[frame] * [1.0, 1.0, 0.0]
         tip = foot - np.outer(longest * height / scene.strongest, [0.0, 0.0, 1.0])
-        ends = 1e3 * np.stack([body.position(foot), body.position(tip)], axis=1)
+        ends = 1e3 * np.stack([body.locate(foot), body.locate(tip)], axis=1)
         _rims(axis, shell)
         _dots(axis, body, foot)
         seen, colours = _faces_eye(body, foot), colormaps[FORCE](colour(height))
@@ -340,7 +340,7 @@ def _rims(axis: Axes3D, shell: _Shell) -> None:
 
 def _dots(axis: Axes3D, body: AbstractBody, positions: np.ndarray) -> None:
     """Draw the sensors (S, 3), m, that lie on the side of the eye."""
-    x, y, z = 1e3 * body.position(positions[_faces_eye(body, positions)]).T
+    x, y, z = 1e3 * body.locate(positions[_faces_eye(body, positions)]).T
     axis.scatter(x, y, z, s=9, c="black", depthshade=False, zorder=3)
 
 

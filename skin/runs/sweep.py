@@ -78,7 +78,7 @@ class Shard:
         return set(sorted(set(names))[self.number - 1 :: self.count])
 
 
-def left_out() -> bool:
+def belongs_to_other_shard() -> bool:
     """Return whether the running job of a multirun belongs to another shard."""
     return str(HydraConfig.get().job.num) in os.environ.get(LEFT_OUT, "").split()
 

@@ -268,14 +268,14 @@ def log_report(store: Store, run: Run, report: Report, task: Task, values: dict[
             named = dict(zip(task.binary, report.confusion.numpy(), strict=True))
             save_figure(confusions(named, ("no", "yes")), Path(folder) / "confusion.png")
         store.client.log_artifacts(run.info.run_id, folder)
-    for column, reason in report.cannot.items():
+    for column, reason in report.unavailable.items():
         store.client.set_tag(run.info.run_id, f"cannot_{column}", reason)
 
 
 # Evaluate a finished run again.
 
 
-# Expected seconds of each step, for the share in the progress.
+# Expected seconds of each step, for the fraction in the progress.
 _STEPS = {
     "loading the run and the threshold of its alarm": 20.0,
     "reading or simulating the touches": 10.0,

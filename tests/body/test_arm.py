@@ -33,7 +33,7 @@ def test_places_by_hand():
     edge = np.pi * 0.05
     chart = [[0, 0, 0], [edge / 2, 0.1, 0], [edge, 0.2, 0], [edge / 2, 0.1, 0.015], [edge, 0, 0.015]]
     space = [[-0.05, 0, 0], [0, 0.1, 0.05], [0.05, 0.2, 0], [0, 0.1, 0.035], [0.035, 0, 0]]
-    np.testing.assert_allclose(half.position(np.array(chart)), space, atol=1e-15)
+    np.testing.assert_allclose(half.locate(np.array(chart)), space, atol=1e-15)
     top = half.frame(np.array([edge / 2, 0.1, 0.0]))
     np.testing.assert_allclose(top, [[1, 0, 0], [0, 1, 0], [0, 0, -1]], atol=1e-15)
     np.testing.assert_allclose(half.frame(np.zeros(3)), [[0, 0, 1], [0, 1, 0], [1, 0, 0]], atol=1e-15)
@@ -42,7 +42,7 @@ def test_places_by_hand():
 def test_all_places_lie_on_the_cylinder_and_into_the_skin_is_to_its_axis():
     body, rng = arm(), np.random.default_rng(0)
     given = rng.uniform(size=(100, 3)) * [*body.size, body.thickness]
-    space, into = body.position(given), body.frame(given)[:, 2]
+    space, into = body.locate(given), body.frame(given)[:, 2]
     radius = np.hypot(space[:, 0], space[:, 2])
     np.testing.assert_allclose(radius, 0.05 - given[:, 2])
     np.testing.assert_allclose(space + radius[:, None] * into, space * [0, 1, 0], atol=1e-15)
@@ -54,11 +54,11 @@ def test_straight_lines_of_the_chart_are_the_shortest_on_the_surface():
     first, second = np.array([0.01, 0.03, 0.0]), np.array([0.09, 0.15, 0.0])
     fraction = np.linspace(0, 1, 2001)[:, None]
     helix = first + fraction * (second - first)
-    along = np.linalg.norm(np.diff(body.position(helix), axis=0), axis=1).sum()
+    along = np.linalg.norm(np.diff(body.locate(helix), axis=0), axis=1).sum()
     assert along == pytest.approx(np.linalg.norm(second - first), rel=1e-6)
     for bend in (-0.01, 0.01):
         detour = helix + bend * np.sin(np.pi * fraction) * [1, 0, 0]
-        assert np.linalg.norm(np.diff(body.position(detour), axis=0), axis=1).sum() > along
+        assert np.linalg.norm(np.diff(body.locate(detour), axis=0), axis=1).sum() > along
 
 
 def test_a_large_arm_is_a_sheet():
@@ -67,7 +67,7 @@ def test_a_large_arm_is_a_sheet():
     large = arm(radius=1e4, angle=size[0] / 1e4)
     given = np.random.default_rng(0).uniform(size=(50, 3)) * [*size, 0.015]
     middle = np.array([size[0] / 2, 0, -1e4])
-    np.testing.assert_allclose(large.position(given) + middle, sheet.position(given), atol=1e-6)
+    np.testing.assert_allclose(large.locate(given) + middle, sheet.locate(given), atol=1e-6)
     np.testing.assert_allclose(large.frame(given), sheet.frame(given), atol=1e-5)
 
 

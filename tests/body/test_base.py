@@ -35,10 +35,10 @@ def test_the_chart_is_a_grid_of_equal_cells(body):
 @pytest.mark.parametrize("shape", [(), (5,), (2, 4)])
 def test_places_and_frames_have_the_shape_of_their_points(body, shape):
     given = points(body, *shape)
-    assert body.position(given).shape == (*shape, 3)
+    assert body.locate(given).shape == (*shape, 3)
     assert body.frame(given).shape == (*shape, 3, 3)
-    alone = body.position(given.reshape(-1, 3)[0])
-    np.testing.assert_array_equal(body.position(given).reshape(-1, 3)[0], alone)
+    alone = body.locate(given.reshape(-1, 3)[0])
+    np.testing.assert_array_equal(body.locate(given).reshape(-1, 3)[0], alone)
 
 
 def test_the_axes_are_orthonormal_and_one_way_round(body):
@@ -54,8 +54,8 @@ def test_the_axes_are_the_way_that_places_move(body):
     """Independent answer: differences of places, from which the lengths at the surface follow too."""
     step, given = 1e-6, points(body, 50)
     for surface in (given, given * [1, 1, 0]):
-        moves = np.stack([body.position(surface + step * axis) for axis in np.eye(3)], axis=1)
-        moves = (moves - body.position(surface)[:, None]) / step
+        moves = np.stack([body.locate(surface + step * axis) for axis in np.eye(3)], axis=1)
+        moves = (moves - body.locate(surface)[:, None]) / step
         length = np.linalg.norm(moves, axis=2)
         np.testing.assert_allclose(moves / length[..., None], body.frame(surface), atol=1e-4)
     np.testing.assert_allclose(length, 1, atol=1e-4)  # the chart is true to length on the surface

@@ -1,9 +1,7 @@
 """A run of drawn skins is used on a skin of its own: simulated, recorded, and at a port."""
 
 import re
-from contextlib import ExitStack
 from dataclasses import replace
-from time import monotonic, sleep
 
 import pytest
 
@@ -37,14 +35,6 @@ def test_it_is_evaluated_on_a_layout_from_a_file_and_says_what_is_new_to_it(run,
 
 
 @pytest.mark.slow("trains and evaluates a run")
-def test_a_recording_gets_the_geometry_of_the_configured_skin(run, folder):
-    run(folder, "generate", "n=200", "out=own.parquet", *OWN, store=False)
-    own = ["device.path=own.parquet", "device.test=all"]
-    run(folder, "evaluate", "device=recording", *own, *OWN)
-    assert 0 < metrics(folder)[-1]["same/overall/accuracy"] < 1
-
-
-@pytest.mark.slow("trains and evaluates a run")
 def test_a_recording_with_one_of_the_labels_is_judged_by_it(run, folder):
     done = run(folder, "generate", "n=40", "out=four.parquet", *OWN, store=False)
     four = read_recording(folder / "four.parquet")
@@ -60,27 +50,6 @@ def test_a_recording_with_one_of_the_labels_is_judged_by_it(run, folder):
         folder, "evaluate", "device=recording", "device.path=other.parquet", "device.test=all", *OWN, code=2
     )
     assert "has the labels firm, and the run learned big, dynamic, press, dangerous" in done.stderr
-
-
-@pytest.mark.slow("trains a run and starts a live view")
-def test_it_watches_nine_sensors_at_a_port(begin, folder):
-    link = folder / "skin"
-    with ExitStack() as both:
-        emulator = both.enter_context(begin(folder, "emulate", f"link={link}", *OWN))
-        deadline = monotonic() + 300
-        while not (scale := re.search(r"device\.scale=(\S+)\n", emulator.out)):
-            assert monotonic() < deadline, emulator.err
-            assert emulator.poll() is None, emulator.err
-            sleep(0.2)
-        reader = ["device=serial", f"device.port={link}", f"device.scale={scale[1]}"]
-        store = [f"tracking.uri=sqlite:///{folder}/m.db", f"tracking.artifacts={folder}/a"]
-        refused = both.enter_context(begin(folder, "live", *reader, *OWN, *store, "seconds=8"))
-        assert refused.wait() == 2, refused.err  # a training of one epoch finds few dangerous touches
-        assert "it hides dangerous touches" in " ".join(refused.err.split())
-        store.append("live.patience.above=0.5")
-        live = both.enter_context(begin(folder, "live", *reader, *OWN, *store, "seconds=8"))
-        assert live.wait() == 0, live.err
-    assert re.search(r"[1-9]\d* verdicts", live.err), live.err
 
 
 @pytest.mark.slow("trains and exports a run")

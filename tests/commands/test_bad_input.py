@@ -44,6 +44,8 @@ PORT = "device.port=/dev/ttyACM77"
         ("live demo=true run=none", "no finished training run none"),
         ("live demo=true device=serial", "leave out device=serial, or demo=true"),
         ("live live.top=0", "live.top=0 must be greater than 0"),
+        ("live live.web_port=70000", "live.web_port=70000 must be less than or equal to 65535"),
+        ("live +live.patience.alarms=0.1", "live.patience has no setting alarms: did you mean alarm"),
         *(
             (f"{verb} seconds=-1", "seconds=-1 is below 0")
             for verb in ("live", "record", "listen", "emulate")

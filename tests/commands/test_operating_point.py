@@ -2,10 +2,8 @@
 
 import json
 import re
-import socket
 import sqlite3
 from contextlib import closing, contextmanager
-from threading import Thread
 
 import numpy as np
 import pytest
@@ -124,31 +122,18 @@ def test_an_unknown_profile_is_refused_before_anything_is_trained(run, folder, t
     assert not (tmp_path / "m.db").exists() or not query(tmp_path, "select * from runs")
 
 
-@contextmanager
-def tapped():
-    """Give the port of a skin that is left alone for five seconds and then tapped."""
+@pytest.fixture
+def port(played):
+    """Give the port of a skin that is left alone for five seconds and then tapped, for each reader anew."""
     frames = np.zeros((60, 4))
     frames[54:57, 1] = 1.5
     rows = "".join(f"{n},{100_000 * n},{','.join(map(str, row))}\n" for n, row in enumerate(frames.tolist()))
-    with socket.create_server(("127.0.0.1", 0)) as server:
 
-        def serve():
-            held = []
-            while True:
-                try:
-                    held.append(server.accept()[0])
-                    held[-1].sendall(b"# skin proto=1 n=4 rate=10 unit=N\n" + rows.encode())
-                except OSError:
-                    break
-            for reader in held:
-                reader.close()
+    def say(reader, stop):
+        reader.sendall(b"# skin proto=1 n=4 rate=10 unit=N\n" + rows.encode())
+        reader.recv(1)  # until it has gone
 
-        thread = Thread(target=serve)
-        thread.start()
-        yield f"socket://127.0.0.1:{server.getsockname()[1]}"
-        # This wakes accept(), which closing would not.
-        server.shutdown(socket.SHUT_RDWR)
-        thread.join(20)
+    return f"device.port={played(say)}"
 
 
 LIVE = ["live.touch=0.3", "live.selftest=false", "seconds=1.2"]  # a training of seconds finds little
@@ -156,24 +141,21 @@ LIVE = ["live.touch=0.3", "live.selftest=false", "seconds=1.2"]  # a training of
 
 @pytest.mark.slow("starts a live view that waits for a tap")
 @pytest.mark.parametrize(("above", "alarm"), [("0.00001", True), ("0.9999", False)])
-def test_live_raises_the_alarm_where_it_is_told(run, folder, above, alarm):
-    with tapped() as port:
-        there = ["device=serial", f"device.port={port}", *LIVE]
-        done = run(folder, "live.py", *there, f"live.patience.above={above}")
+def test_live_raises_the_alarm_where_it_is_told(run, folder, port, above, alarm):
+    done = run(folder, "live.py", "device=serial", port, *LIVE, f"live.patience.above={above}")
     assert re.search(r"[1-9]\d* verdicts", done.stderr)
     assert ('"dangerous": true' in done.stdout) == alarm
     assert f"alarm above {float(above):g}" in done.stderr
 
 
 @pytest.mark.slow("draws and plays touches for three live views")
-def test_live_chooses_a_threshold_per_touch_for_the_profile_and_keeps_it(run, folder, tmp_path, monkeypatch):
+def test_live_chooses_a_threshold_per_touch_for_the_profile_and_keeps_it(
+    run, folder, port, tmp_path, monkeypatch
+):
     monkeypatch.setenv("SKIN_CACHE", str(tmp_path))
     levels, few = [], "evaluation.safe_gestures=50"  # the time goes with their number
     for words in ([], ["evaluation.profile=rough"], ["evaluation.profile=rough"]):
-        with tapped() as port:
-            done = run(
-                folder, "live.py", "device=serial", f"device.port={port}", *LIVE, few, *words, code=None
-            )
+        done = run(folder, "live.py", "device=serial", port, *LIVE, few, *words, code=None)
         said = " ".join(done.stderr.split())
         # A training of seconds may find too few dangerous touches.
         hides = re.search(r"it hides dangerous touches: train with more gestures, or give a lower", said)

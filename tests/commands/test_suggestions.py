@@ -10,6 +10,20 @@ from skin.commands._command import quote_value
 from skin.commands.train import main
 
 
+@pytest.fixture
+def refused(capsys, monkeypatch):
+    """Return a function that returns the sentence with which words are refused."""
+    monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
+
+    def refuse(*words):
+        with pytest.raises(SystemExit) as ended:
+            main(words)
+        assert ended.value.code == 2
+        return capsys.readouterr().err
+
+    return refuse
+
+
 @pytest.mark.parametrize(
     ("word", "answer"),
     [
@@ -25,25 +39,27 @@ from skin.commands.train import main
             """out=bench (1).csv cannot be read: quote the value, as in 'out="bench (1).csv"'""",
         ),
         ("device.path=a=b.csv", """a=b.csv cannot be read: quote the value, as in 'device.path="a=b.csv"'"""),
+        ("qqqq=3", "Could not override 'qqqq'"),  # of Hydra: nothing is near
         ("data.name=a,b", """data.name=a,b cannot be read: quote the value, as in 'data.name="a,b"'"""),
     ],
 )
-def test_the_answer_names_what_was_meant(word, answer, capsys, monkeypatch):
-    monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
-    with pytest.raises(SystemExit) as ended:
-        main([word])
-    assert ended.value.code == 2
-    error = capsys.readouterr().err
+def test_the_answer_names_what_was_meant(word, answer, refused):
+    error = refused(word)
     assert answer in error
     assert len(error.splitlines()) == 1
 
 
 @pytest.mark.skipif(find_spec("hydra_plugins.hydra_optuna_sweeper") is not None, reason="it is installed")
-def test_an_option_of_a_plugin_is_told_how_to_install(capsys):
-    with pytest.raises(SystemExit) as ended:
-        main(["-m", "hydra/sweeper=optuna"])
-    assert ended.value.code == 2
-    assert 'pip install "tactile-skin[optuna]" adds it' in capsys.readouterr().err
+def test_an_option_of_a_plugin_is_told_how_to_install(refused):
+    assert 'pip install "tactile-skin[optuna]" adds it' in refused("-m", "hydra/sweeper=optuna")
+
+
+@pytest.mark.parametrize("scheme", ["postgresql+none", "mysql+none"])
+def test_a_database_without_its_driver_is_refused_at_once(scheme, refused):
+    error = refused(f"tracking.uri={scheme}://me:geheim@127.0.0.1:1/runs")
+    assert f"tracking.uri={scheme}://me:***@127.0.0.1:1/runs needs a driver that is not installed" in error
+    assert "give postgresql+pg8000://" in error
+    assert len(error.splitlines()) == 1
 
 
 @pytest.mark.parametrize("shown", ["job", "hydra"])
@@ -52,23 +68,6 @@ def test_a_password_is_not_in_the_configuration(shown, capsys):
     text = capsys.readouterr().out
     assert "postgresql+pg8000://me:***@h/runs" in text
     assert "heim" not in text
-
-
-@pytest.mark.parametrize("scheme", ["postgresql+none", "mysql+none"])
-def test_a_database_without_its_driver_is_refused_at_once(scheme, capsys):
-    with pytest.raises(SystemExit) as ended:
-        main([f"tracking.uri={scheme}://me:geheim@127.0.0.1:1/runs"])
-    assert ended.value.code == 2
-    error = capsys.readouterr().err
-    assert f"tracking.uri={scheme}://me:***@127.0.0.1:1/runs needs a driver that is not installed" in error
-    assert "give postgresql+pg8000://" in error
-    assert len(error.splitlines()) == 1
-
-
-def test_a_name_that_is_near_to_none_keeps_the_answer_of_hydra(capsys):
-    with pytest.raises(SystemExit):
-        main(["qqqq=3"])
-    assert "Could not override 'qqqq'" in capsys.readouterr().err
 
 
 def test_an_option_may_stand_between_overrides(tmp_path, capsys):
@@ -80,22 +79,16 @@ def test_an_option_may_stand_between_overrides(tmp_path, capsys):
     assert "  seed: 5\n" in shown
 
 
-def test_a_file_that_is_not_yaml_is_refused_with_the_line(tmp_path, capsys):
+def test_a_file_that_is_not_yaml_is_refused_with_the_line(tmp_path, refused):
     (tmp_path / "body").mkdir()
     (tmp_path / "body/mine.yaml").write_text("size: [0.3, 0.2\ncells: 3\n")
-    with pytest.raises(SystemExit) as ended:
-        main(["--config-dir", str(tmp_path), "body=mine"])
-    assert ended.value.code == 2
-    error = capsys.readouterr().err
+    error = refused("--config-dir", str(tmp_path), "body=mine")
     assert "line 2" in error
     assert len(error.splitlines()) == 1
 
 
-def test_an_option_that_does_not_exist_is_named_in_short(capsys):
-    with pytest.raises(SystemExit) as ended:
-        main(["seed=5", "--confg-dir", "x", "body=mine"])
-    assert ended.value.code == 2
-    usage, error = capsys.readouterr().err.splitlines()
+def test_an_option_that_does_not_exist_is_named_in_short(refused):
+    usage, error = refused("seed=5", "--confg-dir", "x", "body=mine").splitlines()
     assert usage.startswith("usage: skin VERB ")
     assert "--confg-dir" in error
 

@@ -10,7 +10,6 @@ from omegaconf import OmegaConf
 
 from skin.core.settings import ONCE, RISING, check_groups, check_settings, checked, configured
 from skin.errors import InputError
-from skin.live.engine_builder import LiveSettings
 from skin.runs.build import build_data, build_device, build_learner
 
 
@@ -81,10 +80,7 @@ def test_what_does_not_fit_is_refused_by_name(wrong, said):
     [
         ({"_target_": f"{__name__}.Thing", "count": 0}, "model.count=0 must be greater"),
         ({"_target_": "absent.Thing"}, "model._target_=absent.Thing cannot be imported: .*'absent'"),
-        (
-            {"_target_": "skin.learning.model.Mpl"},
-            "model._target_=skin.learning.model.Mpl cannot be",
-        ),
+        ({"_target_": "skin.learning.model.Mpl"}, "model._target_=skin.learning.model.Mpl cannot be"),
     ],
 )
 def test_classes_of_others_are_checked_too(part, said):
@@ -126,21 +122,15 @@ SERIAL = ["device=serial", "device.port=/dev/null"]
     [
         (["optimizer.lr=oops"], "optimizer.lr=oops is text"),
         (["+optimizer.lrr=1"], "the optimizer refuses its settings: .*lrr"),
-        (["model.channels=8"], "model.channels=8 must be a list"),
         (["+model.channelz=3"], "model has no setting channelz: did you mean channels"),
-        (["fusion.hidden=x"], "fusion.hidden=x must be a whole number"),
         (["trainer.accelerator=gpus"], "Trainer refuses trainer: .*gpus"),
-        (["+trainer.typo=1"], "Trainer refuses trainer: .*typo"),
         (["learner=boosted_trees", "learner.rounds=0"], "learner.rounds=0 must be greater than or equal"),
-        (["representation=interp", "representation.pixels=x"], "representation.pixels=x must be a whole"),
         (["device.noise=-1"], "device.noise=-1 must be greater than or equal to 0"),
         (["device.dead=[4,2]"], r"device.dead=\[4, 2\] must be a range \[minimum, maximum\]"),
         (
             ["+device.noize=1"],
             "device has no setting noize: did you mean noise[?] it has .*gain_spread, scale_spread, offset",
         ),
-        (["simulator=solid", "simulator.divisions=x"], "simulator.divisions=x must be a whole number"),
-        ([*SERIAL, "device.scale=abc"], "device.scale=abc must be a valid number"),
         ([*SERIAL, "device.limits=[1023,0]"], r"device.limits=\[1023, 0\] must be \[smallest, largest\]"),
     ],
 )
@@ -148,22 +138,3 @@ def test_a_group_refuses_a_setting_before_anything_is_made(configured, overrides
     config = configured(*SMALL, *overrides)
     with pytest.raises(InputError, match=said):
         build_learner(config).check(build_data(config, build_device(config)))
-
-
-LIVE = {"web_port": 8765, "top": 4.0, "touch": None, "drift": 0.2, "verdicts": None, "log": None,
-        "contacts": True, "selftest": True, "patience": {"label": 0.15}}  # fmt: skip
-
-
-@pytest.mark.parametrize(
-    ("wrong", "said"),
-    [
-        ({"web_port": 70000}, "live.web_port=70000 must be less than or equal to 65535"),
-        ({"touch": -1}, "live.touch=-1 must be greater than 0"),
-        ({"patience": {"alarms": 0.1}}, "live.patience has no setting alarms: did you mean alarm"),
-        ({"tuoch": 1}, "live has no setting tuoch: did you mean touch"),
-    ],
-)
-def test_the_live_view_refuses_a_setting_by_name(wrong, said):
-    assert LiveSettings.of(LIVE).patience.label == 0.15
-    with pytest.raises(InputError, match=said):
-        LiveSettings.of(LIVE | wrong)

@@ -95,7 +95,7 @@ def test_the_holdout_was_not_trained_on(device, tried):
 
 def test_who_cannot_take_another_layout_says_so(device):
     report = evaluate(Knows(device.touches("test").positions), device, SETTINGS, POINT)
-    assert report.cannot == {"unseen_layout": "another layout"}
+    assert report.unavailable == {"unseen_layout": "another layout"}
     assert not [name for name in report.metrics if name.startswith("unseen_layout")]
     assert report.metrics["device_shift/overall/accuracy"] == 1
 
@@ -118,7 +118,7 @@ def test_a_layout_of_a_prime_number_of_sensors_makes_no_grid(configured, tmp_pat
     device = build_device(
         configured("simulator=naive", f"layout.path={path}", "data.gestures=80", "device.test_gestures=48")
     )
-    assert "unseen_layout" in evaluate(Knows(), device, SETTINGS, POINT).cannot
+    assert "unseen_layout" in evaluate(Knows(), device, SETTINGS, POINT).unavailable
 
 
 def test_what_is_not_defined_has_a_reason_and_is_shown_as_a_dash(made_up_device, tmp_path):
@@ -129,8 +129,8 @@ def test_what_is_not_defined_has_a_reason_and_is_shown_as_a_dash(made_up_device,
             return touches
 
     found = evaluate(Knows(), AllDangerous(), SETTINGS, POINT)
-    assert "same/dangerous/false_alarm_rate" in found.cannot
-    assert "dangerous/accuracy" not in "".join(found.cannot)
+    assert "same/dangerous/false_alarm_rate" in found.unavailable
+    assert "dangerous/accuracy" not in "".join(found.unavailable)
     seen = io.StringIO()
     show(found, "title", Console(file=seen, width=100))
     line = next(line for line in seen.getvalue().splitlines() if "dangerous/false_alarm_rate" in line)
@@ -155,6 +155,6 @@ def test_labels_that_nobody_knows_have_a_sentence_instead_of_figures(made_up_dev
     report = evaluate(Constant(), made_up_device, SETTINGS, POINT)
     assert not [name for name in report.metrics if name.split("/")[1] in ("big", "dangerous")]
     assert {"same/press/accuracy", "same/overall/accuracy"} <= set(report.metrics)
-    assert report.cannot["labels"] == "the touches of the test tell nothing of big, dangerous"
-    assert "/big" not in "".join(report.cannot)
+    assert report.unavailable["labels"] == "the touches of the test tell nothing of big, dangerous"
+    assert "/big" not in "".join(report.unavailable)
     assert report.reached is None

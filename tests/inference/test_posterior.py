@@ -74,7 +74,7 @@ def draw(count, seed, number=1, margin=0.0, apart=0.0):
     return np.array(touches)
 
 
-def felt(touches, thin=False):
+def true_readings(touches, thin=False):
     """Return the true readings (count, 25), N."""
     flat = touches.reshape(-1, 4)
     body = THIN if thin else DEEP
@@ -138,7 +138,7 @@ def _moments(weight, values):
 def test_a_region_holds_what_it_says():
     """Boxes are up to 1.8 deviations long; what was uniform over each held 88 % in place of 90."""
     prior, touches, fractions = FingertipPrior(), draw(16, 4, margin=0.03), []
-    for readings in measure(felt(touches), NOISE, 3):
+    for readings in measure(true_readings(touches), NOISE, 3):
         estimate = posterior(contacts=1).estimate(readings)
         (contact,) = estimate.contacts
         spread = 6 * contact.position_deviation
@@ -167,7 +167,7 @@ def test_a_region_holds_what_it_says():
 )
 def test_a_contact_agrees_with_brute_force(thin, noise):
     touches = draw(60, seed=3, margin=0.02)
-    true = felt(touches, thin)
+    true = true_readings(touches, thin)
     estimated, compared = posterior(thin, noise, SINGLE), False
     for row in np.flatnonzero((true > 0.15).any(1))[:16]:
         readings = measure(true[row], noise, row)
@@ -186,7 +186,7 @@ def test_a_contact_agrees_with_brute_force(thin, noise):
 @pytest.mark.parametrize(("thin", "noise"), [(False, NOISE), (True, Noise(0.05, 10, gain=0.05, offset=0.02))])
 def test_truth_drawn_from_the_prior_has_uniform_ranks(thin, noise):
     touches = draw(150, seed=8)
-    readings = measure(felt(touches, thin), noise, seed=9)
+    readings = measure(true_readings(touches, thin), noise, seed=9)
     contacts = [
         estimate.contacts[0] if estimate.contacts else None
         for estimate in posterior(thin, noise, SINGLE).estimate(readings)
@@ -220,7 +220,7 @@ def same(first: FrameEstimate, second: FrameEstimate) -> bool:
 
 def test_a_contact_is_told_as_one_and_where_it_is():
     touches = draw(60, seed=1, margin=0.03)
-    true = felt(touches)
+    true = true_readings(touches)
     rows = (true > 0.15).any(1)
     estimates = posterior().estimate(measure(true, NOISE, 2)[rows])
     assert np.mean([estimate.number == 1 for estimate in estimates]) >= 0.97
@@ -233,7 +233,7 @@ def test_a_contact_is_told_as_one_and_where_it_is():
 
 def test_two_contacts_are_told_apart():
     touches = draw(20, seed=4, number=2, margin=0.03, apart=0.064)
-    estimates = posterior().estimate(measure(felt(touches), NOISE, 5))
+    estimates = posterior().estimate(measure(true_readings(touches), NOISE, 5))
     right = [row for row, estimate in enumerate(estimates) if estimate.number == 2]
     assert len(right) >= 19
     errors = []
@@ -273,14 +273,14 @@ def test_contacts_that_no_sensor_feels_are_as_likely_as_brute_force_says():
 def test_a_bar_is_no_fingertip(thin):
     x, y = (part.ravel() for part in np.meshgrid(np.linspace(0.04, 0.12, 21), np.linspace(0.06, 0.084, 7)))
     chain = np.stack([x, y, np.full(x.size, 0.004), np.full(x.size, 0.6)], axis=1)
-    estimate = posterior(thin).estimate(measure(felt(chain[None], thin), NOISE, 22)[0])
+    estimate = posterior(thin).estimate(measure(true_readings(chain[None], thin), NOISE, 22)[0])
     assert not estimate.fingertip
     assert estimate.large > 0.9
 
 
 def test_frames_alone_and_together_give_the_same_bits():
     touches = np.concatenate([draw(3, 11, 2, 0.03, 0.05), np.repeat(draw(3, 12, margin=0.03), 2, 1)])
-    readings = measure(felt(touches), NOISE, 13)
+    readings = measure(true_readings(touches), NOISE, 13)
     together = posterior().estimate(readings)
     assert all(
         same(posterior().estimate(row), estimate) for row, estimate in zip(readings, together, strict=True)
@@ -304,7 +304,7 @@ def test_the_order_of_sensors_does_not_matter():
 
 
 def test_an_invalid_sensor_counts_for_nothing():
-    readings = measure(felt(draw(1, 16, margin=0.05)), NOISE, 17)[0]
+    readings = measure(true_readings(draw(1, 16, margin=0.05)), NOISE, 17)[0]
     valid = np.arange(25) != readings.argmax()
     worse = np.where(valid, readings, 99.0)
     clean, spoilt = posterior().estimate(readings, valid), posterior().estimate(worse, valid)
@@ -318,7 +318,7 @@ def test_an_invalid_sensor_counts_for_nothing():
 
 def test_a_sensor_that_clips_says_at_least_so_much():
     touch = np.array([[[0.08, 0.08, 0.008, 40.0]]])
-    true = felt(touch, thin=True)[0]
+    true = true_readings(touch, thin=True)[0]
     noise = Noise(0.05, 10, clip=float(true.max() / 2))
     prior = FingertipPrior(force=20.0)
     readings = np.minimum(measure(true, noise, 18), noise.clip)
@@ -331,7 +331,7 @@ def test_a_sensor_that_clips_says_at_least_so_much():
 
 def test_frames_of_a_touch_tell_more_together():
     touches = draw(1, 19, margin=0.05)
-    frames = np.concatenate([measure(felt(touches), Noise(0.05), seed) for seed in range(10)])
+    frames = np.concatenate([measure(true_readings(touches), Noise(0.05), seed) for seed in range(10)])
     alone = posterior(noise=Noise(0.05)).estimate(frames[0])
     together = posterior(noise=Noise(0.05)).estimate_touch(frames)
     assert together.contacts[0].region().area < 0.5 * alone.contacts[0].region().area
@@ -353,7 +353,7 @@ def test_two_sensors_say_what_cannot_be_known():
 
 def test_a_limit_of_pressure_has_a_probability():
     touch = np.array([[[0.08, 0.08, 0.008, 10.0]]])
-    estimate = posterior().estimate(measure(felt(touch), NOISE, 21)[0])
+    estimate = posterior().estimate(measure(true_readings(touch), NOISE, 21)[0])
     limits = [estimate.exceeds(limit) for limit in (1e3, 50e3, 1e6)]
     assert limits[0] == pytest.approx(1)
     assert limits[2] < 0.01

@@ -6,15 +6,12 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from pytorch_lightning import LightningModule
-from pytorch_lightning import Trainer as Fit
 
 from skin.device.base import AbstractDevice
 from skin.device.touches import Part, Recording, Touches
 from skin.errors import InputError
 from skin.learning.data import Augmentation, TouchData
-from skin.learning.representation import Frames, Readings
-from skin.learning.training import TouchDataModule
+from skin.learning.representation import Readings
 from skin.runs.build import build_data, build_device
 from skin.touch.labels import TOUCH_SLIDING
 
@@ -89,21 +86,13 @@ def test_processes_share_each_batch(make):
     assert parts[0][-1] == parts[1][-1] == alone[-1]  # three gestures are too few for two processes
 
 
-def test_an_epoch_shows_every_gesture_once(make):
-    batches = make().train_dataloader()
-    assert sorted(flat(batches)) == list(range(23))
-    assert [len(batch) for batch in numbers(batches)] == [5, 5, 5, 5, 3]
-    assert len(batches) == 5
-
-
 def test_one_thread_trains_while_another_draws_the_next_epoch(make, monkeypatch):
     monkeypatch.setattr(torch, "get_num_threads", lambda: 1)
     data, other = make(fresh=True), make(fresh=True)
     data.trainer.strategy = SimpleNamespace(root_device=torch.device("cpu"))
     for epoch in range(3):
         data.trainer.current_epoch = other.trainer.current_epoch = epoch
-        module = TouchDataModule(data)
-        batches = [module.on_after_batch_transfer(batch, 0) for batch in data.train_dataloader()]
+        batches = [*data.train_dataloader()]
         expected = [other.frames(batch) for batch in other.train_dataloader()]
         assert len(batches) == len(expected) == 5
         for batch, (frames, labels) in zip(batches, expected, strict=True):
@@ -112,29 +101,18 @@ def test_one_thread_trains_while_another_draws_the_next_epoch(make, monkeypatch)
     assert sorted(data.device.asked) == [("train", epoch) for epoch in range(3)]
 
 
-def test_the_order_follows_from_seed_and_epoch(make):
-    data = make()
-    first = flat(data.train_dataloader())
-    assert flat(data.train_dataloader()) == first
-    assert first != list(range(23))
-    assert flat(make(seed=1).train_dataloader()) != first
-    data.trainer.current_epoch = 1
-    second = flat(data.train_dataloader())
-    assert second != first
-    assert flat(make(seed=1).train_dataloader()) != second
-
-
-def test_an_epoch_shows_every_gesture_of_every_part_once(make):
-    data = make(kind=InParts)
+@pytest.mark.parametrize(("kind", "sizes"), [(Numbered, [3, 5, 5, 5, 5]), (InParts, [2, 2, 4, 5, 5, 5])])
+def test_an_epoch_shows_every_gesture_once_in_an_order_of_seed_and_epoch(make, kind, sizes):
+    data, other, orders = make(kind=kind), make(seed=1, kind=kind), []
     batches = data.train_dataloader()
-    assert len(batches) == len(numbers(batches)) == 2 + 3 + 1
-    first, again = flat(batches), flat(batches)
-    assert first == again
-    assert sorted(first) == list(range(23))
-    data.trainer.current_epoch = 1
-    second = flat(data.train_dataloader())
-    assert sorted(second) == list(range(23))
-    assert second != first
+    for epoch in range(2):
+        data.trainer.current_epoch = other.trainer.current_epoch = epoch
+        orders += [flat(batches), flat(other.train_dataloader())]
+        assert flat(data.train_dataloader()) == orders[-2]
+    assert sorted(map(len, numbers(batches))) == sizes
+    assert len(batches) == len(sizes)
+    assert all(sorted(order) == list(range(23)) for order in orders)
+    assert len({tuple(order) for order in [*orders, range(23)]}) == 5
 
 
 def test_parts_come_in_another_order_each_epoch_and_one_after_the_other(make):
@@ -163,16 +141,6 @@ def test_the_hash_is_of_all_parts(make, monkeypatch):
     assert make(kind=InParts).hash != one
 
 
-def test_the_order_leaves_the_random_state_alone(make):
-    state = torch.get_rng_state()
-    flat(make().train_dataloader())
-    assert torch.equal(torch.get_rng_state(), state)
-
-
-def test_validation_keeps_its_order(make):
-    assert flat(make().val_dataloader()) == list(range(23))
-
-
 def test_a_device_with_fixed_gestures_is_asked_once_a_split(make):
     data = make()
     for epoch in range(3):
@@ -187,15 +155,6 @@ def test_fresh_gestures_are_drawn_every_epoch(make):
     for epoch in range(3):
         data.trainer.current_epoch = epoch
         assert sorted(flat(data.train_dataloader())) == [1000 * epoch + i for i in range(23)]
-
-
-def test_a_batch_arrives_as_frames_and_labels(make):
-    data = make()
-    touches = next(iter(data.train_dataloader()))
-    frames, labels = TouchDataModule(data).on_after_batch_transfer(touches, 0)
-    assert torch.equal(frames.x, touches.readings)
-    assert labels.shape == (5, 4)
-    assert data.example.readings.shape[1] == 6
 
 
 def test_a_layout_is_represented_once(make):
@@ -220,29 +179,6 @@ def test_without_a_trainer_each_pass_is_the_next_epoch(make, fresh):
             assert torch.equal(labels, y)
         assert len(list(alone.val_dataloader())) == 5
     assert all(frames.x.shape[1:] == (6, 2) for frames, _ in alone.val_dataloader())
-
-
-@pytest.mark.filterwarnings("ignore")  # Lightning's advice
-def test_a_trainer_of_ones_own_is_a_loop_of_ones_own(make, tmp_path):
-    class Constant(LightningModule):
-        def __init__(self):
-            super().__init__()
-            self.weight = torch.nn.Parameter(torch.zeros(1))
-            self.automatic_optimization = False
-
-        def training_step(self, batch, index):
-            assert isinstance(batch[0], Frames)
-
-        def configure_optimizers(self):
-            return torch.optim.SGD(self.parameters())
-
-    data = make(fresh=True)
-    data.trainer = None
-    quiet = {"logger": False, "enable_progress_bar": False, "enable_checkpointing": False}
-    quiet |= {"enable_model_summary": False, "accelerator": "cpu", "default_root_dir": tmp_path}
-    Fit(max_epochs=2, limit_val_batches=0, **quiet).fit(Constant(), data.train_dataloader())
-    firsts = [next(iter(data.train_dataloader()))[0].x.max() // 1000 for _ in range(2)]
-    assert firsts == [2, 3]
 
 
 def test_what_cannot_be_batched_is_refused(make):
@@ -271,3 +207,73 @@ def test_touches_without_geometry_get_that_of_the_configured_skin(configured):
     torch.testing.assert_close(data.show(unknown).summary, data.show(touches).summary)
     other = build_data(configured("representation=sites", "simulator=naive", *small), device)
     assert not torch.allclose(other.show(unknown).x, data.show(touches).x)
+
+
+# Changed touches keep their labels true.
+
+
+TIME, SENSORS = 30, 4
+
+
+@pytest.fixture
+def touches():
+    """Return touches of 8 frames that begin at frame 5 to 12, over constant offsets."""
+    generator = torch.Generator().manual_seed(0)
+    readings = torch.randn(64, 1, SENSORS, generator=generator).expand(-1, TIME, -1).clone()
+    for number in range(64):
+        start = 5 + number % 8
+        readings[number, start : start + 8] += torch.arange(1.0, 9.0)[:, None]
+    valid = torch.ones_like(readings, dtype=torch.bool)
+    return Touches(readings, valid, torch.rand(SENSORS, 3), torch.ones(64, 4), 10.0)
+
+
+def changed(touches, seed=1, **settings):
+    return Augmentation(**settings)(touches, torch.Generator().manual_seed(seed))
+
+
+def pressed(touches):
+    excess = touches.readings - touches.readings.amin(dim=1, keepdim=True)
+    return excess.amax(dim=2)
+
+
+def test_nothing_asked_changes_nothing(touches):
+    assert torch.equal(changed(touches).readings, touches.readings)
+
+
+def test_a_shift_moves_the_touch_whole(touches):
+    before, after = pressed(touches), pressed(changed(touches, shift=True))
+    first = (after > 0).int().argmax(dim=1)
+    assert len(first.unique()) > 8
+    for number, start in enumerate(first.tolist()):
+        assert torch.allclose(after[number, start : start + 8], torch.arange(1.0, 9.0))
+    torch.testing.assert_close(after.sum(dim=1), before.sum(dim=1))
+
+
+def test_every_second_touch_runs_backwards(touches):
+    after = changed(touches, reverse=True).readings
+    back = (after == touches.readings.flip(1)).all(dim=(1, 2))
+    kept = (after == touches.readings).all(dim=(1, 2))
+    assert (back ^ kept).all()
+    assert 16 < back.sum() < 48
+
+
+def test_gain_is_one_factor_per_sensor_and_touch(touches):
+    factor = changed(touches, gain=0.1).readings / touches.readings
+    torch.testing.assert_close(factor, factor[:, :1].expand_as(factor))
+    assert factor[:, 0].log().std() == pytest.approx(0.1, rel=0.15)
+
+
+def test_noise_has_the_deviation_that_was_asked_for(touches):
+    assert (changed(touches, noise=0.2).readings - touches.readings).std() == pytest.approx(0.2, rel=0.05)
+
+
+def test_the_generator_decides(touches):
+    settings = {"shift": True, "reverse": True, "gain": 0.1, "noise": 0.1}
+    once = changed(touches, **settings).readings
+    assert torch.equal(changed(touches, **settings).readings, once)
+    assert not torch.equal(changed(touches, seed=2, **settings).readings, once)
+
+
+def test_what_cannot_be_is_refused(touches):
+    with pytest.raises(InputError, match=r"data\.augment\.noise=-1 must be"):
+        Augmentation(noise=-1)

@@ -6,15 +6,7 @@ import pytest
 from rich.console import Console
 
 from skin.core import progress
-from skin.core.messages import format_duration
 from skin.core.progress import Steps
-
-
-@pytest.mark.parametrize(
-    ("duration", "text"), [(0.4, "0 s"), (89, "89 s"), (91, "2 min"), (7200, "120 min"), (9000, "2.5 h")]
-)
-def test_a_duration_is_in_seconds_minutes_or_hours(duration, text):
-    assert format_duration(duration) == text
 
 
 @pytest.mark.parametrize("terminal", [True, False])

@@ -524,7 +524,7 @@ def _sag(body: AbstractBody, inside: Tensor) -> Tensor:
     cover = inside.double().numpy()
     middle = cover @ cells / np.maximum(cover.sum(axis=1, keepdims=True), 1)
     inward = body.frame(middle)[:, 2]
-    below = inward @ body.position(cells).T - (inward * body.position(middle)).sum(axis=1, keepdims=True)
+    below = inward @ body.locate(cells).T - (inward * body.locate(middle)).sum(axis=1, keepdims=True)
     return torch.from_numpy(below).float()
 
 

@@ -100,7 +100,7 @@ def build_mesh(
         ratio += [ratios[number]] * len(rows[-1])
     x, y = (np.linspace(0, body.size[axis], refinement * body.cells[axis] + 1) for axis in (0, 1))
     depths = np.concatenate([[0.0], *rows]).cumsum()
-    return Hexahedra((x, y, depths), np.array(young), np.array(ratio), body.position, body.frame)
+    return Hexahedra((x, y, depths), np.array(young), np.array(ratio), body.locate, body.frame)
 
 
 def _pieces(body: AbstractBody, sensors: Sensors, width: float) -> Iterator[Pieces]:

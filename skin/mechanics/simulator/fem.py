@@ -195,7 +195,7 @@ class PlatesAndBeams(AbstractSimulator):
         displacement = torch.stack([sensor, surface], dim=-1)
         if self.reading == "interface":
             return Response(force, displacement)
-        # Where nothing moves the share is 0; dividing by 1 there keeps the gradient finite too. Subnormal
+        # Where nothing moves the fraction is 0; dividing by 1 there keeps the gradient finite too. Subnormal
         # motion counts as none: its quotient could overflow.
         moves = surface.abs() > torch.finfo(surface.dtype).tiny
         fraction = torch.where(moves, sensor / torch.where(moves, surface, 1), 0)

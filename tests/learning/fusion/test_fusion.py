@@ -1,17 +1,19 @@
 """Each fusion by itself."""
 
 import math
-import warnings
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from hydra.utils import instantiate
+from omegaconf import OmegaConf
 
 from skin.errors import InputError
 from skin.learning.cnn import Cnn
 from skin.learning.fusion import HEADS, Early, Late, Linked, link, positions
-from skin.learning.graph import normalised
+from skin.learning.graph import Graph, normalised
 from skin.learning.model import Gcn, Mlp
 from skin.learning.representation import Frames
 
@@ -27,41 +29,10 @@ def test_only_mean_and_max_forget_the_order(head):
     assert same == (head in ("mean", "max"))
 
 
-def test_an_unknown_head_is_refused():
-    names = r"'mean', 'max', 'conv', 'lstm', 'gru', 'attention\+gru', 'residual' or 'transformer'"
-    with pytest.raises(InputError, match=rf"fusion\.head=tcn must be {names}"):
-        Late(MODEL, "readings", (4,), 6, head="tcn")
-
-
-@pytest.mark.parametrize(
-    ("head", "hidden", "words"),
-    [
-        ("transformer", 30, r"got fusion\.hidden=30: set fusion\.hidden=32"),
-        ("gru", 0, r"fusion.hidden=0 must be greater than 0: as in fusion.hidden=64"),
-        ("transformer", -4, r"fusion.hidden=-4 must be greater than 0"),
-    ],
-)
-def test_a_width_that_a_head_cannot_have_is_refused(head, hidden, words):
-    with pytest.raises(InputError, match=words):
-        Late(MODEL, "readings", (4,), 6, head=head, hidden=hidden)
-
-
 def test_positions_of_frames_by_hand():
     sin, cos = math.sin, math.cos
     wanted = [[sin(t), cos(t), sin(t / 100), cos(t / 100)] for t in range(3)]
     torch.testing.assert_close(positions(3, 4), torch.tensor(wanted))
-
-
-def test_a_transformer_looks_back_over_the_whole_window():
-    torch.manual_seed(0)
-    head = HEADS["transformer"](4, 8).eval()
-    x = torch.zeros(1, 60, 4, requires_grad=True)
-    states = []
-    head.encoder.register_forward_hook(lambda *call: states.append(call[-1]))
-    head(x)
-    # Not the sum: the layer's norm keeps that at 0, and its gradient would be rounding.
-    states[0][0, 59, 0].backward()
-    assert (x.grad[0].abs().amax(dim=1) > 1e-6).all()
 
 
 class Spy(torch.nn.Module):
@@ -108,22 +79,6 @@ def test_two_sensors_and_three_frames_by_hand():
     np.testing.assert_allclose(link(torch.from_numpy(normalised(PAIR)), 3), wanted)
 
 
-def test_it_is_normalised_as_in_pytorch_geometric():
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "`torch.jit.script", DeprecationWarning)
-        from torch_geometric.nn.conv.gcn_conv import gcn_norm
-    edges = np.random.default_rng(0).random((4, 4))
-    edges = np.triu(edges, 1) + np.triu(edges, 1).T
-    plain = torch.block_diag(*[torch.from_numpy(edges)] * 3)
-    later = torch.arange(4, 12)
-    plain[later, later - 4] = 1
-    target, source = plain.nonzero().T
-    index, weights = gcn_norm(torch.stack([source, target]), plain[target, source], num_nodes=12)
-    wanted = torch.zeros(12, 12, dtype=torch.float64)
-    wanted[index[1], index[0]] = weights.double()
-    torch.testing.assert_close(link(torch.from_numpy(normalised(edges)), 3), wanted, atol=1e-6, rtol=1e-6)
-
-
 def test_news_travel_forward_in_time_only():
     torch.manual_seed(0)
     model = partial(Gcn, widths=[3, 3], pooling="mean", activation="silu")
@@ -137,6 +92,91 @@ def test_news_travel_forward_in_time_only():
     assert (x.grad[0, :, :, 0] != 0).any(dim=1).tolist() == [False, True, True, False, False]
 
 
-def test_images_are_refused():
-    with pytest.raises(InputError, match="got image: add representation=graph model=gcn"):
-        Linked(Cnn, "image", (1, 64, 64), 30)
+# What every fusion must do, whatever model it holds.
+
+
+OPTIONS = sorted((Path(__file__).parents[3] / "conf" / "fusion").glob("*.yaml"))
+MODELS = {
+    "readings": partial(Mlp, widths=[8]),
+    "graph": partial(Gcn, widths=[4, 8]),
+    "image": partial(Cnn, channels=[4], embedding=8, dropout=0.0),
+}
+SHAPES = {"readings": (9,), "graph": (9, 2), "image": (2, 16, 16)}
+WINDOW = 6
+VARIANTS = [
+    (path, extra, kind)
+    for path in OPTIONS
+    for extra in ([{"head": head} for head in HEADS] if path.stem == "late" else [{}])
+    for kind in (["graph"] if path.stem == "linked" else MODELS)
+]
+
+
+def windows(kind, length=WINDOW):
+    generator = torch.Generator().manual_seed(0)
+    x = torch.randn(5, length, *SHAPES[kind], generator=generator)
+    positions = 0.1 * torch.rand(9, 3, generator=generator)
+    return Frames(x, Graph(positions, (0.16, 0.16)).adjacency if kind == "graph" else None)
+
+
+@pytest.fixture(params=VARIANTS, ids=lambda v: "-".join([v[0].stem, *v[1].values(), v[2]]))
+def given(request):
+    path, extra, kind = request.param
+
+    def make():
+        return instantiate(OmegaConf.load(path), **extra)(MODELS[kind], kind, SHAPES[kind], WINDOW)
+
+    torch.manual_seed(0)
+    return make, kind
+
+
+def test_a_window_becomes_one_embedding(given):
+    make, kind = given
+    fusion = make()
+    assert fusion(windows(kind)).shape == (5, fusion.width)
+
+
+def test_a_gradient_reaches_every_parameter(given):
+    make, kind = given
+    fusion = make()
+    fusion(windows(kind)).square().sum().backward()
+    for name, parameter in fusion.named_parameters():
+        assert parameter.grad is not None, name
+        # A softmax takes the bias of a score away: that gradient is rounding, and may be 0.
+        assert parameter.grad.abs().max() > 0 or name.endswith(("score.bias", "gate.bias")), name
+
+
+def test_windows_do_not_see_each_other(given):
+    make, kind = given
+    fusion, (x, adjacency, _) = make().eval(), windows(kind)
+    together = fusion(Frames(x, adjacency))
+    assert torch.equal(fusion(Frames(x, adjacency)), together)
+    torch.testing.assert_close(fusion(Frames(x[1:3], adjacency)), together[1:3])
+
+
+@pytest.mark.parametrize("head", HEADS)
+@pytest.mark.parametrize("kind", MODELS)
+def test_late_fusion_trained_on_30_frames_takes_20_and_60(kind, head):
+    torch.manual_seed(0)
+    late = next(path for path in OPTIONS if path.stem == "late")
+    fusion = instantiate(OmegaConf.load(late), head=head)(MODELS[kind], kind, SHAPES[kind], 30)
+    optimizer = torch.optim.Adam(fusion.parameters())
+    fusion(windows(kind, 30)).square().sum().backward()
+    optimizer.step()
+    fusion.eval()
+    x, adjacency, _ = windows(kind, 60)
+    short, long = fusion(Frames(x[:, :20], adjacency)), fusion(Frames(x, adjacency))
+    assert short.shape == long.shape == (5, fusion.width)
+    assert torch.isfinite(short).all()
+    assert torch.isfinite(long).all()
+    assert not torch.allclose(short, long)  # the frames after the 20th are not overlooked
+
+
+@pytest.mark.parametrize("length", [1, 4, 11])
+def test_windows_of_other_lengths(given, length, request):
+    make, kind = given
+    fusion = make()
+    if "[early" in request.node.name or "-early" in request.node.name:
+        with pytest.raises(InputError, match=rf"windows of 6 frames, got {length}: train with fusion=late"):
+            fusion(windows(kind, length))
+    else:
+        assert fusion(windows(kind, length)).shape == (5, fusion.width)

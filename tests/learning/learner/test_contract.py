@@ -16,29 +16,14 @@ from skin.learning.learner import Rules
 from skin.touch.labels import TOUCH_SLIDING
 
 OPTIONS = sorted(path.stem for path in (Path(__file__).parents[3] / "conf" / "learner").glob("*.yaml"))
+DENSE = ["representation=readings", "model=mlp", "fusion=early", "optimizer.lr=0.01", "trainer.max_epochs=15"]
 CHEAP = {
-    "network": [
-        "representation=readings",
-        "model=mlp",
-        "fusion=early",
-        "optimizer.lr=0.01",
-        "trainer.max_epochs=15",
-    ],
+    "network": DENSE,
     "boosted_trees": ["learner.rounds=20"],
     "chosen": ["learner.folds=2", "learner.members.extra_trees.trees=30"],
     "extra_trees": ["learner.trees=30"],
-    "ensemble": [
-        "representation=readings",
-        "model=mlp",
-        "fusion=early",
-        "optimizer.lr=0.01",
-        "trainer.max_epochs=15",
-        "learner.members.features.rounds=20",
-        "learner.copies.network=2",
-    ],
+    "ensemble": [*DENSE, "learner.members.features.rounds=20", "learner.copies.network=2"],
 }
-
-
 SEVERAL = {"chosen", "ensemble"}
 
 

@@ -4,7 +4,6 @@ import pytest
 import torch
 from torch.nn import functional as F
 
-from skin.errors import InputError
 from skin.learning import cnn as module
 from skin.learning.cnn import Cnn, _FirstMaximum
 
@@ -85,8 +84,3 @@ def test_the_gradient_of_a_tie_goes_to_the_first_maximum():
     plain = x.detach().clone().requires_grad_()
     F.max_pool2d(plain.permute(0, 2, 3, 1), (1, 4)).square().sum().backward()
     assert torch.equal(x.grad, plain.grad)
-
-
-def test_an_image_too_small_for_its_blocks_is_refused():
-    with pytest.raises(InputError, match=r"3 blocks from an image of 16 x 16 pixels: set model\.channels"):
-        Cnn("image", (1, 16, 16), channels=[4, 4, 4])

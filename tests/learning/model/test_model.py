@@ -1,15 +1,16 @@
 """Graph networks against the laws of graphs and against PyTorch Geometric, and the perceptron."""
 
+import math
 import warnings
 from contextlib import contextmanager
 
 import numpy as np
 import pytest
 import torch
+from torch.nn import functional as F
 
-from skin.errors import InputError
 from skin.learning.graph import adjacency, neighbours, normalised
-from skin.learning.model import POOLINGS, Gcn, Mlp, _InstanceNorm
+from skin.learning.model import POOLINGS, Gcn, Mlp, Transformer, _InstanceNorm
 
 PLACES = 0.1 * np.random.default_rng(0).random((8, 3))
 EDGES = adjacency(PLACES, neighbours(PLACES, "knn", 3), "exp")
@@ -103,20 +104,6 @@ def test_a_graph_of_one_sensor_can_be_normed():
     assert torch.isfinite(model(torch.randn(4, 1, 2), torch.ones(1, 1))).all()
 
 
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        ({"widths": []}, "model.widths="),
-        ({"pooling": "set3set"}, "model.pooling=set3set must be 'max', 'mean', 'attention' or 'set2set'"),
-        ({"norm": "group"}, "model.norm=group must be 'none', 'layer', 'batch' or 'instance'"),
-        ({"activation": "tanh"}, "model.activation=tanh must be 'relu', 'elu' or 'silu'"),
-    ],
-)
-def test_bad_options_are_refused(options, words):
-    with pytest.raises(InputError, match=words):
-        gcn(**options)
-
-
 def test_no_layer_leaves_the_readings_as_they_are():
     model = Mlp("readings", (5,), widths=[])
     x = torch.randn(3, 5)
@@ -124,8 +111,50 @@ def test_no_layer_leaves_the_readings_as_they_are():
     assert model.width == 5
 
 
-def test_every_sensor_has_weights_of_its_own():
+# The transformer over sensors: an encoder layer typed out, and what does not matter to it.
+
+
+NO_EDGES = torch.eye(8)
+
+
+def transformer(**options):
     torch.manual_seed(0)
-    model = Mlp("readings", (5,), widths=[8])
-    x = torch.randn(3, 5)
-    assert not torch.allclose(model(x.flip(1), None), model(x, None))
+    return Transformer("graph", (8, 3), **({"width": 12, "feedforward": 20} | options)).eval()
+
+
+def layer_by_hand(layer, x, heads):
+    """Return x + attention(norm(x)), then that + dense(norm(that)), head by head."""
+    y = layer.norm1(x)
+    query, key, value = F.linear(y, layer.self_attn.in_proj_weight, layer.self_attn.in_proj_bias).chunk(3, -1)
+    width = x.shape[-1] // heads
+    parts = []
+    for head in range(heads):
+        mine = slice(head * width, (head + 1) * width)
+        fraction = torch.einsum("nsd,ntd->nst", query[..., mine], key[..., mine]) / math.sqrt(width)
+        fraction = fraction.exp() / fraction.exp().sum(dim=-1, keepdim=True)
+        parts.append(torch.einsum("nst,ntd->nsd", fraction, value[..., mine]))
+    x = x + layer.self_attn.out_proj(torch.cat(parts, dim=-1))
+    return x + layer.linear2(F.gelu(layer.linear1(layer.norm2(x))))
+
+
+@pytest.mark.parametrize("pooling", ["mean", "max"])
+@pytest.mark.parametrize("context", [torch.enable_grad, torch.inference_mode])
+def test_it_is_the_encoder_that_the_formulas_describe(pooling, context):
+    model, x = transformer(heads=3, pooling=pooling), torch.randn(4, 8, 3)
+    tokens = model.tokens(x)
+    for layer in model.encoder.layers:
+        tokens = layer_by_hand(layer, tokens, 3)
+    tokens = model.encoder.norm(tokens)
+    wanted = tokens.amax(dim=1) if pooling == "max" else tokens.mean(dim=1)
+    with context():
+        torch.testing.assert_close(model(x, NO_EDGES), wanted, atol=1e-5, rtol=1e-5)
+
+
+@pytest.mark.parametrize("sensors", [1, 5, 30])
+def test_any_number_of_sensors_is_taken(sensors):
+    assert transformer()(torch.randn(4, sensors, 3), torch.eye(sensors)).shape == (4, 12)
+
+
+def test_layers_start_different():
+    first, second = transformer().encoder.layers
+    assert not torch.equal(first.linear1.weight, second.linear1.weight)

@@ -1,15 +1,11 @@
 """Networks of PyTorch Geometric on the graph of sensors."""
 
-import pytest
 import torch
 from torch_geometric.nn import DenseGCNConv
 from torch_geometric.nn.models import GCN, GraphSAGE
 
-from skin.errors import InputError
-from skin.learning.data import TouchData
 from skin.learning.graph import Graph
 from skin.learning.pyg import Pyg
-from skin.runs.build import build_data, build_learner
 
 
 def graphs(count=3):
@@ -41,34 +37,3 @@ def test_neighbours_are_those_of_the_graph():
     assert set(map(tuple, edges.T.tolist())) == {
         (a, b) for a in range(9) for b in range(9) if a != b and adjacency[a, b] != 0
     }
-
-
-@pytest.mark.parametrize(
-    ("overrides", "said"),
-    [
-        (["+model.network.headz=4"], "model.network refuses its settings: .*headz"),
-        (["model.width=0"], "model.width=0 must be greater than 0"),
-        (["model.pooling=sum"], "model.pooling=sum must be 'max', 'mean'"),
-    ],
-)
-def test_settings_that_do_not_fit_are_refused(configured, made_up_device, overrides, said):
-    config = configured("representation=graph", "model=pyg", *overrides)
-    with pytest.raises(InputError, match=said):
-        build_learner(config).check(build_data(config, made_up_device))
-
-
-def test_it_trains(configured, made_up_device):
-    config = configured(
-        "representation=graph",
-        "model=pyg",
-        "fusion.head=conv",
-        "trainer.max_epochs=12",
-        "optimizer.lr=0.01",
-        "data.batch_size=16",
-    )
-    data: TouchData = build_data(config, made_up_device)
-    learner = build_learner(config)
-    learner.fit(data)
-    touches = made_up_device.touches("test")
-    right = ((learner.probabilities(touches) > 0.5) == touches.labels.bool()).float().mean()
-    assert right > 0.75

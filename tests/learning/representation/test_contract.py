@@ -10,7 +10,7 @@ from omegaconf import OmegaConf
 from skin.errors import InputError
 
 CONF = Path(__file__).parents[3] / "conf"
-# sites needs the geometry of sensors (tests/representation/test_sites.py)
+# sites needs the geometry of sensors (test_representation.py)
 OPTIONS = sorted(path for path in (CONF / "representation").glob("*.yaml") if path.stem != "sites")
 VARIANTS = [
     (path, extra)

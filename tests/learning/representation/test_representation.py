@@ -1,11 +1,26 @@
 """Readings as they are, as images, and as spectra of images."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
+from scipy.spatial import Delaunay
 
+from skin.body.base import GEOMETRY
+from skin.device.touches import Touches
 from skin.errors import InputError
-from skin.learning.representation import Fourier, Image, Readings
+from skin.learning.features import engineered_features
+from skin.learning.representation import (
+    Features,
+    Fourier,
+    Image,
+    Interpolation,
+    Readings,
+    Sites,
+    centres,
+    weights,
+)
 
 
 def image(positions, readings, **options):
@@ -32,12 +47,6 @@ def test_sensors_on_one_pixel_are_averaged():
     torch.testing.assert_close(picture[picture != 0].sort().values, torch.tensor([0.3, 0.6]))
 
 
-@pytest.mark.parametrize("pixels", [7, 0, 64.5])
-def test_an_image_of_few_pixels_is_refused(pixels):
-    with pytest.raises(InputError, match=r"representation\.pixels=64"):
-        image([[0.1, 0.01, 0.0]], [5.0], pixels=pixels)
-
-
 def test_the_spectrum_is_that_of_numpy(made_up_device):
     touches = made_up_device.touches("test")[:3]
     given = touches.positions, made_up_device.size
@@ -61,3 +70,222 @@ def test_readings_then_their_mask():
     valid = torch.tensor([[[True, False, True]]])
     x = Readings(torch.zeros(3, 3), (0.16, 0.16), scale=2.0, mask=True)(readings, valid).x
     assert x.tolist() == [[[0.5, 0.0, 1.5, 0.0, 1.0, 0.0]]]
+
+
+# Readings above their idle level, beside engineered features.
+
+
+TIME, SENSORS = 30, 5
+
+
+@pytest.fixture
+def made():
+    generator = torch.Generator().manual_seed(3)
+    readings = 0.05 * torch.randn(6, TIME, SENSORS, generator=generator)
+    readings[:, 10:18] += torch.rand(6, 1, SENSORS, generator=generator)
+    positions = torch.rand(SENSORS, 3, generator=generator)
+    return Features(positions, (1.0, 1.0)), readings, torch.ones_like(readings, dtype=torch.bool)
+
+
+def test_a_constant_offset_is_not_seen(made):
+    represent, readings, valid = made
+    offset = torch.linspace(-1, 1, SENSORS)
+    torch.testing.assert_close(represent(readings + offset, valid).x, represent(readings, valid).x)
+
+
+def test_both_views_of_one_newton_above_idle(made):
+    represent = made[0]
+    readings = torch.zeros(1, TIME, SENSORS)
+    readings[0, 20, 2] = 1.0
+    x = represent(readings, torch.ones_like(readings, dtype=torch.bool)).x[0, 20]
+    assert x[2] == pytest.approx(1 / 3)
+    # asinh(1 / 0.2) = ln(5 + sqrt(26))
+    assert x[SENSORS + 2] == pytest.approx(2.3124383 / 2)
+    assert x.count_nonzero() == 2
+
+
+def test_the_summary_holds_every_feature(made, made_up_device):
+    represent, readings, valid = made
+    summary = represent(readings, valid).summary
+    assert summary.shape == (6, len(engineered_features(made_up_device.touches("test"))))
+    assert torch.isfinite(summary).all()
+
+
+# Interpolation against planes and brute force.
+
+
+SIZE = (0.16, 0.12)
+
+
+@pytest.fixture
+def points():
+    return np.random.default_rng(0).uniform((0.01, 0.01), (0.15, 0.11), (20, 2))
+
+
+@pytest.mark.parametrize(("method", "tolerance"), [("linear", 1e-12), ("cubic", 1e-8)])
+def test_a_plane_is_reproduced_inside_the_hull(points, method, tolerance):
+    def plane(xy):
+        return 3 + 40 * xy[:, 0] - 70 * xy[:, 1]
+
+    targets = centres(SIZE, 64)
+    inside = Delaunay(points).find_simplex(targets) >= 0
+    values = weights(points, targets, method) @ plane(points)
+    assert inside.sum() > 1000
+    assert np.abs(values - plane(targets))[inside].max() < tolerance
+
+
+def test_nearest_is_that_of_brute_force(points):
+    targets = centres(SIZE, 48)
+    nearest = np.linalg.norm(targets[:, None] - points, axis=2).argmin(axis=1)
+    assert (weights(points, targets, "nearest").argmax(axis=1) == nearest).all()
+    assert (weights(points, targets, "nearest").sum(axis=1) == 1).all()
+
+
+@pytest.mark.parametrize("method", ["linear", "cubic"])
+def test_outside_the_hull_the_nearest_value_holds(points, method):
+    targets = centres(SIZE, 48)
+    outside = Delaunay(points).find_simplex(targets) < 0
+    assert outside.sum() > 100
+    np.testing.assert_array_equal(
+        weights(points, targets, method)[outside], weights(points, targets, "nearest")[outside]
+    )
+
+
+def test_cubic_is_linear_in_the_readings(points):
+    from scipy.interpolate import CloughTocher2DInterpolator
+
+    values = np.random.default_rng(1).normal(size=len(points))
+    targets = centres(SIZE, 48)
+    inside = Delaunay(points).find_simplex(targets) >= 0
+    direct = CloughTocher2DInterpolator(points, values, tol=1e-12, maxiter=5000)(targets)
+    np.testing.assert_allclose(
+        (weights(points, targets, "cubic") @ values)[inside], direct[inside], atol=1e-7
+    )
+
+
+def test_sensors_in_a_line_are_refused(points):
+    with pytest.raises(InputError, match=r"got 3: set representation\.method=nearest"):
+        weights(np.array([[0.0, 0.0], [0.1, 0.1], [0.2, 0.2]]), points, "linear")
+
+
+METHODS = ["nearest", "linear", "cubic"]
+
+
+@pytest.fixture
+def given(made_up_device):
+    touches = made_up_device.touches("test")[:3]
+    valid = touches.valid.clone()
+    valid[:, 4, 5] = False
+    return touches.positions, touches.readings, valid
+
+
+@pytest.mark.parametrize("pixels", [48, 64, 128])
+def test_several_methods_give_a_channel_each(given, pixels):
+    positions, readings, valid = given
+    together = Interpolation(positions, SIZE, METHODS, pixels)(readings, valid).x
+    assert together.shape == (3, 10, 3, pixels, pixels)
+    for channel, method in enumerate(METHODS):
+        alone = Interpolation(positions, SIZE, method, pixels)(readings, valid).x
+        torch.testing.assert_close(together[:, :, channel : channel + 1], alone)
+
+
+def test_the_mask_of_several_methods_follows_their_values(given):
+    positions, readings, valid = given
+    x = Interpolation(positions, SIZE, METHODS, mask=True)(readings, valid).x
+    plain = Interpolation(positions, SIZE, METHODS)
+    torch.testing.assert_close(x[:, :, :3], plain(readings, valid).x)
+    wanted = plain(10 * (~valid).float(), torch.ones_like(valid)).x
+    torch.testing.assert_close(x[:, :, 3:], wanted)
+    assert (wanted.amax(dim=(-2, -1)) > 0.5).sum() == 3 * 3  # in frame 4 of each touch, by each method
+
+
+# Virtual sites do not depend on the number and the order of the sensors.
+
+
+@pytest.fixture
+def touches():
+    """Five touches of nine sensors on a skin of 0.2 x 0.1 m; one sensor is dead in the first touch."""
+    generator = torch.Generator().manual_seed(0)
+    readings = torch.rand(5, 12, 9, generator=generator)
+    sites = torch.rand(9, 2, generator=generator) * torch.tensor([0.2, 0.1])
+    geometry = torch.rand(9, len(GEOMETRY), generator=generator)
+    geometry[:, :2] = sites
+    geometry[:, GEOMETRY.index("width")], geometry[:, GEOMETRY.index("height")] = 0.2, 0.1
+    valid = torch.ones(5, 12, 9, dtype=torch.bool)
+    valid[0, :, 3] = False
+    positions = torch.cat([sites, torch.full((9, 1), 0.005)], dim=1)
+    return Touches(readings, valid, positions, None, 10.0, geometry=geometry, saturated=readings > 0.98)
+
+
+def shown(touches):
+    return Sites(touches.positions, (0.2, 0.1)).show(touches)
+
+
+def test_the_shape_does_not_depend_on_the_sensors(touches):
+    frames = shown(touches)
+    assert frames.x.shape == (5, 12, 36 * 3 * 4 + 2 * 10 + 2)
+    assert frames.summary.shape == (5, 1 + 3 * len(GEOMETRY) + 36 * 3 + 107)
+    assert torch.isfinite(frames.x).all()
+    assert torch.isfinite(frames.summary).all()
+
+
+def test_the_order_of_sensors_does_not_matter(touches):
+    order = torch.randperm(9, generator=torch.Generator().manual_seed(1))
+    other = replace(
+        touches,
+        readings=touches.readings[..., order],
+        valid=touches.valid[..., order],
+        saturated=touches.saturated[..., order],
+        positions=touches.positions[order],
+        geometry=touches.geometry[order],
+    )
+    for found, expected in zip(shown(other)[::2], shown(touches)[::2], strict=True):
+        torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("filled", [0.0, 100.0])
+def test_a_dead_sensor_changes_nothing(touches, filled):
+    extra = torch.full((5, 12, 1), torch.nan)
+    other = replace(
+        touches,
+        readings=torch.cat([touches.readings, extra], dim=2),
+        valid=torch.cat([touches.valid, extra == 0], dim=2),
+        saturated=torch.cat([touches.saturated, extra != extra], dim=2),
+        positions=torch.cat([touches.positions, torch.zeros(1, 3)]),
+        geometry=torch.cat([touches.geometry, filled * torch.ones(1, len(GEOMETRY))]),
+    )
+    for found, expected in zip(shown(other)[::2], shown(touches)[::2], strict=True):
+        torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-6)
+
+
+def test_each_touch_may_have_a_skin_of_its_own(touches):
+    each = replace(
+        touches,
+        positions=touches.positions.expand(5, 9, 3),
+        geometry=touches.geometry.expand(5, 9, len(GEOMETRY)).clone(),
+    )
+    torch.testing.assert_close(shown(each).x, shown(touches).x)
+    each.geometry[2, :, 0] /= 2
+    moved = (shown(each).x - shown(touches).x).abs().amax((1, 2))
+    assert (moved > 1e-3).tolist() == [False, False, True, False, False]
+
+
+def test_a_reading_appears_at_the_site_where_its_sensor_is(touches):
+    readings = torch.zeros(1, 12, 9)
+    readings[:, 11, 4] = 2.0
+    one = replace(
+        touches[:1], readings=readings, saturated=None, valid=torch.ones(1, 12, 9, dtype=torch.bool)
+    )
+    linear = shown(one).x[0, 11, : 36 * 4].view(36, 4)[:, 0]
+    x, y = one.positions[4, :2] / torch.tensor([0.2, 0.1])
+    sites = torch.stack(
+        torch.meshgrid((torch.arange(6) + 0.5) / 6, (torch.arange(6) + 0.5) / 6, indexing="xy"), -1
+    )
+    distance = (sites.flatten(0, 1) - torch.stack([x, y])).norm(dim=1)
+    assert distance[linear.argmax()] < 0.35
+    assert linear.max() <= 2.0 / 3.0 + 1e-6
+
+
+def test_touches_of_unknown_mechanics_are_refused(touches):
+    with pytest.raises(InputError, match="representation=sites needs to know what each sensor responds to"):
+        shown(replace(touches, geometry=None))

@@ -33,7 +33,7 @@ from skin.evaluation.metrics import compute_metrics, encode
 from skin.evaluation.operating_point import LABEL, OperatingPoint, Reached
 from skin.evaluation.settings import StreamSettings, check_evaluation
 from skin.evaluation.streams import WindowReport, evaluate_windows
-from skin.evaluation.touch_scores import touch_scores
+from skin.evaluation.touch_scores import decide_touches
 from skin.learning.graph import neighbours
 from skin.learning.learner import AbstractLearner
 from skin.live.engine import DebounceSettings
@@ -291,9 +291,13 @@ class TouchAlarms:
         danger = labels[:, TOUCH.names.index(LABEL)]
         counted = np.concatenate([labels[~danger][: self.safe], labels[danger][: self.dangerous]])
         few = min(self.safe, SAFE_TOUCHES)
-        alarms = touch.alarm(touch_scores(subject.learner, device, live, counted, self.seed))
+        alarms = touch.alarm(
+            decide_touches(subject.learner, device, live, counted, self.seed).scores(touch.score)
+        )
         at_once = replace(live, patience=0.0)
-        single = window.alarm(touch_scores(subject.learner, device, at_once, counted[:few], self.seed))
+        single = window.alarm(
+            decide_touches(subject.learner, device, at_once, counted[:few], self.seed).scores(None)
+        )
         tests = device.touches("test")
         probabilities = subject.learner.probabilities(tests)
         raised, false = int(alarms[self.safe :].sum()), int(alarms[: self.safe].sum())

@@ -11,7 +11,7 @@ recorded touches first. The folder holds any run: run=my_skin then selects it wh
 
 import sys
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import astuple, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -114,7 +114,7 @@ def _export_file(
     described = replace(model.describe(), skin=describe_skin(settings_of(whole), model.positions))
     if "simulator" in run.stored.device and model.threshold is not None:
         steps.begin(_THRESHOLDS)
-        described = replace(described, thresholds=_choose_thresholds(model, rates))
+        described = replace(described, **_choose_thresholds(model, rates))
     path = path or results(None) / f"{run.title.split()[0]}_{run.identity[:8]}.onnx"
     steps.begin("simulating touches to compare")
     device = model.device
@@ -126,8 +126,8 @@ def _export_file(
     print(f"{path}: differs from the run by {difference:.1g} at most on {len(compared)} touches")
 
 
-def _choose_thresholds(model: "TorchModel", rates: Sequence[float]) -> dict[str, float]:
-    """Return the threshold of the alarm for devices of each rate, Hz; 1 raises no alarm, and is refused."""
+def _choose_thresholds(model: "TorchModel", rates: Sequence[float]) -> dict[str, Any]:
+    """Return thresholds and scores of the alarm by the rate of a device, Hz; 1 is refused: it raises none."""
     from skin.evaluation.alarm import choose_alarm_threshold
     from skin.live.engine import DebounceSettings
 
@@ -137,4 +137,6 @@ def _choose_thresholds(model: "TorchModel", rates: Sequence[float]) -> dict[str,
     hiding = [at.warning() for at in points.values() if at and at.useless]
     refused = "".join(f"{text}: skin live refuses the file at this rate\n" for text in hiding)
     print(refused, end="", file=sys.stderr)
-    return {rate: 1.0 if at.useless else at.threshold for rate, at in points.items() if at}
+    thresholds = {rate: 1.0 if at.useless else at.threshold for rate, at in points.items() if at}
+    scores = {rate: astuple(at.score) for rate, at in points.items() if at and at.score}
+    return {"thresholds": thresholds, "scores": scores or None}

@@ -10,7 +10,7 @@ model. That of the live view, which judges many windows of a touch, depends on t
 import logging
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, astuple, dataclass, field, fields, replace
 from math import log
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -29,6 +29,7 @@ from skin.errors import InputError
 from skin.evaluation.decisions import LiveConditions
 from skin.evaluation.operating_point import (
     LABEL,
+    DangerScore,
     OperatingPoint,
     Predictor,
     dangerous_column,
@@ -47,6 +48,8 @@ SAFE_TOUCHES = ENOUGH
 """Safe touches on which a threshold is chosen."""
 DANGEROUS_TOUCHES = 400
 """Dangerous touches on which a threshold of the live view is checked: 75 % are then 71 to 79 % (95 %)."""
+FITTED_TOUCHES = 300
+"""Safe touches, and as many dangerous ones, to which a score is fitted; fits to 1200 found no more."""
 _USUAL = "mild"
 _EVERY = {"without_lag": 0.0, "framed": 0.0}  # every device is as described, whatever the training mixed in
 _DEVICE = "device"  # in place of a profile: the imperfections of the device that is evaluated
@@ -71,6 +74,7 @@ class AlarmSource:
         profile: for which it was chosen.
         threshold: of an exported network, for single windows; None: no label ``dangerous``.
         thresholds: of an exported network: rate of a device, Hz -> threshold for touches.
+        scores: of an exported network: rate -> the factors of :class:`DangerScore`.
     """
 
     name: str
@@ -86,6 +90,7 @@ class AlarmSource:
     profile: str | None = None
     threshold: float | None = None
     thresholds: Mapping[str, float] = field(default_factory=dict)
+    scores: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
 
 
 def choose_alarm_threshold(
@@ -142,7 +147,7 @@ def _exported_point(
     source: AlarmSource, live: LiveConditions | None, say: Callable[[str], None]
 ) -> OperatingPoint | None:
     """Return the point of an exported network for the rate of a device that is nearest."""
-    threshold = source.threshold
+    threshold, score = source.threshold, None
     if threshold is None:
         return None
     if live is not None:
@@ -150,6 +155,7 @@ def _exported_point(
             nearest = min(source.thresholds, key=lambda text: abs(log(float(text) / live.rate)))
             say(f"the device sends {live.rate:.3g} frames a second: threshold for {nearest} Hz, per touch")
             threshold = source.thresholds[nearest]
+            score = DangerScore(*source.scores[nearest]) if nearest in source.scores else None
         else:
             say("the threshold was chosen for single windows: a touch has many, and raises more false alarms")
         if threshold >= 1:
@@ -157,7 +163,7 @@ def _exported_point(
                 f"{source.name} has no threshold that raises an alarm: give live.patience.above=0.5"
             )
         say(f"alarm above {threshold:.4f}")
-    return OperatingPoint(threshold, math.nan, 0, 0, None)
+    return OperatingPoint(threshold, math.nan, 0, 0, None, score=score)
 
 
 def _stored_point(source: AlarmSource, settings: Evaluation) -> OperatingPoint | None:
@@ -365,12 +371,18 @@ def _on_touches(
         devices = "" if settings.profile is None else f" and devices of the profile {settings.profile}"
         say(f"choosing the alarm's threshold on {count} safe touches at {live.rate:.3g} Hz{devices}")
         point = _on_touches_of(device, source.learner, live, target, count)
-        return {"point": np.array([point.threshold, point.raised, point.dangerous, point.found])}
+        assert point.score is not None
+        counts = point.threshold, point.raised, point.dangerous, point.found
+        return {"point": np.array(counts), "score": np.array(astuple(point.score))}
 
     file = array_cache.folder(None) / f"threshold_{key[:16]}.npz"
-    threshold, *counts = array_cache.kept(file, key, {"point": (4,)}, choose)["point"].tolist()
+    kept = array_cache.kept(file, key, {"point": (4,), "score": (3,)}, choose)
+    threshold, *counts = kept["point"].tolist()
     raised, dangerous, found = (int(number) for number in counts)
-    return OperatingPoint(threshold, target, count, raised, device.data_seed, dangerous, found, live.rate)
+    score = DangerScore(*kept["score"].tolist())
+    return OperatingPoint(
+        threshold, target, count, raised, device.data_seed, dangerous, found, live.rate, score
+    )
 
 
 def _snapped(live: LiveConditions, device: "AbstractSimulated") -> LiveConditions:
@@ -386,9 +398,9 @@ def _snapped(live: LiveConditions, device: "AbstractSimulated") -> LiveCondition
 def _sources() -> list[Path]:
     """Return the files that the thresholds kept on disk depend on."""
     from skin.device import effects, imperfection, sampling
-    from skin.evaluation import decisions, touch_scores
+    from skin.evaluation import decisions, operating_point, touch_scores
 
-    modules = (effects, imperfection, sampling, decisions, touch_scores)
+    modules = (effects, imperfection, sampling, decisions, operating_point, touch_scores)
     return [Path(__file__), *(Path(str(module.__file__)) for module in modules)]
 
 
@@ -399,20 +411,26 @@ def _on_touches_of(
 
     ``device`` measures each touch; with ``randomise``, by another device.
     """
-    from skin.evaluation.touch_scores import touch_scores
+    from skin.evaluation.touch_scores import decide_touches
 
     assert learner is not None
-    seed = device.data_seed
-    labels = device.sampler.balanced(2 * max(count, DANGEROUS_TOUCHES), generator(Stream.ALARM, seed, 1))
+    seed, fitted = device.data_seed, min(count, FITTED_TOUCHES)
+    enough = fitted + max(count, DANGEROUS_TOUCHES) + 16  # of the 16 combinations some have one touch fewer
+    labels = device.sampler.balanced(2 * enough, generator(Stream.ALARM, seed, 1))
     danger = labels[:, TOUCH.names.index(LABEL)]
-    safe, others = labels[~danger][:count], labels[danger][:DANGEROUS_TOUCHES]
-    chosen = np.concatenate([safe, others])
+    safe, others = labels[~danger], labels[danger]
+    chosen = np.concatenate(
+        [safe[:count], others[:DANGEROUS_TOUCHES], safe[count:][:fitted], others[DANGEROUS_TOUCHES:][:fitted]]
+    )
     with Steps({"choosing the threshold of the alarm": 20.0}) as steps:
         # More threads than free cores take many times as long.
-        scores = touch_scores(
+        decisions = decide_touches(
             learner, device, live, chosen, seed, lambda done: steps.report(done / len(chosen))
         )
-    threshold = _lowest_threshold(scores[: len(safe)], target)
-    point = OperatingPoint(threshold, target, len(safe), 0, seed, len(others), rate=live.rate)
+    tested = count + DANGEROUS_TOUCHES
+    score = decisions.fit(np.arange(tested, len(chosen)), np.arange(2 * fitted) >= fitted)
+    scores = decisions.scores(score)[:tested]
+    threshold = _lowest_threshold(scores[:count], target)
+    point = OperatingPoint(threshold, target, count, 0, seed, DANGEROUS_TOUCHES, 0, live.rate, score)
     alarms = point.alarm(scores)
-    return replace(point, raised=int(alarms[: len(safe)].sum()), found=int(alarms[len(safe) :].sum()))
+    return replace(point, raised=int(alarms[:count].sum()), found=int(alarms[count:].sum()))

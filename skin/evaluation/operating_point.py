@@ -9,6 +9,9 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Protocol
 
+import numpy as np
+from scipy.special import expit, logit
+
 from skin.errors import InputError
 from skin.evaluation.settings import ENOUGH
 from skin.touch.labels import ALARM, Task
@@ -19,6 +22,9 @@ if TYPE_CHECKING:
     from skin.device.touches import Touches
 
 LABEL = ALARM
+_SURE = 1e-6  # probabilities of a network in single precision hold no more
+_FAINT = 1e-3  # N, far below any contact threshold
+_RIDGE = 0.01  # as of 100 touches of prior weight: separable touches would need infinite factors
 
 
 class Predictor(Protocol):
@@ -78,6 +84,56 @@ class Reached:
 
 
 @dataclass(frozen=True)
+class DangerScore:
+    """Combines the probability of a model with the largest reading of its window, by a logistic function.
+
+    A network blurs the level of big touches, and a reading alone knows no duration or area: each finds what
+    the other misses. Both factors are 0 or more, so a larger reading never lowers the probability.
+
+    Attributes:
+        odds: factor of the log odds of the model.
+        level: factor of the natural logarithm of the largest reading, N.
+        offset: added to both.
+    """
+
+    odds: float
+    level: float
+    offset: float
+
+    @classmethod
+    def fit(cls, probability: np.ndarray, reading: np.ndarray, dangerous: np.ndarray) -> "DangerScore":
+        """Return the combination of the highest likelihood on some touches, with a small ridge.
+
+        Args:
+            probability: (n,), of ``dangerous``, of the model.
+            reading: (n,), N.
+            dangerous: (n,), bool.
+        """
+        from scipy.optimize import minimize
+
+        inputs = np.stack([*_inputs(probability, reading), np.ones(len(probability))], axis=1)
+        sign = np.where(dangerous, 1.0, -1.0)
+
+        def loss(factors: np.ndarray) -> tuple[float, np.ndarray]:
+            margin, ridge = sign * (inputs @ factors), _RIDGE * factors * (1.0, 1.0, 0.0)
+            slope = -sign * expit(-margin)
+            return np.logaddexp(0.0, -margin).sum() + ridge @ factors / 2, slope @ inputs + ridge
+
+        bounds = [(0.0, None), (0.0, None), (None, None)]
+        return cls(*minimize(loss, (1.0, 1.0, 0.0), jac=True, method="L-BFGS-B", bounds=bounds).x.tolist())
+
+    def probability(self, probability: np.ndarray, reading: np.ndarray) -> np.ndarray:
+        """Return the combined probability of ``dangerous``, in the shape of both; NaN if the model's is."""
+        odds, level = _inputs(probability, reading)
+        return expit(self.odds * odds + self.level * level + self.offset)
+
+
+def _inputs(probability: np.ndarray, reading: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the log odds of a probability, and the logarithm of a reading, N."""
+    return logit(np.clip(probability, _SURE, 1 - _SURE)), np.log(np.maximum(reading, _FAINT))
+
+
+@dataclass(frozen=True)
 class OperatingPoint:
     """An alarm is raised where the probability of ``dangerous`` is greater than the threshold.
 
@@ -91,6 +147,7 @@ class OperatingPoint:
         found: how many of them raise the alarm.
         rate: of the device, Hz, where the threshold was chosen for the alarm of the live view, which judges
             many windows of a touch; None: it was chosen for one window of each gesture.
+        score: gives the probability that is compared; None: it is the model's.
     """
 
     threshold: float
@@ -101,6 +158,7 @@ class OperatingPoint:
     dangerous: int = 0
     found: int = 0
     rate: float | None = None
+    score: DangerScore | None = None
 
     @classmethod
     def default(cls, target: float) -> "OperatingPoint":

@@ -1,8 +1,9 @@
-"""Scores of touches as the live view judges them: the highest of the decisions while a touch lasts."""
+"""Decisions about touches as the live view makes them, and the score of each touch: the highest of them."""
 
 from collections.abc import Callable
 from dataclasses import replace
 from math import ceil
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -14,21 +15,64 @@ from skin.device.base import AbstractSimulated
 from skin.device.sampling import between_frames, draw_constants
 from skin.device.touches import Touches
 from skin.evaluation.decisions import DECISIONS, LiveConditions, held_frames, longest_shown, present_as_press
-from skin.evaluation.operating_point import Predictor
+from skin.evaluation.operating_point import DangerScore, Predictor
 from skin.touch.labels import RELEASE
 from skin.touch.movie import Movie
 
 
+class TouchDecisions(NamedTuple):
+    """The J decisions about each of B touches.
+
+    Attributes:
+        probability: of ``dangerous``, of the model, (B, J).
+        reading: largest of the window, N, (B, J).
+        contact: whether something touches the skin, (B, J), bool.
+        row: decisions in a row that the patience needs.
+    """
+
+    probability: Tensor
+    reading: Tensor
+    contact: Tensor
+    row: int
+
+    def highest(self, values: Tensor) -> Tensor:
+        """Return the largest over the decisions of the smallest value (B, J) among ``row`` ones, (B,).
+
+        Decisions without contact count as 0.
+        """
+        values = values * self.contact
+        minimum = -max_pool1d(-pad(values, (self.row - 1, 0)), self.row, 1) if self.row > 1 else values
+        return minimum.amax(dim=1)
+
+    def fit(self, rows: np.ndarray, dangerous: np.ndarray) -> DangerScore:
+        """Return the combination of probability and reading, fitted to n touches.
+
+        Args:
+            rows: (n,), their numbers.
+            dangerous: (n,), bool.
+        """
+        values = (self.probability, self.reading)
+        probability, reading = (self.highest(value).double().numpy()[rows] for value in values)
+        return DangerScore.fit(probability, reading, dangerous)
+
+    def scores(self, score: DangerScore | None) -> Tensor:
+        """Return the score of each touch, (B,): it raises the alarm above thresholds below; 0 if none."""
+        if score is None:
+            return self.highest(self.probability)
+        combined = score.probability(self.probability.double().numpy(), self.reading.double().numpy())
+        return self.highest(torch.from_numpy(combined))
+
+
 @torch.inference_mode()
-def touch_scores(
+def decide_touches(
     learner: Predictor,
     device: AbstractSimulated,
     live: LiveConditions,
     labels: np.ndarray,
     seed: int,
     report: Callable[[int], None] | None = None,
-) -> Tensor:
-    """Return the score of each touch: it raises the alarm at thresholds below.
+) -> TouchDecisions:
+    """Return the decisions of the live view about touches.
 
     Args:
         learner: trained.
@@ -37,13 +81,9 @@ def touch_scores(
         labels: (B, 4), bool, of the touches.
         seed: of the touches and their devices.
         report: called with the number of touches that are done.
-
-    Returns:
-        (B,), the largest over the decisions of the smallest probability of ``dangerous`` among as many
-        decisions in a row as the patience needs; 0 without contact.
     """
     device = device.replace(padded=False, stream=False)
-    scores = list[Tensor]()
+    parts = list[tuple[Tensor, Tensor, Tensor]]()
     for first in range(0, len(labels), 50):
         batch, draw = labels[first : first + 50], generator(Stream.ALARM, seed, 2, first)
         movie = device.sampler.sample(len(batch), draw, batch)
@@ -52,12 +92,11 @@ def touch_scores(
         probabilities[contact] = _classify_windows(
             learner, device, live, readings[contact], valid[contact.nonzero()[:, 0]]
         )
-        row = live.decisions(_round_rate(device, live))
-        minimum = -max_pool1d(-pad(probabilities, (row - 1, 0)), row, 1) if row > 1 else probabilities
-        scores.append(minimum.amax(dim=1))
+        parts.append((probabilities, readings.amax(dim=(2, 3)), contact))
         if report is not None:
             report(first + len(batch))
-    return torch.cat(scores)
+    probability, reading, contact = (torch.cat(part) for part in zip(*parts, strict=True))
+    return TouchDecisions(probability, reading, contact, live.decisions(_round_rate(device, live)))
 
 
 def _round_rate(device: AbstractSimulated, live: LiveConditions) -> float:

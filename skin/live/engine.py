@@ -20,8 +20,9 @@ from skin.evaluation.decisions import (
     longest_shown,
     present_as_press,
 )
+from skin.evaluation.operating_point import DangerScore
 from skin.live.verdict import LASTING, Note, Verdict, order_notes
-from skin.touch.labels import RELEASE, Task
+from skin.touch.labels import ALARM, RELEASE, Task
 from skin.wire.channels import NewtonFrame, Reason, fails_in_contact
 
 
@@ -145,6 +146,7 @@ class Engine:
         patience: settings of debouncing.
         presses: (S, S), N, readings of a press at the limit of ``dangerous`` on each sensor: where no valid
             one rises by the threshold, the position is unknown. None: each sensor feels what is on itself.
+        danger: combines the model's probability of ``dangerous`` with the largest reading; None: the model's.
 
     Attributes:
         window: of the latest readings, N.
@@ -159,6 +161,7 @@ class Engine:
     detection: Detection
     patience: DebounceSettings = field(default_factory=DebounceSettings)
     presses: np.ndarray | None = None
+    danger: DangerScore | None = None
 
     def __post_init__(self) -> None:
         self.window = Window(self.frames, self.rate, self.sensors)
@@ -238,7 +241,12 @@ class Engine:
         windows = (
             np.stack([getattr(decision, name) for decision in decisions]) for name in ("readings", "valid")
         )
-        probabilities = np.asarray(self.classify(*windows), dtype=float)
+        readings, valid = windows
+        probabilities = np.asarray(self.classify(readings, valid), dtype=float)
+        if self.danger is not None:
+            column = self.task.names.index(ALARM)
+            largest = np.where(valid, readings, 0.0).max(axis=(1, 2))
+            probabilities[:, column] = self.danger.probability(probabilities[:, column], largest)
         return [self._conclude(*pair) for pair in zip(decisions, probabilities.tolist(), strict=True)]
 
     def _take(self, readings: NewtonFrame) -> Iterator[_Decision]:

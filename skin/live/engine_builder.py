@@ -19,6 +19,7 @@ from skin.device.resampling import Frame
 from skin.errors import InputError
 from skin.evaluation.alarm import choose_alarm_threshold
 from skin.evaluation.decisions import DRIFT, minimum_visible
+from skin.evaluation.operating_point import DangerScore
 from skin.live.contacts import Mechanics
 from skin.live.engine import DebounceSettings, Detection, Engine
 from skin.live.verdict import Note, sensor_list
@@ -339,20 +340,24 @@ class LiveSetup:
             InputError: no contact threshold is known, or no threshold raises an alarm as seldom as wanted.
         """
         model, given, usual, conditions = self.model, live.patience.above, None, None
+        danger = None
         if given is None and model.alarms:
             rate = model.rate if self.port is None else measured_rate(self.port.skin)
             conditions = model.live_conditions(rate, live.patience.alarm, self.port is None)
         if given is not None or model.alarms:
             point = choose_alarm_threshold(model.alarm, conditions, given, say=say)
             # A threshold of the command line is tested against the usual one.
-            usual = model.threshold if point is None or given is not None else point.announced(say)
+            if point is None or given is not None:
+                usual = model.threshold
+            else:
+                usual, danger = point.announced(say), point.score
         if conditions is not None and self.port is not None:
             # Frames that waited meanwhile would delay the verdicts about those of now.
             with suppress(SkinTimeout, SkinDisconnected):
                 self.port.skin.read(10**6, 0.0)  # more than any queue holds
-        nominal = engine_settings(model, DebounceSettings(above=usual))
+        nominal = engine_settings(model, DebounceSettings(above=usual), danger=danger)
         patience = replace(live.patience, above=usual if given is None else given)
-        engine = engine_settings(model, patience, live.touch, live.drift)
+        engine = engine_settings(model, patience, live.touch, live.drift, danger)
         source = self.port or self.begin()
         source.tare.glitches.fractions = engine.fractions
         return LiveSession(model, source, engine, nominal)
@@ -449,6 +454,7 @@ def engine_settings(
     patience: DebounceSettings,
     touch: float | None = None,
     drift: float = 600 * DRIFT,
+    danger: DangerScore | None = None,
 ) -> Engine:
     """Return an engine for a model.
 
@@ -458,6 +464,7 @@ def engine_settings(
         touch: contact threshold, N above the baseline; None: that of the model, and the learned label
             ``touch`` counts as touch, too.
         drift: N in ten minutes that the baseline may follow without touch.
+        danger: as in :class:`Engine`.
 
     Raises:
         InputError: ``touch`` is neither given nor known, or the model estimates targets.
@@ -477,6 +484,7 @@ def engine_settings(
         Detection(contact, drift / 600, model.learned and touch is None, model.longest),
         patience,
         model.presses,
+        danger,
     )
 
 

@@ -160,6 +160,9 @@ class ModelMetadata:
         thresholds: rate of a device, Hz -> threshold at which safe touches raise the alarm of the live view
             as seldom as wanted; None: only ``threshold``, chosen for single windows.
         presses: (S, S), N, readings of a press at the limit of ``dangerous`` on each sensor; None if unknown.
+        scores: rate of a device, Hz -> ``odds``, ``level`` and ``offset`` of what is compared with the
+            threshold for touches (:class:`skin.evaluation.operating_point.DangerScore`); None: the network's
+            probability is.
     """
 
     run: str
@@ -181,6 +184,7 @@ class ModelMetadata:
     skin: dict[str, Any] | None = None
     thresholds: dict[str, float] | None = None
     presses: list[list[float]] | None = None
+    scores: dict[str, tuple[float, float, float]] | None = None
 
     @property
     def task(self) -> Task:
@@ -351,8 +355,10 @@ class OnnxModel(Model):
             setattr(self, name, getattr(metadata, name))
         self.positions = np.array(metadata.positions)
         self.presses = None if metadata.presses is None else np.array(metadata.presses)
-        thresholds = metadata.thresholds or {}
-        self.alarm = AlarmSource(str(self.path), threshold=self.threshold, thresholds=thresholds)
+        thresholds, scores = metadata.thresholds or {}, metadata.scores or {}
+        self.alarm = AlarmSource(
+            str(self.path), threshold=self.threshold, thresholds=thresholds, scores=scores
+        )
         self._try(content)
 
     def probabilities(self, readings: np.ndarray, valid: np.ndarray) -> np.ndarray:

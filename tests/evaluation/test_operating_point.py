@@ -2,12 +2,14 @@
 
 import json
 import math
-from dataclasses import replace
+from dataclasses import astuple, replace
 
 import numpy as np
 import pytest
 import torch
+from scipy.special import expit, logit
 from scipy.stats import beta
+from sklearn.linear_model import LogisticRegression
 
 from skin.core.rng import Stream, generator
 from skin.device.resampling import Frame
@@ -16,7 +18,7 @@ from skin.evaluation import alarm, touch_scores
 from skin.evaluation.alarm import AlarmSource, choose_alarm_threshold, threshold_gestures
 from skin.evaluation.decisions import LiveConditions
 from skin.evaluation.metrics import compute_metrics
-from skin.evaluation.operating_point import OperatingPoint, Reached, parse_operating_point
+from skin.evaluation.operating_point import DangerScore, OperatingPoint, Reached, parse_operating_point
 from skin.evaluation.report import evaluate
 from skin.evaluation.settings import Evaluation, check_evaluation
 from skin.live.engine import Detection, Engine
@@ -278,6 +280,12 @@ def engine_windows(drawn, readings, valid, ends, rate):
     return np.stack([windows[n] for n in chosen]), [verdicts[n].contact is not None for n in chosen]
 
 
+def decide(drawn, learner, rate, **changes):
+    """Return the scores of some touches by a learner alone."""
+    labels = balanced(64, generator(Stream.TEST, 8))
+    return touch_scores.decide_touches(learner, drawn, watching(rate, **changes), labels, 9).scores(None)
+
+
 @pytest.mark.parametrize("rate", [20.0, 100.0, 500.0])
 def test_the_windows_are_those_that_the_engine_decides_on(drawn, rate):
     """Independent code: frame by frame there, all touches at once here."""
@@ -308,11 +316,19 @@ def test_the_share_of_new_safe_touches_is_the_one_that_was_asked_for(drawn, rate
     assert point.raised <= 40
     labels = balanced(1600, generator(Stream.TEST, 8))
     safe = labels[~labels[:, 3]]
-    fraction = float(
-        point.alarm(touch_scores.touch_scores(Largest(), drawn, watching(rate), safe, 99)).float().mean()
-    )
+    decisions = touch_scores.decide_touches(Largest(), drawn, watching(rate), safe, 99)
+    fraction = float(point.alarm(decisions.scores(point.score)).float().mean())
     # Both are counted: three standard deviations of 400 and 800 touches.
     assert fraction == pytest.approx(0.1, abs=3 * (0.09 / 400 + 0.09 / 800) ** 0.5)
+
+
+class Blurred(Largest):
+    """Knows the level of a touch to about 30 %."""
+
+    def probabilities(self, touches):
+        peak = touches.readings.flatten(1).amax(1)
+        blur = torch.sin(1e4 * peak) * 0.4  # of each touch, without a state
+        return torch.sigmoid(4 * (torch.log(peak) + blur - 1))[:, None].expand(-1, 4)
 
 
 class Onset(Largest):
@@ -324,11 +340,7 @@ class Onset(Largest):
 
 
 def test_one_decision_raises_more_alarms_than_two_and_a_slow_device_needs_one(drawn):
-    labels = balanced(64, generator(Stream.TEST, 8))
-    two, one = (
-        touch_scores.touch_scores(Onset(), drawn, watching(100.0, patience=patience), labels, 9)
-        for patience in (0.1, 0)
-    )
+    two, one = (decide(drawn, Onset(), 100.0, patience=patience) for patience in (0.1, 0))
     assert (one >= two).all()
     assert (one > two).any()
     assert [watching(1).decisions(rate) for rate in (5.0, 10.0, 20.0, 100.0, 500.0)] == [1, 1, 2, 2, 2]
@@ -336,9 +348,40 @@ def test_one_decision_raises_more_alarms_than_two_and_a_slow_device_needs_one(dr
 
 def test_a_device_of_the_model_gives_its_frames(drawn):
     """The simulator sends the frames of the model; a real one of that rate reads at any phase."""
-    labels = balanced(64, generator(Stream.TEST, 8))
-    aligned, real = (
-        touch_scores.touch_scores(Largest(), drawn, watching(10.0, aligned=aligned), labels, 9)
-        for aligned in (True, False)
-    )
+    aligned, real = (decide(drawn, Largest(), 10.0, aligned=aligned) for aligned in (True, False))
     assert aligned.mean() > real.mean()
+
+
+def test_the_score_is_the_logistic_regression_of_odds_and_level():
+    draw = np.random.default_rng(0)
+    dangerous = draw.random(600) < 0.5
+    probability = expit(draw.normal(np.where(dangerous, 1.0, -1.0), 1.5))
+    reading = np.exp(draw.normal(np.where(dangerous, 1.2, 0.9), 0.2))
+    score = DangerScore.fit(probability, reading, dangerous)
+    inputs = np.stack([logit(probability), np.log(reading)], axis=1)
+    other = LogisticRegression(C=100.0, tol=1e-8).fit(inputs, dangerous)
+    assert astuple(score) == pytest.approx((*other.coef_[0], other.intercept_[0]), rel=1e-3)
+    expected = other.predict_proba(inputs)[:, 1]
+    np.testing.assert_allclose(score.probability(probability, reading), expected, atol=1e-3)
+
+
+def test_a_larger_reading_never_lowers_the_score_and_nan_stays():
+    draw = np.random.default_rng(1)
+    dangerous = draw.random(200) < 0.5
+    score = DangerScore.fit(np.where(dangerous, 0.9, 0.1), np.where(dangerous, 1.0, 2.0), dangerous)
+    assert score.level == 0
+    assert (np.diff(DangerScore(1.0, 2.0, 0.0).probability(np.full(9, 0.5), np.arange(9.0))) > 0).all()
+    assert np.isnan(score.probability(np.array([np.nan]), np.array([1.0]))).all()
+
+
+def test_the_score_finds_what_a_blurred_model_misses(drawn):
+    """A model that sees the level only half is helped by the reading; the score is monotone in it."""
+    point = choose(Blurred(), drawn, replace(SETTINGS, safe_gestures=400), watching(100.0))
+    labels = balanced(800, generator(Stream.TEST, 8))
+    decisions = touch_scores.decide_touches(Blurred(), drawn, watching(100.0), labels, 99)
+    alone, both = decisions.scores(None), decisions.scores(point.score)
+    danger = torch.from_numpy(labels[:, 3])
+    found = [
+        float((scores > scores[~danger].quantile(0.9))[danger].float().mean()) for scores in (alone, both)
+    ]
+    assert found[1] > found[0] + 0.1

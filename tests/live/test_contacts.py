@@ -196,35 +196,16 @@ def test_broken_sensors_do_not_look_like_no_contact(posterior, felt):
     assert clipped["contacts"][0]["force"] > 3
 
 
-def test_a_bad_estimate_is_unknown():
-    message = unknown_contacts("why")
-    assert set(message) == set(contact_fields())
-    assert (message["state"], message["number"], message["contacts"]) == ("unknown", None, [])
-    assert contact_text_lines(message) == ["contacts unknown: why"]
-
-
-def contact_fields():
-    return (
-        "state",
-        "reason",
-        "device_time",
-        "number",
-        "probability",
-        "probabilities",
-        "fit",
-        "large",
-        "contacts",
-    )
-
-
 def test_messages_of_every_state_have_the_same_fields(posterior, felt):
-    estimate = posterior.estimate(felt)
+    none, estimate = unknown_contacts("why"), posterior.estimate(felt)
+    assert (none["state"], none["number"], none["contacts"]) == ("unknown", None, [])
+    assert contact_text_lines(none) == ["contacts unknown: why"]
     for changed in (
         estimate,
         replace(estimate, fingertip=False),
         replace(estimate, number=0, contacts=(), fingertip=False, fit=1.0),
     ):
-        assert set(contact_message(changed, 0.0)) == set(contact_fields())
+        assert set(contact_message(changed, 0.0)) == set(none)
 
 
 def test_readings_are_means_above_the_rest_of_the_sensors_that_work():

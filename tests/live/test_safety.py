@@ -94,11 +94,6 @@ class Paced:
 LATE = 0.02  # s: a frame, and the interval between decisions is in the limits
 
 
-def test_a_tap_after_a_restart_is_found():
-    seen = watch(lines(force(12, (7.8, 7.9, 4, 6.0)), restart=2.5))
-    assert 7.8 <= seen.first(3) <= 7.8 + 0.3 + LATE
-
-
 def test_a_channel_at_its_limit_is_not_tared():
     """All at the limit: there is no baseline. One: its place is unknown, and a press on others is found."""
     counts = lambda row: np.clip(np.round(200 + row / SCALE), 0, 1023).astype(int)  # noqa: E731

@@ -50,25 +50,15 @@ def shown(subject):
     return console.export_text()
 
 
-def fetch(address, **headers):
-    """Return status, headers and the beginning of what an address gives."""
+def fetch(address, data=None, **headers):
+    """Return the status and the text that an address gives."""
+    headers = {name.replace("_", "-"): value for name, value in headers.items()}
     try:
-        with urllib.request.urlopen(urllib.request.Request(address, headers=headers), timeout=30) as answer:
+        with urllib.request.urlopen(urllib.request.Request(address, data, headers), timeout=30) as answer:
             return answer.status, answer.read().decode()
     except urllib.error.HTTPError as error:
         with error:
             return error.code, ""
-
-
-def posted(address, **headers):
-    """Return the status of a request that sends nothing."""
-    headers = {name.replace("_", "-"): value for name, value in headers.items()}
-    try:
-        with urllib.request.urlopen(urllib.request.Request(address, b"", headers), timeout=30) as answer:
-            return answer.status
-    except urllib.error.HTTPError as error:
-        with error:
-            return error.code
 
 
 def test_no_peak_between_two_looks_is_missed():
@@ -178,7 +168,7 @@ def test_the_page_asks_for_a_tare_and_another_site_cannot():
     with web.serve_page(subject, 0) as address:
         for headers, code in (({}, 403), ({"Origin": "http://evil.example"}, 403), ({"X-Skin": "tare"}, 204)):
             assert subject.take_tare() == ""
-            assert posted(f"{address}/tare", **headers) == code
+            assert fetch(f"{address}/tare", b"", **headers)[0] == code
         assert subject.take_tare() == "tare"
         assert fetch(f"{address}/tare")[0] == 405
 
@@ -206,12 +196,17 @@ def test_the_operator_types_t_for_a_tare(monkeypatch, tmp_path):
     os.close(master)
 
 
-def until(reached):
-    deadline = monotonic() + 60
-    while not (result := reached()):
-        assert monotonic() < deadline
+def until(reached, wanted=None):
+    """Wait until a function gives what is wanted, or anything true, and return it."""
+    deadline = monotonic() + 300
+    while not (result := reached()) if wanted is None else (result := reached()) != wanted:
+        assert monotonic() < deadline, result
         sleep(0.05)
     return result
+
+
+def shows(browser, script, wanted):
+    until(lambda: browser.run(f"return {script}"), wanted)
 
 
 def requested(subject):
@@ -354,10 +349,7 @@ def test_the_page_draws_what_it_is_sent(browser):
     subject.line = "99.9 Hz"
     with web.serve_page(subject, 0) as address, repeated(subject, PRESSED):
         browser.open(address)
-        deadline = monotonic() + 300
-        while browser.run("return pictures") < 5:
-            assert monotonic() < deadline
-            sleep(0.1)
+        shows(browser, "pictures >= 5", True)
         text = browser.run("return document.body.innerText")
         colour = browser.run(
             AT.format(*(position / size for position, size in zip(PLACES[2], SIZE, strict=False)))
@@ -395,7 +387,7 @@ def test_the_picture_shows_each_reading_and_no_edge_between_or_outside(browser):
         assert image([0.0] * 5, [False] * 5).max() == 0
 
 
-ANNOUNCED = "return [...document.querySelectorAll('[role=alert]')].map(one => one.textContent)"
+ANNOUNCED = "pictures > 0 && [...document.querySelectorAll('[role=alert]')].map(one => one.textContent)"
 
 
 def test_the_page_announces_an_alarm_and_its_end_once(browser):
@@ -404,35 +396,19 @@ def test_the_page_announces_an_alarm_and_its_end_once(browser):
     subject.set_verdict(None, monotonic(), "taking the baseline")
     with web.serve_page(subject, 0) as address:
         browser.open(address)
-
-        def until(texts):
-            deadline = monotonic() + 300
-            while browser.run("return pictures") < 1 or browser.run(ANNOUNCED) != texts:
-                assert monotonic() < deadline, browser.run(ANNOUNCED)
-                sleep(0.1)
-
-        until([""])
+        shows(browser, ANNOUNCED, [""])
         browser.run(
             "window.changes = 0; new MutationObserver(() => changes++)"
             ".observe(document.querySelector('[role=alert]'), {childList: true, characterData: true})"
         )
         subject.set_verdict(PRESSED, monotonic())
-        until(["Alarm: dangerous touch"])
+        shows(browser, ANNOUNCED, ["Alarm: dangerous touch"])
         subject.set_verdict(None, monotonic(), "the device has stopped sending", alarm=True)
-        while "stopped sending" not in browser.run("return document.body.innerText"):
-            sleep(0.1)
+        shows(browser, "document.body.innerText.includes('stopped sending')", True)
         assert browser.run("return changes") == 1
         assert browser.run("return document.getElementById('head').getAttribute('role')") == "status"
         subject.set_verdict(None, monotonic(), "the device has stopped sending")
-        until([""])
-
-
-def shows(browser, script, wanted):
-    """Wait until a script gives what is wanted."""
-    deadline = monotonic() + 300
-    while (given := browser.run(f"return {script}")) != wanted:
-        assert monotonic() < deadline, given
-        sleep(0.1)
+        shows(browser, ANNOUNCED, [""])
 
 
 CROSSED = "latest && latest.values.length + ' of ' + skin.positions.length + ' on ' + $('port').textContent"

@@ -48,7 +48,7 @@ class Holds:
     def __call__(self, subject: Subject) -> pd.DataFrame:
         model, rows = subject.reloaded, []
         debounce = DebounceSettings(above=model.threshold)
-        engine = engine_builder.engine_settings(model, debounce, self.touch, self.drift).build()
+        engine = engine_builder.engine_settings(model, debounce, self.touch, self.drift)
         device = model.device.simulated("held touches are simulated").replace(stream=False)
         for course, load in self.courses.items():
             number = max(1, self.gestures // 10) if load and load[0][-1] >= 60 else self.gestures

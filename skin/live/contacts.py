@@ -1,26 +1,23 @@
 """Contacts in the live view: where, how hard and how sure, estimated in a process of their own.
 
-No verdict waits for them: the loop hands over the newest readings and continues. The process ends with its
-present estimate when the pipe to it is closed, however the command ends. torch is not imported here, but in
-that process.
+No verdict waits for them: the loop hands over the newest readings once the process has answered, and
+continues. The process ends with its present estimate when the pipe to it is closed, however the command ends.
+torch is not imported here, but in that process.
 """
 
 import os
-import pickle
 import signal
-import subprocess
-import sys
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import partial
-from threading import Event, Lock, Thread
+from multiprocessing import get_context
+from multiprocessing.connection import Connection
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
-from skin.device.resampling import Frame
 from skin.errors import InputError
 from skin.live.verdict import Verdict
 from skin.wire.channels import NewtonFrame, UnitConversion
@@ -32,10 +29,8 @@ if TYPE_CHECKING:
     from skin.inference.posterior import ContactEstimate, FrameEstimate, Posterior
     from skin.mechanics.simulator.base import AbstractSimulator
 
-PREPARING = "being prepared"
 QUIET = 1e-3
 """N, least noise: a device without any would make each reading certain."""
-_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 # What is known of contacts, as JSON data.
@@ -169,7 +164,7 @@ class Mechanics:
 
         advice = "use run=any_skin, or a run of simulator=solid"
         if device is None:
-            raise InputError(f"this run has no simulated skin: {advice}")
+            raise InputError(f"this model has no simulated skin: {advice}")
         if getattr(device.model, "reading", None) == "equation10":
             raise InputError(f"readings of equation 10 do not add up: {advice}")
         settings = device.imperfection
@@ -282,40 +277,23 @@ def estimate_contacts(posterior: "Posterior", nominal: "Noise", readings: MeanRe
 # The process.
 
 
-def serve() -> None:
-    """Estimate contacts: mechanics, then readings on standard input, answers on standard output.
-
-    The first answer is why nothing can be estimated, or empty; then follows a message for each reading.
-    """
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    if hasattr(os, "nice"):
-        os.nice(5)  # below what shows verdicts
-    answers = os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)  # what a library prints is not an answer
-    with suppress(EOFError, OSError, pickle.UnpicklingError):  # the command has ended
-        for answer in _answers(partial(pickle.load, sys.stdin.buffer)):
-            pickle.dump(answer, answers)
-            answers.flush()
-
-
-def _answers(receive: Callable[[], Any]) -> Iterator[Any]:
-    """Yield an empty text once everything is prepared, then a message for each reading; or why not."""
+def serve(mechanics: Mechanics, pipe: Connection) -> None:
+    """Prepare the mechanics, then answer readings with messages until the pipe is closed."""
     import torch
 
+    if hasattr(os, "nice"):
+        os.nice(5)  # below what shows verdicts
+    os.dup2(2, 1)  # what a library prints is no JSON line
     torch.set_num_threads(1)
-    mechanics = receive()
-    try:
-        posterior = mechanics.posterior()
-    except InputError as error:
-        yield str(error)
-        return
-    yield ""
-    while True:
-        readings = receive()
-        try:
-            yield estimate_contacts(posterior, mechanics.noise, readings)
-        except (ArithmeticError, ValueError, AssertionError, InputError) as error:
-            yield unknown_contacts(f"the estimate failed: {error}")
+    posterior = mechanics.posterior()
+    with threadpool_limits(1), suppress(EOFError, OSError):  # the command has ended
+        while True:
+            readings = pipe.recv()
+            try:
+                message = estimate_contacts(posterior, mechanics.noise, readings)
+            except (ArithmeticError, ValueError, AssertionError, InputError) as error:
+                message = unknown_contacts(f"the estimate failed: {error}")
+            pipe.send(message)
 
 
 class LiveContacts:
@@ -330,55 +308,40 @@ class LiveContacts:
     def __init__(
         self, reason: str = "this view estimates none", stale: float = 0.5, span: float = 0.1
     ) -> None:
-        self.stale, self.span = stale, span
-        self._lock, self._wake, self._closed = Lock(), Event(), False
+        self.stale, self._span = stale, span
         self._recent: deque[NewtonFrame] = deque(maxlen=1000)
-        self._newest: MeanReadings | None = None
-        self._process: subprocess.Popen[bytes] | None = None
-        self._thread: Thread | None = None
-        self._whole: Callable[[], bool] = bool
+        self._pipe: Connection | None = None
+        self._asked_at: float | None = None  # the host's time, s, of readings that are not answered yet
         self.explain(reason)
 
     def explain(self, reason: str) -> None:
         """Set why nothing is known, until there is an estimate."""
-        self._set(unknown_contacts(reason), np.inf)
-
-    def _set(self, message: dict[str, Any], host: float) -> None:
-        """Set what is known of the readings at ``host``, s; infinite: it does not become old."""
-        with self._lock:
-            self._latest, self._host = message, host
+        self._latest = unknown_contacts(reason), np.inf  # with the host's time of its readings, s
 
     def start(self, mechanics: Mechanics, whole: Callable[[], bool]) -> None:
-        """Start the process, which needs some seconds.
+        """Start the process, which needs some seconds. To be called in the main thread.
 
         Args:
             mechanics: of the skin.
             whole: tells whether the device sends whole numbers.
         """
-        positions = os.pathsep.join(path for path in sys.path if path)
         self._whole = whole
-        self.explain(PREPARING)
-        # In a group of its own, Ctrl-C does not reach it. In a session of its own, its priority would not
-        # count: Linux shares the processor among sessions first.
-        self._process = subprocess.Popen(
-            [sys.executable, "-c", f"from {__name__} import serve; serve()"],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
-            env=os.environ | dict.fromkeys(_THREADS, "1") | {"PYTHONPATH": positions},
-            process_group=0,
-        )
-        self._thread = Thread(target=self._run, args=(mechanics,), name="skin-contacts", daemon=True)
-        self._thread.start()
+        self.explain("being prepared")
+        context = get_context("spawn")
+        self._pipe, end = context.Pipe()
+        self.process = context.Process(target=serve, args=(mechanics, end), name="skin-contacts", daemon=True)
+        # A process that begins while Ctrl-C is ignored ignores it for good.
+        handler = signal.signal(signal.SIGINT, signal.SIG_IGN)
+        self.process.start()
+        signal.signal(signal.SIGINT, handler)
+        end.close()
 
     def close(self) -> None:
         """End the process."""
-        if self._process is not None and self._thread is not None:
-            self._closed = True
-            self._process.kill()
-            self._wake.set()
-            self._thread.join()
-            self._process.communicate()  # closes the pipes
+        if self._pipe is not None:
+            self.process.kill()
+            self.process.join()
+            self._pipe.close()
 
     def look(
         self,
@@ -387,7 +350,9 @@ class LiveContacts:
         verdicts: Sequence[Verdict],
         baseline: np.ndarray,
     ) -> None:
-        """Take new readings; leave their mean for the process if there is a verdict. It returns at once.
+        """Take new readings, and the answer of the process; if there is a verdict, ask it again.
+
+        It returns at once: the process is asked only after it has answered.
 
         Args:
             stream: the readings.
@@ -395,46 +360,25 @@ class LiveContacts:
             verdicts: on them.
             baseline: (S,), N, what the untouched skin reads by now.
         """
-        if self._process is None or not stream:
+        if self._pipe is None or not stream:
             return
         self._recent.extend(stream)
         last = stream[-1].frame
-        while not self._together(self._recent[0].frame, last):
+        while (first := self._recent[0].frame).segment != last.segment or not (
+            0 <= last.t - first.t < self._span - 1e-6
+        ):
             self._recent.popleft()
-        if verdicts:
-            masked = verdicts[-1].masked
-            self._newest = average_readings(self._recent, conversion, masked, baseline, self._whole())
-            self._wake.set()
-
-    def _together(self, first: Frame, last: Frame) -> bool:
-        return first.segment == last.segment and 0 <= last.t - first.t < self.span - 1e-6
+        try:
+            if self._asked_at is not None and self._pipe.poll():
+                self._latest, self._asked_at = (self._pipe.recv(), self._asked_at), None
+            if verdicts and self._asked_at is None:
+                masked, whole = verdicts[-1].masked, self._whole()
+                self._pipe.send(average_readings(self._recent, conversion, masked, baseline, whole))
+                self._asked_at = last.t_host
+        except (OSError, EOFError):
+            self.explain("the process that estimates them has ended")
 
     def state(self, now: float) -> dict[str, Any]:
         """Return what is known at ``now``, s, on the host's monotonic clock, as JSON data."""
-        with self._lock:
-            latest, host = self._latest, self._host
-        return latest if now - host <= self.stale else unknown_contacts("no estimate for half a second")
-
-    def _run(self, mechanics: Mechanics) -> None:
-        """Pass the newest readings to the process, and keep its answers."""
-        try:
-            if refused := self._ask(mechanics):
-                self.explain(refused)
-                return
-            while not self._closed:
-                self._wake.wait()
-                self._wake.clear()
-                readings, self._newest = self._newest, None
-                if readings is not None:
-                    self._set(self._ask(readings), readings.host)
-        except (OSError, EOFError, ValueError, TypeError, AttributeError, pickle.PickleError):
-            self.explain("the process that estimates them has ended")
-
-    def _ask(self, question: Mechanics | MeanReadings) -> Any:
-        """Return what the process answers."""
-        assert self._process is not None
-        assert self._process.stdin is not None
-        assert self._process.stdout is not None
-        pickle.dump(question, self._process.stdin)
-        self._process.stdin.flush()
-        return pickle.load(self._process.stdout)
+        message, host = self._latest
+        return message if now - host <= self.stale else unknown_contacts("no estimate for half a second")

@@ -80,9 +80,8 @@ class Debounce:
 Classify = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """Readings (B, T, S), float32, N, and valid (B, T, S), bool, of windows -> probabilities (B, L)."""
 
-_GAP = (
-    0.5  # s without a frame after which the history of the window is lost: longer than any burst of a bridge
-)
+_GAP = 0.5
+"""s without a frame after which the history of the window is lost: longer than any burst of a bridge."""
 
 
 @checked("detection")
@@ -150,6 +149,8 @@ class Engine:
 
     Attributes:
         window: of the latest readings, N.
+        detector: of contact, with what the untouched skin reads by now.
+        above: probability above which a touch is dangerous.
         alarm: the latest verdict was dangerous, and the contact has not ended.
     """
 
@@ -166,21 +167,16 @@ class Engine:
     def __post_init__(self) -> None:
         self.window = Window(self.frames, self.rate, self.sensors)
         threshold, drift = self.detection.threshold, self.detection.drift
-        self._contact = ContactDetector(self.sensors, self.rate, threshold, drift, self.fractions)
+        self.detector = ContactDetector(self.sensors, self.rate, threshold, drift, self.fractions)
         self._held = held_frames(self.detection.longest, self.rate, self.frames)
         self._shown = longest_shown(self._held, ceil(RELEASE * self.rate - 1e-9), self.frames)
-        self._above = 0.5 if self.patience.above is None else self.patience.above
-        itself = np.eye(self.sensors, dtype=bool)
-        self._responds = itself if self.presses is None else self.presses >= threshold
+        self.above = 0.5 if self.patience.above is None else self.patience.above
+        self._responds = np.eye(self.sensors) > 0 if self.presses is None else self.presses >= threshold
         self._losses = _Losses()
-        self._latest: tuple[NewtonFrame, float] | None = None  # with the time since those before
-        self._tick = -1
-        self._decided = True
+        self._latest: NewtonFrame | None = None
+        self._pause = 0.0  # s between the latest readings and those before
+        self._tick, self._decided = -1, True
         self.reset()
-
-    def build(self) -> "Engine":
-        """Return a new engine with the same settings."""
-        return replace(self)
 
     @property
     def fractions(self) -> np.ndarray | None:
@@ -193,12 +189,7 @@ class Engine:
     @property
     def contact(self) -> bool:
         """Whether something touches the skin, at the latest decision."""
-        return self._contact.since is not None
-
-    @property
-    def baseline(self) -> np.ndarray:
-        """Readings (S,), N, of the untouched skin by now."""
-        return self._contact.baseline
+        return self.detector.since is not None
 
     def reset(self, raised: np.ndarray | None = None, noise: np.ndarray | None = None) -> None:
         """Forget readings, alarm and contact, after a tare of the untouched skin.
@@ -209,16 +200,15 @@ class Engine:
             noise: (S,), N, standard deviation of the readings of the untouched skin; None: as before.
         """
         raised = np.zeros(self.sensors) if raised is None else raised
-        self._contact.reset(raised >= self.detection.threshold)
-        self._contact.noise = self._contact.noise if noise is None else noise
+        self.detector.reset(raised >= self.detection.threshold)
+        self.detector.noise = self.detector.noise if noise is None else noise
         self.window.clear()
         shape = self.frames, self.sensors
         self._idle = np.zeros(shape, dtype=np.float32), np.ones(shape, dtype=bool)
         self.alarm, self._peak_probability = False, 0.0
-        slow = self.patience.label, self.patience.label
-        self._touch = Debounce(*slow)
-        self._labels = {name: Debounce(*slow) for name in self.task.gated}
-        self._labels |= {"dangerous": Debounce(self.patience.alarm, self.patience.calm)}
+        label, patience = self.patience.label, self.patience
+        self._touch, self._danger = Debounce(label, label), Debounce(patience.alarm, patience.calm)
+        self._labels = {name: Debounce(label, label) for name in self.task.gated if name != "dangerous"}
         self._agreeing, self._lasting = dict[str, float](), dict[str, Note]()
 
     def remember(self, stream: Sequence[NewtonFrame]) -> None:
@@ -258,12 +248,12 @@ class Engine:
             yield from self._decide()
 
     def _interrupted(self, readings: NewtonFrame) -> bool:
+        """Return whether the history of the window is lost with these readings."""
         if self._latest is None:
             return False
-        latest, pause = self._latest[0], readings.t - self._latest[0].t
-        return readings.frame.segment != latest.frame.segment or (
-            pause > _GAP and pause > 3 * self.window.period
-        )
+        pause = readings.t - self._latest.t
+        restarted = readings.frame.segment != self._latest.frame.segment
+        return restarted or (pause > _GAP and pause > 3 * self.window.period)
 
     def _add(self, readings: NewtonFrame) -> bool:
         """Add readings to the window; return whether a decision is due."""
@@ -271,9 +261,9 @@ class Engine:
         if self._interrupted(readings):
             self.window.clear()
             if frame.after in ("reset", "reconnect"):
-                self._contact.restart()
-        self._latest = readings, 0.0 if self._latest is None else t - self._latest[0].t
-        self._decided = False
+                self.detector.restart()
+        self._pause = 0.0 if self._latest is None else t - self._latest.t
+        self._latest, self._decided = readings, False
         # What is frozen now is left out of this whole window, and of no later one. An interval with a
         # reading that no skin can have is unknown: the force may be beyond the range.
         sent = readings._replace(mask=readings.mask & ~(Reason.FROZEN | Reason.IMPLAUSIBLE))
@@ -285,64 +275,57 @@ class Engine:
 
     def _decide(self, last: bool = False) -> Iterator[_Decision]:
         """Yield the decision on the window that ends with the latest readings."""
-        seen = self.window.read(partial=True)
-        if self._decided or seen is None or self._latest is None:
+        window, latest = self.window.read(partial=True), self._latest
+        if self._decided or window is None or latest is None:
             return
         self._decided = True
-        (t, _, mask, frame), pause = self._latest
-        # A tap may come and go; but a device of the rate of a slow model may lose two frames, too.
-        pause = pause if pause > max(_GAP / 2, 2.5 / self.rate) else 0.0
-        readings, valid = seen.values.astype(np.float32), seen.valid & (mask & Reason.FROZEN == 0)
-        below = self._contact.falls(readings, valid)
-        self._contact.update(readings, valid, t)
-        risen = bool(self._contact.rises(readings, valid).any())
-        readings, valid = self._fill_window(readings, valid & ~below & ~self._contact.lost, seen.before)
-        if not self.contact and not risen:
-            self._idle = readings, valid
-        lasted = None if self._contact.since is None else t - self._contact.since
-        responding = self._responds[:, valid[-1] & ~self._contact.void]
-        unknown = np.asarray(~responding.any(axis=1) | (pause > 0))
+        readings, valid = window.values.astype(np.float32), window.valid & (latest.mask & Reason.FROZEN == 0)
+        below = self.detector.falls(readings, valid)
+        self.detector.update(readings, valid, latest.t)
+        risen = bool(self.detector.rises(readings, valid).any())
+        readings, valid = self._fill(readings, valid & ~below & ~self.detector.lost, window.before)
+        blind, notes = self._find_blind(valid[-1], below[-1])
+        contact = None if self.detector.since is None else latest.t - self.detector.since
         draft = Verdict(
-            t=frame.t,
-            t_host=frame.t_host,
-            gap=seen.gap,
+            t=latest.frame.t,
+            t_host=latest.frame.t_host,
+            gap=window.gap,
             masked=_numbers(~valid[-1]),
-            contact=lasted,
-            unknown=_numbers(unknown),
-            notes=self._find_notes(unknown, below[-1], pause),
+            contact=contact,
+            unknown=blind,
+            notes=notes,
         )
-        if (lasted or 0.0) * self.rate > self._shown:
-            idle, idle_valid = self._idle
-            readings, valid = (
-                present_as_press(idle, readings, self._held),
-                present_as_press(idle_valid, valid, self._held),
-            )
-        yield _Decision(draft, t, readings, valid, risen, last)
+        if contact is None and not risen:
+            self._idle = readings, valid
+        if (contact or 0.0) * self.rate > self._shown:
+            pairs = zip(self._idle, (readings, valid), strict=True)
+            readings, valid = (present_as_press(idle, present, self._held) for idle, present in pairs)
+        yield _Decision(draft, latest.t, readings, valid, risen, last)
 
-    def _fill_window(
-        self, readings: np.ndarray, valid: np.ndarray, before: int
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def _fill(self, readings: np.ndarray, valid: np.ndarray, before: int) -> tuple[np.ndarray, np.ndarray]:
         """Return readings and valid, (T, S), with the rest where there is none: in the first rows, too."""
         # To the model a sensor below its rest is as one without a reading.
         readings = np.where(valid, readings, 0.0).astype(np.float32)
         # Unknown history counts as the rest of the sensors that are valid now.
-        readings[:before] = self._contact.baseline
+        readings[:before] = self.detector.baseline
         valid[:before] = valid[before:].any(axis=0)
         return readings, valid
 
-    def _find_notes(self, unknown: np.ndarray, below: np.ndarray, pause: float) -> tuple[Note, ...]:
-        """Return the notes on a decision.
+    def _find_blind(self, valid: np.ndarray, below: np.ndarray) -> tuple[tuple[int, ...], tuple[Note, ...]]:
+        """Return the sensors where a touch would stay undetected, and the notes on a decision.
 
         Args:
-            unknown, below: (S,), bool, sensors where a touch would stay undetected; sensors below rest.
-            pause: s without a frame before the latest; 0 if it was short.
+            valid, below: (S,), bool, sensors whose latest reading can be used; sensors below rest.
         """
-        void, beyond, lost = self._contact.void, self._contact.beyond, self._contact.lost
-        masked = unknown & ~(void | below | beyond | lost | (pause > 0))
+        void, beyond, lost = self.detector.void, self.detector.beyond, self.detector.lost
+        # A tap may come and go; but a device of the rate of a slow model may lose two frames, too.
+        paused = self._pause > max(_GAP / 2, 2.5 / self.rate)
+        blind = ~self._responds[:, valid & ~void].any(axis=1) | paused
+        masked = blind & ~(void | below | beyond | lost | paused)
         sensors = {"below": below, "void": void, "over_range": beyond, "lost_wire": lost, "masked": masked}
         notes = [Note(code, _numbers(which)) for code, which in sensors.items() if which.any()]
-        notes += [Note("unreadable")] * self._losses.excessive + [Note("pause", seconds=pause)] * (pause > 0)
-        return tuple(notes)
+        notes += [Note("unreadable")] * self._losses.excessive + [Note("pause", seconds=self._pause)] * paused
+        return _numbers(blind), tuple(notes)
 
     def _conclude(self, decision: _Decision, outputs: Sequence[float]) -> Verdict:
         """Return the verdict on a decision, given the outputs of its window, probabilities, one per label."""
@@ -377,11 +360,10 @@ class Engine:
         present = contact or (learned and not decision.risen)
         probability = probabilities.get("dangerous", 0.0)
         # A NaN probability must not make a touch safe.
-        dangerous = present and not probability <= self._above
+        dangerous = present and not probability <= self.above
         # No second decision can follow the last one before an interruption.
         period = inf if decision.last and dangerous else period
-        raised = self._labels["dangerous"](dangerous, decision.time, period)
-        self.alarm = raised or (self.alarm and contact)
+        self.alarm = self._danger(dangerous, decision.time, period) or (self.alarm and contact)
         self._peak_probability = max(self._peak_probability, probability) if self.alarm else 0.0
 
     def _collect_notes(
@@ -391,7 +373,7 @@ class Engine:
         notes = self._lasting | {note.code: note for note in present}
         # What makes a touch uncertain holds until it ends.
         self._lasting = {code: note for code, note in notes.items() if code in LASTING and touched}
-        if 0.5 < probabilities.get("dangerous", 0.0) <= self._above and touched and not self.alarm:
+        if 0.5 < probabilities.get("dangerous", 0.0) <= self.above and touched and not self.alarm:
             notes["near_threshold"] = Note("near_threshold")
         return order_notes(notes.values())
 
@@ -400,13 +382,10 @@ class Engine:
     ) -> dict[str, bool]:
         """Return the predicted labels but ``dangerous``: the likeliest one if they exclude each other."""
         best = max(probabilities, key=probabilities.__getitem__)
-        exclusive = self.task.kind == "exclusive"
         labels = {}
-        for name in self.task.gated:
-            if name == "dangerous":
-                continue
-            predicted = name == best if exclusive else probabilities[name] > 0.5
-            labels[name] = self._labels[name](predicted, time, period)
+        for name, debounce in self._labels.items():
+            predicted = name == best if self.task.kind == "exclusive" else probabilities[name] > 0.5
+            labels[name] = debounce(predicted, time, period)
             # A word must not stand beside the probability of its opposite.
             if labels[name] == predicted:
                 self._agreeing[name] = probabilities[name]
@@ -435,13 +414,11 @@ class _Losses:
         """Add a frame, with which ``lost`` frames were lost."""
         self._recent.append((time, lost))
         if not contact:
-            self._touched[:] = 0.0
+            self._touched[:], self.excessive = 0, False
         while time - self._recent[0][0] > _GAP:
             earlier = self._recent.popleft()[1]
             (self._touched if contact else self._rest)[:] += 1, earlier
-        if not contact:
-            self.excessive = False
-        elif lost:
+        if contact and lost:
             failed = self._touched[1] + sum(before for _, before in self._recent)
             frames = self._touched[0] + len(self._recent) + failed
             self.excessive |= fails_in_contact(failed, frames, self._rest[1], self._rest.sum())

@@ -29,8 +29,6 @@ from skin.wire.channels import NewtonFrame, RawRange, UnitConversion, unit_conve
 from skin.wire.reader import Port, SkinDisconnected, SkinTimeout
 from skin.wire.skin import SerialSource, Skin, Source
 
-STRENGTH = 1.5
-"""Pressure of the touches as a multiple of the limit of ``dangerous``."""
 _OVERRIDE = "live.selftest=false skips this test"
 
 
@@ -42,8 +40,8 @@ class SelfTest:
         presses: (S, S), N, true readings of a press at the limit of ``dangerous`` on each sensor.
         used: engine with the settings in use.
         nominal: engine with those that the model brings.
-        weak: as ``STRENGTH``, of weaker presses: a network is surer of strong touches than of those that a
-            limit hides.
+        weak: pressure of weaker presses as a multiple of the limit of ``dangerous``: a network is surer of
+            strong touches than of those that a limit hides.
         minimum: fraction of the presses that must raise the alarm with nominal settings.
         found: fraction of what the model finds with nominal settings that the settings in use must find.
         masked: largest fraction of the sensors without a valid reading.
@@ -79,38 +77,35 @@ class SelfTest:
         raised = self.find(self.used, conversion, device)
         # A place without a valid sensor is shown as unknown, which hides nothing, unless there are many.
         valid = ~conversion.broken[self._sensors]
-        missed = np.unique(self._sensors[expected & ~raised & valid])
+        silent, missed = (
+            sensor_list(np.unique(self._sensors[which]).tolist()) if which.any() else ""
+            for which in (~raised, expected & ~raised & valid)
+        )
         text = f"self-test: {raised.sum()} of {len(raised)} dangerous presses raise the alarm"
-        nominally = f"{text}, {expected.sum()} with nominal settings"
-        if not raised.all():
-            nominally += f"; not on {sensor_list(np.unique(self._sensors[~raised]).tolist())}"
-        untested = "only its range tests the scale" if device.known else "so its scale is not checked"
-        say(f"{nominally}; {'' if device.known else 'the device declares no range, '}{untested}")
-        text += f", not {expected.sum()}"
-        text += f"; {sensor_list(missed.tolist())} cannot raise it" * bool(len(missed))
+        undeclared = "the device declares no range, so its scale is not checked"
+        silence = f"not on {silent}; " if silent else ""
+        scale = "only its range tests the scale" if device.known else undeclared
+        say(f"{text}, {expected.sum()} with nominal settings; {silence}{scale}")
+        text += f", not {expected.sum()}" + (f"; {missed} cannot raise it" if missed else "")
         if expected.mean() < self.minimum:
             raise InputError(
                 f"{text}, even with nominal settings: train another run, or a longer one; {_OVERRIDE}"
             )
         few = raised[valid].sum() < self.found * expected[valid].sum()
-        if len(missed) or few or conversion.broken.mean() > self.masked:
+        if missed or few or conversion.broken.mean() > self.masked:
             raise InputError(f"{text}: {self._suspect(conversion)} is most likely wrong; {_OVERRIDE}")
-        self._check_threshold(unit)
-
-    def _check_threshold(self, unit: UnitConversion) -> None:
-        """Raise InputError if a threshold above the nominal one hides weak touches, which it alone could."""
-        above = [engine.patience.above or 0.5 for engine in (self.used, self.nominal)]
-        if above[0] <= above[1]:
-            return
-        patience = (replace(self.nominal.patience, above=value) for value in above)
-        engines = (replace(self._nominal, patience=each) for each in patience)
-        used, nominal = (self.find(engine, unit, RawRange(), self.weak).sum() for engine in engines)
-        if used < self.found * nominal:
-            raise InputError(
-                f"self-test: {used} of {len(self._sensors)} presses at {self.weak:g} times the limit raise "
-                f"the alarm, {nominal} with nominal settings: live.patience.above={above[0]:g} is most "
-                f"likely wrong; {_OVERRIDE}"
+        # A threshold above the nominal one may hide weaker touches alone.
+        if self.used.above > self.nominal.above:
+            strict = replace(self._nominal, patience=self.used.patience)
+            used, nominal = (
+                self.find(engine, unit, RawRange(), self.weak).sum() for engine in (strict, self._nominal)
             )
+            if used < self.found * nominal:
+                raise InputError(
+                    f"self-test: {used} of {len(raised)} presses at {self.weak:g} times the limit raise the "
+                    f"alarm, {nominal} with nominal settings: live.patience.above={self.used.above:g} is "
+                    f"most likely wrong; {_OVERRIDE}"
+                )
 
     @property
     def _sensors(self) -> np.ndarray:
@@ -130,10 +125,13 @@ class SelfTest:
         engine: Engine,
         conversion: UnitConversion,
         device: RawRange,
-        strength: float = STRENGTH,
+        strength: float = 1.5,
     ) -> np.ndarray:
-        """Return which presses raise the alarm, (P,), bool: a fast one on each sensor, and some slow ones."""
-        engine, raised = engine.build(), list[bool]()
+        """Return which presses raise the alarm, (P,), bool: a fast one on each sensor, and some slow ones.
+
+        Their pressure is ``strength`` times the limit of ``dangerous``.
+        """
+        engine, raised = replace(engine), list[bool]()
         for number, sensor in enumerate(self._sensors):
             engine.reset(noise=conversion.noise)
             press = strength * self.presses[sensor]
@@ -159,8 +157,8 @@ class SelfTest:
             "live.drift": used.detection.drift != nominal.detection.drift,
             "live.patience": used.patience != nominal.patience,
         }
-        named = " or ".join(name for name, differs in differing.items() if differs)
-        return named or "device.limits, device.scale or device.calibration"
+        named = [name for name, differs in differing.items() if differs]
+        return " or ".join(named) or "device.limits, device.scale or device.calibration"
 
 
 def _press(
@@ -250,68 +248,6 @@ class LiveSettings:
 
 
 @dataclass(frozen=True)
-class LiveSession:
-    """An engine and what it is fed with.
-
-    Attributes:
-        model: that predicts.
-        source: open.
-        engine: with the settings in use.
-        nominal: with those that the model brings.
-    """
-
-    model: Model
-    source: Source
-    engine: Engine
-    nominal: Engine
-
-    def check(
-        self,
-        test: bool,
-        say: Callable[[str], None],
-        add_note: Callable[[Note], None],
-        conversion: UnitConversion,
-    ) -> tuple[int, np.ndarray | None]:
-        """Compare the conversion in use with what is stored of the device, and run the self-test with it.
-
-        Args:
-            test: ``live.selftest``.
-            say: called with each message for the user.
-            add_note: called with a note on the whole session.
-            conversion: of the device's values to N.
-
-        Returns:
-            The largest number of sensors that may prove dead afterwards; and the baseline above the stored
-            rest of the device, (S,), N, None if none is stored.
-
-        Raises:
-            InputError: the settings in use hide dangerous touches.
-        """
-        found = verify_source(self.source, conversion, self.model.positions, self.model.size)
-        if found.text:
-            say(found.text)
-        if found.state == "unverified":
-            add_note(Note("unverified", detail=found.text))
-        stored, raised = found.check.rest if found.check else self.source.calibrated_rest, None
-        if stored is not None and conversion.rest is not None:
-            raised = conversion.rest - conversion.newtons(np.asarray(stored))
-        dead, presses = len(self.model.positions), self.nominal.presses
-        if not test:
-            say("no self-test: live.selftest=false")
-        elif presses is None or not self.model.alarms:
-            say("no self-test: this run brings no alarm or no simulated skin")
-        else:
-            selftest = SelfTest(presses, self.engine, self.nominal)
-            selftest.run(conversion, self.source.raw_range, say)
-            dead = int(selftest.masked * dead)
-        if presses is not None and conversion.noise is not None:
-            visible = presses >= minimum_visible(conversion.noise, self.engine.detection.threshold)
-            if alone := np.flatnonzero(visible.sum(axis=1) < 2).tolist():
-                say(f"no neighbour would show that the wire of {sensor_list(alone)} breaks to its rest value")
-        return dead, raised
-
-
-@dataclass(frozen=True)
 class LiveSetup:
     """A model and its device, before the threshold of the alarm is chosen.
 
@@ -329,8 +265,10 @@ class LiveSetup:
     begin: Callable[[], Source]
     mechanics: Callable[[], Mechanics]
 
-    def watch(self, live: LiveSettings, say: Callable[[str], None]) -> LiveSession:
-        """Choose the threshold, which may take seconds, and return the engine with its source.
+    def watch(self, live: LiveSettings, say: Callable[[str], None]) -> tuple[Source, Engine, Engine]:
+        """Choose the threshold, which may take seconds; return the source, and an engine for its frames.
+
+        The second engine has the settings that the model brings.
 
         Args:
             live: settings of the live view.
@@ -360,7 +298,56 @@ class LiveSetup:
         engine = engine_settings(model, patience, live.touch, live.drift, danger)
         source = self.port or self.begin()
         source.tare.glitches.fractions = engine.fractions
-        return LiveSession(model, source, engine, nominal)
+        return source, engine, nominal
+
+    def check(
+        self,
+        source: Source,
+        engine: Engine,
+        nominal: Engine,
+        test: bool,
+        say: Callable[[str], None],
+        add_note: Callable[[Note], None],
+        conversion: UnitConversion,
+    ) -> tuple[int, np.ndarray | None]:
+        """Compare the conversion in use with what is stored of the device, and run the self-test with it.
+
+        Args:
+            source, engine, nominal: from :meth:`watch`.
+            test: ``live.selftest``.
+            say: called with each message for the user.
+            add_note: called with a note on the whole session.
+            conversion: of the device's values to N.
+
+        Returns:
+            The largest number of sensors that may prove dead afterwards; and the baseline above the stored
+            rest of the device, (S,), N, None if none is stored.
+
+        Raises:
+            InputError: the settings in use hide dangerous touches.
+        """
+        found = verify_source(source, conversion, self.model.positions, self.model.size)
+        if found.text:
+            say(found.text)
+        if found.state == "unverified":
+            add_note(Note("unverified", detail=found.text))
+        stored, raised = found.check.rest if found.check else source.calibrated_rest, None
+        if stored is not None and conversion.rest is not None:
+            raised = conversion.rest - conversion.newtons(np.asarray(stored))
+        dead, presses = len(self.model.positions), nominal.presses
+        if not test:
+            say("no self-test: live.selftest=false")
+        elif presses is None or not self.model.alarms:
+            say("no self-test: this run brings no alarm or no simulated skin")
+        else:
+            selftest = SelfTest(presses, engine, nominal)
+            selftest.run(conversion, source.raw_range, say)
+            dead = int(selftest.masked * dead)
+        if presses is not None and conversion.noise is not None:
+            visible = presses >= minimum_visible(conversion.noise, engine.detection.threshold)
+            if alone := np.flatnonzero(visible.sum(axis=1) < 2).tolist():
+                say(f"no neighbour would show that the wire of {sensor_list(alone)} breaks to its rest value")
+        return dead, raised
 
 
 def watch_exported(
@@ -386,11 +373,7 @@ def watch_exported(
     source = SerialSource(Port.select(device), len(model.positions), model.rate).open_source()
     opened.enter_context(source.skin)
     say(f"loaded {model.title} from {path}, exported by version {model.metadata.version}")
-    return LiveSetup(model, source.name, source, lambda: source, _refuse_contacts)
-
-
-def _refuse_contacts() -> Mechanics:
-    raise InputError("an exported model has no mechanics: give the run itself, as in run=latest")
+    return LiveSetup(model, source.name, source, lambda: source, partial(Mechanics.of, None, False))
 
 
 def watch_run(
@@ -519,5 +502,4 @@ def measured_rate(
         arrived = (stats.frames - before) / max(passed, shown)
         if stats.frames >= enough and arrived / bursts < stats.rate_hz < arrived * bursts:
             break
-    declared = skin.header.rate if skin.header is not None else None
-    return skin.stats.rate_hz or declared or usual
+    return skin.stats.rate_hz or (skin.header and skin.header.rate) or usual

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from math import inf
 from threading import Event, RLock, Thread
 from time import monotonic
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from skin.device.resampling import Frame
 from skin.errors import InputError
 from skin.live.contacts import LiveContacts, unknown_contacts
 from skin.live.engine import Engine
-from skin.live.verdict import Note, Verdict, order_notes, sensor_list, summarize_notes
+from skin.live.verdict import Assessment, Note, Verdict, order_notes, sensor_list, summarize_notes
 from skin.wire.channels import NewtonFrame, UnitConversion
 from skin.wire.reader import SkinDisconnected, SkinTimeout
 from skin.wire.skin import Skin
@@ -25,25 +25,9 @@ from skin.wire.tare import Frozen, Tare
 _log = logging.getLogger(__name__)
 
 
-class Assessment(NamedTuple):
-    """What is known of the skin at a moment.
-
-    Attributes:
-        verdict: the present one; None if there is none.
-        reason: why there is none, in words.
-        alarm: including one that continues without a verdict.
-    """
-
-    verdict: Verdict | None
-    reason: str
-    alarm: bool
-
-
-Observer = Callable[[Assessment, float], None]
-"""Takes an assessment and its time, s; it must return at once."""
-
-TareRequest = Literal["", "tare", "forced"]
-"""A request for a new baseline: none, from the next quiet stretch, or from the next frames."""
+Observer = Callable[[Assessment, float, str], None]
+"""Takes an assessment, its time, s, and the operator's event, such as ``tare``, or an empty text; it must
+return at once."""
 
 _ONSET = 10  # frames of a touch before its contact is decided
 Refusal = Literal["", "touched", "unforced"]
@@ -54,7 +38,9 @@ REFUSALS: dict[Refusal, str] = {
     "unforced": "there is nothing to force",
 }
 """Why the latest request for a new baseline was refused, in words."""
-_TARES = {"tare": "new tare", "tare_forced": "tare forced by the operator"}
+TareRequest = Literal["", "tare", "tare_forced"]
+"""A request for a new baseline: none, from the next quiet stretch, or from the next frames."""
+_TARES: dict[TareRequest, str] = {"tare": "new tare", "tare_forced": "tare forced by the operator"}
 
 STALE = 1.5
 """s without frames after which nothing is known of the skin."""
@@ -64,27 +50,6 @@ FROZEN_READINGS: dict[Frozen, str] = {
     "still": "readings are frozen: no channel has changed for 5 s",
     "repeated": "readings are frozen: the same frames come again and again",
 }
-
-
-@dataclass(frozen=True)
-class DisplayInfo:
-    """Constant information about a live view.
-
-    Attributes:
-        title: of the run.
-        port: source of the frames.
-        positions: (S, 3), m.
-        size: extent (x, y) of the sheet, m.
-        top: upper end of the colour scale, N.
-        window: length of the classified window, s.
-    """
-
-    title: str
-    port: str
-    positions: np.ndarray
-    size: tuple[float, float]
-    top: float
-    window: float = 3.0
 
 
 @dataclass(frozen=True)
@@ -123,14 +88,9 @@ class DisplayState:
 
     @property
     def held(self) -> bool:
-        """Whether the verdict is about a touch that has ended, or an alarm is on: show :attr:`peak`."""
+        """Whether the verdict is about a touch that has ended, or an alarm is on: the map shows the peak."""
         ended = self.verdict is not None and self.verdict.touched and self.verdict.contact is None
         return self.alarm or ended
-
-    @property
-    def map(self) -> np.ndarray:
-        """Readings (S,), N, at the time of the verdict."""
-        return self.peak if self.held else self.values
 
 
 @dataclass(eq=False)
@@ -142,7 +102,12 @@ class Display:
     frames that came late.
 
     Args:
-        info: constant information.
+        title: of the run.
+        port: source of the frames.
+        positions: (S, 3), m.
+        size: extent (x, y) of the sheet, m.
+        top: upper end of the colour scale, N.
+        window: length of the classified window, s.
         contacts: tells what is known of them.
         calm: s.
         age: s after which a decision is old where the next is not overdue.
@@ -153,12 +118,17 @@ class Display:
 
     Attributes:
         notes: on the whole session.
+        line: text with rate, lost frames and latency.
         closed: event, set at the end.
-        observers: called with each assessment, in the thread that classifies.
-        listeners: called with the name of each event of the operator, such as ``tare``, and its time, s.
+        observers: called whenever the skin is assessed, and with each event of the operator.
     """
 
-    info: DisplayInfo
+    title: str
+    port: str
+    positions: np.ndarray
+    size: tuple[float, float]
+    top: float
+    window: float = 3.0
     contacts: LiveContacts = field(default_factory=LiveContacts)
     calm: float = 2.0
     age: float = 0.5
@@ -171,28 +141,30 @@ class Display:
         self.closed = Event()
         self.notes: tuple[Note, ...] = ()
         self.observers: list[Observer] = []
-        self.listeners: list[Callable[[str, float], None]] = []
+        self.line = ""
         self._lock = RLock()
-        sensors = len(self.info.positions)
+        sensors = len(self.positions)
         first = np.zeros(sensors), np.zeros(sensors, dtype=bool)
         self._frames: deque[tuple[np.ndarray, np.ndarray]] = deque([first], maxlen=self.kept)
         self._valid, self._peak, self._contact = np.ones(sensors, dtype=bool), np.zeros(sensors), False
-        self._number, self._line = 0, ""
+        self._number = 0
         self._latest = Assessment(None, "waiting for the first frame", False)
         self._alarm_at, self._decided = -inf, deque([-inf])
-        self._published: Assessment | None = None
         self._request: TareRequest = ""
         self._refusal: Refusal = ""
         self._refused_at = -inf
 
+    def close(self, *_: object) -> None:
+        """Let the loop and the views end."""
+        self.closed.set()
+
     def add(self, readings: NewtonFrame) -> None:
         """Add a frame in newtons."""
-        values, valid = readings.newtons, readings.usable
         with self._lock:
             self._number += 1
-            self._frames.append((values, readings.saturated))
-            self._valid = valid
-            self._peak = np.maximum(self._peak, values)
+            self._frames.append((readings.newtons, readings.saturated))
+            self._valid = readings.usable
+            self._peak = np.maximum(self._peak, readings.newtons)
 
     def set_verdict(self, verdict: Verdict | None, now: float, reason: str = "", alarm: bool = False) -> None:
         """Set the verdict; or None with the reason and whether an alarm continues.
@@ -220,18 +192,19 @@ class Display:
                 recent = [values for values, _ in list(self._frames)[-_ONSET:]]
                 self._peak = np.max(recent, axis=0) if contact else np.zeros_like(self._peak)
             self._contact = contact
-            self._publish(now)
+            self.refresh(now)
 
-    def refresh(self, now: float) -> None:
-        """Inform the observers if the latest verdict has become too old, or a late alarm ends."""
+    def refresh(self, now: float, event: str = "") -> None:
+        """Inform the observers: the latest verdict may have become too old, a late alarm may end.
+
+        Args:
+            now: s, the host's monotonic clock.
+            event: of the operator.
+        """
         with self._lock:
-            if self.assess(now) != self._published:
-                self._publish(now)
-
-    def _publish(self, now: float) -> None:
-        self._published = self.assess(now)
-        for observer in self.observers:
-            observer(self._published, now)
+            assessment = self.assess(now)
+            for observer in self.observers:
+                observer(assessment, now, event)
 
     def assess(self, now: float) -> Assessment:
         """Return what is known of the skin at ``now``, s, on the host's monotonic clock."""
@@ -247,13 +220,7 @@ class Display:
 
     def add_note(self, note: Note) -> None:
         """Add a note on the whole session."""
-        with self._lock:
-            self.notes = (*(other for other in self.notes if other.code != note.code), note)
-
-    def set_status(self, line: str) -> None:
-        """Set the text with rate, lost frames and latency."""
-        with self._lock:
-            self._line = line
+        self.notes = (*(other for other in self.notes if other.code != note.code), note)
 
     def request_tare(self, now: float, force: bool = False) -> str:
         """Request a new baseline at ``now``, s; return why it is refused, or an empty text.
@@ -265,14 +232,14 @@ class Display:
             forced = force and self._refusal == "touched" and now - self._refused_at <= self.confirm
             touched = self._latest.alarm or self._contact
             self._refusal = "" if forced else "touched" if touched else "unforced" if force else ""
+            request: TareRequest = "tare_forced" if forced else "tare"
             if self._refusal:
-                event, self._refused_at = "tare_refused", now
+                self._refused_at = now
             else:
-                event, self._request = ("tare_forced", "forced") if forced else ("tare", "tare")
-        _log.warning("%s", REFUSALS[self._refusal] or _TARES[event])
-        for listener in self.listeners:
-            listener(event, now)
-        return REFUSALS[self._refusal]
+                self._request = request
+            _log.warning("%s", REFUSALS[self._refusal] or _TARES[request])
+            self.refresh(now, "tare_refused" if self._refusal else request)
+            return REFUSALS[self._refusal]
 
     def take_tare(self) -> TareRequest:
         """Return the latest request for a new baseline, once."""
@@ -292,7 +259,7 @@ class Display:
             fresh = 1 if since is None else min(max(1, self._number - since), len(self._frames))
             latest = [self._frames[-1 - back] for back in range(fresh)]
             refusal = REFUSALS[self._refusal] if now - self._refused_at <= self.confirm else ""
-            line = ", ".join(filter(None, (refusal, self._line)))
+            line = ", ".join(filter(None, (refusal, self.line)))
             peak, number, valid = self._peak, self._number, self._valid
         values, saturated = (np.max(part, axis=0) for part in zip(*latest, strict=True))
         readings = np.where(valid, values, 0.0), valid, saturated & valid
@@ -309,11 +276,11 @@ class Display:
 
 @contextmanager
 def watch_age(display: Display, interval: float = 0.1) -> Iterator[None]:
-    """Inform the observers of a display while the block runs when its verdict becomes too old.
+    """Refresh a display while the block runs: also where the engine hangs, which would tell nothing itself.
 
     Args:
         display: to be watched.
-        interval: s between two looks.
+        interval: s between two refreshes.
     """
 
     def watch() -> None:
@@ -405,7 +372,7 @@ class LiveLoop:
         """Show the state of the stream, if it was not shown within half a second before ``now``, s."""
         if now - self._updated_at >= self._status:
             self._updated_at = now
-            self._display.set_status(self.line)
+            self._display.line = self.line
             if not self._skin.stats.clock_trusted:
                 self._display.add_note(Note("clock", detail=self._skin.stats.clock))
 
@@ -426,7 +393,7 @@ class LiveLoop:
         """Take frames that have arrived at ``now``, s, and show what follows from them."""
         self._received_at = now
         if request := self._display.take_tare():
-            self._tare.restart(force=request == "forced")
+            self._tare.restart(force=request == "tare_forced")
         stream = self._convert(frames, now)
         if self._tare.conversion is None:
             self._display.set_verdict(None, now, self._tare.status, self._engine.alarm)
@@ -447,28 +414,27 @@ class LiveLoop:
         if verdicts:
             self._delays.append(self._clock() - verdicts[-1].t_host)
         # After the verdict is shown: it waits for nothing.
-        self._display.contacts.look(stream, self._tare.conversion, verdicts, self._engine.baseline)
+        self._display.contacts.look(stream, self._tare.conversion, verdicts, self._engine.detector.baseline)
 
     def _convert(self, frames: list[Frame], now: float) -> list[NewtonFrame]:
         """Return frames in newtons; those before a new baseline are left out."""
         stream = list[NewtonFrame]()
         for frame in frames:
-            before, count = self._tare.conversion, self._tare.count
+            before = self._tare.conversion
             readings = self._tare.add(frame, self._engine.contact or self._engine.alarm)
-            if readings is not None and (before is None or self._tare.count > count):
-                self._begin(now)
+            if (conversion := self._tare.conversion) is not None and conversion is not before:
+                self._begin(conversion, now)
                 stream.clear()
             stream += [] if readings is None else [readings]
         return stream
 
-    def _begin(self, now: float) -> None:
+    def _begin(self, conversion: UnitConversion, now: float) -> None:
         """Begin anew with another conversion; test it if it is the first."""
-        assert self._tare.conversion is not None
         raised = None
         if self._verify is not None:
-            (self._maximum_dead, raised), self._verify = self._verify(self._tare.conversion), None
+            (self._maximum_dead, raised), self._verify = self._verify(conversion), None
             self._tested_at = now
-        self._engine.reset(raised, self._tare.conversion.noise)
+        self._engine.reset(raised, conversion.noise)
         self._engine.remember(self._tare.take_earlier())
 
     def _count_dead(self, now: float) -> None:

@@ -1,7 +1,8 @@
-"""The verdict of a live view: state, labels, alarm, and notes on what may be wrong with them."""
+"""The verdict of a live view: state, labels, alarm, notes on what may be wrong; in words and as JSON data."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime, timedelta
 from math import isfinite, nan
 from typing import Any, Literal, NamedTuple
 
@@ -143,3 +144,80 @@ class Verdict:
         return replace(
             self, dangerous=True, labels=labels, probabilities=self.probabilities | {"dangerous": nan}
         )
+
+
+class Assessment(NamedTuple):
+    """What is known of the skin at a moment.
+
+    Attributes:
+        verdict: the present one; None if there is none.
+        reason: why there is none, in words.
+        alarm: including one that continues without a verdict.
+    """
+
+    verdict: Verdict | None
+    reason: str
+    alarm: bool
+
+
+SCHEMA = 1
+"""Version of the messages. A field may be added without a new version; a reader ignores unknown ones."""
+
+
+def verdict_message(
+    assessment: Assessment, notes: Sequence[Note], contacts: dict[str, Any], now: float
+) -> dict[str, Any]:
+    """Return what is known of the skin as JSON data.
+
+    Args:
+        assessment: the present one.
+        notes: on the verdict or its absence, the gravest first.
+        contacts: what is known of them.
+        now: s, the host's monotonic clock.
+
+    Returns:
+        The fields of ``docs/export.md`` but ``number`` and ``event``.
+    """
+    verdict, _, alarm = assessment
+    moment = datetime.now(UTC) - timedelta(seconds=0.0 if verdict is None else now - verdict.t_host)
+    shared = {
+        "schema": SCHEMA,
+        "stale": verdict is None,
+        "reason": summarize_notes(notes),
+        "state": "unknown" if verdict is None else verdict.state,
+        "alarm": alarm,
+        "dangerous": True if alarm else None if verdict is None else verdict.danger,
+        "notes": [note.message for note in notes],
+        "time": moment.isoformat(timespec="milliseconds").replace("+00:00", "Z"),
+        "contacts": contacts,
+    }
+    if verdict is None:
+        return shared
+    return shared | {
+        "device_time": verdict.t,
+        "touched": verdict.touched,
+        "labels": verdict.known,
+        # JSON has no NaN, and the probabilities of an untouched skin mean nothing.
+        "probabilities": {
+            name: round(value, 6) if isfinite(value) and verdict.state == "touch" else None
+            for name, value in verdict.probabilities.items()
+        },
+        "contact": verdict.contact,
+        "gap": verdict.gap,
+        "masked": list(verdict.masked),
+        "unknown": list(verdict.unknown),
+    }
+
+
+def contact_text(contact: float | None, short: float = 3.0, long: float = 60.0) -> str:
+    """Return a text with the time since which something touches the skin; empty without contact.
+
+    Args:
+        contact: duration of the contact, s; None without contact.
+        short, long: s of contact from which it is shown, and from which it may be drift.
+    """
+    if contact is None or contact < short:
+        return ""
+    began = datetime.now() - timedelta(seconds=contact)
+    hint = "; if nothing touches the skin, take a new tare" if contact >= long else ""
+    return f"contact since {began:%H:%M:%S} ({contact:.0f} s){hint}"

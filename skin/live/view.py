@@ -1,28 +1,224 @@
-"""The whole live view of ``skin live``, and the emulated skin of its demonstration."""
+"""The live view of ``skin live``: terminal, JSON lines, log of alarms, and the emulated skin of its demo."""
 
 import gc
+import signal
 import sys
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence, Set
+from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
 from pathlib import Path
-from threading import Thread
+from threading import Condition, Thread
 from time import monotonic
+from typing import IO, Any
 
-from rich.console import Console
+from rich.console import Console, Group, RenderableType
+from rich.live import Live
+from rich.panel import Panel
+from rich.text import Text
 
+from skin.core.files import json_line, unwritable
 from skin.core.interrupt import ends_on_signal
 from skin.core.messages import quiet
 from skin.errors import InputError
-from skin.live.contacts import LiveContacts
+from skin.live.contacts import LiveContacts, contact_text_lines
 from skin.live.engine_builder import LiveSettings, LiveSetup, watch_exported, watch_run
-from skin.live.loop import Display, DisplayInfo, LiveLoop, watch_age
-from skin.live.terminal import show_in_terminal
-from skin.live.verdicts import log_alarms, print_verdicts
+from skin.live.loop import Display, DisplayState, LiveLoop, watch_age
+from skin.live.verdict import Assessment, contact_text, verdict_message
 from skin.runs.configuration import Config
 from skin.runs.model import check_overrides
+from skin.wire.segmentation import typed_lines
 
 _say = Console(stderr=True, highlight=False).print
+
+# JSON lines, for other programs and as a log.
+
+
+HEARTBEAT = 0.4
+"""s without a line from which the state is repeated: 0.5 s at most, as :func:`watch_age` looks each 0.1 s."""
+
+
+class LineQueue:
+    """Writes numbered JSON lines in a thread of its own, flushed one by one: a slow reader delays no verdict.
+
+    Args:
+        file: open for writing.
+        failed: called with the error when the file cannot be written any more, as its reader is gone.
+        waiting: lines for a slow reader; then the oldest is dropped.
+        ending: s in which a slow reader may take the last lines.
+    """
+
+    def __init__(
+        self, file: IO[str], failed: Callable[[Exception], object], waiting: int = 256, ending: float = 1.0
+    ) -> None:
+        self._file, self._failed, self._ending = file, failed, ending
+        self._changed, self._over, self._number = Condition(), False, 0
+        self._waiting: deque[str] = deque(maxlen=waiting)
+        self._thread = Thread(target=self._run, name="skin-lines", daemon=True)
+
+    def __enter__(self) -> "LineQueue":
+        self._thread.start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        """Write the lines that wait, and end."""
+        with self._changed:
+            self._over = True
+            self._changed.notify()
+        self._thread.join(self._ending)
+
+    def add(self, message: dict[str, Any]) -> None:
+        """Add a line with its number, from 1 up; return at once."""
+        with self._changed:
+            self._number += 1
+            self._waiting.append(json_line({"number": self._number, **message}) + "\n")
+            self._changed.notify()
+
+    def _run(self) -> None:
+        try:
+            while self._waiting or not self._over:
+                with self._changed:
+                    self._changed.wait_for(lambda: self._waiting or self._over)
+                    line = self._waiting.popleft() if self._waiting else ""
+                self._file.write(line)
+                self._file.flush()
+        except (OSError, ValueError) as error:
+            self._failed(error)
+
+
+VERDICTS = frozenset(("verdict", "change", "heartbeat"))
+"""Events for other programs: a verdict, another reason for none, and the state again after ``HEARTBEAT``."""
+_STATES = ("stale", "resumed"), ("alarm", "cleared"), ("unknown", "known")
+CHANGES = frozenset(("started", *sum(_STATES, ()), "tare", "tare_refused", "tare_forced", "ended"))
+"""Events of a log: changes of what is known of the skin, of the alarm, of what is known of a position (its
+sensors have no valid reading), and of the baseline."""
+
+
+@contextmanager
+def write_lines(
+    display: Display, file: IO[str], failed: Callable[[Exception], object], wanted: Set[str]
+) -> Iterator[None]:
+    """Write a line to a file for each event while the block runs.
+
+    Args:
+        display: gives the verdicts; watched by :func:`watch_age`.
+        file: open for writing.
+        failed: called with the error when the file cannot be written any more; the live view continues.
+        wanted: names of the events, of :data:`VERDICTS` and :data:`CHANGES`.
+    """
+    written = monotonic()
+    latest, states = display.assess(written), (True, False, False)
+
+    def observe(assessment: Assessment, now: float, event: str) -> None:
+        nonlocal latest, states
+        former, before, latest, verdict = latest, states, assessment, assessment.verdict
+        # Places stay as they were while nothing is known of the skin.
+        states = verdict is None, assessment.alarm, before[2] if verdict is None else bool(verdict.unknown)
+        pairs = zip(_STATES, before, states, strict=True)
+        changes = [names[not state] for names, previous, state in pairs if state != previous]
+        if not write(now, *changes, event):
+            again = "heartbeat" if now - written >= HEARTBEAT else ""
+            write(now, again if latest == former else "change" if verdict is None else "verdict")
+
+    def write(now: float, *events: str) -> bool:
+        nonlocal written
+        chosen = [event for event in events if event in wanted]
+        for event in chosen:
+            written, described = now, display.describe(latest, now)
+            lines.add({"event": event, **verdict_message(latest, *described, now)})
+        return bool(chosen)
+
+    with LineQueue(file, failed) as lines:
+        write(monotonic(), "started")
+        display.observers.append(observe)
+        try:
+            yield
+        finally:
+            write(monotonic(), "ended")
+
+
+@contextmanager
+def log_alarms(display: Display, path: Path) -> Iterator[None]:
+    """Append the lines of :data:`CHANGES` to a file while the block runs.
+
+    If it becomes unwritable, a message says so once.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        file = path.open("a", encoding="utf-8")
+    except OSError as error:
+        raise unwritable(path, error, "live.log=FILE.jsonl") from error
+    warn = partial(print, "the alarm log ends here:", file=sys.stderr)
+    try:
+        with write_lines(display, file, warn, CHANGES):
+            yield
+    finally:
+        with suppress(OSError):  # of a full disk, which the message has reported
+            file.close()
+
+
+# The terminal; where output is no terminal, JSON lines of its changes.
+
+
+_KEYS = "t and Enter: a new tare, nothing may touch the skin; Ctrl-C ends"
+
+
+@contextmanager
+def show_in_terminal(display: Display, console: Console) -> Iterator[None]:
+    """Show the display while the block runs, and read typed commands."""
+    with suppress(AttributeError, ValueError):  # Windows; another thread than the main one
+        # In the background the program reads no keys; it must not be stopped.
+        signal.signal(signal.SIGTTIN, signal.SIG_IGN)
+    Thread(target=_read_keys, args=(display,), name="skin-keys", daemon=True).start()
+    render = lambda: screen(display, monotonic())  # noqa: E731
+    live = Live(get_renderable=render, console=console, refresh_per_second=8, transient=True)
+    lines = write_lines(display, console.file, display.close, CHANGES | {"change"})
+    with live if console.is_terminal else lines:
+        yield
+
+
+def _read_keys(display: Display) -> None:
+    """Request a new tare at every line ``t``, or ``force`` after a refusal, until the input ends."""
+    with suppress(OSError, ValueError):  # no input, or a closed one
+        for text in typed_lines(sys.stdin.fileno()):
+            if (word := text.strip().lower()) in ("t", "force"):
+                display.request_tare(monotonic(), force=word == "force")
+
+
+def screen(display: Display, now: float) -> RenderableType:
+    """Return the verdict and the contacts at ``now``, s, with the status of the stream below."""
+    state, title = display.state(now), f"{display.title} on {display.port}"
+    shown = Group(_verdict(state), Text(), Text("\n".join(contact_text_lines(state.contacts))))
+    panel = Panel(shown, title=title, border_style="bold red" if state.alarm else "dim", expand=False)
+    return Group(panel, Text(state.line or " ", style="dim"), Text(_KEYS, style="dim"))
+
+
+def _verdict(state: DisplayState) -> RenderableType:
+    """Return the verdict in words."""
+    verdict, alarm = state.verdict, Text("DANGEROUS", "bold white on red")
+    if verdict is None or not verdict.touched:
+        shown = "unknown" if verdict is None else verdict.state
+        text = ": ".join(filter(None, (shown, state.reason)))
+        trouble = Text(text, style="dim" if shown == "no touch" else "yellow")
+        return Group(alarm, Text(), trouble) if state.alarm else trouble
+    strongest, limited = int(state.peak.argmax()), int(state.saturated.sum())
+    notes = (
+        f"strongest reading {state.peak[strongest]:.1f} N, sensor {strongest}",
+        contact_text(verdict.contact),
+        state.reason,
+        "the touch has ended" * (verdict.contact is None),
+        f"{limited} sensors at their limit" * (limited > 0),
+        "frames are missing" * verdict.gap,
+    )
+    words = "\n".join(f"{word:10} {100 * probability:3.0f} %" for word, probability in verdict.words())
+    head = alarm if state.alarm else Text("touch", "bold")
+    return Group(head, Text(), Text(words), Text("\n".join(filter(None, notes)), "yellow"))
+
+
+# The whole view, and the emulated skin of its demonstration.
 
 
 @contextmanager
@@ -92,11 +288,10 @@ def show(
                 quiet()
                 setup = watch_run(run, config, live, _say, overrides, opened, own_mechanics)
             display = _open_views(setup, live, web, opened)
-            watched = setup.watch(live, _say)
+            source, engine, nominal = setup.watch(live, _say)
             if live.verdicts is None:
                 opened.enter_context(show_in_terminal(display, Console()))
-            source, engine = watched.source, watched.engine
-            check = partial(watched.check, live.selftest, _say, display.add_note)
+            check = partial(setup.check, source, engine, nominal, live.selftest, _say, display.add_note)
             loop = LiveLoop(source.skin, source.tare, engine, display, check)
             opened.callback(lambda: _say(f"{loop.verdicts} verdicts, {loop.line}"))
             # A search for garbage among all that is loaded would stop the loop for 0.3 s, every few seconds.
@@ -117,15 +312,16 @@ def _open_views(setup: LiveSetup, live: LiveSettings, web: bool, opened: ExitSta
     except InputError as error:
         contacts.explain(str(error))
         _say(f"no contacts: {error}")
-    model = setup.model
-    span = model.window / model.rate
-    info = DisplayInfo(model.title, setup.name, model.positions, model.size, live.top, span)
-    display = Display(info, contacts, live.patience.calm)
+    model, span = setup.model, setup.model.window / setup.model.rate
+    skin = model.positions, model.size
+    display = Display(model.title, setup.name, *skin, live.top, span, contacts, live.patience.calm)
     display.set_verdict(None, monotonic(), "the threshold of the alarm is being chosen")
     if live.log is not None:
         opened.enter_context(log_alarms(display, Path(live.log).expanduser()))
     if live.verdicts is not None:
-        opened.enter_context(print_verdicts(display))
+        # A file of its own, and never closed: lines that a reader did not take would fail once more.
+        stdout = open(sys.stdout.fileno(), "w", closefd=False)  # noqa: SIM115
+        opened.enter_context(write_lines(display, stdout, display.close, VERDICTS))
     if web:
         from skin.live.web import serve_page
 

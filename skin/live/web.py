@@ -1,7 +1,6 @@
 """Live view on a local web page; pictures are sent as server-sent events."""
 
 import asyncio
-import base64
 import socket
 from collections.abc import AsyncIterator, Iterator
 from contextlib import contextmanager
@@ -10,9 +9,7 @@ from threading import Thread
 from time import monotonic, time
 from typing import Any
 
-import numpy as np
 import uvicorn
-from scipy.interpolate import RBFInterpolator
 from starlette.applications import Starlette
 from starlette.middleware import Middleware
 from starlette.middleware.trustedhost import TrustedHostMiddleware
@@ -22,52 +19,14 @@ from starlette.routing import Route
 
 from skin.core.files import json_line
 from skin.errors import InputError
-from skin.learning.representation import centres
 from skin.live.contacts import contact_text_lines
-from skin.live.loop import Assessment, Display, DisplayState
-from skin.live.terminal import contact_text
-from skin.live.verdicts import verdict_message
+from skin.live.loop import Display, DisplayState
+from skin.live.verdict import Assessment, contact_text, verdict_message
 
 HERTZ = 33
 """Pictures per second: 30, with a margin for a busy machine."""
 _HOST = "127.0.0.1"
 _PAGE = Path(__file__).with_name("page.html")
-
-
-class SkinPicture:
-    """Interpolates readings between the sensors, for display only: radial functions, linear in the distance.
-
-    Each sensor shows its own reading, and there is no edge between the sensors or outside of them.
-
-    Args:
-        positions: (S, 3), m.
-        size: extent (x, y) of the sheet, m.
-        pixels: edge length of the picture, which is stretched over the sheet.
-        top: N at the brightest value.
-    """
-
-    def __init__(self, positions: np.ndarray, size: tuple[float, float], pixels: int, top: float) -> None:
-        self.pixels, self.top = pixels, top
-        self._points, self._targets = np.asarray(positions, dtype=float)[:, :2], centres(size, pixels)
-        self._known = np.zeros(len(self._points), dtype=bool)
-        self._matrix = np.zeros((pixels**2, len(self._points)), np.float32)
-
-    def __call__(self, values: np.ndarray, valid: np.ndarray | None = None) -> np.ndarray:
-        """Return the picture of readings (S,), N, as (pixels, pixels), uint8: 255 is ``top`` and above.
-
-        Args:
-            values: N.
-            valid: (S,), bool; other sensors are left out, not shown as 0; None: all are known.
-        """
-        valid = np.ones(len(values), dtype=bool) if valid is None else valid
-        if not np.array_equal(valid, self._known):
-            self._known, self._matrix = valid.copy(), np.zeros_like(self._matrix)
-            if valid.any():
-                points, own = self._points[valid], np.eye(int(valid.sum()))
-                radial = RBFInterpolator(points, own, kernel="linear", degree=0)
-                self._matrix[:, valid] = radial(self._targets)
-        image = self._matrix @ values.astype(np.float32)
-        return (255 * np.clip(image / self.top, 0, 1)).astype(np.uint8).reshape(self.pixels, self.pixels)
 
 
 @contextmanager
@@ -94,20 +53,19 @@ def serve_page(display: Display, port: int) -> Iterator[str]:
     try:
         yield f"http://{_HOST}:{listening.getsockname()[1]}"
     finally:
-        display.closed.set()
+        display.close()
         server.should_exit = True
         thread.join(5)
         listening.close()
 
 
-def message(state: DisplayState, picture: SkinPicture, now: float) -> dict[str, Any]:
+def message(state: DisplayState, now: float) -> dict[str, Any]:
     """Return the data of each picture: the fields of a JSON line, and what the page draws.
 
-    Forces are in N, the picture is base64 of uint8 row by row, the time ``sent`` in s.
+    Forces are in N, the time ``sent`` in s.
 
     Args:
         state: of the display.
-        picture: interpolates the forces.
         now: s, the host's monotonic clock.
     """
     verdict, assessment = state.verdict, Assessment(state.verdict, "", state.alarm)
@@ -120,7 +78,6 @@ def message(state: DisplayState, picture: SkinPicture, now: float) -> dict[str, 
         "saturated": state.saturated.tolist(),
         "peak": [round(value, 3) for value in state.peak.tolist()],
         "held": state.held,
-        "picture": base64.b64encode(picture(state.map, state.valid).tobytes()).decode(),
         "unknown": list(range(len(state.valid))) if verdict is None else list(verdict.unknown),
         "since": "" if verdict is None else contact_text(verdict.contact),
         "words": [] if verdict is None else verdict.words(),
@@ -129,20 +86,10 @@ def message(state: DisplayState, picture: SkinPicture, now: float) -> dict[str, 
     }
 
 
-def _application(display: Display, pixels: int = 64) -> Starlette:
-    info = display.info
-    picture = SkinPicture(info.positions, info.size, pixels, info.top)
-
-    async def page(request: Request) -> Response:
-        return FileResponse(_PAGE, media_type="text/html", headers={"Cache-Control": "no-store"})
-
-    async def skin(request: Request) -> Response:
-        geometry = {"positions": info.positions.tolist(), "size": list(info.size), "pixels": pixels}
-        named = {"title": info.title, "port": info.port, "top": info.top, "window": info.window}
-        return JSONResponse(geometry | named)
+def _application(display: Display) -> Starlette:
 
     async def pictures(request: Request) -> Response:
-        return StreamingResponse(_events(display, picture), media_type="text/event-stream")
+        return StreamingResponse(_events(display), media_type="text/event-stream")
 
     async def tare(request: Request) -> Response:
         # Another site's page can send a plain POST here, but not with a header of its own.
@@ -153,23 +100,25 @@ def _application(display: Display, pixels: int = 64) -> Starlette:
 
     # Other host names are refused, so that pages of other sites cannot read the skin.
     local = Middleware(TrustedHostMiddleware, allowed_hosts=[_HOST, "localhost"])
+    named = {name: getattr(display, name) for name in ("title", "port", "top", "window", "size")}
+    info = named | {"positions": display.positions.tolist()}
     routes = [
-        Route("/", page),
-        Route("/skin.json", skin),
+        Route("/", FileResponse(_PAGE, media_type="text/html", headers={"Cache-Control": "no-store"})),
+        Route("/skin.json", JSONResponse(info)),
         Route("/pictures", pictures),
         Route("/tare", tare, methods=["POST"]),
     ]
     return Starlette(routes=routes, middleware=[local])
 
 
-async def _events(display: Display, picture: SkinPicture) -> AsyncIterator[str]:
+async def _events(display: Display) -> AsyncIterator[str]:
     due = monotonic()
     number = display.state(due).number  # of the first picture: the latest frame
     while not display.closed.is_set():
         now = monotonic()
         state = display.state(now, number)
         number = state.number
-        yield f"data: {json_line(message(state, picture, now))}\n\n"
+        yield f"data: {json_line(message(state, now))}\n\n"
         # A picture that is a little late does not delay the next; those that are very late are left out.
         due = max(due + 1 / HERTZ, monotonic() - 1 / HERTZ)
         await asyncio.sleep(max(0.0, due - monotonic()))

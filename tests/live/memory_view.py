@@ -1,10 +1,11 @@
 """A live view of bytes in memory: decoder, tare, engine, loop and display, with the time as an argument."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 
-from skin.live.loop import Display, DisplayInfo, LiveLoop
+from skin.live.loop import Display, LiveLoop
 from skin.wire.decoder import Decoder
 from skin.wire.reader import Port, WireFeed
 from skin.wire.skin import SerialSource
@@ -49,9 +50,9 @@ class MemoryView:
         tare = Tare(source.convert, 2.0, engine.rate, lambda: decoder.header)
         tare.glitches.fractions = engine.fractions
         positions = np.zeros((engine.sensors, 3))
-        self.display = Display(DisplayInfo("memory", "memory", positions, (0.1, 0.1), 4.0))
-        self.display.observers.append(lambda assessment, now: self.said.append((now, *assessment)))
-        self.loop = LiveLoop(skin, tare, engine.build(), self.display, verify)
+        self.display = Display("memory", "memory", positions, (0.1, 0.1), 4.0)
+        self.display.observers.append(lambda assessment, now, event: self.said.append((now, *assessment)))
+        self.loop = LiveLoop(skin, tare, replace(engine), self.display, verify)
         for arrival, data in stream:
             self.look(arrival)
             frames = feed.decode(data, arrival)

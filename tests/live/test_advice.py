@@ -10,16 +10,15 @@ PORT = ("device=serial", "device.port=/dev/ttyACM0", "device.scale=0.04")
 
 @pytest.mark.parametrize(
     ("trained", "warned"),
-    [("fem", True), ("solid", False), ("naive", False)],
+    [
+        (["simulator=fem"], True),
+        (["simulator=fem", "simulator.reading=interface"], False),
+        (["simulator=solid"], False),
+    ],
 )
 def test_a_run_on_equation_10_is_announced_at_a_port_only(configured, trained, warned):
-    stored = configured(f"simulator={trained}")
+    stored = configured(*trained)
     said = equation10_warning(stored, build_device(configured(*PORT)))
     assert (said is not None) == warned
     assert said is None or "simulator=solid" in said
     assert equation10_warning(stored, build_device(configured("simulator=naive"))) is None
-
-
-def test_another_reading_of_plates_is_not(configured):
-    stored = configured("simulator=fem", "simulator.reading=interface")
-    assert equation10_warning(stored, build_device(configured(*PORT))) is None

@@ -138,13 +138,12 @@ def test_the_settings_of_the_file_and_of_the_command(with_thresholds, skin):
         device = {"port": skin, "labels": "announced"}
         setup = watch_exported(str(path), device, said.append, opened)
         assert not any("alarm above" in text for text in said)  # the views open before
-        watched = setup.watch(LIVE, said.append)
-    assert (watched.model.title, len(watched.model.positions)) == ("untrained", 6)
-    assert (setup.model.title, setup.name) == ("untrained", watched.source.name)
+        source, _, nominal = setup.watch(LIVE, said.append)
+    assert (setup.model.title, len(setup.model.positions), setup.name) == ("untrained", 6, source.name)
     assert said[-1] == f"alarm above {threshold:.4f}"
     assert ("single windows" in said[-2]) == (threshold == 0.25)
-    assert watched.nominal.presses.shape == (6, 6)
-    assert (watched.nominal.presses.argmax(axis=1) == np.arange(6)).all()
+    assert nominal.presses.shape == (6, 6)
+    assert (nominal.presses.argmax(axis=1) == np.arange(6)).all()
 
 
 @pytest.mark.parametrize("at_once", [1, 25])
@@ -168,17 +167,17 @@ def test_no_frame_that_waited_while_the_threshold_was_chosen_is_judged(model, sk
     with ExitStack() as opened:
         setup = watch_exported(str(model), {"port": skin}, print, opened)
         sleep(1.5)
-        watched = setup.watch(LIVE, print)
-        (frame,) = watched.source.skin.read(1)
+        (frame,) = setup.watch(LIVE, print)[0].skin.read(1)
         assert monotonic() - frame.t_host < 0.5
 
 
 def test_the_command_replaces_settings_of_the_file(model, skin):
     said, other = [], replace(LIVE, touch=0.5, patience=DebounceSettings(above=0.75))
     with ExitStack() as opened:
-        watched = watch_exported(str(model), {"port": skin}, said.append, opened).watch(other, said.append)
+        setup = watch_exported(str(model), {"port": skin}, said.append, opened)
+        _, engine, nominal = setup.watch(other, said.append)
     assert said[-1] == "alarm above 0.75"
-    assert (watched.engine.detection.threshold, watched.nominal.detection.threshold) == (0.5, 0.3)
+    assert (engine.detection.threshold, nominal.detection.threshold) == (0.5, 0.3)
 
 
 @pytest.mark.slow("starts a process that imports anew")

@@ -10,7 +10,7 @@ from skin.body.base import Sheet
 from skin.body.layout import Grid
 from skin.device.files import read_recording
 from skin.live.engine import Detection, Engine
-from skin.live.loop import Display, DisplayInfo, LiveLoop
+from skin.live.loop import Display, LiveLoop
 from skin.record.recorder import convert_session, record_session
 from skin.record.serial import Serial
 from skin.runs.build import build_data, build_device, build_learner
@@ -124,7 +124,7 @@ def live(learner, stream):
     decoder = Decoder(6)
     feed = WireFeed(lambda: None, decoder, (None, LIMIT))
     skin = SimpleNamespace(stats=decoder.stats, header=None, channels=())
-    display = Taking(DisplayInfo("rules", "memory", positions.numpy(), device.size, 4.0))
+    display = Taking("rules", "memory", positions.numpy(), device.size, 4.0)
     loop = LiveLoop(skin, Tare(device.wire.convert, 2.0, 10.0), engine, display)
     for number, data in stream:
         if frames := feed.decode(data, number / RATE):

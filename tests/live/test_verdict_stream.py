@@ -17,15 +17,15 @@ import pytest
 
 from skin.core.files import ROOT
 from skin.errors import InputError
-from skin.live.loop import Display, DisplayInfo, watch_age
+from skin.live.loop import Display, watch_age
 from skin.live.verdict import Verdict
-from skin.live.verdicts import HEARTBEAT, LineQueue, log_alarms, write_verdicts
+from skin.live.view import HEARTBEAT, VERDICTS, log_alarms, write_lines
 
 PATIENCE = 60  # s
 
 
 def display(calm=2.0):
-    return Display(DisplayInfo("run", "port", np.zeros((4, 3)), (0.1, 0.1), 4.0), calm=calm)
+    return Display("run", "port", np.zeros((4, 3)), (0.1, 0.1), 4.0, calm=calm)
 
 
 def logged(dangerous):
@@ -47,7 +47,8 @@ def piped(shown):
     with (
         os.fdopen(reading, "rb") as lines,
         os.fdopen(writing, "w", buffering=1) as file,
-        write_verdicts(shown, file),
+        watch_age(shown),
+        write_lines(shown, file, shown.close, VERDICTS),
     ):
         yield lines
 
@@ -84,7 +85,7 @@ def test_a_verdict_is_a_line():
 def test_a_verdict_that_is_too_old_is_stale_and_keeps_its_alarm():
     """Also where the engine hangs, which would tell nothing itself."""
     shown = display()
-    with watch_age(shown), connected(shown) as take:
+    with connected(shown) as take:
         shown.set_verdict(verdict(dangerous=True), monotonic())
         began = monotonic()
         fresh = wait_for(take, lambda message: message["event"] == "verdict")
@@ -101,15 +102,6 @@ def test_a_verdict_that_is_too_old_is_stale_and_keeps_its_alarm():
         assert "labels" not in old
 
 
-def test_the_first_line_tells_what_is_waited_for():
-    shown = display()
-    shown.set_verdict(None, monotonic(), "the threshold of the alarm is being chosen")
-    with connected(shown) as take:
-        message = take()
-    assert (message["event"], message["stale"], message["state"]) == ("heartbeat", True, "unknown")
-    assert message["reason"] == "the threshold of the alarm is being chosen"
-
-
 def test_a_reason_is_sent_once_and_then_with_each_heartbeat():
     shown = display()
     with connected(shown) as take:
@@ -122,16 +114,6 @@ def test_a_reason_is_sent_once_and_then_with_each_heartbeat():
         "heartbeat",
     ]
     assert all(one["alarm"] for one in events)
-
-
-def test_each_line_is_there_at_once():
-    """A reader that waits for a full buffer would show an alarm seconds late."""
-    shown = display()
-    with connected(shown) as take:
-        for probability in (0.25, 0.5, 0.75):
-            shown.set_verdict(verdict(probability=probability), monotonic())
-            found = wait_for(take, lambda message: message["event"] == "verdict")
-            assert found["probabilities"]["big"] == probability
 
 
 def test_a_reader_that_is_slow_delays_nothing_and_misses_the_oldest():
@@ -160,7 +142,7 @@ def test_what_waits_is_written_before_the_end():
     shown = display()
     reading, writing = os.pipe()
     with os.fdopen(reading, "rb") as lines:
-        with os.fdopen(writing, "w", buffering=1) as file, write_verdicts(shown, file):
+        with os.fdopen(writing, "w", buffering=1) as file, write_lines(shown, file, shown.close, VERDICTS):
             for _ in range(20):
                 shown.set_verdict(verdict(), monotonic())
         assert [json.loads(line)["number"] for line in lines] == [*range(1, 21)]
@@ -204,18 +186,6 @@ def test_a_folder_that_cannot_be_written_is_refused(tmp_path):
         pass
 
 
-def test_a_full_disk_ends_the_log_and_not_the_view():
-    class Full:
-        def write(self, text):
-            raise OSError("No space left on device")
-
-    errors = []
-    with LineQueue(Full(), errors.append) as lines:
-        for _ in range(3):
-            lines.add({"event": "alarm"})
-    assert [str(error) for error in errors] == ["No space left on device"]
-
-
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no such device")
 def test_a_full_disk_does_not_hide_how_the_view_ends(capsys):
     """Closing the file raised an error of its own: SIGTERM ended with code 2."""
@@ -239,14 +209,14 @@ def test_the_log_is_valid_json_whatever_a_verdict_holds(tmp_path):
 LIVE = """
 import sys
 import numpy as np
-from skin.live.loop import Display, DisplayInfo, watch_age
+from skin.live.loop import Display, watch_age
 from skin.live.verdict import Verdict
-from skin.live.verdicts import print_verdicts
+from skin.live.view import VERDICTS, write_lines
 from time import monotonic
 
 assert sys.argv[-1] == "live.verdicts=stdout"
-shown = Display(DisplayInfo("run", "port", np.zeros((4, 3)), (0.1, 0.1), 4.0))
-with watch_age(shown), print_verdicts(shown):
+shown = Display("run", "port", np.zeros((4, 3)), (0.1, 0.1), 4.0)
+with watch_age(shown), write_lines(shown, sys.stdout, shown.close, VERDICTS):
     shown.closed.wait(1)
     for _ in range(40):
         chances = {"big": 0.3, "dangerous": 1.0}

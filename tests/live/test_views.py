@@ -5,7 +5,6 @@ import os
 import re
 import urllib.error
 import urllib.request
-from base64 import b64decode
 from contextlib import contextmanager
 from dataclasses import replace
 from io import StringIO
@@ -18,10 +17,10 @@ from rich.console import Console
 
 from skin.device.resampling import Frame
 from skin.errors import InputError
-from skin.live import loop, terminal, web
-from skin.live.loop import Display, DisplayInfo
-from skin.live.verdict import Note, Verdict
-from skin.live.web import SkinPicture
+from skin.live import loop, web
+from skin.live.loop import Display
+from skin.live.verdict import Note, Verdict, contact_text
+from skin.live.view import screen, show_in_terminal
 from skin.wire.channels import UnitConversion
 
 PLACES = np.array([[0.02, 0.02, 0], [0.14, 0.03, 0], [0.03, 0.1, 0], [0.13, 0.11, 0], [0.08, 0.06, 0]])
@@ -35,7 +34,7 @@ PRESSED = Verdict(0, 0, {"big": 0.2, "dangerous": 0.9}, True, {"big": False, "da
 
 
 def display():
-    return Display(DisplayInfo("rules naive 0", "/dev/skin", PLACES, SIZE, 4.0))
+    return Display("rules naive 0", "/dev/skin", PLACES, SIZE, 4.0)
 
 
 def frame(values, valid=None, **more):
@@ -47,29 +46,19 @@ def frame(values, valid=None, **more):
 def shown(subject):
     """Return the text in the terminal."""
     console = Console(width=120, record=True, force_terminal=True, file=StringIO())
-    console.print(terminal.screen(subject, monotonic()))
+    console.print(screen(subject, monotonic()))
     return console.export_text()
 
 
-def fetch(address, **headers):
-    """Return status, headers and the beginning of what an address gives."""
+def fetch(address, data=None, **headers):
+    """Return the status and the text that an address gives."""
+    headers = {name.replace("_", "-"): value for name, value in headers.items()}
     try:
-        with urllib.request.urlopen(urllib.request.Request(address, headers=headers), timeout=30) as answer:
+        with urllib.request.urlopen(urllib.request.Request(address, data, headers), timeout=30) as answer:
             return answer.status, answer.read().decode()
     except urllib.error.HTTPError as error:
         with error:
             return error.code, ""
-
-
-def posted(address, **headers):
-    """Return the status of a request that sends nothing."""
-    headers = {name.replace("_", "-"): value for name, value in headers.items()}
-    try:
-        with urllib.request.urlopen(urllib.request.Request(address, b"", headers), timeout=30) as answer:
-            return answer.status
-    except urllib.error.HTTPError as error:
-        with error:
-            return error.code
 
 
 def test_no_peak_between_two_looks_is_missed():
@@ -83,24 +72,11 @@ def test_no_peak_between_two_looks_is_missed():
     assert subject.state(monotonic(), state.number).values[3] == 2
 
 
-def test_the_picture_shows_each_reading_and_no_edge_between_or_outside():
-    values = np.array([0.0, 4.0, 1.0, 3.0, 2.0])
-    picture = SkinPicture(PLACES, SIZE, 64, 4.0)
-    image = picture(values).astype(int)
-    for (x, y, _), value in zip(PLACES, values, strict=True):
-        row, column = int(64 * y / SIZE[1]), int(64 * x / SIZE[0])
-        assert image[row, column] == pytest.approx(255 * value / 4, abs=8)
-    assert image[32, 20] == pytest.approx(np.mean(image[[31, 33, 32, 32], [20, 20, 19, 21]]), abs=2)
-    # Half a picture from dark to bright is 8 a pixel.
-    assert max(np.abs(np.diff(image, axis=axis)).max() for axis in (0, 1)) <= 8
-    assert SkinPicture(PLACES[:1], SIZE, 8, 4.0)(values[1:2] / 4).tolist() == [[63] * 8] * 8
-
-
 def test_where_output_is_no_terminal_a_line_tells_each_change(tmp_path):
     subject = display()
     with (
         (tmp_path / "said").open("w") as file,
-        terminal.show_in_terminal(subject, Console(file=file, width=60)),
+        show_in_terminal(subject, Console(file=file, width=60)),
     ):
         for verdict in (None, None, PRESSED, PRESSED):
             subject.set_verdict(verdict, monotonic(), "" if verdict else "taking the baseline: do not touch")
@@ -119,7 +95,7 @@ def test_the_terminal_shows_the_alarm_and_the_probability():
     subject.set_verdict(replace(PRESSED, dangerous=False, contact=0.1), monotonic())
     subject.add(frame([0, 0, 6.25, 0, 0]))
     subject.set_verdict(PRESSED, monotonic())
-    subject.set_status("99.9 Hz")
+    subject.line = "99.9 Hz"
     text = shown(subject)
     assert "DANGEROUS" in text
     assert re.search(r"small .* 80 %", text)
@@ -145,7 +121,6 @@ def test_the_page_gets_pictures_and_needs_nothing_from_elsewhere():
     assert picture["words"] == [["small", 0.8], ["dangerous", 0.9]]
     assert picture["values"][2] == 2.0
     assert picture["valid"] == [True, True, True, True, False]
-    assert len(b64decode(picture["picture"])) == info["pixels"] ** 2
 
 
 @pytest.mark.parametrize("value", [1e300, -1e300, 1e10])
@@ -160,23 +135,14 @@ def test_the_page_gets_valid_json_whatever_the_device_sends(value):
 
 
 def test_a_saturated_sensor_shows_its_limit_and_an_unknown_one_nothing():
-    """A dark hole at the sensor that is pressed hardest would hide the press."""
     subject = display()
     valid, saturated = np.array([True, True, True, True, False]), np.array([False, False, True, False, False])
     subject.add(frame([1.0, 1.0, 4.0, 1.0, 9.0], valid, saturated=saturated))
     state = subject.state(monotonic())
     assert state.values.tolist() == [1, 1, 4, 1, 0]
     assert state.saturated.tolist() == saturated.tolist()
-    picture = SkinPicture(PLACES, SIZE, 64, 4.0)
-    image = picture(state.values, state.valid)
-    # Where the unknown sensor is, the picture shows what lies around it; the saturated one is brightest.
-    row, column = (round(PLACES[4, axis] / SIZE[axis] * 64) for axis in (1, 0))
-    assert image[row, column] > 60
-    row, column = (round(PLACES[2, axis] / SIZE[axis] * 64) for axis in (1, 0))
-    assert image[row - 2 : row + 3, column - 2 : column + 3].max() > 235
-    sent = web.message(state, picture, monotonic())
+    sent = web.message(state, monotonic())
     assert (sent["saturated"][2], sent["valid"][4], sent["values"][2]) == (True, False, 4.0)
-    assert picture(np.zeros(5), np.zeros(5, dtype=bool)).max() == 0
 
 
 def test_an_alarm_outlives_silence_in_every_view():
@@ -185,16 +151,16 @@ def test_an_alarm_outlives_silence_in_every_view():
     subject.set_verdict(None, monotonic(), "the device has stopped sending", alarm=True)
     state = subject.state(monotonic())
     assert (state.verdict, state.alarm) == (None, True)
-    assert web.message(state, SkinPicture(PLACES, SIZE, 8, 4.0), monotonic())["alarm"] is True
+    assert web.message(state, monotonic())["alarm"] is True
     text = shown(subject)
     assert "DANGEROUS" in text
     assert "stopped sending" in text
 
 
 def test_the_views_say_since_when_something_touches():
-    assert terminal.contact_text(None) == terminal.contact_text(1.0) == ""
-    assert re.fullmatch(r"contact since \d\d:\d\d:\d\d \(12 s\)", terminal.contact_text(12.0))
-    assert "take a new tare" in terminal.contact_text(75.0)
+    assert contact_text(None) == contact_text(1.0) == ""
+    assert re.fullmatch(r"contact since \d\d:\d\d:\d\d \(12 s\)", contact_text(12.0))
+    assert "take a new tare" in contact_text(75.0)
 
 
 def test_the_page_asks_for_a_tare_and_another_site_cannot():
@@ -202,7 +168,7 @@ def test_the_page_asks_for_a_tare_and_another_site_cannot():
     with web.serve_page(subject, 0) as address:
         for headers, code in (({}, 403), ({"Origin": "http://evil.example"}, 403), ({"X-Skin": "tare"}, 204)):
             assert subject.take_tare() == ""
-            assert posted(f"{address}/tare", **headers) == code
+            assert fetch(f"{address}/tare", b"", **headers)[0] == code
         assert subject.take_tare() == "tare"
         assert fetch(f"{address}/tare")[0] == 405
 
@@ -213,7 +179,7 @@ def test_the_operator_types_t_for_a_tare(monkeypatch, tmp_path):
     subject = display()
     with os.fdopen(slave) as typed, (tmp_path / "said").open("w") as file:
         monkeypatch.setattr("sys.stdin", typed)
-        with terminal.show_in_terminal(subject, Console(file=file)):
+        with show_in_terminal(subject, Console(file=file)):
             os.write(master, b"x\n")
             sleep(0.3)
             assert subject.take_tare() == ""
@@ -224,18 +190,23 @@ def test_the_operator_types_t_for_a_tare(monkeypatch, tmp_path):
             until(lambda: "tare refused" in subject.state(monotonic()).line)
             assert subject.take_tare() == ""
             os.write(master, b"force\n")
-            assert requested(subject) == "forced"
+            assert requested(subject) == "tare_forced"
             os.write(master, b"\x04")
             sleep(0.1)
     os.close(master)
 
 
-def until(reached):
-    deadline = monotonic() + 60
-    while not (result := reached()):
-        assert monotonic() < deadline
+def until(reached, wanted=None):
+    """Wait until a function gives what is wanted, or anything true, and return it."""
+    deadline = monotonic() + 300
+    while not (result := reached()) if wanted is None else (result := reached()) != wanted:
+        assert monotonic() < deadline, result
         sleep(0.05)
     return result
+
+
+def shows(browser, script, wanted):
+    until(lambda: browser.run(f"return {script}"), wanted)
 
 
 def requested(subject):
@@ -244,14 +215,14 @@ def requested(subject):
 
 def test_a_tare_is_refused_under_a_touch_until_it_is_confirmed():
     subject, events = display(), []
-    subject.listeners.append(lambda event, now: events.append(event))
+    subject.observers.append(lambda assessment, now, event: event and events.append(event))
     assert subject.request_tare(monotonic(), force=True) != ""  # there is nothing to confirm
     for verdict in (PRESSED, replace(PRESSED, dangerous=False, contact=0.5)):
         subject.set_verdict(verdict, monotonic())
         assert "something touches the skin" in subject.request_tare(monotonic())
         assert subject.take_tare() == ""
         assert subject.request_tare(monotonic(), force=True) == ""
-        assert subject.take_tare() == "forced"
+        assert subject.take_tare() == "tare_forced"
     subject.set_verdict(None, monotonic(), "the device has stopped sending", alarm=True)
     assert subject.request_tare(monotonic()) != ""
     subject.set_verdict(replace(PRESSED, dangerous=False, touched=False), monotonic())
@@ -263,7 +234,7 @@ def test_a_tare_is_refused_under_a_touch_until_it_is_confirmed():
 def test_a_refused_tare_is_said_while_it_may_be_forced():
     subject, idle = display(), replace(PRESSED, touched=False, dangerous=False)
     refused = loop.REFUSALS["touched"]
-    subject.set_status("99.9 Hz")
+    subject.line = "99.9 Hz"
     subject.set_verdict(PRESSED, 100.0)
     assert subject.request_tare(100.0) == refused
     assert subject.request_tare(100.0, force=True) == ""
@@ -289,12 +260,12 @@ def test_the_map_of_an_alarm_is_held_and_goes_with_the_touch():
     subject.add(frame([0, 0, 6.0, 0, 0]))
     subject.set_verdict(replace(PRESSED, dangerous=False, contact=0.1), monotonic())
     state = subject.state(monotonic())
-    assert (state.held, state.map[2]) == (False, 6.0)
+    assert (state.held, state.peak[2]) == (False, 6.0)
     subject.add(frame([0, 0, 0.1, 0, 0]))
     for verdict in (PRESSED, replace(PRESSED, dangerous=False, contact=None)):
         subject.set_verdict(verdict, monotonic())
         state = subject.state(monotonic(), state.number)
-        assert (state.held, state.map[2], state.values[2]) == (True, 6.0, 0.1)
+        assert (state.held, state.peak[2], state.values[2]) == (True, 6.0, 0.1)
     # The next touch follows before the prediction is over: its map is its own.
     for _ in range(20):
         subject.add(frame(np.zeros(5)))
@@ -309,16 +280,14 @@ def test_an_unknown_place_is_not_shown_as_no_touch():
     subject = display()
     masked = {"unknown": (2,), "masked": (2,), "notes": (Note("masked", (2,)), Note("pause", seconds=0.7))}
     subject.set_verdict(replace(PRESSED, touched=False, labels={}, dangerous=False, **masked), monotonic())
-    sent = web.message(subject.state(monotonic()), SkinPicture(PLACES, SIZE, 8, 4.0), monotonic())
+    sent = web.message(subject.state(monotonic()), monotonic())
     assert (sent["state"], sent["unknown"]) == ("unknown", [2])
     text = shown(subject)
     assert "no touch" not in text
     assert "near sensor 2 would stay undetected" in text
     assert "(and 1 more note)" in text
     subject.set_verdict(None, monotonic(), "readings are frozen")
-    assert web.message(subject.state(monotonic()), SkinPicture(PLACES, SIZE, 8, 4.0), monotonic())[
-        "unknown"
-    ] == [0, 1, 2, 3, 4]
+    assert web.message(subject.state(monotonic()), monotonic())["unknown"] == [0, 1, 2, 3, 4]
     assert "unknown: readings are frozen" in shown(subject)
 
 
@@ -377,13 +346,10 @@ def repeated(subject, verdict):
 def test_the_page_draws_what_it_is_sent(browser):
     subject = display()
     subject.add(frame([0, 0, 2.0, 0, 0], np.array([True, True, True, True, False])))
-    subject.set_status("99.9 Hz")
+    subject.line = "99.9 Hz"
     with web.serve_page(subject, 0) as address, repeated(subject, PRESSED):
         browser.open(address)
-        deadline = monotonic() + 300
-        while browser.run("return pictures") < 5:
-            assert monotonic() < deadline
-            sleep(0.1)
+        shows(browser, "pictures >= 5", True)
         text = browser.run("return document.body.innerText")
         colour = browser.run(
             AT.format(*(position / size for position, size in zip(PLACES[2], SIZE, strict=False)))
@@ -396,7 +362,32 @@ def test_the_page_draws_what_it_is_sent(browser):
     assert min(colour[:2]) > 60
 
 
-ANNOUNCED = "return [...document.querySelectorAll('[role=alert]')].map(one => one.textContent)"
+def test_the_picture_shows_each_reading_and_no_edge_between_or_outside(browser):
+    """Of an invalid sensor it shows what lies around: a dark hole would hide the press."""
+    subject = display()
+    with web.serve_page(subject, 0) as address:
+        browser.open(address)
+        shows(browser, "Boolean(skin)", True)
+
+        def image(values, valid):
+            dots = browser.run(f"return [...picture({values}, {json.dumps(valid)})]")
+            return np.array(dots).reshape(64, 64)
+
+        values = [0.0, 4.0, 1.0, 3.0, 2.0]
+        whole = image(values, [True] * 5)
+        for (x, y, _), value in zip(PLACES, values, strict=True):
+            row, column = int(64 * y / SIZE[1]), int(64 * x / SIZE[0])
+            assert whole[row, column] == pytest.approx(255 * value / 4, abs=8)
+        assert whole[32, 20] == pytest.approx(np.mean(whole[[31, 33, 32, 32], [20, 20, 19, 21]]), abs=2)
+        # Half a picture from dark to bright is 8 a pixel.
+        assert max(np.abs(np.diff(whole, axis=axis)).max() for axis in (0, 1)) <= 8
+        one = image([0.0, 0.0, 1.0, 0.0, 0.0], [False, False, True, False, False])
+        assert (one.min(), one.max()) == (63, 63)
+        assert image([1, 1, 4, 1, 0], [True, True, True, True, False])[32, 32] > 60
+        assert image([0.0] * 5, [False] * 5).max() == 0
+
+
+ANNOUNCED = "pictures > 0 && [...document.querySelectorAll('[role=alert]')].map(one => one.textContent)"
 
 
 def test_the_page_announces_an_alarm_and_its_end_once(browser):
@@ -405,35 +396,19 @@ def test_the_page_announces_an_alarm_and_its_end_once(browser):
     subject.set_verdict(None, monotonic(), "taking the baseline")
     with web.serve_page(subject, 0) as address:
         browser.open(address)
-
-        def until(texts):
-            deadline = monotonic() + 300
-            while browser.run("return pictures") < 1 or browser.run(ANNOUNCED) != texts:
-                assert monotonic() < deadline, browser.run(ANNOUNCED)
-                sleep(0.1)
-
-        until([""])
+        shows(browser, ANNOUNCED, [""])
         browser.run(
             "window.changes = 0; new MutationObserver(() => changes++)"
             ".observe(document.querySelector('[role=alert]'), {childList: true, characterData: true})"
         )
         subject.set_verdict(PRESSED, monotonic())
-        until(["Alarm: dangerous touch"])
+        shows(browser, ANNOUNCED, ["Alarm: dangerous touch"])
         subject.set_verdict(None, monotonic(), "the device has stopped sending", alarm=True)
-        while "stopped sending" not in browser.run("return document.body.innerText"):
-            sleep(0.1)
+        shows(browser, "document.body.innerText.includes('stopped sending')", True)
         assert browser.run("return changes") == 1
         assert browser.run("return document.getElementById('head').getAttribute('role')") == "status"
         subject.set_verdict(None, monotonic(), "the device has stopped sending")
-        until([""])
-
-
-def shows(browser, script, wanted):
-    """Wait until a script gives what is wanted."""
-    deadline = monotonic() + 300
-    while (given := browser.run(f"return {script}")) != wanted:
-        assert monotonic() < deadline, given
-        sleep(0.1)
+        shows(browser, ANNOUNCED, [""])
 
 
 CROSSED = "latest && latest.values.length + ' of ' + skin.positions.length + ' on ' + $('port').textContent"
@@ -446,7 +421,7 @@ def test_the_page_goes_on_after_a_restart_with_more_sensors(browser):
         browser.open(address)
         shows(browser, CROSSED, "5 of 5 on /dev/skin")
     positions = np.concatenate([PLACES, PLACES + np.array([0.01, 0.01, 0])])
-    other = Display(DisplayInfo("any_skin", "/dev/other", positions, SIZE, 4.0))
+    other = Display("any_skin", "/dev/other", positions, SIZE, 4.0)
     verdict = replace(PRESSED, touched=False, dangerous=False, unknown=(7, 9), masked=(7, 9))
     with web.serve_page(other, int(address.rsplit(":", 1)[1])), repeated(other, verdict):
         shows(browser, CROSSED, "10 of 10 on /dev/other")
@@ -458,7 +433,7 @@ def test_the_page_goes_on_after_a_restart_with_more_sensors(browser):
 def test_the_map_of_a_program_that_has_ended_is_outdated(browser):
     subject = display()
     subject.add(frame([0, 0, 2.0, 0, 0]))
-    subject.set_status("99.9 Hz")
+    subject.line = "99.9 Hz"
     bright = "getComputedStyle($('map')).filter"
     with web.serve_page(subject, 0) as address:
         browser.open(address)

@@ -42,7 +42,7 @@ def trained(request, configured):
 def engine(request, trained):
     """Return a live engine with each gate, and the device."""
     of, device = trained
-    return engine_settings(of, DebounceSettings(), request.param).build(), device
+    return engine_settings(of, DebounceSettings(), request.param), device
 
 
 @pytest.mark.slow("plays long courses through an engine")

@@ -100,6 +100,12 @@ def test_a_cut_wire_is_unknown(board, cut):
     assert "no touch" not in seen.states(6.2 + LATE, 14)
 
 
+def test_silence_is_unknown(board):
+    seen = watch(board, [*frames(board, counts(force(5))), 3.0, *frames(board, counts(force(1)))])
+    assert seen.states(3, 5) == {"no touch"}
+    assert seen.states(5.7, 8) == {"unknown"}
+
+
 def test_damaged_frames_hide_no_press(board):
     """A tenth of the frames loses a byte."""
     randomness, pieces = np.random.default_rng(5), []

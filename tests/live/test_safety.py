@@ -94,6 +94,27 @@ class Paced:
 LATE = 0.02  # s: a frame, and the interval between decisions is in the limits
 
 
+def test_a_press_is_found_though_the_device_restarts_every_two_and_a_half_seconds():
+    seen = watch(lines(force(22, (8, 18, 4, 6.0)), restart=2.5))
+    assert seen.first(4) <= 8 + 0.5 + LATE
+    assert seen.kept(8 + 0.5 + LATE, 18)
+    assert seen.first(4) >= 8
+
+
+def test_a_tap_after_a_restart_is_found():
+    seen = watch(lines(force(12, (7.8, 7.9, 4, 6.0)), restart=2.5))
+    assert 7.8 <= seen.first(3) <= 7.8 + 0.3 + LATE
+
+
+def test_frozen_readings_are_unknown():
+    values = force(24)
+    values[600:2100] = values[600]
+    seen = watch(lines(values))
+    assert seen.states(3, 6) == {"no touch"}
+    assert seen.states(11 + LATE, 21) == {"unknown"}
+    assert seen.states(22.5, 24) == {"no touch"}
+
+
 def test_a_channel_at_its_limit_is_not_tared():
     """All at the limit: there is no baseline. One: its place is unknown, and a press on others is found."""
     counts = lambda row: np.clip(np.round(200 + row / SCALE), 0, 1023).astype(int)  # noqa: E731
@@ -110,6 +131,26 @@ def test_a_channel_at_its_limit_is_not_tared():
     assert {verdict.unknown for at, verdict, _, _ in seen.said if verdict and at > 4} == {(2,)}
     assert "channel 2 at the limit" in seen.loop.line
     assert 6 <= seen.first(3) <= 6.5 + LATE
+
+
+@pytest.mark.parametrize("broken", [-20.0, -1.5])
+def test_a_broken_wire_does_not_clear_the_alarm(broken):
+    values = force(24, (6, 14, 7, 6.0), (20, 21, 7, 6.0))
+    values[900:1500, 7] = broken
+    seen = watch(lines(values))
+    assert seen.first(3) <= 6.5 + LATE
+    assert seen.kept(6.5 + LATE, 14)
+    assert "no touch" not in seen.states(6.2 + LATE, 15)
+    assert not seen.kept(19, 20)
+    assert 20 <= seen.first(19.5) <= 20.5 + LATE
+
+
+def test_values_that_fall_with_force_are_unknown_and_told():
+    values = force(12, (6, 8, 4, -6.0), (6, 8, 5, -3.0))
+    seen = watch(lines(values))
+    assert seen.states(6.2, 7.95) == {"unknown"}
+    verdict = next(verdict for at, verdict, _, _ in seen.said if verdict and at > 7)
+    assert "device.scale" in verdict.notes[0].text
 
 
 def test_bursts_without_a_clock_are_decided_like_single_frames():

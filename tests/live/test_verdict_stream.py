@@ -19,7 +19,7 @@ from skin.core.files import ROOT
 from skin.errors import InputError
 from skin.live.loop import Display, watch_age
 from skin.live.verdict import Verdict
-from skin.live.view import HEARTBEAT, VERDICTS, log_alarms, write_lines
+from skin.live.view import HEARTBEAT, VERDICTS, LineQueue, log_alarms, write_lines
 
 PATIENCE = 60  # s
 
@@ -116,6 +116,16 @@ def test_a_reason_is_sent_once_and_then_with_each_heartbeat():
     assert all(one["alarm"] for one in events)
 
 
+def test_each_line_is_there_at_once():
+    """A reader that waits for a full buffer would show an alarm seconds late."""
+    shown = display()
+    with connected(shown) as take:
+        for probability in (0.25, 0.5, 0.75):
+            shown.set_verdict(verdict(probability=probability), monotonic())
+            found = wait_for(take, lambda message: message["event"] == "verdict")
+            assert found["probabilities"]["big"] == probability
+
+
 def test_a_reader_that_is_slow_delays_nothing_and_misses_the_oldest():
     shown = display()
     with piped(shown) as lines:
@@ -184,6 +194,18 @@ def test_a_folder_that_cannot_be_written_is_refused(tmp_path):
         log_alarms(display(0.0), tmp_path / "file" / "log"),
     ):
         pass
+
+
+def test_a_full_disk_ends_the_log_and_not_the_view():
+    class Full:
+        def write(self, text):
+            raise OSError("No space left on device")
+
+    errors = []
+    with LineQueue(Full(), errors.append) as lines:
+        for _ in range(3):
+            lines.add({"event": "alarm"})
+    assert [str(error) for error in errors] == ["No space left on device"]
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no such device")

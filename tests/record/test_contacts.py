@@ -17,8 +17,7 @@ from skin.device.files import read_recording
 from skin.device.simulated import Simulated
 from skin.mechanics.simulator.naive import Naive
 from skin.record.comparison import compare_session
-from skin.record.recorder import convert_session, record_session
-from skin.record.serial import Serial
+from skin.record.serial import Serial, convert_session, record_session
 from skin.record.session import read_session
 from skin.wire.contact_lines import (
     contact_lines,

@@ -15,8 +15,7 @@ from skin.device.files import read_recording
 from skin.device.resampling import Frame
 from skin.device.simulated import Simulated
 from skin.mechanics.simulator.naive import Naive
-from skin.record.recorder import convert_session, record_session
-from skin.record.serial import Serial
+from skin.record.serial import Serial, convert_session, record_session
 from skin.record.session import read_session
 from skin.touch.labels import TOUCH, TOUCH_OR_NOT
 from skin.wire.channels import UnitConversion
@@ -95,7 +94,7 @@ def test_a_gesture_that_nobody_made_is_asked_for_again(recorded, tmp_path):
 
 
 def test_frames_between_two_gestures_are_kept_however_many(recorded, tmp_path, monkeypatch):
-    monkeypatch.setattr("skin.record.recorder._MOST", 50)
+    monkeypatch.setattr("skin.record.serial._MOST", 50)
     recorded(2)
     tables = read_session(tmp_path / "s").tables
     rows = sorted((row for table in tables for row in table.to_pylist()), key=lambda row: row["time"])

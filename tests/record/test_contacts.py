@@ -1,7 +1,6 @@
 """The contacts of an emulated skin reach a recorded session whole, or not at all; a gauge tells its own."""
 
 from itertools import islice
-from threading import Thread
 
 import numpy as np
 import pyarrow as pa
@@ -26,7 +25,7 @@ from skin.wire.contact_lines import (
     parse_contact_line,
 )
 from skin.wire.decoder import Decoder
-from skin.wire.emulator import Emulator, EmulatorSettings, Faults, emulated_gestures, open_port
+from skin.wire.emulator import emulated_gestures
 from skin.wire.protocol import encode_line
 
 SHEET = Sheet((0.16, 0.16), (32, 32), [{"material": "EcoFlex 00-30", "thickness": 0.005}])
@@ -76,33 +75,12 @@ def test_a_reader_takes_them_for_comments(played):
     assert not decoder.stats.bad
 
 
-@pytest.fixture
-def recorded(device, tmp_path):
-    """Return a function that records an emulated skin over a port, with faults, and gives the session."""
-
-    def record(faults=Faults()):  # noqa: B008
-        port = open_port("tcp:0", None)
-        settings = EmulatorSettings(rate=100.0, speed=5.0, idle=4.0, gap=0.1)
-        emulator = Emulator(device, port, settings, faults)
-        thread = Thread(target=emulator.run, kwargs={"count": COUNT + 1})
-        thread.start()
-        settings = {"touch": {"window": 1.0}, "tare": 1.0, "scale": emulator.converter.scale}
-        reader = Serial(
-            body=SHEET, layout=Grid(3, 3), port=port.address, gestures=COUNT, timeout=20.0, **settings
-        )
-        try:
-            record_session(reader, tmp_path / "s", None, False, lambda text: None)
-        finally:
-            emulator.stop()
-            thread.join(20)
-            port.unplug()
-        return reader, tmp_path / "s"
-
-    return record
-
-
-def test_a_recorded_session_has_them(recorded, played):
-    reader, path = recorded()
+def test_a_recorded_session_has_them(emulate, device, played, tmp_path):
+    emulator = emulate(device, rate=100.0, speed=5.0, gap=0.1)
+    settings = {"touch": {"window": 1.0}, "tare": 1.0, "scale": emulator.converter.scale, "timeout": 20.0}
+    port, path = emulator.port.address, tmp_path / "s"
+    reader = Serial(body=SHEET, layout=Grid(3, 3), port=port, gestures=COUNT, **settings)
+    record_session(reader, path, None, False, lambda text: None)
     stored = read_session(path)
     for number, gesture in enumerate(played):
         assert same(stored.gestures[number][0].contacts, gesture.contacts)

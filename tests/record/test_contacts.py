@@ -13,11 +13,13 @@ from skin.calibration import bench, bench_protocol
 from skin.core.files import CONF
 from skin.core.safe_loading import load_yaml
 from skin.device.files import read_recording
+from skin.device.resampling import Frame, Window
 from skin.device.simulated import Simulated
 from skin.mechanics.simulator.naive import Naive
 from skin.record.comparison import compare_session
 from skin.record.serial import Serial, convert_session, record_session
 from skin.record.session import read_session
+from skin.touch.labels import TOUCH
 from skin.wire.contact_lines import (
     contact_lines,
     encode_contact_line,
@@ -26,7 +28,9 @@ from skin.wire.contact_lines import (
 )
 from skin.wire.decoder import Decoder
 from skin.wire.emulator import emulated_gestures
-from skin.wire.protocol import encode_line
+from skin.wire.protocol import Announcement, encode_announcement, encode_line
+from skin.wire.segmentation import AnnouncedSegmenter, AnnouncementListener
+from tests.wire.memory import Sent
 
 SHEET = Sheet((0.16, 0.16), (32, 32), [{"material": "EcoFlex 00-30", "thickness": 0.005}])
 COUNT = 3
@@ -73,6 +77,20 @@ def test_a_reader_takes_them_for_comments(played):
     decoder = Decoder(2)
     assert len(decoder.feed(b"".join([*frames[:3], *lines, *frames[3:]]))) == 6
     assert not decoder.stats.bad
+
+
+def test_contacts_of_the_next_gesture_wait_for_it(played):
+    """A reader that is late has the lines of several gestures at once."""
+    data = b""
+    for number, gesture in enumerate(played):
+        data += encode_announcement(Announcement(number, 10 * number, 10, gesture.labels))
+        data += b"".join(map(encode_contact_line, contact_lines(number, gesture.contacts, 10.0)))
+    listener = AnnouncementListener(lambda: Sent(data))()
+    listener.read()
+    segmenter = AnnouncedSegmenter(Window(10, 10.0, 2), listener, TOUCH)
+    frames = [Frame(n, n / 10, n / 10, np.zeros(2), np.ones(2, dtype=bool)) for n in range(10 * COUNT + 1)]
+    gestures = [gesture for frame in frames if (gesture := segmenter.add(frame))]
+    assert [same(gesture.contacts, played[gesture.number].contacts) for gesture in gestures] == [True] * COUNT
 
 
 def test_a_recorded_session_has_them(emulate, device, played, tmp_path):

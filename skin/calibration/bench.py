@@ -83,7 +83,10 @@ def _join(folder: Path, parts: Mapping[Path, pa.Table | None]) -> pa.Table:
     """Return the frames in all intact files of a session of skin record."""
     if damaged := [path.name for path, part in parts.items() if part is None]:
         _log.warning("%s: damaged files are left out: %s", folder, ", ".join(damaged))
-    table = pa.concat_tables([part for part in parts.values() if part is not None]).sort_by("time")
+    intact = [part for part in parts.values() if part is not None]
+    if not intact:
+        raise ValueError("it has no frames: record some")
+    table = pa.concat_tables(intact).sort_by("time")
     return table.select([name for name in table.column_names if name in _OTHER or name.startswith("raw_")])
 
 

@@ -37,6 +37,6 @@ def main(
     calibrated = f" with {device.calibration}." if device.calibration else ", not calibrated."
     description = f"Session {session}, simulated by {type(device.model).__name__}{calibrated}"
     comparison = compare_session(device, session, presses, compare)
-    agreement = None if run is None else compare_predictions(run, config, comparison, device)
+    agreement = [] if run is None else compare_predictions(run, config, comparison, device)
     page, picture = publish_comparison(comparison, agreement, description, compare["shown"], results(out))
     print(page.read_text(encoding="utf-8"), page, picture, sep="\n")

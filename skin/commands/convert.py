@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from skin.commands._command import command
-from skin.core.files import tabular
+from skin.core.files import tabular, whole
 from skin.errors import InputError
 from skin.runs.configuration import Config
 
@@ -35,14 +35,19 @@ def main(
         raise InputError("skin convert needs from= or reader=, and out=, as in from=map.yaml out=x.parquet")
     session, target = Path(from_ or "map.yaml").expanduser(), Path(out).expanduser()
     if (session / "about.json").is_file():
-        from skin.record.session import write_table
+        from pyarrow.csv import write_csv
+
+        from skin.calibration.bench import load_table
 
         if target.suffix != ".csv":
             raise InputError(f"the table of a session is a .csv file, got {out}: give out=x.csv")
-        print(f"{target}: {write_table(session, target)} frames")
+        table, _ = load_table(session, "session")
+        with whole(target) as partial:
+            write_csv(table, partial)
+        print(f"{target}: {len(table)} frames")
         return
     if session.suffix == ".csv":
-        from skin.record.recorder import convert_old_session
+        from skin.record.session import convert_old_session
 
         print(convert_old_session(session, target))
         return

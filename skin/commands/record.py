@@ -26,8 +26,7 @@ def main(config: Config, out: str | None, seconds: float | None, record: dict[st
     if unknown := sorted(set(record) - {"free", "finish"}):
         raise InputError(f"record has no {unknown[0]}: it takes free, finish")
 
-    from skin.record.recorder import convert_session, record_session
-    from skin.record.serial import require_port
+    from skin.record.serial import convert_session, record_session, require_port
     from skin.runs.build import build_device
 
     device = require_port(build_device(config))

@@ -6,11 +6,13 @@ simulated and what was measured, with one page and one figure.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import torch
 from matplotlib.figure import Figure
 
@@ -25,7 +27,6 @@ from skin.calibration.bench import (
 from skin.calibration.wiring import turn_gauge
 from skin.core.files import write
 from skin.core.rng import Stream, generator
-from skin.core.settings import configured
 from skin.device.base import AbstractSimulated, Blank
 from skin.device.resampling import resample
 from skin.device.touches import Touches
@@ -38,8 +39,6 @@ from skin.wire.emulator import Gesture, emulated_gestures, gestures_with_labels
 from skin.wire.segmentation import label_text
 
 _IDLE = 30  # frames before a simulated gesture, which give its baseline
-_BEFORE, _AFTER = 20, 40  # frames of a session that the figure shows around a press
-_FEWEST = 3  # frames of a press: less determines no slope
 
 
 @dataclass(frozen=True)
@@ -49,48 +48,53 @@ class Pair:
     Attributes:
         number: of the touch in its session.
         labels: name -> 0 or 1; None: a press of a bench, at one position.
-        time: (T,), s, from the beginning of the touch.
-        applied: force on the simulated skin, (T,), N.
-        simulated: (T, S), N.
-        measured: (T, S), N; NaN where nothing was measured.
-        valid: (T, S), bool: frames of the touch, of sensors that work on both sides.
+        same: the very same touch is simulated, not one of the same labels.
+        applied: force on the simulated skin, (T,), N; NaN in frames outside of the touch.
+        simulated, measured: (T, S), N, at the model's rate.
+        valid: (T, S), bool: sensors that work on both sides.
     """
 
     number: int
     labels: Mapping[str, int] | None
-    time: np.ndarray
+    same: bool
     applied: np.ndarray
     simulated: np.ndarray
     measured: np.ndarray
     valid: np.ndarray
 
     @property
-    def sensor(self) -> int:
-        """The sensor that answers most in simulation."""
-        return _find_strongest(self.simulated, self.valid)
+    def thing(self) -> str:
+        """What the touch is called."""
+        return "press" if self.labels is None else "gesture"
 
-    @property
-    def force(self) -> float:
-        """The largest applied force, N."""
-        return float(self.applied[self.valid.any(axis=1)].max())
+    @cached_property
+    def touched(self) -> np.ndarray:
+        """Valid readings of the touch, (T, S), bool."""
+        return self.valid & np.isfinite(self.applied)[:, None]
 
-    @property
-    def peaks(self) -> tuple[float, float]:
-        """Largest reading, simulated and measured, N: of ``sensor`` for a press, else of any sensor."""
-        others = self.labels is not None or np.arange(self.valid.shape[1]) == self.sensor
-        answering = self.valid & others
-        return float(self.simulated[answering].max()), float(self.measured[answering].max())
+    @cached_property
+    def sensors(self) -> tuple[int, int]:
+        """The sensors that answer most, simulated and measured; of the same touch the former is both."""
+        sides = (self.simulated, self.measured)
+        first, second = (int(np.where(self.touched, side, -np.inf).max(axis=0).argmax()) for side in sides)
+        return first, first if self.same else second
 
-    @property
-    def rmse(self) -> float:
-        """Over all readings, N."""
-        return float(np.sqrt(np.mean((self.simulated - self.measured)[self.valid] ** 2)))
+    @cached_property
+    def measures(self) -> dict[str, float]:
+        """The largest force and the largest readings of ``sensors``, N; measured over simulated; RMSE, N.
 
-    @property
-    def slope(self) -> float:
-        """Measured over simulated readings of ``sensor``, through 0."""
-        x, y = (side[:, self.sensor][self.valid[:, self.sensor]] for side in (self.simulated, self.measured))
-        return float(x @ y / (x @ x))
+        The ratio is that of all readings of the sensor, through 0, or of the largest readings if the touches
+        differ.
+        """
+        sides = zip((self.simulated, self.measured), self.sensors, strict=True)
+        x, y = (side[self.touched[:, sensor], sensor] for side, sensor in sides)
+        return {
+            "force": float(np.nanmax(self.applied)),
+            "simulated": float(x.max()),
+            "recorded": float(y.max()),
+            "ratio": float(x @ y / (x @ x) if self.same else y.max() / x.max()),
+            "rmse": float(np.sqrt(np.mean((self.simulated - self.measured)[self.touched] ** 2))),
+        }
 
 
 @dataclass(frozen=True)
@@ -99,43 +103,13 @@ class SessionComparison:
 
     Attributes:
         things: ``presses`` or ``gestures``.
-        same: the very same touches are simulated, not only such of the same labels.
         pairs: touch by touch.
         touches: both sides as a model sees them, simulated and measured.
     """
 
     things: str
-    same: bool
     pairs: Sequence[Pair]
-    touches: tuple[Touches, Touches]
-
-
-@dataclass(frozen=True)
-class Agreement:
-    """What a run predicts of both sides.
-
-    Attributes:
-        names: of the labels.
-        simulated, measured: (B, L), bool.
-        truth: (B, L), bool; None where nobody knows.
-    """
-
-    names: Sequence[str]
-    simulated: np.ndarray
-    measured: np.ndarray
-    truth: np.ndarray | None = None
-
-    def lines(self, things: str) -> list[str]:
-        """Return how often the run says the same of both sides, and how often what is true."""
-        lines = []
-        truth = [None] * len(self.names) if self.truth is None else self.truth.T
-        for name, *sides, right in zip(self.names, self.simulated.T, self.measured.T, truth, strict=True):
-            same = (sides[0] == sides[1]).sum()
-            lines.append(f"- the run says the same of `{name}` on {same} of {len(sides[0])} {things}")
-            if right is not None:
-                first, second = ((side == right).sum() for side in sides)
-                lines[-1] += f", and is right on {first} simulated and {second} recorded ones"
-        return lines
+    touches: Sequence[Touches]
 
 
 def compare_session(
@@ -154,8 +128,8 @@ def compare_session(
     """
     if presses is None and Path(path).expanduser().is_dir():
         return compare_gestures(device, path, settings["seed"])
-    shape, scales = (settings["indenter"], settings["radius"]), ("force_scale", "time_scale")
-    units = configured(Units, {name: settings[name] for name in scales} | {"command": "compare"}, "compare")
+    shape = settings["indenter"], settings["radius"]
+    units = Units(settings["force_scale"], settings["time_scale"], "compare")
     session = read_bench_session(path, *shape, settings["unit"], units)
     calibration = device.imperfection.calibration
     if calibration is not None and calibration.channels and session.channels is None:
@@ -168,8 +142,8 @@ def compare_session(
 
 def compare_predictions(
     name: str, config: Config, comparison: SessionComparison, device: AbstractSimulated
-) -> Agreement:
-    """Return the predictions of a run for both sides; print a warning if it learned another mechanics.
+) -> list[str]:
+    """Return what a run predicts of both sides; print a warning if it learned another mechanics.
 
     Args:
         name: of the run.
@@ -190,9 +164,25 @@ def compare_predictions(
     blank = Blank.of(device.task, device.size, comparison.touches[0])
     model = load_model(run, replace(run.stored, layout=config.layout), device=blank, alarm=False)
     simulated, measured = ((model.predict(side) > 0.5).numpy() for side in comparison.touches)
+    return describe_agreement(comparison, device.task.names, simulated, measured)
+
+
+def describe_agreement(
+    comparison: SessionComparison, names: Sequence[str], simulated: np.ndarray, measured: np.ndarray
+) -> list[str]:
+    """Return how often predictions (B, L), bool, are the same for both sides, and how often they are true."""
+    count, same = len(simulated), (simulated == measured).sum(axis=0)
+    lines = [
+        f"- the run says the same of `{name}` on {number} of {count} {comparison.things}"
+        for name, number in zip(names, same, strict=True)
+    ]
     labels = [pair.labels for pair in comparison.pairs if pair.labels is not None]
-    truth = np.array([[bool(row[name]) for name in device.task.names] for row in labels])
-    return Agreement(device.task.names, simulated, measured, truth if labels else None)
+    if labels:
+        truth = np.array([[bool(row[name]) for name in names] for row in labels])
+        right = zip(*((side == truth).sum(axis=0) for side in (simulated, measured)), strict=True)
+        words = [f", and is right on {first} simulated and {second} recorded ones" for first, second in right]
+        lines = [line + text for line, text in zip(lines, words, strict=True)]
+    return lines
 
 
 def compare_gestures(device: AbstractSimulated, path: str, seed: int) -> SessionComparison:
@@ -212,41 +202,40 @@ def compare_gestures(device: AbstractSimulated, path: str, seed: int) -> Session
     stored = read_session(Path(path).expanduser())
     now = {"positions": device.sensors.positions.tolist(), "window": device.window, "rate": device.model_rate}
     check_session(Path(path), stored.metadata, now)
-    takes = [entry for _, entry in sorted(stored.gestures.items()) if entry[0].labels is not None]
-    if not takes:
+    taken = [take for _, take in sorted(stored.gestures.items()) if take[0].labels is not None]
+    if not taken:
         raise InputError(f"{path} has no gesture with labels: record it with device.labels=prompted")
     same = stored.metadata.get("labels") == "announced"
-    numbers, labels = [take.number for take, _ in takes], [dict(take.labels or {}) for take, _ in takes]
+    labels = {gesture.number: dict(gesture.labels or {}) for gesture, _ in taken}
     if same:
-        played = list(islice(emulated_gestures(device, seed), max(numbers) + 1))
-        gestures = [played[number] for number in numbers]
-        for number, gesture, row in zip(numbers, gestures, labels, strict=True):
-            if any(row.get(name, holds) != holds for name, holds in gesture.labels.items()):
+        played = list(islice(emulated_gestures(device, seed), max(labels) + 1))
+        gestures = [played[number] for number in labels]
+        for gesture, (number, row) in zip(gestures, labels.items(), strict=True):
+            if any(row.get(name, value) != value for name, value in gesture.labels.items()):
                 raise InputError(
                     f"gesture {number} of the session is {label_text(row)}, the simulated one is "
                     f"{label_text(gesture.labels)}: give the emulator's settings and its emulate.seed as "
                     "compare.seed"
                 )
     else:
-        rows = np.array([[row[name] for name in TOUCH.names] for row in labels])
+        rows = np.array([[row[name] for name in TOUCH.names] for row in labels.values()])
         gestures = gestures_with_labels(device, rows, seed)
-    working, pairs = ~device.constants.dead.numpy(), []
-    for simulated, gesture, (take, conversion) in zip(
-        _simulate_readings(device, gestures), gestures, takes, strict=True
-    ):
-        assert take.resampled is not None  # of a stored gesture
-        values, valid = conversion(take.resampled.values, take.resampled.valid & working)
-        if valid.any() and simulated.any():
-            time = np.arange(len(simulated)) / device.model_rate
-            measured = np.where(valid, values.astype(float), np.nan)
-            pairs.append(Pair(take.number, take.labels, time, gesture.applied, simulated, measured, valid))
+    recorded = [
+        (*conversion(take.resampled.values, take.resampled.valid), gesture.applied)
+        for (take, conversion), gesture in zip(taken, gestures, strict=True)
+        if take.resampled is not None  # never of a stored gesture
+    ]
+    measured, received, applied = map(np.stack, zip(*recorded, strict=True))
+    valid = received & ~device.constants.dead.numpy()
+    simulated = _simulate_readings(device, gestures)
+    pairs = [
+        Pair(number, row, same, *sides)
+        for (number, row), *sides in zip(labels.items(), applied, simulated, measured, valid, strict=True)
+        if sides[1][sides[3]].any()
+    ]
     if not pairs:
         raise InputError(f"{path} has no gesture with a sensor response: record more, or check the wiring")
-    simulated, measured, valid = (
-        np.stack([getattr(pair, name) for pair in pairs]) for name in ("simulated", "measured", "valid")
-    )
-    sides = _touches(device, simulated, valid), _touches(device, measured, valid)
-    return SessionComparison("gestures", same, pairs, sides)
+    return SessionComparison("gestures", pairs, _touches(device, pairs))
 
 
 def _simulate_readings(device: AbstractSimulated, gestures: Sequence[Gesture]) -> np.ndarray:
@@ -281,139 +270,125 @@ def compare_presses(device: AbstractSimulated, bench: BenchData, scale: float | 
     simulated = device.imperfection.raw(true, device.constants, noise, time)[0].double().numpy()
     measured = session.raw * (scale * (1.0 if calibration is None else calibration.signs))
     working = ~device.constants.dead.numpy() & np.isfinite(measured[bench.idle]).any(axis=0)
-    simulated, measured = (_subtract_idle(side, bench.idle) for side in (simulated, measured))
-    valid = np.isfinite(measured) & working
-    cut = [_cut_press(bench, simulated, measured, valid, number) for number in range(len(bench.gauge))]
-    pairs = [pair for pair in cut if pair is not None]
+    sides = np.stack([simulated, measured])
+    idle = np.ma.median(np.ma.masked_invalid(sides[:, bench.idle]), axis=1, keepdims=True)
+    sides -= np.ma.filled(idle, np.nan)
+    received = np.isfinite(sides).all(axis=0) & working
+    rate, window, gauge = device.model_rate, device.window, bench.gauge
+    # In the middle of each frame of the model; its intervals end halfway between two frames of the session,
+    # because a frame on the edge between two intervals could fall in either.
+    times = gauge.time[gauge.first][:, None] + (np.arange(window) + 0.5) / rate
+    ends = times[:, -1] + 0.5 / rate - 0.5 * float(np.median(np.diff(session.time)))
+    rows = [
+        [
+            resample(session.time, np.where(received, side, 0.0), received, ~received, end, 1 / rate, window)
+            for side in sides
+        ]
+        for end in ends
+    ]
+    pairs = []
+    for number, (first, second) in enumerate(rows):
+        force, press = gauge.at(times[number])
+        if first.values[press == number].any():
+            applied = np.where(press == number, force, np.nan)
+            pairs.append(Pair(number, None, True, applied, first.values, second.values, first.valid))
     if not pairs:
         raise InputError("no press has frames in the session: check the clocks, see compare.delay")
-    begins = [bench.gauge.time[bench.gauge.first[pair.number]] for pair in pairs]
-    # In the middle of each frame of the model.
-    middles = (np.arange(device.window) + 0.5) / device.model_rate
-    peaks = pressed_peaks(device.body, bench.gauge)
-    rows = np.stack([bench.gauge.contacts(begin + middles, peaks) for begin in begins])
-    simulation, recording = (
-        replace(_resample(device, session.time, side, mask, begins), contacts=torch.from_numpy(rows).float())
-        for side, mask in ((simulated, np.isfinite(simulated) & working), (measured, valid))
-    )
-    return SessionComparison("presses", True, pairs, (simulation, recording))
+    peaks = pressed_peaks(device.body, gauge)
+    contacts = torch.from_numpy(np.stack([gauge.contacts(times[pair.number], peaks) for pair in pairs]))
+    touches = [replace(side, contacts=contacts.float()) for side in _touches(device, pairs)]
+    return SessionComparison("presses", pairs, touches)
 
 
-def _subtract_idle(values: np.ndarray, idle: np.ndarray) -> np.ndarray:
-    """Return readings (T, S) without their idle medians; NaN for a channel without values."""
-    return values - np.ma.filled(np.ma.median(np.ma.masked_invalid(values[idle]), axis=0), np.nan)
-
-
-def _cut_press(
-    bench: BenchData, simulated: np.ndarray, measured: np.ndarray, valid: np.ndarray, number: int
-) -> Pair | None:
-    """Return a press with some frames around it; None if it has too few, or no sensor that works feels it."""
-    force, press = bench.applied
-    inside = np.flatnonzero((press == number) & valid.any(axis=1))
-    if len(inside) < _FEWEST or not simulated[inside][valid[inside]].any():
-        return None
-    span = slice(max(0, inside[0] - _BEFORE), inside[-1] + _AFTER)
-    time = bench.session.time[span] - bench.session.time[inside[0]]
-    pressed = valid[span] & (press[span] == number)[:, None]
-    return Pair(number, None, time, force[span], simulated[span], measured[span], pressed)
-
-
-def _resample(
-    device: AbstractSimulated, time: np.ndarray, values: np.ndarray, valid: np.ndarray, begins: list[float]
-) -> Touches:
-    """Return a window of readings from the beginning of each press."""
-    rate, window = device.model_rate, device.window
-    # Halfway between two frames, because one on the edge between two intervals could fall in either.
-    ends = np.array(begins) + window / rate - 0.5 * float(np.median(np.diff(time)))
-    clean, saturated = np.where(valid, values, 0.0), np.zeros_like(valid)
-    rows = [resample(time, clean, valid, saturated, end, 1 / rate, window) for end in ends]
-    return _touches(device, np.stack([row[0] for row in rows]), np.stack([row[1] for row in rows]))
-
-
-def _touches(device: AbstractSimulated, readings: np.ndarray, valid: np.ndarray) -> Touches:
-    """Return readings (B, T, S), N, as a model sees them: 0 where not valid."""
-    clean, positions = map(torch.from_numpy, (np.where(valid, readings, 0.0), device.sensors.positions))
-    return Touches(clean.float(), torch.from_numpy(valid), positions.float(), None, device.model_rate)
-
-
-def comparison_markdown(comparison: SessionComparison, agreement: Agreement | None, about: str) -> str:
-    """Return a page in Markdown.
-
-    Args:
-        comparison: the touches.
-        agreement: predictions of a run; None without one.
-        about: a sentence on where this came from.
-    """
-    pairs, things, same = comparison.pairs, comparison.things, comparison.same
-    ratios = [pair.slope if same else pair.peaks[1] / pair.peaks[0] for pair in pairs]
-    low, middle, high = np.percentile(ratios, [25, 50, 75])
-    title = f"The same {things}" if same else f"{things.capitalize()} of the same labels"
-    lines = [
-        f"# {title}, simulated and recorded",
-        "",
-        about,
-        "",
-        "![force and reading](compare.png)",
-        "",
-        f"- {things}: {len(pairs)}",
-        f"- gain ratio of {'readings' if same else 'largest readings'} (recorded over simulated), median: "
-        f"{middle:.3f}, middle half {low:.3f} to {high:.3f}",
-    ]
-    if same:
-        rmse = np.sqrt(np.mean([pair.rmse**2 for pair in pairs]))
-        fractions = [np.median([pair.peaks[side] / pair.force for pair in pairs]) for side in (0, 1)]
-        lines += [
-            f"- RMSE of readings: {rmse:.3f} N",
-            f"- largest reading per applied force: {fractions[0]:.1%} simulated, {fractions[1]:.1%} recorded "
-            "(the report's skin: about 5 %)",
-        ]
-    else:
-        lines.append("- what a person did is known by its labels only, so frames are not compared one by one")
-    lines += [] if agreement is None else agreement.lines(things)
-    columns = ["gesture" if things == "gestures" else "press", "sensor", "force, N", "simulated, N"]
-    lines += ["", f"| {' | '.join([*columns, 'recorded, N', 'ratio', 'RMSE, N'])} |", "|---" * 7 + "|"]
-    for pair, ratio in zip(pairs, ratios, strict=True):
-        name = f"{pair.number}: {label_text(pair.labels)}" if pair.labels else str(pair.number)
-        error = f"{pair.rmse:.3f}" if same else ""
-        lines.append(
-            f"| {name} | {pair.sensor} | {pair.force:.1f} | {pair.peaks[0]:.2f} | {pair.peaks[1]:.2f} | "
-            f"{ratio:.3f} | {error} |"
+def _touches(device: AbstractSimulated, pairs: Sequence[Pair]) -> list[Touches]:
+    """Return simulated and measured readings as a model sees them: 0 where not valid."""
+    valid, positions = np.stack([pair.valid for pair in pairs]), device.sensors.positions
+    return [
+        Touches(
+            torch.from_numpy(np.where(valid, np.stack(side), 0.0)).float(),
+            torch.from_numpy(valid),
+            torch.from_numpy(positions).float(),
+            None,
+            device.model_rate,
         )
-    return "\n".join(lines) + "\n"
-
-
-def plot_comparison(comparison: SessionComparison, count: int) -> Figure:
-    """Draw applied force and reading, simulated above, measured below, of the ``count`` strongest touches."""
-    strongest = sorted(comparison.pairs, key=lambda pair: -pair.peaks[0])[:count]
-    figure = Figure(figsize=(3.6 * len(strongest), 5.4), layout="constrained")
-    axes = figure.subplots(2, len(strongest), squeeze=False, sharex="col")
-    for column, pair in enumerate(strongest):
-        answering = pair.sensor if comparison.same else _find_strongest(pair.measured, pair.valid)
-        sides = ("simulated", pair.simulated, pair.sensor), ("recorded", pair.measured, answering)
-        for axis, (name, values, sensor) in zip(axes[:, column], sides, strict=True):
-            if name == "simulated" or comparison.same:
-                axis.plot(pair.time, pair.applied, color=COLOURS[0])
-                axis.set_ylabel("applied force, N", color=COLOURS[0])
-            else:
-                axis.set_yticks([])
-            twin = axis.twinx()
-            twin.plot(pair.time, values[:, sensor], ".-", color=COLOURS[4], linewidth=1, markersize=3)
-            twin.set_ylabel("reading, N", color=COLOURS[4])
-            twin.set_ylim(-0.05 * max(pair.peaks), 1.1 * max(pair.peaks))
-            thing = "press" if pair.labels is None else "gesture"
-            axis.set_title(f"{name}, {thing} {pair.number}, sensor {sensor}", fontsize=9)
-        axes[1, column].set_xlabel("time, s")
-    return figure
-
-
-def _find_strongest(values: np.ndarray, valid: np.ndarray) -> int:
-    """Return the sensor with the largest valid reading."""
-    return int(np.where(valid, values, -np.inf).max(axis=0).argmax())
+        for side in zip(*((pair.simulated, pair.measured) for pair in pairs), strict=True)
+    ]
 
 
 def publish_comparison(
-    comparison: SessionComparison, agreement: Agreement | None, about: str, count: int, folder: Path
+    comparison: SessionComparison, agreement: Sequence[str], description: str, count: int, folder: Path
 ) -> list[Path]:
-    """Write ``compare.md`` and ``compare.png`` into a folder, each whole; return their paths."""
-    page = write(comparison_markdown(comparison, agreement, about), folder / "compare.md")
-    return [page, save_figure(plot_comparison(comparison, count), folder / "compare.png")]
+    """Write ``compare.md`` and ``compare.png`` into a folder, each whole; return their paths.
+
+    Args:
+        comparison: the touches.
+        agreement: lines of :func:`compare_predictions`; none without a run.
+        description: a sentence on where this came from.
+        count: how many touches the figure shows.
+        folder: of the files.
+    """
+    page = write(_page(comparison, agreement, description), folder / "compare.md")
+    return [page, save_figure(_figure(comparison, count), folder / "compare.png")]
+
+
+def _page(comparison: SessionComparison, agreement: Sequence[str], description: str) -> str:
+    """Return a page in Markdown."""
+    pairs, things, same = comparison.pairs, comparison.things, comparison.pairs[0].same
+    table = pd.DataFrame([pair.measures for pair in pairs])
+    low, middle, high = table["ratio"].quantile([0.25, 0.5, 0.75])
+    if same:
+        simulated, recorded = table[["simulated", "recorded"]].div(table["force"], axis=0).median()
+        errors = (
+            f"- RMSE of readings: {np.sqrt((table['rmse'] ** 2).mean()):.3f} N\n"
+            f"- largest reading per applied force: {simulated:.1%} simulated, {recorded:.1%} recorded "
+            "(the report's skin: about 5 %)"
+        )
+    else:
+        errors = "- what a person did is known by its labels only, so frames are not compared one by one"
+    names = [
+        f"{pair.number}: {label_text(pair.labels)}" if pair.labels else f"{pair.number}" for pair in pairs
+    ]
+    rows = [
+        f"| {name} | {pair.sensors[0]} | {row.force:.1f} | {row.simulated:.2f} | {row.recorded:.2f} | "
+        f"{row.ratio:.3f} | {f'{row.rmse:.3f}' if same else ''} |"
+        for name, pair, row in zip(names, pairs, table.itertuples(), strict=True)
+    ]
+    title = f"The same {things}" if same else f"{things.capitalize()} of the same labels"
+    lines = [
+        f"# {title}, simulated and recorded\n",
+        f"{description}\n",
+        "![force and reading](compare.png)\n",
+        f"- {things}: {len(pairs)}",
+        f"- gain ratio of {'readings' if same else 'largest readings'} (recorded over simulated), median: "
+        f"{middle:.3f}, middle half {low:.3f} to {high:.3f}",
+        errors,
+        *agreement,
+        f"\n| {pairs[0].thing} | sensor | force, N | simulated, N | recorded, N | ratio | RMSE, N |",
+        "|---" * 7 + "|",
+        *rows,
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _figure(comparison: SessionComparison, count: int) -> Figure:
+    """Draw applied force and reading, simulated above, measured below, of the ``count`` strongest touches."""
+    strongest = sorted(comparison.pairs, key=lambda pair: -pair.measures["simulated"])[:count]
+    figure = Figure(figsize=(3.6 * len(strongest), 5.4), layout="constrained")
+    axes = figure.subplots(2, len(strongest), squeeze=False, sharex="col")
+    time = np.arange(len(strongest[0].applied)) / comparison.touches[0].rate
+    for column, pair in zip(axes.T, strongest, strict=True):
+        top = max(pair.measures["simulated"], pair.measures["recorded"])
+        sides = zip(
+            column, ("simulated", "recorded"), (pair.simulated, pair.measured), pair.sensors, strict=True
+        )
+        for axis, name, values, sensor in sides:
+            if name == "simulated" or pair.same:
+                axis.plot(time, pair.applied, color=COLOURS[0])
+                axis.set_ylabel("applied force, N", color=COLOURS[0])
+            twin = axis.twinx()
+            twin.plot(time, values[:, sensor], ".-", color=COLOURS[4], linewidth=1, markersize=3)
+            twin.set_ylabel("reading, N", color=COLOURS[4])
+            twin.set_ylim(-0.05 * top, 1.1 * top)
+            axis.set_title(f"{name}, {pair.thing} {pair.number}, sensor {sensor}", fontsize=9)
+        column[1].set_xlabel("time, s")
+    return figure

@@ -1,9 +1,13 @@
-"""Touches from a real or emulated skin, gesture by gesture."""
+"""Touches from a real or emulated skin, gesture by gesture, recorded to a session."""
 
+import logging
 import sys
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Collection, Mapping, Sequence
+from datetime import UTC, datetime
 from itertools import chain
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from time import monotonic, time
 from typing import Any, Literal
 
 import numpy as np
@@ -14,12 +18,15 @@ from skin.body.base import AbstractBody
 from skin.body.layout import AbstractLayout
 from skin.core.settings import check_settings, configured
 from skin.device.base import AbstractDevice, Blank, Split
+from skin.device.files import write_recording
 from skin.device.resampling import Frame, Window
 from skin.device.touches import Recording, Touches, join_contacts
 from skin.errors import InputError
+from skin.record.session import FORMAT, SessionLog, StoredSession, Taken, check_session, locked, read_session
 from skin.touch.labels import TOUCH, TOUCH_OR_NOT
 from skin.touch.paths import TouchSettings, model_window
 from skin.wire.channels import UnitConversion
+from skin.wire.protocol import Header
 from skin.wire.reader import Port, SkinDisconnected, SkinTimeout
 from skin.wire.segmentation import (
     AbstractSegmenter,
@@ -27,11 +34,13 @@ from skin.wire.segmentation import (
     AnnouncementListener,
     ContinuousSegmenter,
     PromptedSegmenter,
-    RecordedGesture,
     label_plan,
     label_text,
 )
 from skin.wire.skin import SerialSource, Source, play
+
+_MOST = 6000  # frames without a gesture in memory, a minute at 100 Hz: a killed program loses no more
+_log = logging.getLogger(__name__)
 
 
 def open_source(device: AbstractDevice) -> Source:
@@ -124,7 +133,12 @@ class Serial(AbstractDevice):
                 "skin record, then take device=recording"
             )
         if self._recording is None:
-            self._recording = self._record()
+            with TemporaryDirectory() as folder:
+                session = Path(folder, "session")
+                _print(f"waiting for {self.gestures} gestures, labels {self.labels}")
+                if not record_session(self, session, None, False, _print, reconnect=False):
+                    raise InputError("no gesture was read: does the emulator announce, is the skin touched?")
+                self._recording = read_gestures(self, session)
         return self._recording
 
     def blank(self) -> AbstractDevice:
@@ -180,57 +194,154 @@ class Serial(AbstractDevice):
             whole * np.minimum(np.abs(conversion.scale), self.trigger),
         )
 
-    def to_recording(self, gestures: Sequence[RecordedGesture], conversion: UnitConversion) -> Recording:
-        """Return gestures as a recording."""
-        windows = [gesture.resampled for gesture in gestures if gesture.resampled is not None]
-        values, received, saturated = map(np.stack, zip(*(window[:3] for window in windows), strict=True))
-        readings, valid = conversion(values, received)
-        force, mask, limited = map(torch.from_numpy, (readings, valid, valid & saturated))
-        touches = Touches(force, mask, self._positions, None, self.model_rate, saturated=limited)
-        if gestures and gestures[0].labels is not None:
-            rows = [list(map(float, gesture.labels.values())) for gesture in gestures if gesture.labels]
-            touches = replace(touches, labels=torch.tensor(rows))
-        contacts = [
-            None if gesture.contacts is None else torch.from_numpy(gesture.contacts)[None].float()
-            for gesture in gestures
-        ]
-        touches = replace(touches, contacts=join_contacts(contacts) if contacts else None)
-        about = {"source": "serial", "lost": [gesture.lost for gesture in gestures]}
-        return Recording(touches, self.task, self.size, self.sensors.footprint, metadata=about)
 
-    def _record(self) -> Recording:
-        """Read gestures until there are enough, the skin stops sending, or the user ends it."""
-        gestures: list[RecordedGesture] = []
-        skin, listener = self.wire.open()
+def record_session(
+    device: Serial,
+    path: Path,
+    seconds: float | None,
+    free: bool,
+    notify: Callable[[str], None],
+    reconnect: bool = True,
+) -> int:
+    """Record frames until all gestures are done, ``seconds`` are over, or the user ends it.
+
+    Args:
+        device: source of the frames, with the planned gestures.
+        path: folder; an existing session is resumed.
+        seconds: duration of the session, with disconnections; None: no limit.
+        free: record consecutive windows without labels.
+        notify: called with each message for the user.
+        reconnect: wait for an unplugged skin; else it ends the session.
+
+    Returns:
+        The number of complete gestures.
+
+    Raises:
+        InputError: another process records to the folder, or it cannot be written; its content is kept.
+    """
+    with locked(path):
+        skin, listener = device.wire.open(reconnect)
         with skin:
-            first, conversion = self.wire.warm_up(skin, _print)
-            segmenter = self.segmenter(listener, conversion, first)
-            _print(f"waiting for {self.gestures} gestures, labels {self.labels}")
+            first, conversion = device.wire.warm_up(skin, notify)
+            log = SessionLog(path, _describe(device, skin.header))
+            for frame in first:
+                _add(log, frame)
+            # In time of the session, because the device's clock restarts with each session.
+            begin = log.frames[0][0]
+            if log.done:
+                notify(f"{path} has {len(log.done)} gestures: going on")
+            segmenter = device.segmenter(listener, conversion, first, log.done)
+            if free:
+                segmenter = ContinuousSegmenter(segmenter.window, max(log.done, default=-1) + 1)
+            number = None if free else device.gestures
             try:
                 for frame in skin:
-                    gesture = segmenter.add(frame)
-                    if gesture is not None and not gesture.broken:
-                        gestures.append(gesture)
-                        words = "" if gesture.labels is None else f": {label_text(gesture.labels)}"
-                        lost = f" ({gesture.lost} frames lost)" * bool(gesture.lost)
-                        _print(f"{len(gestures)}/{self.gestures}{words}{lost}")
-                    elif gesture is not None and self.labels != "prompted":  # which says so itself
-                        _print(f"gesture {gesture.number} was interrupted: the device restarted")
-                    if segmenter.over or len(gestures) == self.gestures:
+                    done = segmenter.add(frame)
+                    if done is not None and not done.broken and done.number not in log.done:
+                        log.write((done, conversion))
+                        words = f": {label_text(done.labels)}" if done.labels else ""
+                        words += f" ({done.lost} frames lost)" * bool(done.lost)
+                        notify(f"{len(log.done)} of {number or 'any'} gestures{words}")
+                    elif segmenter.gesture is None and len(log.frames) >= _MOST:
+                        log.write()
+                    _add(log, frame)
+                    late = seconds is not None and log.time - begin >= seconds
+                    if late or segmenter.over or (number is not None and len(log.done) >= number):
                         break
             except (SkinTimeout, SkinDisconnected) as end:
-                _print(str(end))
-        warn_of_contacts(gestures)
-        if not gestures:
-            raise InputError("no gesture was read: does the emulator announce, is the skin touched?")
-        return self.to_recording(gestures, conversion)
+                notify(str(end))
+            finally:
+                log.write()
+    return len(log.done)
 
 
-def warn_of_contacts(gestures: Sequence[RecordedGesture]) -> None:
-    """Warn where the contacts of some gestures are unknown, so that a recording of all has none."""
-    unknown = sum(gesture.contacts is None for gesture in gestures)
-    if 0 < unknown < len(gestures):
-        _print(f"contacts are left out: of {unknown} of {len(gestures)} gestures a line was lost or damaged")
+def _add(log: SessionLog, frame: Frame) -> None:
+    """Add a frame that arrived by the host's clock."""
+    log.add(frame, time() - (monotonic() - frame.t_host) - log.metadata["started_unix"])
+
+
+def _describe(device: Serial, header: Header | None) -> dict[str, Any]:
+    """Return the metadata of a session that begins now."""
+    channels = list(device.wire.channels)
+    return {
+        "format": FORMAT,
+        "unit": header.unit if header and header.unit else "adc",
+        "bits": header.bits if header else None,
+        "id": header.id if header else None,
+        "started": datetime.now(UTC).isoformat(),
+        "started_unix": time(),
+        "positions": device.sensors.positions.tolist(),
+        "footprint": list(device.sensors.footprint),
+        "size": list(device.size),
+        "rate": device.model_rate,
+        "window": device.window,
+        "labels": device.labels,
+        "calibration": device.port.calibration,
+    } | ({"channels": channels} if channels else {})
+
+
+def read_gestures(device: Serial, path: Path) -> Recording:
+    """Return the complete gestures of a session, in N.
+
+    Raises:
+        InputError: no session, no complete gesture, or another layout, window, rate or labels.
+    """
+    stored = read_session(path)
+    now = {"positions": device.sensors.positions.tolist(), "window": device.window, "rate": device.model_rate}
+    check_session(path, stored.metadata, now)
+    gestures = _same_labels(device.task.names, path, stored)
+    rows = [
+        (*conversion(window.values, window.valid), window.saturated)
+        for gesture, conversion in gestures
+        if (window := gesture.resampled) is not None
+    ]
+    readings, valid, saturated = (torch.from_numpy(np.stack(part)) for part in zip(*rows, strict=True))
+    labels = [
+        [float(gesture.labels[name]) for name in device.task.names]
+        for gesture, _ in gestures
+        if gesture.labels
+    ]
+    contacts = [torch.from_numpy(g.contacts)[None].float() for g, _ in gestures if g.contacts is not None]
+    if contacts and (unknown := len(gestures) - len(contacts)):
+        _log.warning("contacts are left out, unknown of %d of %d gestures", unknown, len(gestures))
+    touches = Touches(
+        readings,
+        valid,
+        torch.from_numpy(device.sensors.positions).float(),
+        torch.tensor(labels) if labels else None,
+        device.model_rate,
+        saturated=valid & saturated,
+        contacts=join_contacts(contacts) if len(contacts) == len(gestures) else None,
+    )
+    lost = [gesture.lost for gesture, _ in gestures]
+    metadata = stored.metadata | {"source": "session", "session": path.name, "lost": lost}
+    return Recording(touches, device.task, device.size, device.sensors.footprint, metadata=metadata)
+
+
+def convert_session(device: Serial, path: Path) -> tuple[Path, int]:
+    """Write the gestures of :func:`read_gestures` as a recording beside a session; return path and number."""
+    recording = read_gestures(device, path)
+    return write_recording(recording, path.with_name(path.name + ".parquet")), len(recording)
+
+
+def _same_labels(names: Sequence[str], path: Path, stored: StoredSession) -> list[Taken]:
+    """Return the complete gestures with the labels; if no gesture has them, those without labels."""
+    gestures = [stored.gestures[number] for number in sorted(stored.gestures)]
+    if not gestures:
+        frames = sum(map(len, stored.tables))
+        raise InputError(f"{path} has {frames} frames and no complete gesture: record some more")
+    wanted = set(names)
+    usable = [take for take in gestures if take[0].labels is not None and set(take[0].labels) == wanted]
+    usable = usable or [take for take in gestures if take[0].labels is None]
+    if not usable:
+        labels = gestures[0][0].labels or {}
+        raise InputError(
+            f"{path} has the labels {', '.join(labels)}, the configuration has {', '.join(names)}: give "
+            f"data.stream={str('touch' in labels).lower()}"
+        )
+    if others := len(gestures) - len(usable):
+        _log.warning("%s: %d gestures without these labels left out", path, others)
+    return usable
 
 
 def _print(text: str) -> None:

@@ -211,8 +211,10 @@ class AnnouncedSegmenter(AbstractSegmenter):
 
     def _take_contacts(self, number: int) -> np.ndarray | None:
         """Return the contacts of a gesture, and forget those of the gestures before it."""
+        while self._contacts and self._contacts[0].number < number:
+            self._contacts.popleft()
+        # Those of the next gesture may be there where the reader is late.
         lines = [line for line in self._contacts if line.number == number]
-        self._contacts.clear()
         return join_contact_lines(lines, self.window.frames, self.window.rate)
 
 

@@ -101,8 +101,3 @@ def test_plates_do_not_bend_around_it():
     with pytest.raises(InputError, match="plates and beams are flat, body=arm is not: set simulator=solid"):
         PlatesAndBeams(arm(), sensors)
     assert Naive(arm(), sensors)(torch.ones(6, 8)).readings.numpy() == pytest.approx(1e-4)
-
-
-def test_its_size_is_not_to_be_given():
-    with pytest.raises(TypeError, match="size"):
-        arm(size=[0.16, 0.16])

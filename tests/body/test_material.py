@@ -31,12 +31,6 @@ def test_one_constant_of_a_known_material_can_change():
     assert (material.young, material.poisson) == (69e3, 0.499)
 
 
-def test_any_material_can_be_given_by_its_constants():
-    assert Material.of({"name": "foam", "young": 1e4, "poisson": -0.2}) == Material("foam", 1e4, -0.2)
-    gel = Material.of({"name": "EcoFlex Gel", "young": 2e4, "poisson": 0.49})
-    assert gel.young == 2e4
-
-
 @pytest.mark.parametrize(
     ("given", "says"),
     [

@@ -24,16 +24,6 @@ def test_interfaces_run_from_the_table_up():
     assert body.thickness == pytest.approx(0.017)
 
 
-def test_sensors_of_a_single_layer_lie_on_its_surface():
-    assert sheet(layers=LAYERS[1:]).sensor_depth == 0
-
-
-def test_rows_run_along_y():
-    body = sheet()
-    assert body.shape == (6, 8)
-    assert body.cell == pytest.approx((0.02, 0.08 / 6))
-
-
 def test_equal_sheets_are_equal_however_they_were_given():
     assert sheet() == sheet(size=(0.16, 0.08), cells=(8, 6), layers=sheet().layers)
     assert hash(sheet()) == hash(sheet())

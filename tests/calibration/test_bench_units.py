@@ -65,10 +65,10 @@ def test_a_comparison_takes_the_units_and_axes_of_the_calibration(rows, tmp_path
         compare_session(device(), path, None, source | {"time_scale": 0.001})
     scales = source | {"time_scale": 0.001, "force_scale": -9.80665}
     pairs = compare_session(device(), path, None, scales).pairs
-    assert [pair.force for pair in pairs] == pytest.approx([pair.force for pair in straight.pairs])
-    assert [pair.slope for pair in pairs] == pytest.approx([pair.slope for pair in straight.pairs], rel=1e-3)
+    for pair, other in zip(pairs, straight.pairs, strict=True):
+        assert pair.measures == pytest.approx(other.measures, rel=1e-3)
     turned = compare_session(device(), str(rows[0]), None, source | {"places": "mirror_y"})
-    assert turned.pairs[0].sensor != straight.pairs[0].sensor
+    assert turned.pairs[0].sensors[0] != straight.pairs[0].sensors[0]
 
 
 @pytest.mark.parametrize(("unit", "newtons"), [("kg", 9.80665), ("g", 0.00980665), (None, 1.0)])

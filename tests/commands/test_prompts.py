@@ -153,7 +153,7 @@ def test_evaluating_a_person(run, person_at, address, tmp_path):
         for number in range(1, 4):
             person.until("next: ")
             person.types("")
-            person.until(f"{number}/16: ")
+            person.until(f"{number} of 16 gestures: ")
         person.until("next: ")
         person.types("q")
         code, said = ended(person)

@@ -131,28 +131,9 @@ def test_a_session_that_is_being_recorded_is_left_alone(record, tmp_path):
     assert not (tmp_path / "s").exists()
 
 
-@pytest.mark.slow("two processes that record")
-def test_two_recordings_at_once_do_not_mix_and_kill_9_unlocks(record, begin, tmp_path):
-    with skin({}) as port, begin(tmp_path, "record.py", "out=s", *FREE, port) as first:
-        next(line for line in first.lines(errors=True) if line.startswith("2 of"))
-        refused(record(*FREE, port, code=2), "being recorded by another process")
-    with skin({}) as port:
-        done = record(*FREE, port, "seconds=3")
-    assert "going on" in done.stderr
-
-
-@pytest.mark.parametrize(
-    ("change", "reason"),
-    [
-        (
-            "touch.window=0.7",
-            "windows of 5 frames at 10 Hz, the configuration has 7 at 10 Hz: give touch.window=0.5 ",
-        ),
-        ("touch.rate=5", "5 frames at 10 Hz, the configuration has 2 at 5 Hz: give .* touch.rate=10$"),
-    ],
-)
-def test_another_window_or_rate_is_refused_in_finishing_and_going_on(record, recorded, change, reason):
-    before = content(recorded)
+def test_another_window_is_refused_in_finishing_and_going_on(record, recorded):
+    before, change = content(recorded), "touch.window=0.7"
+    reason = "windows of 5 frames at 10 Hz, the configuration has 7 at 10 Hz: give touch.window=0.5 "
     refused(record(*SKIN, change, "record.finish=true", code=2), reason)
     with skin({}) as port:
         refused(record(*FREE, change, port, "device.tare=2", "seconds=6", code=2), reason)
@@ -163,10 +144,8 @@ def test_another_window_or_rate_is_refused_in_finishing_and_going_on(record, rec
 def test_another_device_is_refused_however_late_its_header_comes(record, recorded):
     before = content(recorded)
     with skin({"id": "arm-R", "header": 500}) as port:
-        refused(
-            record(*FREE, port, "device.scale=1", "seconds=30", code=2),
-            "from the device arm-L, this is arm-R",
-        )
+        done = record(*FREE, port, "device.scale=1", "seconds=30", code=2)
+    refused(done, "from the device arm-L, this is arm-R")
     assert content(recorded) == before
 
 
@@ -201,21 +180,17 @@ def test_a_session_becomes_a_table_and_one_of_an_earlier_version_a_session(run, 
     done = run(tmp_path, "convert", "from=s", "out=t.csv", store=False)
     lines = (tmp_path / "t.csv").read_text().splitlines()
     assert (done.returncode, done.stdout) == (0, f"t.csv: {len(lines) - 1} frames\n"), done.stderr
-    refused(
-        run(tmp_path, "convert", "from=s", "out=t.xlsx", store=False, code=2), r"a \.csv file, got t\.xlsx"
-    )
+    done = run(tmp_path, "convert", "from=s", "out=t.xlsx", store=False, code=2)
+    refused(done, r"a \.csv file, got t\.xlsx")
     for name in ("old_session.csv", "old_session.csv.json"):
         shutil.copy(OLD / name, tmp_path)
     done = run(tmp_path, "convert", "from=old_session.csv", "out=old", store=False)
     assert (done.returncode, done.stdout) == (0, "old: 6 gestures\n"), done.stderr
 
 
-@pytest.mark.parametrize("out", ["out=s.csv", "out=null", "out=."])
-def test_a_session_is_a_folder(record, out):
-    refused(
-        record(*FREE, out, code=2),
-        r"a session is a folder, got .*skin convert from=session\.csv out=session$",
-    )
+def test_a_session_is_a_folder(record):
+    reason = r"a session is a folder, got .*skin convert from=session\.csv out=session$"
+    refused(record(*FREE, "out=s.csv", code=2), reason)
 
 
 def test_a_half_open_socket_is_opened_anew(record, tmp_path):
@@ -238,10 +213,3 @@ def test_what_cannot_be_recorded_is_one_sentence(record, tmp_path, lives, reason
         refused(record(*FREE, port, "seconds=30", "device.timeout=1", "device.silence=0.3", code=2), reason)
     assert not (tmp_path / "s.parquet").exists()
     assert not (tmp_path / "s").exists() or read_session(tmp_path / "s").tables
-
-
-def test_a_silence_that_is_none_is_refused(record):
-    refused(
-        record(*FREE, "device.port=socket://127.0.0.1:1", "device.silence=-1", code=2),
-        r"device\.silence=-1 must be greater than or equal to 0",
-    )

@@ -69,7 +69,7 @@ def test_a_session_that_was_killed_goes_on_and_is_played_back(run, begin, emulat
     ("command", "reason"),
     [
         (("emulate", "port=usb"), "pty or tcp"),
-        (("emulate", "format=morse"), "text, binary"),
+        (("emulate", "format=morse"), "must be 'text' or 'binary'"),
         (("emulate", "+faults.flip=1"), "flip"),
         (("record.py",), "give out=session"),
         (("compare",), "which session?"),

@@ -17,10 +17,9 @@ from skin.device.simulated import Simulated
 from skin.errors import InputError
 from skin.mechanics.simulator.naive import Naive
 from skin.record.comparison import (
-    Agreement,
     compare_gestures,
     compare_session,
-    comparison_markdown,
+    describe_agreement,
     publish_comparison,
 )
 from skin.record.session import SessionLog
@@ -61,15 +60,17 @@ def session(device, path, labels, known=True):
 def test_a_gain_between_session_and_simulation_is_found(device, tmp_path):
     path = session(device, tmp_path / "s", "announced")
     comparison = compare_gestures(device, path, 0)
-    assert (comparison.same, len(comparison.pairs)) == (True, COUNT)
+    assert [pair.same for pair in comparison.pairs] == [True] * COUNT
     for pair, played in zip(comparison.pairs, emulated_gestures(device), strict=False):
-        assert pair.slope == pytest.approx(GAIN, rel=1e-3)
-        assert pair.rmse == pytest.approx((1 - GAIN) * np.sqrt((played.force**2).mean()), rel=2e-3)
+        assert pair.measures["ratio"] == pytest.approx(GAIN, rel=1e-3)
+        assert pair.measures["rmse"] == pytest.approx(
+            (1 - GAIN) * np.sqrt((played.force**2).mean()), rel=2e-3
+        )
         # The applied force is the sum of the pressure, told by the movie and not by any sensor.
-        assert pair.applied.max() > pair.peaks[0]
-    page = comparison_markdown(comparison, None, "Here.")
+        assert pair.applied.max() > pair.measures["simulated"]
+    page = publish_comparison(comparison, [], "Here.", 2, tmp_path)[0].read_text()
     assert "gain ratio of readings (recorded over simulated), median: 0.800" in page
-    path, picture = publish_comparison(comparison, None, "Here.", 2, tmp_path)
+    path, picture = publish_comparison(comparison, [], "Here.", 2, tmp_path)
     assert path.read_text() == page
     assert picture.stat().st_size > 10_000
     simulated, recorded = comparison.touches
@@ -81,21 +82,21 @@ def test_agreements_are_counted(device, tmp_path):
     truth = np.array([[bool(pair.labels[name]) for name in TOUCH.names] for pair in comparison.pairs])
     wrong = truth.copy()
     wrong[:2, 1] ^= True
-    page = comparison_markdown(comparison, Agreement(TOUCH.names, truth, wrong, truth), "Here.")
+    page = "\n".join(describe_agreement(comparison, TOUCH.names, truth, wrong))
     assert "the same of `big` on 6 of 6 gestures, and is right on 6 simulated and 6 recorded ones" in page
     assert "the same of `dynamic` on 4 of 6 gestures, and is right on 6 simulated and 4 recorded" in page
 
 
 def test_what_a_person_did_is_compared_with_gestures_of_the_same_labels(device, tmp_path):
     comparison = compare_gestures(device, session(device, tmp_path / "s", "prompted"), 0)
-    assert not comparison.same
+    assert not comparison.pairs[0].same
     played = list(islice(emulated_gestures(device), COUNT))
     assert [pair.labels for pair in comparison.pairs] == [one.labels for one in played]
     assert not np.allclose(comparison.pairs[0].simulated, played[0].force)
-    page = comparison_markdown(comparison, None, "Here.")
+    page = publish_comparison(comparison, [], "Here.", 2, tmp_path)[0].read_text()
     assert page.startswith("# Gestures of the same labels")
     assert "RMSE of readings" not in page
-    assert publish_comparison(comparison, None, "Here.", 2, tmp_path)[1].stat().st_size > 10_000
+    assert publish_comparison(comparison, [], "Here.", 2, tmp_path)[1].stat().st_size > 10_000
 
 
 def test_other_gestures_layouts_and_windows_are_refused(device, tmp_path):
@@ -131,13 +132,13 @@ def test_presses_are_compared_as_gestures_are(device, tmp_path):
         number for number in range(len(rows)) if number % 9 != 8
     ]
     first = comparison.pairs[0]
-    assert first.slope == pytest.approx(GAIN, rel=1e-3)
-    assert first.peaks[1] == pytest.approx(GAIN * first.peaks[0], rel=1e-3)
-    assert first.force == pytest.approx(force[press == 0].max())
+    assert first.measures["ratio"] == pytest.approx(GAIN, rel=1e-3)
+    assert first.measures["recorded"] == pytest.approx(GAIN * first.measures["simulated"], rel=1e-3)
+    assert first.measures["force"] == pytest.approx(force[press == 0].max())
     assert comparison.pairs[1].valid.sum() == comparison.pairs[1].valid.any(axis=1).sum() * 8
     simulated, measured = comparison.touches
     assert measured.readings.numpy() == pytest.approx(GAIN * simulated.readings.numpy(), abs=2e-2)
     assert not measured.valid[:, :, 8].any()
-    path, picture = publish_comparison(comparison, None, "Here.", 2, tmp_path)
+    path, picture = publish_comparison(comparison, [], "Here.", 2, tmp_path)
     assert "gain ratio of readings (recorded over simulated), median: 0.800" in path.read_text()
     assert picture.stat().st_size > 10_000

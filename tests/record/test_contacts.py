@@ -1,7 +1,6 @@
 """The contacts of an emulated skin reach a recorded session whole, or not at all; a gauge tells its own."""
 
 from itertools import islice
-from threading import Thread
 
 import numpy as np
 import pyarrow as pa
@@ -14,12 +13,13 @@ from skin.calibration import bench, bench_protocol
 from skin.core.files import CONF
 from skin.core.safe_loading import load_yaml
 from skin.device.files import read_recording
+from skin.device.resampling import Frame, Window
 from skin.device.simulated import Simulated
 from skin.mechanics.simulator.naive import Naive
 from skin.record.comparison import compare_session
-from skin.record.recorder import convert_session, record_session
-from skin.record.serial import Serial
+from skin.record.serial import Serial, convert_session, record_session
 from skin.record.session import read_session
+from skin.touch.labels import TOUCH
 from skin.wire.contact_lines import (
     contact_lines,
     encode_contact_line,
@@ -27,8 +27,10 @@ from skin.wire.contact_lines import (
     parse_contact_line,
 )
 from skin.wire.decoder import Decoder
-from skin.wire.emulator import Emulator, EmulatorSettings, Faults, emulated_gestures, open_port
-from skin.wire.protocol import encode_line
+from skin.wire.emulator import emulated_gestures
+from skin.wire.protocol import Announcement, encode_announcement, encode_line
+from skin.wire.segmentation import AnnouncedSegmenter, AnnouncementListener
+from tests.wire.memory import Sent
 
 SHEET = Sheet((0.16, 0.16), (32, 32), [{"material": "EcoFlex 00-30", "thickness": 0.005}])
 COUNT = 3
@@ -77,33 +79,26 @@ def test_a_reader_takes_them_for_comments(played):
     assert not decoder.stats.bad
 
 
-@pytest.fixture
-def recorded(device, tmp_path):
-    """Return a function that records an emulated skin over a port, with faults, and gives the session."""
-
-    def record(faults=Faults()):  # noqa: B008
-        port = open_port("tcp:0", None)
-        settings = EmulatorSettings(rate=100.0, speed=5.0, idle=4.0, gap=0.1)
-        emulator = Emulator(device, port, settings, faults)
-        thread = Thread(target=emulator.run, kwargs={"count": COUNT + 1})
-        thread.start()
-        settings = {"touch": {"window": 1.0}, "tare": 1.0, "scale": emulator.converter.scale}
-        reader = Serial(
-            body=SHEET, layout=Grid(3, 3), port=port.address, gestures=COUNT, timeout=20.0, **settings
-        )
-        try:
-            record_session(reader, tmp_path / "s", None, False, lambda text: None)
-        finally:
-            emulator.stop()
-            thread.join(20)
-            port.unplug()
-        return reader, tmp_path / "s"
-
-    return record
+def test_contacts_of_the_next_gesture_wait_for_it(played):
+    """A reader that is late has the lines of several gestures at once."""
+    data = b""
+    for number, gesture in enumerate(played):
+        data += encode_announcement(Announcement(number, 10 * number, 10, gesture.labels))
+        data += b"".join(map(encode_contact_line, contact_lines(number, gesture.contacts, 10.0)))
+    listener = AnnouncementListener(lambda: Sent(data))()
+    listener.read()
+    segmenter = AnnouncedSegmenter(Window(10, 10.0, 2), listener, TOUCH)
+    frames = [Frame(n, n / 10, n / 10, np.zeros(2), np.ones(2, dtype=bool)) for n in range(10 * COUNT + 1)]
+    gestures = [gesture for frame in frames if (gesture := segmenter.add(frame))]
+    assert [same(gesture.contacts, played[gesture.number].contacts) for gesture in gestures] == [True] * COUNT
 
 
-def test_a_recorded_session_has_them(recorded, played):
-    reader, path = recorded()
+def test_a_recorded_session_has_them(emulate, device, played, tmp_path):
+    emulator = emulate(device, rate=100.0, speed=5.0, gap=0.1)
+    settings = {"touch": {"window": 1.0}, "tare": 1.0, "scale": emulator.converter.scale, "timeout": 20.0}
+    port, path = emulator.port.address, tmp_path / "s"
+    reader = Serial(body=SHEET, layout=Grid(3, 3), port=port, gestures=COUNT, **settings)
+    record_session(reader, path, None, False, lambda text: None)
     stored = read_session(path)
     for number, gesture in enumerate(played):
         assert same(stored.gestures[number][0].contacts, gesture.contacts)

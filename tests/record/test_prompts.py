@@ -1,7 +1,6 @@
 """What a prompted gesture needs to be recorded: that the skin has felt something."""
 
 import os
-from threading import Thread
 from time import sleep
 
 import numpy as np
@@ -15,12 +14,11 @@ from skin.device.files import read_recording
 from skin.device.resampling import Frame
 from skin.device.simulated import Simulated
 from skin.mechanics.simulator.naive import Naive
-from skin.record.recorder import convert_session, record_session
-from skin.record.serial import Serial
+from skin.record.serial import Serial, convert_session, record_session
 from skin.record.session import read_session
 from skin.touch.labels import TOUCH, TOUCH_OR_NOT
 from skin.wire.channels import UnitConversion
-from skin.wire.emulator import Emulator, EmulatorSettings, Faults, open_port
+from skin.wire.emulator import Faults
 from skin.wire.segmentation import label_plan
 
 BODY, LAYOUT = Sheet((0.16, 0.16), (32, 32), [{"material": "EcoFlex 00-30", "thickness": 0.005}]), Grid(3, 3)
@@ -30,14 +28,13 @@ LEAST = 0.09  # N: five times that, less what the largest value of an interval h
 
 
 @pytest.fixture
-def recorded(tmp_path, monkeypatch, capfd):
+def recorded(emulate, tmp_path, monkeypatch, capfd):
     """Return a function that records an emulated skin and gives the session, and what was said.
 
     Nothing touches the skin for some seconds, and then fingertips do. Enter is pressed at every prompt.
     """
 
-    def record(count, stream=False, faults=Faults()):  # noqa: B008
-        port = open_port("pty", None)
+    def record(count, stream=False, faults=None):
         device = Simulated(
             body=BODY,
             layout=LAYOUT,
@@ -46,11 +43,12 @@ def recorded(tmp_path, monkeypatch, capfd):
             touch={"window": 1.0, "press": [0.8, 0.95], "radius": [0.006, 0.012]},
             noise=NOISE,
         )
-        emulator = Emulator(device, port, EmulatorSettings(rate=100.0, speed=5.0, idle=IDLE, gap=0.1), faults)
+        played = {"count": 40, "port": "pty", "rate": 100.0, "speed": 5.0, "idle": IDLE, "gap": 0.1}
+        emulator = emulate(device, faults, **played)
         reader = Serial(
             body=BODY,
             layout=LAYOUT,
-            port=port.address,
+            port=emulator.port.address,
             labels="prompted",
             gestures=count,
             timeout=20.0,
@@ -61,17 +59,10 @@ def recorded(tmp_path, monkeypatch, capfd):
         )
         typed, keyboard = os.pipe()
         os.write(keyboard, b"\n" * 60)
-        thread = Thread(target=emulator.run, kwargs={"count": 40})
-        thread.start()
-        try:
-            with os.fdopen(typed) as lines:
-                monkeypatch.setattr("sys.stdin", lines)
-                record_session(reader, tmp_path / "s", None, False, lambda text: None)
-                os.close(keyboard)
-        finally:
-            emulator.stop()
-            thread.join(20)
-            port.unplug()
+        with os.fdopen(typed) as lines:
+            monkeypatch.setattr("sys.stdin", lines)
+            record_session(reader, tmp_path / "s", None, False, lambda text: None)
+            os.close(keyboard)
         recording = read_recording(convert_session(reader, tmp_path / "s")[0])
         return recording.touches, capfd.readouterr().err.splitlines()
 
@@ -95,7 +86,7 @@ def test_a_gesture_that_nobody_made_is_asked_for_again(recorded, tmp_path):
 
 
 def test_frames_between_two_gestures_are_kept_however_many(recorded, tmp_path, monkeypatch):
-    monkeypatch.setattr("skin.record.recorder._MOST", 50)
+    monkeypatch.setattr("skin.record.serial._MOST", 50)
     recorded(2)
     tables = read_session(tmp_path / "s").tables
     rows = sorted((row for table in tables for row in table.to_pylist()), key=lambda row: row["time"])

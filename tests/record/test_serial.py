@@ -1,7 +1,5 @@
 """A skin at a port gives the touches that were played, or says why it cannot."""
 
-from threading import Thread
-
 import numpy as np
 import pytest
 import torch
@@ -16,8 +14,7 @@ from skin.errors import InputError
 from skin.mechanics.simulator.naive import Naive
 from skin.record.serial import Serial
 from skin.wire.channels import unit_conversion
-from skin.wire.emulator import Emulator, EmulatorSettings, Faults, emulated_gestures, open_port
-from skin.wire.protocol import Header
+from skin.wire.emulator import Faults, emulated_gestures
 
 SHEET = Sheet((0.16, 0.16), (32, 32), [{"material": "EcoFlex 00-30", "thickness": 0.005}])
 LAYOUT = Grid(2, 3)
@@ -30,29 +27,8 @@ def skin(**settings):
     return Simulated(body=SHEET, layout=LAYOUT, simulator=Naive, gestures=10, **settings)
 
 
-@pytest.fixture
-def emulate():
-    """Return a function that plays a device and gives the port; nothing is left behind."""
-    playing = []
-
-    def begin(device, faults=None, binary=False, **settings):
-        port = open_port("tcp:0", None)
-        chosen = EmulatorSettings(**{"speed": 40.0, "idle": 4.0, "rate": 40.0} | settings)
-        emulator = Emulator(device, port, chosen, faults or Faults(), binary)
-        thread = Thread(target=emulator.run, kwargs={"count": COUNT + 1})
-        thread.start()
-        playing.append((emulator, thread))
-        return port.address
-
-    yield begin
-    for emulator, thread in playing:
-        emulator.stop()
-        thread.join(20)
-        assert not thread.is_alive()
-        emulator.port.unplug()
-
-
-def serial(port, layout=LAYOUT, **settings):
+def serial(emulator, layout=LAYOUT, **settings):
+    port = emulator and emulator.port.address
     return Serial(body=SHEET, layout=layout, port=port, gestures=COUNT, timeout=30.0, **settings)
 
 
@@ -84,25 +60,23 @@ def test_counts_offsets_and_lost_frames_change_little(emulate):
         assert np.median(wrong) <= 20 / 512
 
 
-def test_another_number_of_sensors_is_refused_with_both(emulate):
-    with pytest.raises(InputError, match="sends 6 values per frame, the layout has 4"):
-        serial(emulate(skin()), layout=Grid(2, 2), scale=1.0).touches("test")
-
-
-def test_a_slower_device_is_refused_with_both_rates(emulate):
-    with pytest.raises(InputError, match=r"sends 5 frames a second, the model needs 10"):
-        serial(emulate(skin(), rate=5.0, idle=30.0), scale=1.0).touches("test")
-
-
-def test_counts_without_a_unit_are_refused(emulate):
-    with pytest.raises(InputError, match=r"sends adc.*device\.scale"):
-        serial(emulate(skin(noise=0.5))).touches("test")
+@pytest.mark.parametrize(
+    ("played", "settings", "reason"),
+    [
+        ({}, {"layout": Grid(2, 2), "scale": 1.0}, "sends 6 values per frame, the layout has 4"),
+        ({"rate": 5.0, "idle": 30.0}, {"scale": 1.0}, r"sends 5 frames a second, the model needs 10"),
+        ({}, {}, r"sends adc.*device\.scale"),
+    ],
+)
+def test_a_device_that_does_not_match_is_refused(emulate, played, settings, reason):
+    with pytest.raises(InputError, match=reason):
+        serial(emulate(skin(noise=0.5), **played), **settings).touches("test")
 
 
 @pytest.mark.parametrize("split", ["train", "validation", "holdout"])
 def test_only_a_test_split(split):
     with pytest.raises(InputError, match="skin record"):
-        serial("/dev/null").touches(split)
+        serial(None).touches(split)
 
 
 def test_a_port_is_needed():
@@ -121,8 +95,3 @@ def test_a_calibration_undoes_gain_and_offset():
     assert valid.tolist() == [[True, False]]
     tared = unit_conversion(2, raw[0], None, known, None)(raw + 50.0, np.ones((1, 2), dtype=bool))[0]
     assert tared[0, 0] == pytest.approx(0.25)
-
-
-def test_newtons_are_newtons():
-    found = unit_conversion(1, None, None, None, Header(unit="N"))
-    assert found(np.array([1.5]), np.array([True]))[0].tolist() == [1.5]

@@ -110,13 +110,6 @@ def test_labels_are_what_the_movie_gives_and_balanced(sampled):
     assert not movie.labels[:, 0].any()
 
 
-@pytest.mark.parametrize("count", [1, 3, 10, 257])
-def test_counts_of_combinations_differ_by_one_at_most(count):
-    labels = sampler().balanced(count, np.random.default_rng(0))
-    assert np.ptp(np.bincount(labels[:, 1:3] @ [1, 2], minlength=4)) <= 1
-    assert not labels[:, [0, 3]].any()
-
-
 def test_few_fingertips_are_dangerous():
     """About one in a hundred with the shipped ranges: a tip must press a whole footprint at the limit."""
     labels = sampler(BODIES["oblong"]).sample(2000, np.random.default_rng(0)).labels

@@ -13,8 +13,7 @@ from skin.body.base import Sheet
 from skin.body.layout import Grid
 from skin.live.engine import Detection, Engine
 from skin.live.loop import LiveLoop
-from skin.record.recorder import record_session
-from skin.record.serial import Serial
+from skin.record.serial import Serial, record_session
 from skin.record.session import read_session
 from skin.touch.labels import TOUCH
 from skin.wire.protocol import Header, encode_header, encode_line

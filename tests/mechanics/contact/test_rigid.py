@@ -167,18 +167,6 @@ def test_white_touches_first_and_the_outline_is_an_arc():
         assert ((row.numpy() <= arc + 1e-6) if start == 0 else (row.numpy() >= arc - 1e-6)).all()
 
 
-@pytest.mark.parametrize("wanted", [(1, 0, 0, 0), (1, 0, 0, 1), (0, 0, 0, 1)])
-def test_the_force_is_raised_until_the_classes_hold(wanted):
-    """At a low drawn peak a ball is small and safe; it is pressed until it is what it should be."""
-    where = problem(shapes=["blurred_disc"])
-    low = (where.settings.dangerous_peak if wanted[3] else where.settings.safe_peak)[0]
-    pressed = rigid(relief=0.002).press(still(0.065 if wanted[0] else 0.03, peak=low, wanted=wanted), where)
-    assert not pressed.refused.any()
-    movie = pressed.frames[None]
-    labels = movie_labels(movie, where.footprints, BODY.cell)[0, [0, 3]]
-    assert labels.tolist() == [wanted[0], wanted[3]]
-
-
 def rounded(compliance: torch.Tensor, seed: int) -> torch.Tensor:
     """Return what another processor may make of a compliance: noise of 1e-12 to 1e-7, or fewer digits."""
     if seed < 4:  # so few that sums are exact, whatever their order

@@ -205,7 +205,7 @@ def test_a_file_of_another_name_or_without_checksum_is_left_out(copied):
     assert stored.damaged == [f"gesture_0000{number}.parquet" for number in (2, 7, 9)]
 
 
-@pytest.mark.parametrize("name", ["about.json", "gesture_00005.parquet"])
+@pytest.mark.parametrize("name", ["about.json", "gesture_00001.parquet", "gesture_00005.parquet"])
 def test_damage_never_passes_for_another_value(copied, recorded, name):
     whole, data = everything(recorded[1]), (copied / name).read_bytes()
     frames = {(row["segment"], row["seq"]): row for row in frames_of(copied)}

@@ -13,8 +13,7 @@ from skin.live.engine import Detection, Engine
 from skin.live.loop import Display, DisplayInfo, LiveLoop
 from skin.record.recorder import convert_session, record_session
 from skin.record.serial import Serial
-from skin.runs.build import build_data, build_device, build_learner
-from skin.runs.torch_model import window_classifier
+from skin.runs.build import build_data, build_device, build_learner, window_classifier
 from skin.touch.labels import TOUCH
 from skin.wire.clocks import FrameClock
 from skin.wire.decoder import Decoder

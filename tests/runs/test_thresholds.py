@@ -10,8 +10,6 @@ from contextlib import closing
 import numpy as np
 import pytest
 
-pytestmark = pytest.mark.filterwarnings("ignore:The ``noload`` loader strategy")
-
 SKIN = ("layout=grid", "layout.rows=2", "layout.columns=2", "simulator=naive")
 MODEL = ("representation=readings", "model=mlp", "fusion=early", "trainer.max_epochs=8")
 SAFE = "evaluation.safe_gestures=100"

@@ -264,12 +264,12 @@ def validate_config(config: Any) -> Config:
         InputError: a key or a value does not fit, or an interpolation cannot be resolved.
     """
     try:
+        # Before a learner gets the settings of its optimizer, which have names of their own.
+        _check_numbers(OmegaConf.to_container(config) if isinstance(config, DictConfig) else config)
         if isinstance(config, DictConfig):
             plain = _resolved(config)
             config = {name: plain[name] for name in Config.__annotations__ if name in plain}
-        whole = OmegaConf.merge(OmegaConf.structured(Config), config)
-        _check_numbers(OmegaConf.to_container(whole))
-        return cast(Config, OmegaConf.to_object(whole))
+        return cast(Config, OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(Config), config)))
     except OmegaConfBaseException as error:
         raise InputError(one_line(error)) from error
 

@@ -227,9 +227,10 @@ class SweepCallback(Callback):
 
     def on_job_end(self, config: DictConfig, job_return: JobReturn, **kwargs: Any) -> None:
         """Print how a job ended."""
-        number, value = config.hydra.job.num, job_return._return_value
-        if self._store is None or str(number) in os.environ.get(LEFT_OUT, "").split():
+        # A single run has no number.
+        if self._store is None or str(config.hydra.job.num) in os.environ.get(LEFT_OUT, "").split():
             return
+        number, value = config.hydra.job.num, job_return._return_value
         if self._bar:
             self._bar.advance(self._task)
         count = f"{self._jobs.index(number) + 1}/{len(self._jobs)}" if self._jobs else f"{number + 1}"

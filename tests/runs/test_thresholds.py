@@ -101,15 +101,8 @@ def found(run, tmp_path_factory):
             "evaluate", "run=default_skin", out, SKIN[3], *tests, "evaluation.profile=mild"
         )
         values["drawn"] = verbs.stored("evaluate", "run=any_skin", out, "device=simulated", *SKIN, *tests)
-        live = (
-            "live.py",
-            own,
-            "live.selftest=false",
-            "live.contacts=false",
-            "seconds=0.1",
-            "live.touch=0.3",
-            FEW,
-        )
+        still = ("live.selftest=false", "live.contacts=false", "seconds=0.1", "live.touch=0.3")
+        live = ("live.py", own, *still, FEW)
         values["live"] = verbs.per_touch(patch, *live)
         values["live profile"] = verbs.per_touch(patch, *live, ROUGH)
         values["live rate"] = verbs.per_touch(

@@ -35,11 +35,10 @@ from skin.device.resampling import Frame
 from skin.learning.data import TouchData
 from skin.learning.network import Network
 from skin.live.engine import Detection, Engine
-from skin.runs.build import build_data, build_device, build_learner
+from skin.runs.build import TorchModel, build_data, build_device, build_learner
 from skin.runs.configuration import Config, validate_config
 from skin.runs.model import Model, OnnxModel
 from skin.runs.onnx_writer import write_model
-from skin.runs.torch_model import TorchModel
 from skin.wire.channels import UnitConversion
 from skin.wire.decoder import Decoder
 from skin.wire.protocol import encode_line

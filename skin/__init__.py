@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from skin.inference.posterior import Posterior as Posterior
     from skin.mechanics.simulator.fem import PlatesAndBeams as PlatesAndBeams
     from skin.mechanics.simulator.solid import Solid as Solid
+    from skin.runs.build import load_run as load_run
     from skin.runs.build import training_data as data
-    from skin.runs.torch_model import load_run as load_run
     from skin.wire.skin import open_skin as open_skin
 
 __version__ = "0.2.0"
@@ -38,7 +38,7 @@ _PLACES = {
     "Sheet": "skin.body.sheet",
     "Solid": "skin.mechanics.simulator.solid",
     "data": "skin.runs.build:training_data",
-    "load_run": "skin.runs.torch_model",
+    "load_run": "skin.runs.build",
     "open_skin": "skin.wire.skin",
     "read_recording": "skin.device.files",
 }

@@ -23,31 +23,10 @@ DAMAGED_FILES = settings(
 """The same files in every run of the tests: 100, or as many as ``make slow`` says."""
 
 _NUMBER = re.compile(rb"-?\d+(\.\d+)?(e-?\d+)?")
-_ODD_NUMBERS = (
-    b"-1",
-    b"0",
-    b"7",
-    b"1e300",
-    b"1e999",
-    b"-1e-320",
-    b"nan",
-    b"Infinity",
-    b".inf",
-    b"1000000000",
-)
-_ODD_TEXTS = (
-    b"null",
-    b"true",
-    b'"x"',
-    b"[]",
-    b"{}",
-    b"''",
-    b"9" * 5000,
-    b"[[[[",
-    b"*a",
-    b"!!python/name:os",
-    b"\n",
-)
+_ODD = (
+    b"-1", b"0", b"7", b"1e300", b"1e999", b"-1e-320", b"nan", b"Infinity", b".inf", b"1000000000", b"null",
+    b"true", b'"x"', b"[]", b"{}", b"''", b"9" * 5000, b"[[[[", b"*a", b"!!python/name:os", b"\n",
+)  # fmt: skip
 ODD_VALUES = st.sampled_from(
     (None, True, False, 0, -1, 0.5, 10**9, 2**63, 10**400, 1e300, -1e300, 1e-320, float("nan"), float("inf"))
 ) | st.sampled_from(
@@ -61,65 +40,33 @@ def damaged(draw: Callable[..., Any], content: bytes) -> bytes:
     """Draw a copy of a file with one to three places damaged; it differs from the file."""
     result = content
     for _ in range(draw(st.integers(1, 3))):
-        result = draw(st.sampled_from(_DAMAGES))(draw, result) or b"\0"
+        result = _damage(draw(st.sampled_from(_KINDS)), draw, result) or b"\0"
     return result if result != content else content[:-1]
 
 
-def _position(draw: Callable[..., Any], content: bytes) -> tuple[int, int]:
-    """Draw a part of a file, often a short one."""
+def _damage(kind: str, draw: Callable[..., Any], content: bytes) -> bytes:
+    """Damage a part of a file, often a short one."""
     start = draw(st.integers(0, max(0, len(content) - 1)))
-    length = draw(st.integers(1, 8) | st.integers(1, max(1, len(content) // 2)))
-    return start, start + length
+    end = start + draw(st.integers(1, 8) | st.integers(1, max(1, len(content) // 2)))
+    before, part, after = content[:start], content[start:end], content[end:]
+    if kind == "flip":
+        return before + bytes([content[start] ^ 1 << draw(st.integers(0, 7))]) + content[start + 1 :]
+    if kind == "overwrite":
+        new = draw(st.binary(min_size=1, max_size=12) | st.sampled_from((b"\0" * 64, b"\xff" * 16)))
+        return before + new + content[start + len(new) :]
+    if kind == "insert":
+        return before + draw(st.binary(min_size=1, max_size=12)) + part + after
+    if kind == "swap":  # two neighbouring parts
+        middle = len(part) // 2
+        return before + part[middle:] + part[:middle] + after
+    if kind == "number":  # as far as there is text
+        positions = [position.span() for position in _NUMBER.finditer(content[: 1 << 14])] or [(start, end)]
+        start, end = draw(st.sampled_from(positions))
+        return content[:start] + draw(st.sampled_from(_ODD)) + content[end:]
+    return {"delete": before + after, "repeat": before + part + part + after, "truncate": before}[kind]
 
 
-def _flip(draw: Callable[..., Any], content: bytes) -> bytes:
-    start, _ = _position(draw, content)
-    bit = 1 << draw(st.integers(0, 7))
-    return content[:start] + bytes([content[start] ^ bit]) + content[start + 1 :]
-
-
-def _overwrite(draw: Callable[..., Any], content: bytes) -> bytes:
-    start, _ = _position(draw, content)
-    new = draw(st.binary(min_size=1, max_size=12) | st.sampled_from((b"\0" * 64, b"\xff" * 16)))
-    return content[:start] + new + content[start + len(new) :]
-
-
-def _insert(draw: Callable[..., Any], content: bytes) -> bytes:
-    start, _ = _position(draw, content)
-    return content[:start] + draw(st.binary(min_size=1, max_size=12)) + content[start:]
-
-
-def _delete(draw: Callable[..., Any], content: bytes) -> bytes:
-    start, end = _position(draw, content)
-    return content[:start] + content[end:]
-
-
-def _repeat(draw: Callable[..., Any], content: bytes) -> bytes:
-    start, end = _position(draw, content)
-    return content[:end] + content[start:]
-
-
-def _truncate(draw: Callable[..., Any], content: bytes) -> bytes:
-    return content[: _position(draw, content)[0]]
-
-
-def _swap(draw: Callable[..., Any], content: bytes) -> bytes:
-    """Swap two neighbouring parts."""
-    start, end = _position(draw, content)
-    middle = (start + end) // 2
-    return content[:start] + content[middle:end] + content[start:middle] + content[end:]
-
-
-def _number(draw: Callable[..., Any], content: bytes) -> bytes:
-    """Replace a number, as far as there is text."""
-    positions = [position.span() for position in _NUMBER.finditer(content[: 1 << 14])]
-    if not positions:
-        return _flip(draw, content)
-    start, end = draw(st.sampled_from(positions))
-    return content[:start] + draw(st.sampled_from(_ODD_NUMBERS + _ODD_TEXTS)) + content[end:]
-
-
-_DAMAGES = (_flip, _overwrite, _insert, _delete, _repeat, _truncate, _swap, _number)
+_KINDS = ("flip", "overwrite", "insert", "delete", "repeat", "truncate", "swap", "number")
 
 
 @st.composite

@@ -37,9 +37,8 @@ from skin.evaluation.touch_scores import decide_touches
 from skin.learning.graph import neighbours
 from skin.learning.learner import AbstractLearner
 from skin.live.engine import DebounceSettings
-from skin.runs.build import build_device
+from skin.runs.build import TorchModel, alarm_source, build_device, load_model, load_run
 from skin.runs.configuration import Config
-from skin.runs.torch_model import TorchModel, alarm_source, load_model, load_run
 from skin.touch.labels import TOUCH
 
 

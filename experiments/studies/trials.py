@@ -48,11 +48,11 @@ from skin.core.files import whole
 from skin.core.messages import PARENT
 from skin.errors import InputError
 from skin.evaluation.metrics import OUTCOMES, decode, disagreement, vote
+from skin.runs.build import TorchModel, load_model
 from skin.runs.configuration import Config, fingerprint, simulator, source_tags, validate_config
 from skin.runs.run import TAG, FinishedRun, find_run
 from skin.runs.store import Store, note_reuse, note_source
 from skin.runs.sweep import LEFT_OUT, Shard
-from skin.runs.torch_model import TorchModel, load_model
 from skin.touch.labels import TOUCH
 
 _log = logging.getLogger(__name__)
@@ -382,7 +382,7 @@ def measure_once(
         frame.attrs |= {"run": identity, "name": name, "measure": repr(measure), "source": source_tags()}
         write_frame(frame, path)
     else:
-        note_source(str(path), f"{study} of {name}", frame.attrs["source"])
+        note_source(frame.attrs["source"])
     return frame, key
 
 

@@ -27,7 +27,7 @@ from skin.errors import InputError
 from skin.runs.configuration import Config, overrides, settings_of
 
 if TYPE_CHECKING:
-    from skin.runs.torch_model import TorchModel
+    from skin.runs.build import TorchModel
 
 _THRESHOLDS = "choosing the thresholds of the alarm for touches"
 # Expected seconds of each step, for the fraction that is done.
@@ -55,8 +55,7 @@ def main(
         if out is not None:
             raise InputError(f"a folder is written to models/NAME, not to out={out}: add name=my_skin")
 
-        from skin.runs.card import check_folder, write_folder
-        from skin.runs.run import find_run
+        from skin.runs.run import check_folder, find_run, write_folder
 
         folder = check_folder(name, licence)
         write_folder(find_run(config.tracking, run, config.trust), folder, str(licence))
@@ -93,9 +92,9 @@ def _export_file(
     if path is not None and path.suffix != ".onnx":
         raise InputError(f"out={out} must end in .onnx: as in out=skin.onnx")
 
+    from skin.runs.build import equation10_warning, load_model
     from skin.runs.model import describe_skin
     from skin.runs.run import find_run
-    from skin.runs.torch_model import equation10_warning, load_model
 
     try:
         from skin.runs.onnx_writer import write_model

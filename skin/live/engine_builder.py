@@ -402,9 +402,8 @@ def watch_run(
     import torch
 
     from skin.record.serial import open_source
-    from skin.runs.build import build_device
+    from skin.runs.build import build_device, equation10_warning, load_model
     from skin.runs.run import find_run
-    from skin.runs.torch_model import equation10_warning, load_model
 
     torch.set_num_threads(config.tracking.threads or 1)
     run = find_run(config.tracking, name, config.trust)

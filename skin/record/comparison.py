@@ -154,8 +154,8 @@ def compare_predictions(
     Raises:
         InputError: there is no such run, or it cannot predict these touches.
     """
+    from skin.runs.build import load_model
     from skin.runs.run import find_run
-    from skin.runs.torch_model import load_model
 
     run = find_run(config.tracking, name, config.trust)
     if (learned := run.stored.simulator["_target_"]) != config.simulator["_target_"]:

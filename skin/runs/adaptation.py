@@ -48,11 +48,17 @@ from skin.learning.small_data import (
     split_folds,
     touch_losses,
 )
-from skin.runs.build import build_data, build_device, build_learner, default_option
+from skin.runs.build import (
+    alarm_source,
+    build_data,
+    build_device,
+    build_learner,
+    default_option,
+    device_on_skin,
+)
 from skin.runs.configuration import Config, settings_of, tags
 from skin.runs.run import TAG, FinishedRun, find_run
 from skin.runs.store import Store
-from skin.runs.torch_model import alarm_source, device_on_skin
 from skin.runs.train import find_finished, log_configuration, log_learner, log_report
 from skin.touch.labels import Task
 
@@ -62,8 +68,12 @@ LEAST = 8
 """Smallest number of gestures to fine-tune on."""
 _COMMAND = ("adapt", "data", "evaluation")  # groups that are taken from the command, not from the run
 # Expected seconds of each step, for the fraction in the progress.
-_STEPS = {"loading the run": 10.0, "reading or simulating the gestures": 15.0}
-_STEPS |= {"choosing the threshold of the alarm": 15.0, "fine-tuning, and evaluating the result": 100.0}
+_STEPS = {
+    "loading the run": 10.0,
+    "reading or simulating the gestures": 15.0,
+    "choosing the threshold of the alarm": 15.0,
+    "fine-tuning, and evaluating the result": 100.0,
+}
 
 
 @checked("adapt")
@@ -117,11 +127,11 @@ def fine_tune(
     fold = split_folds(labels, settings.folds, settings.seed)
     candidates = [Candidate("", _predict(network, data, touches), lambda: learner)]
 
+    @torch.random.fork_rng()
     def finish(layers: str, lr: float, epochs: int) -> AbstractLearner:
-        with torch.random.fork_rng():
-            torch.manual_seed(settings.seed)
-            steps = _train(network, data, touches, settings, (layers, lr, settings.folds))
-            network.load_state_dict(next(islice(steps, epochs - 1, None)).state_dict())
+        torch.manual_seed(settings.seed)
+        steps = _train(network, data, touches, settings, (layers, lr, settings.folds))
+        network.load_state_dict(next(islice(steps, epochs - 1, None)).state_dict())
         return learner
 
     with torch.random.fork_rng():
@@ -267,28 +277,23 @@ def find_target(
     words = [word for word in words if groups[word] not in ("device", "profile")]
     words += [] if "simulator" in parent.stored.device else ["device=simulated"]
     simulated = replace(parent.configured(words), evaluation=command.evaluation)
-    device, trained, build = (
-        build_device(measured),
-        simulated.device,
-        device_on_skin(simulated, vars(simulated)),
-    )
+    device, trained = build_device(measured), simulated.device
+    build = device_on_skin(simulated, vars(simulated))
     twin = threshold_device(AlarmSource("", command.evaluation, None, trained, trained, build=build))
     _check(parent, device, twin)
-    device, drawn = device.with_labels(twin.task), device.simulation is not None
-    gestures: dict[str, Any] = simulated_budget(settings) if drawn else {}
-    adapted = measured if drawn else simulated
-    assert adapted.data is not None
-    assert command.data is not None
-    budget = {name: value for name, value in gestures.items() if name != "data_seed"}
+    drawn = device.simulation is not None
+    adapted, budget = (measured, simulated_budget(settings)) if drawn else (simulated, {})
+    assert adapted.data is not None and command.data is not None  # noqa: PT018
+    of_data = {name: value for name, value in budget.items() if name != "data_seed"}
     adapted = replace(
         adapted,
         row=f"{str(adapted.row).removesuffix('_adapted')}_adapted",
         adapt=asdict(settings) | {"run": parent.run.data.tags["fingerprint"], "device": measured.device},
-        data=replace(adapted.data, augment=command.data.augment, **budget),
-        device=adapted.device | gestures,
+        data=replace(adapted.data, augment=command.data.augment, **of_data),
+        device=adapted.device | budget,
         evaluation=command.evaluation,
     )
-    return device, twin, adapted
+    return device.with_labels(twin.task), twin, adapted
 
 
 def _check(parent: FinishedRun, device: AbstractDevice, twin: AbstractDevice) -> None:
@@ -379,7 +384,7 @@ def adapt(config: Config, run: str, overrides: Sequence[str]) -> None:
         figures: dict[str, float] = {}
         if others is not None:
             tests = others.touches("test")
-            figures = _figures("before", learner.probabilities(tests).numpy(), tests, task, point)
+            figures |= _figures("before", learner.probabilities(tests).numpy(), tests, task, point)
         name = f"{target.row} {identity['simulator']} {len(touches)} gestures seed {settings.seed}"
         store = Store.open(tracking)
         with store.run(name, identity, parent.identity) as made:
@@ -388,8 +393,8 @@ def adapt(config: Config, run: str, overrides: Sequence[str]) -> None:
             candidates += learn_from_scratch(touches, task, settings, options)
             best, after = choose_candidate(candidates, touches, task, settings)
             learner = best.train()
-            chosen = replace(target, learner=best.settings or target.learner)
-            log_configuration(store, made.info.run_id, settings_of(chosen), touches_hash(touches))
+            chosen = settings_of(replace(target, learner=best.settings or target.learner))
+            log_configuration(store, made.info.run_id, chosen, touches_hash(touches))
             log_learner(store, made, learner)
             if best.name and point is not None:
                 point = choose(replace(source, learner=learner), anew=True)

@@ -60,14 +60,6 @@ ADDED: dict[str, Any] = {
 _FOLDERS = ("skin", "experiments", "conf", "data")  # results depend on nothing else in the repository
 
 
-def config_hash(content: dict[str, Any]) -> str:
-    """Return the hash of a configuration in plain containers, 16 hexadecimal digits."""
-    texts = {value for _, value in walk_settings(content) if isinstance(value, str)}
-    files = {text: hashlib.sha256(path.read_bytes()).hexdigest() for text in texts if (path := _file(text))}
-    text = json.dumps([_counted(content), files, __version__], sort_keys=True)
-    return hashlib.sha256(text.encode()).hexdigest()[:16]
-
-
 def _counted(value: Any, group: str = "") -> Any:
     """Return a configuration without :data:`MACHINE`, and without the values in :data:`ADDED`."""
     if not isinstance(value, dict):
@@ -122,12 +114,9 @@ def _git(*arguments: str) -> str | None:
 
 def _processor() -> str:
     """Return the name of the processor, with its family and model where the system gives them."""
-    with suppress(OSError):
-        text = Path("/proc/cpuinfo").read_text()
-        lines = dict(re.findall(r"^(model name|cpu family|model)\s*:\s*(.+)$", text, re.MULTILINE))
-        prefixes = {"model name": "", "cpu family": "family ", "model": "model "}
-        if name := ", ".join(f"{prefix}{lines[key]}" for key, prefix in prefixes.items() if key in lines):
-            return name
+    with suppress(OSError, KeyError):
+        lines = re.findall(r"^([\w ]+?)\s*:\s*(.+)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE)
+        return "{model name}, family {cpu family}, model {model}".format_map(dict(lines))
     return platform.processor() or platform.machine() or "unknown"
 
 
@@ -275,13 +264,12 @@ def validate_config(config: Any) -> Config:
         InputError: a key or a value does not fit, or an interpolation cannot be resolved.
     """
     try:
+        # Before a learner gets the settings of its optimizer, which have names of their own.
+        _check_numbers(OmegaConf.to_container(config) if isinstance(config, DictConfig) else config)
         if isinstance(config, DictConfig):
-            _check_numbers(OmegaConf.to_container(config))
             plain = _resolved(config)
             config = {name: plain[name] for name in Config.__annotations__ if name in plain}
-        whole = OmegaConf.merge(OmegaConf.structured(Config), config)
-        _check_numbers(OmegaConf.to_container(whole))
-        return cast(Config, OmegaConf.to_object(whole))
+        return cast(Config, OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(Config), config)))
     except OmegaConfBaseException as error:
         raise InputError(one_line(error)) from error
 
@@ -350,8 +338,12 @@ def settings_of(config: Config) -> dict[str, Any]:
 
 
 def settings_hash(settings: Mapping[str, Any]) -> str:
-    """Return a hash of everything that results depend on: settings, files they name, version."""
-    return config_hash({key: value for key, value in settings.items() if key not in _STEERING})
+    """Return a hash of everything that results depend on, 16 digits: settings, files they name, version."""
+    content = {key: value for key, value in settings.items() if key not in _STEERING}
+    texts = {value for _, value in walk_settings(content) if isinstance(value, str)}
+    files = {text: hashlib.sha256(path.read_bytes()).hexdigest() for text in texts if (path := _file(text))}
+    text = json.dumps([_counted(content), files, __version__], sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 def fingerprint(config: Config) -> str:

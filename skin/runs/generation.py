@@ -35,8 +35,7 @@ def generate_data_set(device: AbstractDevice, settings: Mapping[str, Any], folde
     Raises:
         InputError: the folder has something else, or cannot be written.
     """
-    parts = list(device.parts() or [])
-    if not parts:
+    if not (parts := list(device.parts() or [])):
         whole = device.recording()
         parts = [Part(len(whole), lambda: whole)]
     source = {"config_hash": settings_hash(settings), "config": json.loads(json.dumps(settings))}
@@ -64,25 +63,26 @@ def _begin(device: AbstractDevice, parts: list[Part], source: dict[str, Any], fo
         raise InputError(f"{folder} exists and has no {MANIFEST}: add out= with a new or an empty folder")
     drawn = [parts[0].make()]
     report_balance(device, drawn[0])
-    code = {name: tag for name, tag in source_tags().items() if name.startswith("source_")}
-    counts = [part.count for part in parts]
-    seed = source["config"].get("seed")
-    Manifest.of(describe_recording(drawn[0]), counts, seed=seed, **code, **source).write(folder)
+    source |= {name: tag for name, tag in source_tags().items() if name.startswith("source_")}
+    counts, seed = [part.count for part in parts], source["config"].get("seed")
+    Manifest.of(describe_recording(drawn[0]), counts, seed=seed, **source).write(folder)
     parts[0] = Part(parts[0].count, drawn.pop)  # its memory is free once it is written
 
 
 def _compare(manifest: Manifest, source: dict[str, Any], folder: Path) -> None:
     """Check that a data set was begun with the same settings by the same code."""
-    commit = source_tags()["source_commit"]
     if manifest.config_hash != source["config_hash"]:
         before, now = (dict(iterate_leaves(part)) for part in (manifest.config, source["config"]))
         changed = [path for path in before | now if before.get(path, ...) != now.get(path, ...)]
-        changed.sort(key=len)  # settings before what is derived from them
-        differences = [f"{'.'.join(path)}={before.get(path)}, not {now.get(path)}" for path in changed[:3]]
-        other = "other contents of the files that its settings name, or another version"
-        what = "; ".join(differences) or other
-        raise InputError(f"{folder} was begun with {what}: repeat those settings, or add out= with a new one")
-    if manifest.source_commit != commit:
+        differences = [
+            f"{'.'.join(path)}={before.get(path)}, not {now.get(path)}"
+            for path in sorted(changed, key=len)[:3]  # settings before what is derived from them
+        ] or ["other contents of the files that its settings name, or another version"]
+        raise InputError(
+            f"{folder} was begun with {'; '.join(differences)}: repeat those settings, or add out= with a "
+            "new folder"
+        )
+    if manifest.source_commit != (commit := source_tags()["source_commit"]):
         raise InputError(
             f"{folder} was begun by the code of commit {manifest.source_commit[:12]}, this is {commit[:12]}: "
             "use that code, or add out= with a new folder"
@@ -119,7 +119,7 @@ def generate_file(device: AbstractDevice, settings: Mapping[str, Any], path: Pat
         InputError: the touches do not fit into memory, or the file cannot be written.
     """
     if (simulation := device.simulation) is not None:
-        count = settings["data"]["gestures"] if "data" in settings else 0
+        count = settings.get("data", {}).get("gestures", 0)
         # 40 bytes for each reading: with displacements, and a table of everything.
         needed = 40.0 * count * simulation.window * len(simulation.sensors)
         require_memory(needed, f"n={count} in one file", "add out=FOLDER for a data set, which needs less")

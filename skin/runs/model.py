@@ -1,11 +1,12 @@
 """A trained model: its interface, and the form of ``skin export``, which ONNX Runtime runs.
 
-torch is not imported: :class:`skin.runs.torch_model.TorchModel` is the form that needs it.
+torch is not imported: :class:`skin.runs.build.TorchModel` is the form that needs it.
 """
 
 import json
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
+from concurrent.futures import Future
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from threading import Thread
@@ -21,12 +22,11 @@ from numpy.typing import ArrayLike
 from skin.core.files import json_line
 from skin.core.safe_loading import KEY as CHECKSUM
 from skin.core.safe_loading import ChecksumError, check_content, limited_memory, read_file
-from skin.core.settings import ONCE, check_groups, check_targets, configured
+from skin.core.settings import ONCE, check_groups, configured
 from skin.errors import InputError
 from skin.evaluation.alarm import AlarmSource
 from skin.evaluation.decisions import LiveConditions
 from skin.evaluation.operating_point import LABEL
-from skin.runs.configuration import recompose, settings_of, validate_config
 from skin.touch.labels import Task
 
 if TYPE_CHECKING:
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 class Model(ABC):
     """Predicts the labels of touches of one skin.
 
-    Attributes:
+    Args:
         identity: id of the run.
         title: name of the run.
         task: the labels.
@@ -45,26 +45,36 @@ class Model(ABC):
         positions: of the sensors, (S, 3), m.
         size: extent (x, y) of the skin, m.
         threshold: a window is dangerous where its probability is greater; None: not chosen, or no alarm.
+        alarm: what decides where the alarm is raised.
+
+    Attributes:
+        identity, title, task, window, rate, positions, size, threshold, alarm: as above.
         contact: N above the baseline that count as touch.
         learned: whether the label ``touch`` counts as touch, too.
         longest: longest touch of the training, s.
         presses: readings of a press at the limit of ``dangerous`` on each sensor, (S, S), N; None: unknown.
-        alarm: what decides where the alarm is raised.
     """
 
-    identity: str
-    title: str
-    task: Task
-    window: int
-    rate: float
-    positions: np.ndarray
-    size: tuple[float, float]
-    threshold: float | None
     contact: float
     learned: bool
     longest: float
     presses: np.ndarray | None
-    alarm: AlarmSource
+
+    def __init__(
+        self,
+        identity: str,
+        title: str,
+        task: Task,
+        window: int,
+        rate: float,
+        positions: np.ndarray,
+        size: tuple[float, float],
+        threshold: float | None,
+        alarm: AlarmSource,
+    ) -> None:
+        self.identity, self.title, self.task = identity, title, task
+        self.window, self.rate, self.positions, self.size = window, rate, positions, size
+        self.threshold, self.alarm = threshold, alarm
 
     @abstractmethod
     def probabilities(self, readings: np.ndarray, valid: np.ndarray) -> np.ndarray:
@@ -350,15 +360,17 @@ class OnnxModel(Model):
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path).expanduser()
         content, metadata = inspect(self.path)
-        self.metadata, self.identity, self.task = metadata, metadata.run, metadata.task
-        for name in ("title", "window", "rate", "size", "threshold", "contact", "learned", "longest"):
-            setattr(self, name, getattr(metadata, name))
-        self.positions = np.array(metadata.positions)
-        self.presses = None if metadata.presses is None else np.array(metadata.presses)
-        thresholds, scores = metadata.thresholds or {}, metadata.scores or {}
-        self.alarm = AlarmSource(
-            str(self.path), threshold=self.threshold, thresholds=thresholds, scores=scores
+        self.metadata, positions, threshold = metadata, np.array(metadata.positions), metadata.threshold
+        alarm = AlarmSource(
+            str(self.path),
+            threshold=threshold,
+            thresholds=metadata.thresholds or {},
+            scores=metadata.scores or {},
         )
+        facts = metadata.run, metadata.title, metadata.task, metadata.window, metadata.rate
+        super().__init__(*facts, positions, metadata.size, threshold, alarm)
+        self.contact, self.learned, self.longest = metadata.contact, metadata.learned, metadata.longest
+        self.presses = None if metadata.presses is None else np.array(metadata.presses)
         self._try(content)
 
     def probabilities(self, readings: np.ndarray, valid: np.ndarray) -> np.ndarray:
@@ -377,25 +389,24 @@ class OnnxModel(Model):
         # One thread: a window alone is too small to be shared among threads.
         options.intra_op_num_threads = options.inter_op_num_threads = 1
         options.log_severity_level = 4  # its errors are reported by the caller
-        shape = 1, self.window, len(self.positions)
-        results: list[np.ndarray | BaseException] = []
+        shape, trial = (1, self.window, len(self.positions)), Future[np.ndarray]()
 
         def classify() -> None:
             try:
                 self._session = runtime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
-                results.append(self.probabilities(np.zeros(shape, np.float32), np.ones(shape, bool)))
+                trial.set_result(self.probabilities(np.zeros(shape, np.float32), np.ones(shape, bool)))
             except BaseException as error:  # those of ONNX Runtime share no other base
-                results.append(error)
+                trial.set_exception(error)
 
-        thread = Thread(target=classify, name="skin-trial", daemon=True)
         with limited_memory(1 << 30):  # bytes; a window takes some MB, and some ms
-            thread.start()
-            thread.join(20.0)
-        if not results:
-            raise InputError(f"{self.path} needs more than 20 s for a window: export it again")
-        (result,) = results
-        if isinstance(result, BaseException):
-            raise InputError(f"ONNX Runtime cannot load {self.path}: export it again") from result
+            Thread(target=classify, name="skin-trial", daemon=True).start()
+            try:
+                refused = trial.exception(20.0)
+            except TimeoutError as late:
+                raise InputError(f"{self.path} needs more than 20 s for a window: export it again") from late
+        if refused is not None:
+            raise InputError(f"ONNX Runtime cannot load {self.path}: export it again") from refused
+        result = trial.result()
         wanted = result.shape == (1, len(self.labels)) and result.dtype == np.float32
         if not wanted or not np.isfinite(result).all():
             raise InputError(
@@ -430,43 +441,18 @@ def describe_skin(settings: Mapping[str, Any], positions: np.ndarray) -> dict[st
 
 
 def check_overrides(path: str, overrides: Sequence[str]) -> None:
-    """Check that overrides do not contradict an exported network.
+    """Check that overrides leave the skin and the network of an exported file as they are.
 
     Args:
-        path: of its file.
+        path: of the file, for the message.
         overrides: of the command line.
 
     Raises:
-        InputError: an override contradicts the file or has no effect on an exported network, or the file does
-            not describe its skin or cannot be used.
+        InputError: an override describes something that the file fixes.
     """
-    parsed = OverridesParser.create().parse_overrides(list(overrides))
-    groups = {str(word.input_line): word.key_or_group.split(".")[0].split("/")[0] for word in parsed}
-    restricted = [word for word, group in groups.items() if group not in _FREE]
-    if ineffective := [word for word in restricted if groups[word] not in GROUPS]:
-        raise InputError(f"{ineffective[0]} has no effect on {path}, a network for one skin: leave it out")
-    if not restricted:
-        return
-    words, metadata = " ".join(restricted), OnnxModel(path).metadata
-    if metadata.skin is None:
-        raise InputError(
-            f"{words} cannot be compared with {path}, which does not describe its skin: leave it "
-            "out, or write the file again with skin export"
-        )
-    check_targets({name: metadata.skin.get(name) for name in ("body", "layout")}, path)
-    stored = validate_config({name: group for name in GROUPS if (group := metadata.skin.get(name))})
-    # Another device is at a port, and has no part in the skin.
-    changed = [word for word, group in groups.items() if group != "device"]
-    before, after = (
-        describe_skin(settings_of(recompose(stored, given)), np.array(metadata.positions))
-        for given in ([], changed)
-    )
-    # Layouts are compared by their positions: a file of the same name may list others.
-    for described in (before, after):
-        if described is not None:
-            described["layout"] = described["layout"].get("footprint")
-    if after is None or after != before:
-        raise InputError(
-            f"{words} contradicts {path}, which was exported for another skin: leave it out, or export the "
-            "run again with it"
-        )
+    for word in OverridesParser.create().parse_overrides(list(overrides)):
+        if word.key_or_group.split(".")[0].split("/")[0] not in _FREE:
+            raise InputError(
+                f"{word.input_line} has no effect on {path}, a network for one skin: leave it out, or export "
+                "the run again with it"
+            )

@@ -5,15 +5,17 @@ Runs are in MLflow, or in folders of ``models/``: pretrained models. Such a fold
 hashes of the others, which ``sha256sum --check`` reads.
 """
 
+import json
 import pickle
 import re
 import shutil
-import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from functools import cached_property
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Annotated, Any, cast
 from urllib.parse import urlsplit
@@ -21,16 +23,26 @@ from urllib.request import url2pathname
 
 from annotated_types import Ge, Le
 from hydra.errors import InstantiationException
+from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from skin.core.files import candidates
+from skin import __version__
+from skin.core.files import candidates, unwritable
 from skin.core.messages import one_line
 from skin.core.safe_loading import TEXT, file_sha256, load_yaml, parse_json, read_file, regular
 from skin.core.settings import check_targets, configured
 from skin.errors import InputError
-from skin.evaluation.operating_point import OperatingPoint, parse_operating_point
+from skin.evaluation.operating_point import LABEL, OperatingPoint, parse_operating_point
 from skin.learning.learner import AbstractLearner
-from skin.runs.configuration import Config, Tracking, recompose, reveal_password, validate_config
+from skin.runs.configuration import (
+    Config,
+    Tracking,
+    iterate_leaves,
+    recompose,
+    reveal_password,
+    settings_of,
+    validate_config,
+)
 
 if TYPE_CHECKING:
     from mlflow.entities import Run
@@ -45,6 +57,10 @@ FORMAT = 1
 MODELS = "models"
 """The folder of all pretrained models, in the current folder and beside the package."""
 RECORD, CONFIG, CARD, SUMS = "run.json", "config.yaml", "README.md", "SHA256SUMS"
+PROCESS = "process"
+"""Tag of a run: the number of the process that makes it."""
+_TEMPLATE = Path(__file__).with_name("card.md")
+_LARGEST = 4_000_000  # bytes of weights
 
 # Errors of loading a file that is damaged or belongs to another learner.
 _UNFIT = (
@@ -93,7 +109,7 @@ class FinishedRun:
                 (:mod:`skin.core.settings`).
         """
         try:
-            with tempfile.TemporaryDirectory() as folder:
+            with TemporaryDirectory() as folder:
                 stored = load_yaml(self.fetch(CONFIG, folder))
             if not isinstance(stored, dict) or not all(isinstance(key, str) for key in stored):
                 raise ValueError("it holds no settings")
@@ -150,7 +166,7 @@ class FinishedRun:
                 f"run {self.identity} names {name!r} as what it learned, a file of something else"
             )
         refused = "is damaged or does not fit these touches"
-        with tempfile.TemporaryDirectory() as folder, self.reading(name, refused):
+        with TemporaryDirectory() as folder, self.reading(name, refused):
             learner.load(data, self.fetch(name, folder))
 
     def fetch(self, name: str, folder: str) -> Path:
@@ -163,8 +179,13 @@ class FinishedRun:
         parts = urlsplit(position)
         try:
             if not parts.netloc and parts.scheme in ("", "file"):  # a folder of this machine
-                local = Path(url2pathname(parts.path) if parts.scheme else position)
-                return _copied(local / name, Path(folder) / name)
+                local = Path(url2pathname(parts.path) if parts.scheme else position) / name
+                copy = Path(folder) / name
+                return Path(
+                    shutil.copytree(local, copy, copy_function=_copy)
+                    if local.is_dir()
+                    else _copy(local, copy)
+                )
             from mlflow.artifacts import download_artifacts
 
             assert self.store is not None
@@ -202,17 +223,10 @@ def find_run(tracking: Tracking, name: str, trust: bool = False) -> FinishedRun:
     return FinishedRun(store, matches[0], trust)
 
 
-def _copied(path: Path, copy: Path) -> Path:
-    """Copy a file or folder and return the copy.
-
-    Raises:
-        OSError: it does not exist or cannot be read.
-        ValueError: a file is a device or a named pipe, which would never end.
-    """
-    for part in path.rglob("*") if path.is_dir() else [path]:
-        if part.exists() and not part.is_dir():
-            regular(part)
-    return Path(shutil.copytree(path, copy) if path.is_dir() else shutil.copyfile(path, copy))
+def _copy(path: str | Path, copy: str | Path) -> str | Path:
+    """Copy a file and return the copy; ValueError for a device or a named pipe, which would never end."""
+    regular(Path(path))
+    return shutil.copyfile(path, copy)
 
 
 def _reason(error: BaseException) -> str:
@@ -309,3 +323,136 @@ def _record(folder: Path) -> dict[str, Any]:
     needed = {name: record[name] for name in _Record.__annotations__ if name in record}
     configured(_Record, needed, f"{RECORD} of {folder}")
     return record
+
+
+# Write a folder of ``models/``, and its card: how a model was trained and measured, what it is not for.
+
+
+def check_folder(name: str | None, licence: str | None) -> Path:
+    """Return the folder of a new model.
+
+    Args:
+        name: of the model.
+        licence: of its weights.
+
+    Raises:
+        InputError: one is missing, or there is such a model.
+    """
+    if name is None or not is_name(name):
+        raise InputError(
+            f"name={name} is no name of a model: use lower-case letters, digits and _, as in name=my_skin"
+        )
+    if licence is None:
+        raise InputError("the weights have no licence: add licence=MIT, or another one")
+    folder = Path(MODELS) / name
+    if folder.exists():
+        raise InputError(f"{folder} exists: delete it, or give the model another name")
+    return folder
+
+
+def write_folder(run: FinishedRun, folder: Path, licence: str) -> None:
+    """Write the files of a model, all or none.
+
+    Args:
+        run: whose weights and figures they hold.
+        folder: new.
+        licence: of the weights.
+
+    Raises:
+        InputError: the run has too many weights or no predictions, or the folder cannot be written.
+    """
+    # Without the machine and the folders of the training.
+    omitted = ("tracking", "trust")
+    settings = {key: value for key, value in settings_of(run.stored).items() if key not in omitted}
+    tags, metrics = run.run.data.tags, run.run.data.metrics
+    record = {
+        "format": FORMAT,
+        "version": __version__,
+        "licence": licence,
+        "run": run.identity,
+        "start_time": run.run.info.start_time,
+        "tags": {key: tag for key, tag in tags.items() if key != PROCESS and not key.startswith("mlflow.")},
+        "metrics": {key: value for key, value in metrics.items() if "/" in key or key == "parameters"},
+        "check": _reference(run),
+    }
+    try:
+        folder.parent.mkdir(exist_ok=True)
+        with TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name}.") as partial:
+            made = Path(partial) / folder.name
+            made.mkdir()
+            weights = run.fetch(tags["learned"], str(made))
+            if weights.is_dir() or weights.stat().st_size > _LARGEST:
+                raise InputError(
+                    f"the weights of {run.title} are not one file of at most {_LARGEST / 1e6:g} MB: choose "
+                    "the run of a smaller network"
+                )
+            (made / RECORD).write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+            (made / CONFIG).write_text(OmegaConf.to_yaml(OmegaConf.create(settings)), encoding="utf-8")
+            (made / CARD).write_text(model_card(folder.name, record, settings), encoding="utf-8")
+            (made / SUMS).write_text(checksums(made, weights.name), encoding="utf-8")
+            made.rename(folder)
+    except OSError as error:
+        raise unwritable(folder, error, "another current folder") from error
+
+
+def _reference(run: FinishedRun) -> dict[str, Any]:
+    """Return predictions on the first 400 test gestures, of the evaluation after the training."""
+    import pandas as pd
+
+    with TemporaryDirectory() as folder:
+        table = pd.read_parquet(run.fetch("predictions.parquet", folder)).head(400)
+    levels = {name: (name, 0.5) for name in table if f"same/{name}/accuracy" in run.run.data.metrics}
+    if (point := run.point) is not None:
+        levels["alarm"] = LABEL, point.threshold
+    predicted = {name: table[f"p_{label}"] > level for name, (label, level) in levels.items()}
+    correct = {
+        name: int((predicted[name] == (table[label] > 0.5)).sum()) for name, (label, _) in levels.items()
+    }
+    predictions = {name: "".join(values.astype(int).astype(str)) for name, values in predicted.items()}
+    # Two may be closer to a threshold than processors round.
+    return {"touches": len(table), "tolerance": 2, "correct": correct, "predictions": predictions}
+
+
+def model_card(name: str, record: Mapping[str, Any], config: Mapping[str, Any]) -> str:
+    """Return the card of a model in Markdown, by the template ``card.md``.
+
+    Args:
+        name: of the model.
+        record: content of ``run.json`` (:mod:`skin.runs.run`).
+        config: configuration of the run, in plain containers.
+    """
+    from jinja2 import Environment
+
+    from skin.evaluation.report import PERCENTAGES, format_number
+
+    network = "model" in config["learner"]
+    measured = [metric.split("/", 1) for metric in record["metrics"] if metric.count("/") == 2]
+    fractions = (*PERCENTAGES, "/balanced_accuracy", "/ece")  # in per cent
+    template = Environment(trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True).from_string(
+        _TEMPLATE.read_text(encoding="utf-8")
+    )
+    return template.render(
+        record,
+        name=name,
+        config=config,
+        settings=_settings,
+        network=["representation", "model", "fusion"] if network else [],
+        trained=["optimizer", "trainer"] if network else [],
+        point=parse_operating_point(record["tags"]["operating_point"]),
+        day=datetime.fromtimestamp(record["start_time"] / 1000, UTC),
+        columns=dict.fromkeys(column for column, _ in measured),
+        rows=dict.fromkeys(row for _, row in measured),
+        cell=lambda value, row: format_number(value, 100 if row.endswith(fractions) else 1),
+    )
+
+
+def _settings(group: Mapping[str, Any], *without: str) -> str:
+    """Return the class of a group, if it has one, and its settings; nested ones as ``outer.inner``."""
+    settings = {key: value for key, value in group.items() if key not in without}
+    name = [f"`{settings['_target_']}`"] if "_target_" in settings else []
+    texts = [
+        f"{'.'.join(path)}={str(value).replace('|', '/')}"
+        for path, value in iterate_leaves(settings)
+        if not path[-1].startswith("_") and value not in (None, {})
+    ]
+    return " ".join([*name, ", ".join(texts)]).strip()

@@ -13,7 +13,6 @@ os.environ.setdefault("MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT", "true")
 os.environ.setdefault("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "3")
 os.environ.setdefault("MLFLOW_HTTP_REQUEST_BACKOFF_FACTOR", "1")
 
-import atexit
 import json
 import logging
 import sqlite3
@@ -21,6 +20,7 @@ import time
 from collections.abc import Iterator, Mapping
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any, cast
 from urllib.parse import unquote
@@ -47,12 +47,9 @@ from skin.runs.configuration import (
     shorten,
     source_tags,
 )
+from skin.runs.run import PROCESS
 
 _log = logging.getLogger(__name__)
-
-PROCESS = "process"
-"""Tag of a run: the number of the process that makes it."""
-
 _QUICK = {"MLFLOW_HTTP_REQUEST_MAX_RETRIES": "3", "MLFLOW_HTTP_REQUEST_BACKOFF_FACTOR": "1"}
 # During a run: waits of 0, 20, 40, 80 and five times 120 s, together 12 minutes. MLflow takes no more than 9.
 _PATIENT = {"MLFLOW_HTTP_REQUEST_MAX_RETRIES": "9", "MLFLOW_HTTP_REQUEST_BACKOFF_FACTOR": "10"}
@@ -322,36 +319,28 @@ def _lock_creation(uri: str, artifacts: Path) -> Iterator[Any]:
                 os.removedirs(encoded)
 
 
-_reused: dict[str, str] = {}  # id -> name of reused runs of other code
-
-
 def note_reuse(run: Run) -> None:
-    """Note that this command uses a finished run.
-
-    At exit, one warning counts the runs of other code: of another commit, or with files that differ from the
-    commit then or now. Runs that began after this process do not count.
-    """
+    """Note that this command uses a finished run, unless it was made by this process."""
     if run.info.start_time < 1000 * psutil.Process().create_time():
-        note_source(run.info.run_id, run.info.run_name, run.data.tags)
+        note_source(run.data.tags)
 
 
-def note_source(identity: str, name: str, tags: Mapping[str, str]) -> None:
-    """Note that this command uses an earlier result with some tags (:func:`source_tags`)."""
+def note_source(tags: Mapping[str, str]) -> None:
+    """Note that this command uses an earlier result with some tags (:func:`source_tags`).
+
+    The first one of other code gives a warning: of another commit, or with files that differ from the commit
+    then or now.
+    """
     code = source_tags()
     same = tags.get("source_commit") == code["source_commit"]
     if not same or "true" in (tags.get("source_dirty"), code["source_dirty"]):
-        _reused.setdefault(identity, name)
+        _warn_of_other_code()
 
 
-@atexit.register
-def _warn() -> None:
-    """Print the warning that :func:`note_reuse` announces."""
-    if not _reused:
-        return
-    count, first = len(_reused), next(iter(_reused.values()))
-    what = f"finished run {first}" if count == 1 else f"{count} finished runs, such as {first}"
+@cache
+def _warn_of_other_code() -> None:
+    """Print a warning once."""
     _log.warning(
-        "warning: reused %s, of other code (tags source_commit and source_dirty): "
-        "tracking.resume=false repeats them",
-        what,
+        "warning: results of other code are reused (tags source_commit and source_dirty): "
+        "tracking.resume=false repeats them"
     )

@@ -7,7 +7,6 @@ import sys
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
@@ -142,7 +141,7 @@ class SweepCallback(Callback):
     def __init__(self, parent: bool = True, runs: Collection[str] | None = None) -> None:
         self._wanted, self._runs = parent, runs
         self._store: Store | None = None
-        self._held = ExitStack()  # the lock of the parent
+        self._held = ExitStack()  # the lock of the parent, and the bar
         self._jobs: list[int] = []  # numbers of the jobs of this shard; empty: unknown
         self._open: set[int] = set()  # those that have not ended
         self._swept: list[str] = []
@@ -169,7 +168,7 @@ class SweepCallback(Callback):
             _refuse(refused)
 
     def _begin(self, config: DictConfig) -> None:
-        """Choose the jobs, and make the folder that Hydra writes to, and the parent run."""
+        """Choose the jobs, and make the parent run."""
         words = _words(config)
         # Swept or not, Hydra lists only what belongs to jobs here.
         if config.hydra.sweeper._target_.endswith(f".{BasicSweeper.__name__}"):
@@ -180,16 +179,16 @@ class SweepCallback(Callback):
         else:
             jobs, parsed = [], OverridesParser.create().parse_overrides(words)
             self._swept = [override.get_key_element() for override in parsed if override.is_sweep_override()]
-        if "tracking" not in config:
-            self._choose(config, jobs)
-            return
         if config.hydra.job.config_name == "train":
             refuse_unknown(config)
+        self._choose(config, jobs)
+        if "tracking" not in config:
+            return
         settings = validate_config(config).tracking
         check_server(settings.uri)
         config.tracking.uri = settings.uri  # without its password, for the file that Hydra writes
-        self._choose(config, jobs)
-        Path(config.hydra.sweep.dir).mkdir(parents=True, exist_ok=True)
+
+        from joblib import cpu_count, effective_n_jobs
 
         from skin.runs.store import Store
 
@@ -200,20 +199,24 @@ class SweepCallback(Callback):
         self._held.enter_context(self._store.hold(self._parent))
         atexit.register(self._close)
         os.environ[PARENT] = self._parent
-        _share_cores(config.hydra.launcher)
-        if (console := Console(stderr=True)).is_terminal:
+        parallel = config.hydra.launcher.get("n_jobs") or 1  # of joblib's launcher
+        basic = config.hydra.launcher._target_.endswith(".BasicLauncher")
+        if parallel != 1:
+            # Two jobs with two threads each are several times slower than two with one.
+            threads = max(1, cpu_count() // effective_n_jobs(parallel))
+            os.environ.setdefault("OMP_NUM_THREADS", str(threads))
+        elif basic and (console := Console(stderr=True)).is_terminal:
             columns = "{task.description}", BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
-            redirect = sys.stdout.isatty()
-            self._bar = Progress(*columns, console=console, transient=True, redirect_stdout=redirect)
+            bar = Progress(*columns, console=console, transient=True, redirect_stdout=sys.stdout.isatty())
+            self._bar = self._held.enter_context(bar)
             self._task = self._bar.add_task(name, total=len(self._jobs) or None)
 
     def _choose(self, config: DictConfig, jobs: Sequence[Mapping[str, str]]) -> None:
         """Choose the jobs of this shard, and tell the others that they have nothing to do."""
-        shard = Shard.parse(config.shard) if config.get("shard") is not None else None
-        names = [str(job) for job in jobs]
-        if (shard or self._runs is not None) and config.hydra.job.config_name == "train":
-            names = [_identify_job(config, job) for job in jobs]
-        chosen = self._runs if self._runs is not None else (shard or Shard(1, 1)).part(names)
+        shard = None if config.get("shard") is None else Shard.parse(config.shard)
+        divided = (shard or self._runs is not None) and config.hydra.job.config_name == "train"
+        names = [_identify_job(config, job) if divided else str(job) for job in jobs]
+        chosen = (shard or Shard(1, 1)).part(names) if self._runs is None else self._runs
         self._jobs = [number for number, name in enumerate(names) if name in chosen]
         self._open = {*self._jobs}
         os.environ[LEFT_OUT] = " ".join(str(n) for n in range(len(names)) if n not in self._open)
@@ -222,29 +225,24 @@ class SweepCallback(Callback):
                 print(f"shard {config.shard} has no job: the sweep has only {len(set(names))}")
             sys.exit(0)
 
-    def on_job_start(self, config: DictConfig, **kwargs: Any) -> None:
-        """Show the bar, where standard error is a terminal."""
-        if self._bar:
-            self._bar.start()
-
     def on_job_end(self, config: DictConfig, job_return: JobReturn, **kwargs: Any) -> None:
         """Print how a job ended."""
-        if self._store is None or (self._jobs and config.hydra.job.num not in self._jobs):
+        # A single run has no number.
+        if self._store is None or str(config.hydra.job.num) in os.environ.get(LEFT_OUT, "").split():
             return
         number, value = config.hydra.job.num, job_return._return_value
         if self._bar:
             self._bar.advance(self._task)
-            self._bar.stop()
         count = f"{self._jobs.index(number) + 1}/{len(self._jobs)}" if self._jobs else f"{number + 1}"
         job = _parse_choices(_words(config))
         label = f"[{count}] {' '.join(f'{key}={job[key]}' for key in self._swept or job)}"
-        if job_return.status != JobStatus.FAILED:
-            print(f"{label}: done", flush=True)
+        failed = job_return.status == JobStatus.FAILED
+        print(
+            f"{label}: {value if failed else 'done'}", file=sys.stderr if failed else sys.stdout, flush=True
+        )
+        if not failed or isinstance(value, InputError):
             self._open.discard(number)
-            return
-        print(f"{label}: {value}", file=sys.stderr, flush=True)
-        if isinstance(value, InputError):
-            self._open.discard(number)
+        if failed and isinstance(value, InputError):
             self._store.client.set_tag(self._parent, f"refused_{number}", f"{label}: {value}"[:500])
 
     def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
@@ -257,11 +255,9 @@ class SweepCallback(Callback):
         # Errors of the database were reported before; the next start closes the run.
         with suppress(Exception), self._held:
             if store is not None:
-                from mlflow.utils.mlflow_tags import MLFLOW_PARENT_RUN_ID
-
                 complete = ended or (self._jobs and not self._open)
                 store.end(self._parent, "FINISHED" if complete else "FAILED")
-                if not store.find(**{MLFLOW_PARENT_RUN_ID: self._parent}):
+                if not store.find(**{"mlflow.parentRunId": self._parent}):
                     store.client.delete_run(self._parent)
 
 
@@ -279,15 +275,3 @@ def _identify_job(config: DictConfig, job: Mapping[str, str]) -> str:
         return fingerprint(validate_config(whole))
     except InputError:
         return str(job)
-
-
-def _share_cores(launcher: DictConfig) -> None:
-    """Give every job of a parallel launcher (joblib's, submitit's) its fraction of the cores.
-
-    Two jobs with two threads each are several times slower than two with one.
-    """
-    parallel = launcher.get("n_jobs") or 1
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    if parallel != 1:
-        count = cores if parallel < 0 else min(parallel, cores)
-        os.environ.setdefault("OMP_NUM_THREADS", str(max(1, cores // count)))

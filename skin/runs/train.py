@@ -37,7 +37,7 @@ from skin.evaluation.settings import check_evaluation
 from skin.learning.learner import AbstractLearner
 from skin.learning.network import LAST
 from skin.plot.figures import confusions, save_figure
-from skin.runs.build import build_data, build_device, build_learner
+from skin.runs.build import build_data, build_device, build_learner, device_on_skin, load_model
 from skin.runs.configuration import (
     MACHINE,
     NETWORK,
@@ -55,7 +55,6 @@ from skin.runs.configuration import (
 )
 from skin.runs.run import TAG, find_run
 from skin.runs.store import Store, note_reuse
-from skin.runs.torch_model import device_on_skin, load_model
 from skin.touch.labels import Task
 
 _log = logging.getLogger(__name__)
@@ -74,8 +73,7 @@ def train(config: Config) -> float:
     """
     quiet()
     tracking, identity = config.tracking, tags(config)
-    if tracking.threads:
-        torch.set_num_threads(tracking.threads)
+    torch.set_num_threads(tracking.threads or torch.get_num_threads())
     identity["threads"] = str(torch.get_num_threads())
     if getattr(rank_zero_only, "rank", 0):
         # One of several processes (trainer.devices); the first one does all the rest.
@@ -200,13 +198,13 @@ def find_unfinished(store: Store, fingerprint: str) -> Run | None:
 
 def find_finished(store: Store, fingerprint: str) -> Run | None:
     """Return the newest run that did a training before; print its metrics, unless a sweep does."""
-    finished = store.find("FINISHED", fingerprint=fingerprint)
-    for run in finished[:1]:
+    for run in store.find("FINISHED", fingerprint=fingerprint):
         note_reuse(run)
         _log.info("run %s did this before: tracking.resume=false repeats it", run.info.run_id)
         if PARENT not in os.environ:
             Console().print(metrics_table(run.data.metrics, run.info.run_name))
-    return finished[0] if finished else None
+        return run
+    return None
 
 
 def log_learner(store: Store, run: Run, learner: AbstractLearner) -> None:
@@ -228,11 +226,8 @@ def log_configuration(store: Store, run: str, settings: dict[str, Any], data_has
     """
     store.client.log_text(run, OmegaConf.to_yaml(OmegaConf.create(settings)), "config.yaml")
     store.client.set_tag(run, "data_hash", data_hash)
-    unused = unused_groups(settings["learner"])
-    simulated = "simulator" in settings["device"]
+    unused, simulated = unused_groups(settings["learner"]), "simulator" in settings["device"]
     groups = ("simulator", "device", "representation", "model", "fusion", "learner")[0 if simulated else 1 :]
-    used = [group for group in groups if group in settings and group not in unused]
-    choices = {group: name_option(settings[group], group) for group in used}
     parts = {part: settings.get(part, {}) for part in ("data", *NETWORK, "learner") if part not in unused}
     if not simulated:
         parts["data"] = {name: settings["data"][name] for name in ("batch_size", "augment")}
@@ -241,7 +236,9 @@ def log_configuration(store: Store, run: str, settings: dict[str, Any], data_has
         for path, value in iterate_leaves(parts)
         if not path[-1].startswith("_") and not {"body", *NETWORK, *MACHINE}.intersection(path[1:])
     }
-    values |= relevant_overrides(settings["learner"]) | choices
+    values |= relevant_overrides(settings["learner"])
+    used = [group for group in groups if group in settings and group not in unused]
+    values |= {group: name_option(settings[group], group) for group in used}
     values |= {"seed": settings["seed"], "row": settings.get("row")}
     store.client.log_batch(run, params=[Param(name, str(value)) for name, value in values.items()])
 
@@ -319,21 +316,11 @@ def evaluate_run(name: str, tracking: Tracking, trust: bool, folder: Path, chang
             else:
                 report = evaluate(learner, device, settings, point)
                 log_report(store, evaluation, report, device.task, {})
-                description = describe_evaluation(title, changes, len(report.predictions))
+                words = f"`{' '.join(changes)}`" if changes else "the settings of the run"
+                count = len(report.predictions)
+                description = f"Run {title}, evaluated with {words}, {count} gestures."
                 written = publish_evaluation(path, report, device.task, run.title, description)
                 show(report, title)
             for file in written:
                 store.client.log_artifact(evaluation.info.run_id, str(file))
     print(*written, sep="\n")
-
-
-def describe_evaluation(title: str, changes: Sequence[str], count: int) -> str:
-    """Return a sentence about an evaluation of ``count`` gestures.
-
-    Args:
-        title: of the run.
-        changes: the overrides; none keep the settings of the run.
-        count: number of gestures.
-    """
-    settings = f"`{' '.join(changes)}`" if changes else "the settings of the run"
-    return f"Run {title}, evaluated with {settings}, {count} gestures."

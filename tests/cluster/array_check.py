@@ -24,7 +24,8 @@ from typing import Any
 
 from skin.core.files import ROOT
 from skin.runs.configuration import Tracking
-from skin.runs.store import PROCESS, Store
+from skin.runs.run import PROCESS
+from skin.runs.store import Store
 
 FOLDER = ROOT / "experiments" / "cluster"
 STUDY = ["study", "--config-dir", str(FOLDER / "conf"), "study=short_runs"]

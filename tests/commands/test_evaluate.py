@@ -6,7 +6,6 @@ from dataclasses import replace
 import pytest
 
 from skin.device.files import read_recording, write_recording
-from skin.runs.train import describe_evaluation
 
 SMALL = [
     "data.gestures=160",
@@ -29,16 +28,6 @@ def metrics(folder):
     return [{key: value for key, value in one.items() if key.endswith("/accuracy")} for one in found]
 
 
-@pytest.mark.parametrize(
-    ("given", "settings"),
-    [([], "the settings of the run"), (["profile=rough", "device.seed=7"], "`profile=rough device.seed=7`")],
-)
-def test_the_page_says_with_what_a_run_was_evaluated(given, settings):
-    assert describe_evaluation("gru (ab12)", given, 96) == (
-        f"Run gru (ab12), evaluated with {settings}, 96 gestures."
-    )
-
-
 @pytest.fixture(scope="module")
 def folder(run, tmp_path_factory):
     """A folder with one finished run of the quickest row that has weights."""
@@ -54,6 +43,8 @@ def test_the_same_device_gives_the_same_figures(run, folder):
     assert len(trained) == 20
     assert evaluated == pytest.approx(trained, abs=1e-6)
     assert f"{100 * trained['same/overall/accuracy']:.1f}" in done.stdout
+    (page,) = (folder / "results").glob("evaluation_*.md")
+    assert ", evaluated with the settings of the run, 96 gestures." in page.read_text()
 
 
 @pytest.mark.slow("trains a run")

@@ -79,10 +79,10 @@ def test_bad_input_ends_with_a_sentence(folder, run, overrides, message):
 
 
 def test_weights_that_are_too_large_are_refused(folder, run):
-    code = "import skin.runs.card as m; from skin.commands.export import main; m._LARGEST = 100\n"
+    code = "import skin.runs.run as m; from skin.commands.export import main; m._LARGEST = 100\n"
     code += "main(['format=folder', 'name=new', 'licence=MIT'{own}])"
     own = f", 'tracking.uri=sqlite:///{folder}/m.db'"
     (folder / "limited.py").write_text(code.format(own=own))
     done = run(folder, folder / "limited.py", store=False, code=2)
-    assert "0.0 MB of weights, and a model is one file of at most 0.0001 MB" in done.stderr
+    assert "are not one file of at most 0.0001 MB" in done.stderr
     assert [path.name for path in (folder / "models").iterdir()] == ["small"]

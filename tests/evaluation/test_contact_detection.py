@@ -9,10 +9,9 @@ RATE, WINDOW = 10.0, 30
 THRESHOLD = 0.25  # N
 
 
-def follow(contact, force, noise=0.0, valid=None, seed=0):
+def follow(contact, force, noise=0.0, valid=None):
     """Show a stream (F, S), N, window by window; return whether there was contact at each frame."""
-    force = np.asarray(force, dtype=float)
-    force = force + noise * np.random.default_rng(seed).standard_normal(force.shape)
+    force = force + noise * np.random.default_rng(0).standard_normal(force.shape)
     known = np.ones(force.shape, dtype=bool) if valid is None else valid
     pad = np.zeros((WINDOW - 1, force.shape[1]))
     rows = np.concatenate([pad, force])

@@ -124,11 +124,9 @@ def test_reached_rates_are_counted_their_range_is_exact_and_accuracy_is_at_one_h
 def test_rates_of_no_gesture_are_undefined_and_printed_so():
     safe = POINT.reached(torch.zeros(3, 4), torch.zeros(3, 4), TOUCH)
     dangerous = POINT.reached(torch.ones(3, 4), torch.ones(3, 4), TOUCH)
-    assert math.isnan(safe.recall)
-    assert math.isnan(dangerous.false_alarm_rate)
+    assert all(map(math.isnan, (safe.recall, dangerous.false_alarm_rate, dangerous.range[0])))
     assert safe.sentence().endswith("dangerous gestures found: -")
     assert dangerous.sentence() == "false alarms: - (no safe gesture); dangerous gestures found: 100.0 % of 3"
-    assert math.isnan(dangerous.range[0])
 
 
 def test_a_shut_gate_and_an_exclusive_task_are_counted_right():
@@ -136,19 +134,13 @@ def test_a_shut_gate_and_an_exclusive_task_are_counted_right():
     assert POINT.reached(torch.ones(3, 5), labels, TOUCH_OR_NOT) == Reached(1, 1, 1, 1)
     probabilities = torch.tensor([[0.1, 0.6, 0.3], [0.7, 0.3, 0.0], [0.1, 0.1, 0.8]])
     found = compute_metrics(probabilities, torch.eye(3)[[1, 0, 2]], GESTURES, POINT)
-    assert found == {
-        "overall/accuracy": 1.0,
-        "dangerous/alarm_recall": 1.0,
-        "dangerous/false_alarm_rate": 0.5,
-    }
+    rates = {"dangerous/alarm_recall": 1.0, "dangerous/false_alarm_rate": 0.5}
+    assert found == {"overall/accuracy": 1.0} | rates
 
 
 def test_fresh_gestures_belong_to_no_split_and_enough_are_safe(device):
-    known = {
-        row.item()
-        for split in ("train", "validation", "holdout", "test")
-        for row in device.touches(split).readings.flatten(1).sum(1)
-    }
+    splits = [device.touches(split) for split in ("train", "validation", "holdout", "test")]
+    known = {row.item() for touches in splits for row in touches.readings.flatten(1).sum(1)}
     fresh = threshold_gestures(device, SETTINGS)
     assert len(fresh) == 128
     assert int((fresh.labels[:, 3] < 0.5).sum()) == 64
@@ -216,14 +208,9 @@ def test_what_is_stored_reads_back_to_the_last_digit():
     "text",
     [
         "", "{}", "[]", "0.5", "[" * 5000,
-        *(
-            json.dumps(json.loads(POINT.text()) | change)
-            for change in (
-                {"threshold": None}, {"threshold": math.nan}, {"threshold": math.inf}, {"threshold": -1},
-                {"target": 2}, {"safe": "many"}, {"raised": 9999}, {"found": 1}, {"label": "big"},
-                {"seed": {}},
-            )
-        ),
+        *(json.dumps(json.loads(POINT.text()) | change) for change in (
+            {"threshold": None}, {"threshold": math.nan}, {"threshold": math.inf}, {"threshold": -1},
+            {"target": 2}, {"safe": "many"}, {"raised": 9999}, {"found": 1}, {"label": "big"}, {"seed": {}})),
     ],
 )  # fmt: skip
 def test_a_damaged_one_is_refused(text):
@@ -232,16 +219,12 @@ def test_a_damaged_one_is_refused(text):
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
-    [
-        ({"false_alarm_rate": 0.0}, "false_alarm_rate=0.02"),
-        ({"false_alarm_rate": 1.0}, "false_alarm_rate=0.02"),
-        ({"safe_gestures": 0}, "safe_gestures=2000"),
-    ],
+    ("name", "value", "better"),
+    [("false_alarm_rate", 0.0, 0.02), ("false_alarm_rate", 1.0, 0.02), ("safe_gestures", 0, 2000)],
 )
-def test_what_cannot_be_chosen_is_refused(change, said):
-    with pytest.raises(InputError, match=said):
-        check_evaluation(replace(SETTINGS, **change))
+def test_what_cannot_be_chosen_is_refused(name, value, better):
+    with pytest.raises(InputError, match=f"{name}={better}"):
+        check_evaluation(replace(SETTINGS, **{name: value}))
 
 
 class Largest:

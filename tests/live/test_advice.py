@@ -2,8 +2,7 @@
 
 import pytest
 
-from skin.runs.build import build_device
-from skin.runs.torch_model import equation10_warning
+from skin.runs.build import build_device, equation10_warning
 
 PORT = ("device=serial", "device.port=/dev/ttyACM0", "device.scale=0.04")
 

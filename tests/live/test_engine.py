@@ -10,7 +10,7 @@ from skin.device.resampling import Frame
 from skin.device.touches import Touches
 from skin.errors import InputError
 from skin.live.engine import Debounce, DebounceSettings, Detection, Engine
-from skin.runs.torch_model import window_classifier
+from skin.runs.build import window_classifier
 from skin.touch.labels import TOUCH, Task
 from skin.wire.channels import UnitConversion
 from skin.wire.tare import Tare

@@ -43,8 +43,7 @@ finally:
 @pytest.fixture(scope="module")
 def trained(configured):
     """Return a small untrained network with six sensors, whose alarm is above 0.25, and some touches."""
-    from skin.runs.build import build_data, build_device, build_learner
-    from skin.runs.torch_model import TorchModel
+    from skin.runs.build import TorchModel, build_data, build_device, build_learner
 
     sizes = ["layout=grid", "layout.rows=2", "layout.columns=3", "data.gestures=100"]
     config = configured("simulator=naive", *sizes, "representation=readings", "model=mlp", "fusion=early")

@@ -12,8 +12,7 @@ from skin.device.files import read_recording
 from skin.live.engine import Detection, Engine
 from skin.live.loop import Display, LiveLoop
 from skin.record.serial import Serial, convert_session, record_session
-from skin.runs.build import build_data, build_device, build_learner
-from skin.runs.torch_model import window_classifier
+from skin.runs.build import build_data, build_device, build_learner, window_classifier
 from skin.touch.labels import TOUCH
 from skin.wire.clocks import FrameClock
 from skin.wire.decoder import Decoder

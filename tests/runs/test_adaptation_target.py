@@ -40,30 +40,25 @@ def test_a_part_of_a_recording_is_chosen_and_the_rest_is_reported(made_up_device
     assert torch.equal(both.sum(dim=(1, 2)).sort().values, whole.readings.sum(dim=(1, 2)).sort().values)
     other, _ = choose_gestures(made_up_device, FineTuning(gestures=16, seed=2))
     assert not torch.equal(touches.readings, other.readings)
-
-
-def test_all_of_a_recording_leaves_nothing_to_report(made_up_device):
     touches, others = choose_gestures(made_up_device, FineTuning())
-    assert len(touches) == len(made_up_device.all_touches())
-    assert others is None
+    assert (len(touches), others) == (len(whole), None)
 
 
 @pytest.mark.parametrize(
-    ("count", "wanted", "reason"),
-    [(7, None, "7 gestures are too few .* record 8 or more"), (20, 21, "use adapt.gestures=20")],
+    ("change", "wanted", "reason"),
+    [
+        (lambda touches: touches[:7], None, "7 gestures are too few .* record 8 or more"),
+        (lambda touches: touches[:20], 21, "use adapt.gestures=20"),
+        (lambda touches: replace(touches, labels=None), None, "record them with labels"),
+    ],
 )
-def test_too_few_gestures_are_refused(made_up_device, monkeypatch, count, wanted, reason):
-    few = made_up_device.all_touches()[:count]
-    monkeypatch.setattr(made_up_device, "all_touches", lambda: few)
+def test_too_few_gestures_or_gestures_without_labels_are_refused(
+    made_up_device, monkeypatch, change, wanted, reason
+):
+    touches = change(made_up_device.all_touches())
+    monkeypatch.setattr(made_up_device, "all_touches", lambda: touches)
     with pytest.raises(InputError, match=reason):
         choose_gestures(made_up_device, FineTuning(gestures=wanted))
-
-
-def test_gestures_without_labels_are_refused(made_up_device, monkeypatch):
-    unknown = replace(made_up_device.all_touches(), labels=None)
-    monkeypatch.setattr(made_up_device, "all_touches", lambda: unknown)
-    with pytest.raises(InputError, match="record them with labels"):
-        choose_gestures(made_up_device, FineTuning())
 
 
 def test_the_threshold_of_the_alarm_may_be_for_a_profile():

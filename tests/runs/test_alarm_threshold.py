@@ -14,9 +14,9 @@ from skin.evaluation import alarm
 from skin.evaluation.alarm import choose_alarm_threshold, profile_settings
 from skin.evaluation.decisions import LiveConditions
 from skin.evaluation.operating_point import OperatingPoint
+from skin.runs.build import alarm_source
 from skin.runs.configuration import validate_config
 from skin.runs.run import TAG, FinishedRun
-from skin.runs.torch_model import alarm_source
 
 SMALL = ["simulator=naive", "data.gestures=40", "evaluation.safe_gestures=16"]
 
@@ -33,50 +33,41 @@ def threshold_device(stored, config):
     return alarm.threshold_device(alarm_source(run_of(stored, STORED), None, config))
 
 
-def test_a_profile_replaces_the_imperfections_of_the_training(hydra):
+SKINS = ("device=skins", "device.count=1")
+
+
+def test_a_profile_replaces_the_imperfections_of_the_training(hydra, tmp_path):
     stored = hydra("seed=3", "device.quantum=0.1")
     device = threshold_device(stored, hydra("evaluation.profile=calibrated", "layout=grid", "layout.rows=3"))
     assert device.randomise
     assert (device.gain_spread, device.noise, device.dead, device.tare) == (0.02, 0.1, [0, 2], True)
     # What a profile does not name is that of the training; the skin is the new one.
     assert (device.quantum, device.data_seed, len(device.sensors)) == (0.1, 3, 15)
-
-
-def test_without_a_profile_it_is_the_device_of_the_training(hydra):
-    stored = hydra("profile=rough")
-    device = threshold_device(stored, hydra())
-    assert (device.gain_spread, device.randomise) == (0.2, False)
-
-
-def test_a_profile_does_not_follow_a_calibration(hydra, tmp_path):
     stored = hydra(f"device.calibration={tmp_path}/gone.yaml")
     assert threshold_device(stored, hydra("evaluation.profile=mild")).calibration is None
-
-
-def test_a_profile_holds_on_a_run_of_drawn_skins(hydra):
-    stored = hydra("device=skins", "device.count=1")
     for profile in ("rough", "drawn"):
-        device = threshold_device(stored, hydra(f"evaluation.profile={profile}"))
+        device = threshold_device(hydra(*SKINS), hydra(f"evaluation.profile={profile}"))
         assert device.randomise
         assert device.noise == profile_settings(profile)["noise"]
 
 
+def test_without_a_profile_it_is_the_device_of_the_training(hydra):
+    device = threshold_device(hydra("profile=rough"), hydra())
+    assert (device.gain_spread, device.randomise) == (0.2, False)
+
+
 def test_the_evaluated_device_counts_with_its_rate_and_alignment(hydra):
     changes = ["profile=rough", "device.rate=100", "device.aligned=false", "evaluation.profile=device"]
-    for stored in (hydra("device=skins", "device.count=1"), hydra("device.seed=3")):
+    for stored in (hydra(*SKINS), hydra("device.seed=3")):
         device = threshold_device(stored, hydra(*changes))
         assert device.randomise
         assert (device.rate, device.aligned, device.gain_spread) == (100, False, 0.2)
-    with pytest.raises(InputError, match="device=simulated"):
-        threshold_device(hydra(), hydra("device=recording", "device.path=x", "evaluation.profile=device"))
 
 
 def test_a_profile_counts_at_the_rate_and_alignment_of_the_evaluated_device(hydra):
     """False alarms of lagging devices depend on them; a run of drawn devices has many."""
-    stored = hydra(
-        *("device=skins", "device.count=1", "device.rate=[10,1000]", "device.aligned=false"),
-        *("device.framed=0.2", "device.without_lag=0.5"),
-    )
+    mixed = ("device.rate=[10,1000]", "device.aligned=false", "device.framed=0.2", "device.without_lag=0.5")
+    stored = hydra(*SKINS, *mixed)
     frames = threshold_device(stored, hydra("evaluation.profile=calibrated"))
     assert (frames.rate, frames.aligned, frames.framed, frames.gain_spread) == (10.0, True, 0.0, 0.02)
     assert frames.without_lag == 0.0
@@ -118,7 +109,7 @@ def test_the_stored_threshold_holds_without_another_profile(hydra):
 
 
 def test_another_profile_and_one_of_many_skins_have_a_threshold_of_their_own(hydra):
-    skins = hydra("device=skins", "device.count=1")
+    skins = hydra(*SKINS)
     assert alarm_point(skins, skins) == STORED
     for run, config, one_skin in (
         (hydra(), hydra("evaluation.profile=rough"), False),
@@ -130,17 +121,9 @@ def test_another_profile_and_one_of_many_skins_have_a_threshold_of_their_own(hyd
 
 
 def test_a_profile_is_refused_where_the_device_draws_many_skins(hydra):
-    many = hydra("device=skins", "device.count=1", "evaluation.profile=device")
+    many = hydra(*SKINS, "evaluation.profile=device")
     with pytest.raises(InputError, match="the threshold for one skin: add device=simulated"):
         alarm_point(many, many)
-
-
-@pytest.fixture
-def force_resistors(hydra, tmp_path):
-    """The configuration of sensors that follow the root of the force, with a noise of 0.06 N at 4 N."""
-    sensors = {"gain": [1.0] * 25, "noise": [0.03] * 25, "exponent": [0.5] * 25}
-    path = write_calibration(Calibration(sensors, exponent_at=4.0), tmp_path / "fsr.yaml")
-    return hydra("device=serial", "device.port=x", f"device.calibration={path}")
 
 
 @pytest.fixture
@@ -161,25 +144,33 @@ def device_of(tmp_path, monkeypatch):
     return device_of
 
 
-def test_the_noise_of_curved_sensors_is_that_of_the_force(hydra, force_resistors, device_of):
-    device = device_of(hydra(), force_resistors)
-    assert device.imperfection.noise == pytest.approx(0.06, rel=0.01)
+def calibrated(hydra, path, **sensors):
+    """Return the configuration of a device with a calibration of 25 sensors, with a noise of 0.03."""
+    values = {"gain": 1.0, "noise": 0.03} | sensors
+    calibration = Calibration({name: [value] * 25 for name, value in values.items()}, exponent_at=4.0)
+    path = write_calibration(calibration, path)
+    return hydra("device=serial", "device.port=x", f"device.calibration={path}")
+
+
+def test_the_noise_of_sensors_that_follow_the_root_of_the_force_is_that_of_the_force(
+    hydra, device_of, tmp_path
+):
+    device = device_of(hydra(), calibrated(hydra, tmp_path / "fsr.yaml", exponent=0.5))
+    assert device.imperfection.noise == pytest.approx(0.06, rel=0.01)  # N, at 4 N
 
 
 def test_a_calibrated_device_has_the_lag_of_its_calibration(hydra, device_of, tmp_path):
     """A run of drawn devices was trained on half of them without lag, and on some with frames."""
-    sensors = {"gain": [1.0] * 25, "noise": [0.03] * 25, "time_constant": [0.05] * 25}
-    path = write_calibration(Calibration(sensors), tmp_path / "slow.yaml")
-    mixed = hydra("device=skins", "device.count=1", "device.framed=0.2", "device.without_lag=0.5")
-    device = device_of(mixed, hydra("device=serial", "device.port=x", f"device.calibration={path}"))
+    mixed = hydra(*SKINS, "device.framed=0.2", "device.without_lag=0.5")
+    device = device_of(mixed, calibrated(hydra, tmp_path / "slow.yaml", time_constant=0.05))
     assert (device.time_constant, device.without_lag, device.framed) == (0.05, 0.0, 0.0)
 
 
 def test_touches_of_a_run_of_drawn_skins_are_measured_by_mild_devices(hydra, device_of):
     """One threshold for all devices of its training would hide dangerous touches on a usual one."""
-    skins = hydra("device=skins", "device.count=1")
+    skins = hydra(*SKINS)
     assert device_of(skins, skins).noise == profile_settings("mild")["noise"]
-    rough = hydra("device=skins", "device.count=1", "evaluation.profile=rough")
+    rough = hydra(*SKINS, "evaluation.profile=rough")
     assert device_of(skins, rough).noise == profile_settings("rough")["noise"]
     assert device_of(hydra("profile=rough"), hydra()).noise == profile_settings("rough")["noise"]
 
@@ -200,9 +191,16 @@ def test_more_noise_means_higher_readings_at_rest(hydra):
     assert idle["harsh"] > 2 * idle["mild"]
 
 
-def test_runs_on_other_touches_and_unknown_profiles_are_refused(hydra, tmp_path):
-    stored = hydra("device=recording", f"device.path={tmp_path}/x.csv")
-    with pytest.raises(InputError, match="trained on others"):
-        threshold_device(stored, hydra("evaluation.profile=rough"))
-    with pytest.raises(InputError, match="no profile soft: choose one of calibrated, drawn, harsh"):
-        threshold_device(hydra(), hydra("evaluation.profile=soft"))
+@pytest.mark.parametrize(
+    ("trained", "used", "reason"),
+    [
+        ("device=recording", "evaluation.profile=rough", "trained on others"),
+        ("seed=0", "evaluation.profile=soft", "no profile soft: choose one of calibrated, drawn, harsh"),
+        ("seed=0", "evaluation.profile=device", "device=simulated"),
+    ],
+)
+def test_runs_on_other_touches_and_unknown_profiles_are_refused(hydra, trained, used, reason):
+    recording = ["device=recording", "device.path=x.csv"] if used.endswith("device") else []
+    stored = hydra(trained, *(["device.path=x.csv"] if "recording" in trained else []))
+    with pytest.raises(InputError, match=reason):
+        threshold_device(stored, hydra(used, *recording))

@@ -13,28 +13,26 @@ from skin.learning.data import TouchData
 from skin.learning.small_data import split_folds
 from skin.runs.adaptation import Candidate, FineTuning, choose_candidate, fine_tune, learn_from_scratch
 from skin.runs.build import build_learner, default_option
+from tests.made_up import MadeUpDevice
 
 SMALL = FineTuning(layers=["all"], lr=[3e-3], epochs=15, patience=5)
 
 
 @pytest.fixture(scope="module")
-def once():
-    """Return what the first test has trained: a training takes seconds."""
-    return []
+def once(configured):
+    """Return a learner that has learnt the touches of the made-up device, and its data."""
+    config = configured(
+        "representation=features", "model=mlp", "model.widths=[]", "fusion.head=residual",
+        "fusion.hidden=16", "optimizer.lr=0.003", "trainer.max_epochs=15",
+    )  # fmt: skip
+    data, learner = TouchData(MadeUpDevice(), instantiate(config.representation), 32), build_learner(config)
+    learner.fit(data)
+    return learner, data
 
 
 @pytest.fixture
-def trained(configured, made_up_device, once):
-    """Return a copy of a learner that has learnt the touches of the made-up device, and its data."""
-    if not once:
-        config = configured(
-            "representation=features", "model=mlp", "model.widths=[]", "fusion.head=residual",
-            "fusion.hidden=16", "optimizer.lr=0.003", "trainer.max_epochs=15",
-        )  # fmt: skip
-        data = TouchData(made_up_device, instantiate(config.representation), 32)
-        learner = build_learner(config)
-        learner.fit(data)
-        once.extend((learner, data))
+def trained(once):
+    """Return a copy of the learner, and the data."""
     return deepcopy(once[0]), once[1]
 
 
@@ -158,16 +156,13 @@ def test_folds_have_equal_shares_of_each_combination():
 
 
 @pytest.mark.parametrize(
-    ("settings", "reason"),
+    ("name", "value", "reason"),
     [
-        ({"gestures": 7}, "adapt.gestures=7 must be greater than or equal to 8"),
-        ({"folds": 1}, "adapt.folds=1"),
-        ({"folds": 9}, "adapt.folds=9"),
-        ({"layers": ["body"]}, "adapt.layers"),
-        ({"layers": []}, "too few"),
-        ({"lr": [0.0]}, "adapt.lr"),
+        ("gestures", 7, "adapt.gestures=7 must be greater than or equal to 8"), ("layers", [], "too few"),
+        *((name, value, f"adapt.{name}") for name, value in (
+            ("folds", 1), ("folds", 9), ("layers", ["body"]), ("lr", [0.0]))),
     ],
-)
-def test_bad_settings_are_refused(settings, reason):
+)  # fmt: skip
+def test_bad_settings_are_refused(name, value, reason):
     with pytest.raises(InputError, match=reason):
-        FineTuning(**settings)
+        FineTuning(**{name: value})

@@ -5,24 +5,38 @@ from dataclasses import replace
 
 import pytest
 
-from skin.runs.configuration import ADDED, config_hash, fingerprint
+from skin.runs.configuration import ADDED, fingerprint, settings_hash
 
 
 @pytest.mark.parametrize(
-    "overrides",
+    ("overrides", "same"),
     [
-        ["trainer.precision=bf16-mixed"],
-        ["trainer.devices=2", "trainer.strategy=ddp", "+trainer.num_nodes=2"],
-        ["trainer.accelerator=gpu"],
-        ["+trainer.enable_progress_bar=true"],
-        ["tracking.threads=1"],
+        (["tracking.uri=sqlite:///elsewhere.db", "tracking.resume=false", "tracking.threads=1"], True),
+        (
+            ["trainer.precision=bf16-mixed", "trainer.accelerator=gpu", "+trainer.enable_progress_bar=true"],
+            True,
+        ),
+        (["trainer.devices=2", "trainer.strategy=ddp", "+trainer.num_nodes=2"], True),
+        *(
+            ([word], False)
+            for word in ("seed=1", "simulator=naive", "device.noise=0.06", "trainer.max_epochs=3")
+        ),
     ],
 )
 @pytest.mark.parametrize("learner", ["network", "ensemble"])
-def test_the_machine_makes_no_other_run(configured, overrides, learner):
-    assert fingerprint(configured(f"learner={learner}", *overrides)) == fingerprint(
-        configured(f"learner={learner}")
-    )
+def test_only_what_results_depend_on_changes_the_fingerprint_and_not_the_machine(
+    configured, overrides, same, learner
+):
+    plain = f"learner={learner}"
+    assert (fingerprint(configured(plain, *overrides)) == fingerprint(configured(plain))) == same
+
+
+def test_a_changed_layout_file_changes_the_fingerprint(configured, tmp_path):
+    path, prints = tmp_path / "sensors.csv", []
+    for y in (0.05, 0.05, 0.06):
+        path.write_text(f"x_m,y_m\n0.05,{y}\n")
+        prints.append(fingerprint(configured(f"layout.path={path}")))
+    assert prints[0] == prints[1] != prints[2]
 
 
 @pytest.mark.parametrize("device", ["simulated", "skins"])
@@ -48,5 +62,5 @@ def test_a_data_set_counts_by_its_manifest(tmp_path, monkeypatch):
         if manifest:
             (tmp_path / "touches").mkdir(exist_ok=True)
             (tmp_path / "touches" / "manifest.json").write_text(manifest)
-        hashes.append({config_hash({"path": path}) for path in ("touches", "./touches")})
+        hashes.append({settings_hash({"path": path}) for path in ("touches", "./touches")})
     assert len(set.union(*hashes)) == 6

@@ -5,6 +5,7 @@ import signal
 
 import pytest
 import torch
+from filelock import FileLock
 from hydra import compose, initialize_config_dir
 
 from skin.core.files import CONF
@@ -15,14 +16,8 @@ from skin.runs.build import build_device
 from skin.runs.configuration import settings_of, validate_config
 from skin.runs.generation import generate_data_set, generate_file
 
-SMALL = [
-    "simulator=naive",
-    "layout=grid",
-    "layout.rows=3",
-    "layout.columns=3",
-    "n=80",
-    "touch.leak=0.95",
-]  # few gestures may have few shapes
+SMALL = ["simulator=naive", "layout=grid", "layout.rows=3", "layout.columns=3", "n=80"]
+SMALL += ["touch.leak=0.95"]  # few gestures may have few shapes
 
 
 def composed(*overrides):
@@ -30,9 +25,10 @@ def composed(*overrides):
         return validate_config(compose("generate", [*SMALL, *overrides]))
 
 
-def generate(folder, *overrides) -> str:
+def generate(path, *overrides) -> str:
     config = composed(*overrides)
-    return generate_data_set(build_device(config), settings_of(config), folder)
+    write = generate_file if path.suffix else generate_data_set
+    return write(build_device(config), settings_of(config), path)
 
 
 @pytest.fixture(autouse=True)
@@ -54,9 +50,8 @@ def test_shards_are_the_budget(tmp_path, stream):
     assert found.counts == [16] * 5
     joined = concatenate([found.read(number) for number in range(5)])
     whole = build_device(composed(f"data.stream={stream}")).recording(complete=False)
-    assert torch.equal(joined.touches.readings, whole.touches.readings)
-    assert torch.equal(joined.touches.valid, whole.touches.valid)
-    assert torch.equal(joined.touches.labels, whole.touches.labels)
+    for name in ("readings", "valid", "labels"):
+        assert torch.equal(getattr(joined.touches, name), getattr(whole.touches, name))
     assert torch.equal(joined.force, whole.force)
     assert all(torch.equal(values, whole.parameters[name]) for name, values in joined.parameters.items())
 
@@ -128,58 +123,47 @@ def test_a_killed_generation_goes_on(begin, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("overrides", "message"),
+    ("overrides", "commit", "message"),
     [
-        (["seed=1"], r"was begun with seed=0, not 1; device.data_seed=0, not 1: repeat those settings"),
-        (["n=96"], r"was begun with device.gestures=80, not 96"),
-        (["device.noise=0.1"], r"was begun with device.noise=0.05, not 0.1: repeat"),
+        (["seed=1"], None, r"was begun with seed=0, not 1; device.data_seed=0, not 1: repeat those settings"),
+        (["n=96"], None, r"was begun with device.gestures=80, not 96"),
+        (["device.noise=0.1"], None, r"was begun with device.noise=0.05, not 0.1: repeat"),
+        ([], "f" * 40, r"was begun by the code of commit \w+, this is f{12}: use"),
     ],
 )
-def test_other_settings_are_refused(tmp_path, overrides, message):
+def test_other_settings_and_other_code_are_refused(tmp_path, monkeypatch, overrides, commit, message):
     generate(tmp_path)
     (tmp_path / "shards" / "00001.parquet").unlink()
     before = contents(tmp_path)
+    if commit:
+        other = {"source_commit": commit, "source_dirty": "false"}
+        monkeypatch.setattr("skin.runs.generation.source_tags", lambda: other)
     with pytest.raises(InputError, match=message):
         generate(tmp_path, *overrides)
     assert contents(tmp_path) == before
 
 
-def test_other_code_is_refused(tmp_path, monkeypatch):
-    generate(tmp_path)
-    other = {"source_commit": "f" * 40, "source_dirty": "false"}
-    monkeypatch.setattr("skin.runs.generation.source_tags", lambda: other)
-    with pytest.raises(InputError, match=r"was begun by the code of commit \w+, this is f{12}: use"):
-        generate(tmp_path)
-
-
-def test_a_folder_with_other_things_is_refused(tmp_path):
-    (tmp_path / "mine.txt").write_text("x")
-    with pytest.raises(InputError, match=r"exists and has no manifest.json: add out= with a new or an empty"):
-        generate(tmp_path)
-    assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
-    with pytest.raises(InputError, match=r"exists and has no manifest.json"):
-        generate(tmp_path / "mine.txt")
-
-
-def test_only_one_process_generates_a_folder(tmp_path):
-    from filelock import FileLock
-
-    generate(tmp_path)
-    with FileLock(tmp_path / ".lock"), pytest.raises(InputError, match=r"another process generates"):
-        generate(tmp_path)
+def test_a_folder_with_other_things_or_of_another_process_is_refused(tmp_path):
+    (tmp_path / "mine").write_text("x")
+    for path in (tmp_path, tmp_path / "mine"):
+        with pytest.raises(InputError, match=r"exists and has no manifest\.json: add out= with a new"):
+            generate(path)
+    assert [path.name for path in tmp_path.iterdir()] == ["mine"]
+    folder = tmp_path / "touches"
+    generate(folder)
+    with FileLock(folder / ".lock"), pytest.raises(InputError, match=r"another process generates"):
+        generate(folder)
 
 
 def test_a_file_larger_than_memory_is_refused(tmp_path):
-    config = composed("n=100000000")
     with pytest.raises(InputError, match=r"n=100000000 in one file needs about .* GB .*: add out=FOLDER"):
-        generate_file(build_device(config), settings_of(config), tmp_path / "x.parquet")
+        generate(tmp_path / "x.parquet", "n=100000000")
 
 
 def test_a_recording_becomes_a_data_set(tmp_path):
-    config = composed()
-    generate_file(build_device(config), settings_of(config), tmp_path / "x.csv")
+    generate(tmp_path / "x.csv")
     said = generate(tmp_path / "touches", "device=recording", f"device.path={tmp_path / 'x.csv'}")
     assert said.startswith("80 gestures in 1 shards")
-    whole, found = build_device(config).recording(), DataSet(tmp_path / "touches").read(0)
+    whole, found = build_device(composed()).recording(), DataSet(tmp_path / "touches").read(0)
     assert torch.equal(found.touches.readings, whole.touches.readings)
     assert torch.equal(found.parameters["peak"], whole.parameters["peak"])

@@ -15,24 +15,20 @@ import pytest
 
 from skin.core.files import ROOT
 from skin.errors import InputError
+from skin.runs.build import load_run
 from skin.runs.configuration import Tracking, hide_password, reveal_password, source_tags
 from skin.runs.run import FinishedRun
 from skin.runs.store import Store, print_table_link
-from skin.runs.torch_model import load_run
 from tests.budget import free
 
-# MLflow's own business with SQLAlchemy.
-pytestmark = pytest.mark.filterwarnings("ignore:The ``noload`` loader strategy")
-
 BEGIN = f"""
-import sys
+import sys, time
 sys.path.insert(0, {str(ROOT)!r})
 from skin.runs.configuration import Tracking
 from skin.runs.store import Store
-store = Store.open(Tracking(sys.argv[1], sys.argv[2], "skin", True, None))
+store = Store.open(Tracking(sys.argv[1], sys.argv[2]))
 """
 WAIT = """
-import time
 with store.run("waiting", {"fingerprint": "f"}):
     print("open", flush=True)
     time.sleep(120)
@@ -42,7 +38,7 @@ with store.run("waiting", {"fingerprint": "f"}):
 @pytest.fixture(scope="module")
 def settings(tmp_path_factory):
     folder = tmp_path_factory.mktemp("store")
-    return Tracking(f"sqlite:///{folder / 'm.db'}", str(folder / "artifacts"), "skin", True, None)
+    return Tracking(f"sqlite:///{folder / 'm.db'}", str(folder / "artifacts"))
 
 
 @pytest.fixture(scope="module")
@@ -89,11 +85,7 @@ def test_a_signal_leaves_no_finished_run(begin, tmp_path, settings, store, numbe
 
 def test_a_second_signal_does_not_interrupt_the_end_of_a_run(store, monkeypatch):
     before, ended = signal.getsignal(signal.SIGTERM), []
-
-    def end(store, run, status):
-        signal.raise_signal(signal.SIGTERM)
-        ended.append(status)
-
+    end = lambda store, run, status: (signal.raise_signal(signal.SIGTERM), ended.append(status))  # noqa: E731
     monkeypatch.setattr(Store, "end", end)
     # Else a signal that is not expected would end the tests.
     signal.signal(signal.SIGTERM, lambda *_: pytest.fail("a signal was not expected"))
@@ -111,11 +103,8 @@ def test_a_run_without_a_process_is_closed(settings, store):
     (store.folder / f"{abandoned.info.run_id}.lock").touch()
     with store.run("mine", {}) as mine:
         Store.open(settings)
-        assert [status(store, run) for run in (abandoned, elsewhere, mine)] == [
-            "KILLED",
-            "RUNNING",
-            "RUNNING",
-        ]
+        ended = [status(store, run) for run in (abandoned, elsewhere, mine)]
+    assert ended == ["KILLED", "RUNNING", "RUNNING"]
     assert not (store.folder / f"{mine.info.run_id}.lock").exists()
 
 
@@ -127,6 +116,10 @@ def test_a_child_knows_its_parent(store):
 
 def test_a_store_is_opened_again_with_its_files_and_read_while_it_is_written(settings, store):
     assert Store.open(settings).experiment == Store.existing(settings).experiment == store.experiment
+    tags = store.client.get_experiment(store.experiment).tags
+    assert tags["mlflow.experimentKind"] == "custom_model_development"
+    view = json.loads(tags["mlflow.sharedViewState.skin"])
+    assert "metrics.`same/overall/accuracy`" in view["selectedColumns"]
     with store.run("with a file", {}) as run:
         store.client.log_text(run.info.run_id, "hello", "note.txt")
     (found,) = (ROOT / settings.artifacts).glob("**/note.txt")
@@ -149,13 +142,6 @@ def test_processes_that_start_at_once_share_one_new_database(tmp_path):
     assert len({one.stdout for one in done}) == 1
 
 
-def test_the_experiment_has_the_tags_of_the_run_table(store):
-    tags = store.client.get_experiment(store.experiment).tags
-    assert tags["mlflow.experimentKind"] == "custom_model_development"
-    view = json.loads(tags["mlflow.sharedViewState.skin"])
-    assert "metrics.`same/overall/accuracy`" in view["selectedColumns"]
-
-
 def test_the_link_opens_the_runs_of_the_experiment(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     print_table_link("http://127.0.0.1:1")
@@ -169,7 +155,9 @@ def test_a_working_folder_may_have_any_name(name, tmp_path, monkeypatch):
     folder = tmp_path / name
     folder.mkdir()
     monkeypatch.chdir(folder)
-    store = Store.open(Tracking(None, None, "skin", True, None))
+    assert Store.existing(Tracking()).find("FINISHED", fingerprint="a") == []
+    assert not list(folder.iterdir())
+    store = Store.open(Tracking())
     with store.run("here", {}) as run:
         store.client.log_text(run.info.run_id, "text", "note.txt")
     assert FinishedRun(store, run).fetch("note.txt", str(tmp_path)).read_text() == "text"
@@ -177,24 +165,13 @@ def test_a_working_folder_may_have_any_name(name, tmp_path, monkeypatch):
     assert [path.name for path in tmp_path.iterdir() if path.is_dir()] == [name]
 
 
-def test_a_store_without_a_database_has_no_runs_and_makes_no_file(tmp_path):
-    store = Store.existing(Tracking(f"sqlite:///{tmp_path}/m.db", None, "skin", True, None))
-    assert store.find("FINISHED", fingerprint="a") == []
-    assert not list(tmp_path.iterdir())
-
-
 @pytest.mark.parametrize(
     "words",
-    [
-        ["evaluate", "run=latest"],
-        ["live", "run=none"],
-        ["export", "run=latest", "out=x.onnx"],
-        ["train", "simulator=fem", "body=arm", "layout=grid"],
-    ],
-    ids=lambda words: words[0],
-)
+    ["evaluate run=latest", "live run=none", "export run=latest out=x.onnx",
+     "train simulator=fem body=arm layout=grid"],
+)  # fmt: skip
 def test_a_refused_command_leaves_no_database(words, run, tmp_path):
-    done = run(tmp_path, *words, store=False)
+    done = run(tmp_path, *words.split(), store=False)
     assert done.returncode == 2, done.stderr
     assert not list(tmp_path.glob("mlflow.db*"))
 

@@ -10,8 +10,6 @@ from contextlib import closing
 import numpy as np
 import pytest
 
-pytestmark = pytest.mark.filterwarnings("ignore:The ``noload`` loader strategy")
-
 SKIN = ("layout=grid", "layout.rows=2", "layout.columns=2", "simulator=naive")
 MODEL = ("representation=readings", "model=mlp", "fusion=early", "trainer.max_epochs=8")
 SAFE = "evaluation.safe_gestures=100"
@@ -103,15 +101,8 @@ def found(run, tmp_path_factory):
             "evaluate", "run=default_skin", out, SKIN[3], *tests, "evaluation.profile=mild"
         )
         values["drawn"] = verbs.stored("evaluate", "run=any_skin", out, "device=simulated", *SKIN, *tests)
-        live = (
-            "live.py",
-            own,
-            "live.selftest=false",
-            "live.contacts=false",
-            "seconds=0.1",
-            "live.touch=0.3",
-            FEW,
-        )
+        still = ("live.selftest=false", "live.contacts=false", "seconds=0.1", "live.touch=0.3")
+        live = ("live.py", own, *still, FEW)
         values["live"] = verbs.per_touch(patch, *live)
         values["live profile"] = verbs.per_touch(patch, *live, ROUGH)
         values["live rate"] = verbs.per_touch(

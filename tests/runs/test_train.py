@@ -1,7 +1,6 @@
 """A run counts as finished only with all its results."""
 
 import re
-import sqlite3
 
 import pytest
 from hydra import compose, initialize_config_dir
@@ -11,39 +10,19 @@ from omegaconf import OmegaConf
 import skin.runs.train
 from skin.core.files import CONF, ROOT
 from skin.errors import InputError
-from skin.runs.configuration import (
-    Tracking,
-    name_run,
-    relevant_overrides,
-    settings_of,
-    tags,
-    validate_config,
-)
+from skin.runs.configuration import name_run, relevant_overrides, settings_of, tags, validate_config
 from skin.runs.store import Store
 
-# MLflow's own business with SQLAlchemy.
-pytestmark = pytest.mark.filterwarnings("ignore:The ``noload`` loader strategy")
-
 SMALL = (
-    "experiment=linked_graph",
-    "simulator=naive",
-    "data.gestures=64",
-    "trainer.max_epochs=1",
-    "device.test_gestures=32",
-    "evaluation.devices=1",
-    "evaluation.layouts=1",
-    "evaluation.safe_gestures=64",
-)
+    "experiment=linked_graph", "simulator=naive", "data.gestures=64", "trainer.max_epochs=1",
+    "device.test_gestures=32", "evaluation.devices=1", "evaluation.layouts=1", "evaluation.safe_gestures=64",
+)  # fmt: skip
 
 
 @pytest.fixture
 def config(configured, tmp_path):
     """Return a small training that logs to a folder of its own."""
-    return validate_config(
-        configured(
-            *SMALL, f"tracking.uri=sqlite:///{tmp_path}/runs.db", f"tracking.artifacts={tmp_path}/artifacts"
-        )
-    )
+    return configured(*SMALL, f"tracking.uri=sqlite:///{tmp_path}/m.db", f"tracking.artifacts={tmp_path}/a")
 
 
 def name_of(*changes):
@@ -73,21 +52,13 @@ def test_runs_of_other_settings_have_other_names():
 @pytest.mark.parametrize(
     ("chosen", "expected"),
     [
-        (
-            "model=cnn",
-            {
-                "optimizer.lr": "0.001",
-                "model.channels": "[8, 16]",
-                "fusion.hidden": "64",
-                "learner.dropout": "0.0",
-            },
-        ),
+        ("model=cnn", {"optimizer.lr": "0.001", "model.channels": "[8, 16]", "learner.dropout": "0.0"}),
         ("experiment=features", {"learner.rounds": "500", "learner.learning_rate": "0.1"}),
     ],
 )
-def test_settings_are_parameters_at_their_defaults(chosen, expected, configured, tmp_path):
-    store = Store.open(Tracking(f"sqlite:///{tmp_path}/m.db", str(tmp_path)))
-    config = validate_config(configured(chosen, "tracking.uri=http://me:geheim@h"))
+def test_settings_are_parameters_at_their_defaults(chosen, expected, configured, tmp_path, opened):
+    store = opened(tmp_path)
+    config = configured(chosen, "tracking.uri=http://me:geheim@h")
     with store.run("x", {}) as run:
         skin.runs.train.log_configuration(store, run.info.run_id, settings_of(config), "")
     params = store.client.get_run(run.info.run_id).data.params
@@ -145,46 +116,27 @@ def test_a_run_stays_open_until_its_results_are_logged(config, monkeypatch):
         assert all(f"`{part}`" in page for part in parts), name
 
 
-@pytest.mark.parametrize(
-    ("words", "name"),
-    [
-        (("simulator=solid", "data=fem"), "solid"),
-        (("simulator=naive",), "naive"),
-        (("device=recording",), "recording"),
-        (("device=serial",), "serial"),
-    ],
-)
-def test_a_run_is_found_by_its_simulator_or_else_its_device(configured, words, name):
-    assert tags(configured(*words))["simulator"] == name
-
-
-def test_no_threads_are_refused(configured):
-    with pytest.raises(InputError, match=r"tracking\.threads=0 must be at least 1, or null"):
-        configured("tracking.threads=0")
-
-
-def logged(folder):
+def logged(store):
     """Return (name, status, losses of validation by epoch) of every run that is no sweep, oldest first."""
-    with sqlite3.connect(folder / "m.db") as database:
-        if not database.execute("select name from sqlite_master where name = 'runs'").fetchall():
-            return []
-        found = database.execute(
-            "select name, status, (select group_concat(value) from metrics "
-            "where metrics.run_uuid = runs.run_uuid and key = 'val_loss') "
-            "from runs where name not like 'sweep%' order by start_time"
-        ).fetchall()
-    database.close()
-    return [(name, status, [float(loss) for loss in losses.split(",")]) for name, status, losses in found]
+    return [
+        (
+            run.info.run_name,
+            run.info.status,
+            [each.value for each in store.client.get_metric_history(run.info.run_id, "val_loss")],
+        )
+        for run in store.find()[::-1]
+        if "sweep" not in run.data.tags
+    ]
 
 
 @pytest.mark.slow("trains in two processes that import anew")
-def test_two_processes_make_one_run(run, tmp_path):
+def test_two_processes_make_one_run(run, tmp_path, opened):
     """The second one, which Lightning starts as the command again, neither logs nor prints."""
     given = [*SMALL, "data.gestures=80", "trainer.max_epochs=2"]  # 64 to train on: two equal parts
     two = ["trainer.devices=2", "trainer.strategy=ddp", "trainer.accelerator=cpu"]
     done = run(tmp_path, "train", *given, *two, apart=True)
     assert done.returncode == 0, done.stderr
-    ((name, status, losses),) = logged(tmp_path)
+    ((name, status, losses),) = logged(opened(tmp_path))
     assert status == "FINISHED"
     assert "strategy" not in name  # names tell what results depend on
     assert done.stdout.count("overall/accuracy") == 1
@@ -194,16 +146,16 @@ def test_two_processes_make_one_run(run, tmp_path):
     assert "did this before" in alone.stderr
     alone = run(tmp_path, "train", *given, "tracking.resume=false")
     assert alone.returncode == 0, alone.stderr
-    assert losses == pytest.approx(logged(tmp_path)[1][2], rel=1e-5)
+    assert losses == pytest.approx(logged(opened(tmp_path))[1][2], rel=1e-5)
     assert len(losses) == 2
 
 
 @pytest.mark.slow("trains in two processes that import anew")
-def test_a_sweep_trains_each_job_in_two_processes(run, tmp_path):
+def test_a_sweep_trains_each_job_in_two_processes(run, tmp_path, opened):
     two = ["trainer.devices=2", "trainer.strategy=ddp_spawn", f"hydra.sweep.dir={tmp_path}/out"]
     done = run(tmp_path, "train", "-m", *SMALL, "seed=0", *two, apart=True)
     assert done.returncode == 0, done.stderr
-    ((_, status, losses),) = logged(tmp_path)
+    ((_, status, losses),) = logged(opened(tmp_path))
     assert (status, len(losses)) == ("FINISHED", 1)
 
 
@@ -215,11 +167,11 @@ def test_a_sweep_trains_each_job_in_two_processes(run, tmp_path):
         (["-m", "trainer.strategy=ddp"], "add trainer.strategy=ddp_spawn"),
     ],
 )
-def test_processes_that_cannot_train_together_are_refused(run, tmp_path, given, said):
+def test_processes_that_cannot_train_together_are_refused(run, tmp_path, opened, given, said):
     done = run(
         tmp_path, "train", *given, *SMALL, "trainer.devices=2", f"hydra.sweep.dir={tmp_path}/out", apart=True
     )
     assert done.returncode in (1, 2)
     assert said in done.stderr
     assert "Traceback" not in done.stderr
-    assert not logged(tmp_path)
+    assert not logged(opened(tmp_path))

@@ -22,9 +22,6 @@ from skin.runs.configuration import Tracking, source_tags
 from skin.runs.store import Store
 from skin.runs.train import RunLogger, find_unfinished
 
-# MLflow's own business with SQLAlchemy.
-pytestmark = pytest.mark.filterwarnings("ignore:The ``noload`` loader strategy")
-
 TRAINING = (
     "train", "experiment=best_fresh", "simulator=naive", "data.gestures=400", "learner.dropout=0.2",
     "trainer.max_epochs=8", "device.test_gestures=48", "evaluation.devices=0", "evaluation.layouts=0",
@@ -32,23 +29,12 @@ TRAINING = (
 )  # fmt: skip
 
 
-def stored(folder):
-    settings = Tracking(f"sqlite:///{folder}/m.db", f"{folder}/a", "skin", True, None)
-    return settings, Store.open(settings)
-
-
-def learned(folder):
-    """Return the only finished run of a folder and its weights."""
-    _, store = stored(folder)
+def learned(store):
+    """Return the only finished run of a store, its weights, and its validation loss by step."""
     (run,) = store.find("FINISHED")
     path = store.client.download_artifacts(run.info.run_id, "weights.pt")
-    return run, torch.load(path, weights_only=True)
-
-
-def epochs(folder, run):
-    """Return the validation loss by step."""
-    _, store = stored(folder)
-    return {one.step: one.value for one in store.client.get_metric_history(run.info.run_id, "val_loss")}
+    history = store.client.get_metric_history(run.info.run_id, "val_loss")
+    return run, torch.load(path, weights_only=True), {each.step: each.value for each in history}
 
 
 def wait_for(epoch, folder, command, artifacts="a"):
@@ -63,7 +49,7 @@ def wait_for(epoch, folder, command, artifacts="a"):
 
 
 @pytest.mark.slow("trains three times")
-def test_a_killed_training_ends_with_the_weights_of_one_that_was_not(run, begin, tmp_path):
+def test_a_killed_training_ends_with_the_weights_of_one_that_was_not(run, begin, tmp_path, opened):
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     for folder in (whole, killed):
         folder.mkdir()
@@ -71,25 +57,27 @@ def test_a_killed_training_ends_with_the_weights_of_one_that_was_not(run, begin,
     own = [f"tracking.uri=sqlite:///{killed}/m.db", f"tracking.artifacts={killed}/a"]
     with begin(killed, *TRAINING, *own) as first:
         last = wait_for(2, killed, first)
-    _, store = stored(killed)
+    store = opened(killed)
     (left,) = store.find("KILLED")
     again = run(killed, *TRAINING)
     assert again.returncode == 0, again.stderr
     assert f"run {left.info.run_id} was interrupted and continues" in again.stderr
     assert not last.parent.exists()
-    (expected, weights), (found, same) = learned(whole), learned(killed)
+    (_, weights, losses), (found, same, repeated) = learned(opened(whole)), learned(store)
     assert found.info.run_id == left.info.run_id
-    assert epochs(killed, found) == epochs(whole, expected)
+    assert repeated == losses
     assert all(torch.equal(weights[name], same[name]) for name in weights)
     assert find_unfinished(store, found.data.tags["fingerprint"]) is None
 
 
 @pytest.mark.slow("trains several times")
-def test_other_code_and_resume_false_begin_again_and_a_complete_training_is_evaluated(run, begin, tmp_path):
+def test_other_code_and_resume_false_begin_again_and_a_complete_training_is_evaluated(
+    run, begin, tmp_path, opened
+):
     own = [f"tracking.uri=sqlite:///{tmp_path}/m.db", f"tracking.artifacts={tmp_path}/a"]
     with begin(tmp_path, *TRAINING, *own) as first:
         wait_for(7, tmp_path, first)
-    _, store = stored(tmp_path)
+    store = opened(tmp_path)
     (left,) = store.find("KILLED")
     identity, commit = left.data.tags["fingerprint"], left.data.tags["source_commit"]
     assert find_unfinished(store, "another") is None
@@ -98,9 +86,9 @@ def test_other_code_and_resume_false_begin_again_and_a_complete_training_is_eval
     store.client.set_tag(left.info.run_id, "source_commit", commit)
     again = run(tmp_path, *TRAINING)
     assert again.returncode == 0, again.stderr
-    found, _ = learned(tmp_path)
+    found, _, losses = learned(store)
     assert found.info.run_id == left.info.run_id
-    assert sorted(epochs(tmp_path, found)) == sorted(epochs(tmp_path, left))
+    assert sorted(losses) == [*range(8)]
     assert "same/overall/accuracy" in found.data.metrics
 
 
@@ -138,10 +126,11 @@ class Server:
 def on_server(server):
     """Return the only run of a server and the steps of its metrics."""
     with server:
-        store = Store.open(Tracking(server.uri, None, "skin", True, None))
+        store = Store.open(Tracking(server.uri))
         (run,) = store.find()
+        of = run.info.run_id
         history = {
-            name: [one.step for one in store.client.get_metric_history(run.info.run_id, name)]
+            name: [each.step for each in store.client.get_metric_history(of, name)]
             for name in ("train_loss", "val_loss")
         }
         files = {one.path for one in store.client.list_artifacts(run.info.run_id)}
@@ -197,7 +186,7 @@ def test_a_training_without_its_server_is_complete_when_repeated(begin, run, tmp
 
 
 @pytest.mark.slow("trains and waits for a killed process")
-def test_a_training_in_progress_is_refused_and_a_killed_one_is_not(run, begin, tmp_path):
+def test_a_training_in_progress_is_refused_and_a_killed_one_is_not(run, begin, tmp_path, opened):
     own = [f"tracking.uri=sqlite:///{tmp_path}/m.db", f"tracking.artifacts={tmp_path}/a"]
     with begin(tmp_path, *TRAINING, *own) as first:
         wait_for(0, tmp_path, first)
@@ -207,36 +196,35 @@ def test_a_training_in_progress_is_refused_and_a_killed_one_is_not(run, begin, t
         assert "Traceback" not in second.stderr
         first.kill()
         first.wait(60)
-    _, store = stored(tmp_path)
+    store = opened(tmp_path)
     (left,) = store.find()
     assert run(tmp_path, *TRAINING).returncode == 0
     (finished,) = store.find()
     assert (finished.info.run_id, finished.info.status) == (left.info.run_id, "FINISHED")
 
 
-def test_only_one_process_trains_a_configuration(tmp_path):
-    _, store = stored(tmp_path)
-    refused = pytest.raises(InputError, match="wait for it")
-    with store.hold("a"), store.hold("b"), refused, store.hold("a"):
+def test_only_one_process_trains_a_configuration(tmp_path, opened):
+    store = opened(tmp_path)
+    with store.hold("a"), store.hold("b"), pytest.raises(InputError, match="wait for it"), store.hold("a"):
         pass
     with store.hold("a"):
         pass
 
 
-def test_a_killed_run_of_another_machine_is_continued_where_its_folder_is_here(tmp_path):
-    settings, store = stored(tmp_path)
+def test_a_killed_run_of_another_machine_is_continued_where_its_folder_is_here(tmp_path, opened):
+    store = opened(tmp_path)
     run = store.create("killed", source_tags() | {"fingerprint": "a"})
     folder = store.folder / run.info.run_id
     folder.mkdir(parents=True)
     folder.with_name(f"{run.info.run_id}.lock").touch()
-    store = Store.open(settings)
+    store = opened(tmp_path)
     assert find_unfinished(store, "a") is None
     (folder / LAST).touch()
     assert find_unfinished(store, "a").info.run_id == run.info.run_id
 
 
-def test_metrics_that_a_server_did_not_take_are_sent_by_the_next_logger(tmp_path, monkeypatch):
-    _, store = stored(tmp_path)
+def test_metrics_that_a_server_did_not_take_are_sent_by_the_next_logger(tmp_path, monkeypatch, opened):
+    store = opened(tmp_path)
     run = store.create("a run", {})
     logger = RunLogger(store, run.info.run_id, tmp_path)
     with monkeypatch.context() as patch:
@@ -246,4 +234,4 @@ def test_metrics_that_a_server_did_not_take_are_sent_by_the_next_logger(tmp_path
     for _ in range(2):
         RunLogger(store, run.info.run_id, tmp_path)
     found = store.client.get_metric_history(run.info.run_id, "train_loss")
-    assert [(one.step, one.value) for one in found] == [(3, 0.5)]
+    assert [(each.step, each.value) for each in found] == [(3, 0.5)]

@@ -8,8 +8,7 @@ from experiments.studies.alarm_timing import dangerous_touches, play_touch
 from skin.core.files import CONF
 from skin.live.engine import DebounceSettings
 from skin.live.engine_builder import engine_settings
-from skin.runs.build import build_data, build_device, build_learner
-from skin.runs.torch_model import TorchModel
+from skin.runs.build import TorchModel, build_data, build_device, build_learner
 
 SMALL = ["simulator=naive", "layout=grid", "layout.rows=3", "layout.columns=3", "data.gestures=600"]
 LEARNERS = {

@@ -6,8 +6,7 @@ import pytest
 import torch
 from filelock import FileLock
 
-from skin.runs.build import build_data, build_device, build_learner
-from skin.runs.torch_model import TorchModel
+from skin.runs.build import TorchModel, build_data, build_device, build_learner
 
 SMALL = ["simulator=naive", "layout=grid", "layout.rows=2", "layout.columns=3", "data.gestures=96"]
 

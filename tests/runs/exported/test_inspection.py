@@ -17,8 +17,6 @@ from tests.damage import DAMAGED_FILES, damaged, mutated, opened
 
 onnx = pytest.importorskip("onnx")
 pytest.importorskip("onnxruntime")
-TensorProto, helper = onnx.TensorProto, onnx.helper
-
 ABOUT = ModelMetadata(
     "abc", "title", "1", ["a", "b"], "binary", None, False, 10.0, 3, [(0.0, 0.0, 0.0)] * 4, (0.1, 0.1),
     10.0, 0.5, 0.3, False, 3.0,
@@ -26,36 +24,21 @@ ABOUT = ModelMetadata(
 WINDOW = np.ones((1, 3, 4), np.float32), np.ones((1, 3, 4), bool)
 
 
-def constant(name, values, kind=TensorProto.INT64):
-    return helper.make_tensor(name, kind, [len(values)], values)
-
-
-def model(*nodes, constants=(), about=None):
-    """Return a model of the mean of the readings, with further operators before it, and a seal to fill."""
-    graph = helper.make_graph(
-        [
-            *nodes,
-            helper.make_node("Reshape", ["readings", "flat"], ["rows"]),
-            helper.make_node("MatMul", ["rows", "weights"], ["sums"]),
-            helper.make_node("Sigmoid", ["sums"], ["probabilities"]),
-        ],
-        "graph",
-        [
-            helper.make_tensor_value_info("readings", TensorProto.FLOAT, ["batch", 3, 4]),
-            helper.make_tensor_value_info("valid", TensorProto.BOOL, ["batch", 3, 4]),
-        ],
-        [helper.make_tensor_value_info("probabilities", TensorProto.FLOAT, ["batch", 2])],
-        [
-            constant("flat", [-1, 12]),
-            helper.make_tensor(
-                "weights", TensorProto.FLOAT, [12, 2], [0.01 * number for number in range(24)]
-            ),
-            *constants,
-        ],
+def model(nodes="", constants="", domains=""):
+    """Return a model of a sum of the readings, with further operators before it, and a seal to fill."""
+    weights = ", ".join(f"{0.01 * number:.2f}" for number in range(24))
+    made = onnx.parser.parse_model(
+        f"""
+        <ir_version: 10, opset_import: ["": 20{domains}]>
+        graph (float[batch,3,4] readings, bool[batch,3,4] valid) => (float[batch,2] probabilities)
+        <int64[2] flat = {{-1, 12}}, float[12,2] weights = {{{weights}}}{constants}> {{
+            {nodes}
+            rows = Reshape(readings, flat)
+            sums = MatMul(rows, weights)
+            probabilities = Sigmoid(sums)
+        }}"""
     )
-    made = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 20)], ir_version=10)
-    text = ABOUT.text() if about is None else about
-    helper.set_model_props(made, {checksum.KEY: checksum.BLANK, KEY: text})
+    onnx.helper.set_model_props(made, {checksum.KEY: checksum.BLANK, KEY: ABOUT.text()})
     return made
 
 
@@ -91,80 +74,44 @@ def test_every_description_works_or_is_refused(written, data):
     opened(lambda: ModelMetadata.parse({KEY: text}, "skin.onnx"))
 
 
-def loop(count):
-    """Return a loop that does nothing ``count`` times."""
-    body = helper.make_graph(
-        [helper.make_node("Identity", ["go"], ["going"])],
-        "body",
-        [
-            helper.make_tensor_value_info("round", TensorProto.INT64, []),
-            helper.make_tensor_value_info("go", TensorProto.BOOL, []),
-        ],
-        [helper.make_tensor_value_info("going", TensorProto.BOOL, [])],
-    )
-    return model(
-        helper.make_node("Loop", ["count", "yes"], [], body=body),
-        constants=[
-            helper.make_tensor("count", TensorProto.INT64, [], [count]),
-            helper.make_tensor("yes", TensorProto.BOOL, [], [True]),
-        ],
-    )
-
-
-def doubled(times):
-    """Return a tensor joined with itself again and again."""
-    nodes = [helper.make_node("Identity", ["weights"], ["joined0"])]
-    for number in range(times):
-        before, after = f"joined{number}", f"joined{number + 1}"
-        nodes.append(helper.make_node("Concat", [before, before], [after], axis=0))
-    return model(*nodes, helper.make_node("ReduceMax", [f"joined{times}"], ["probability"]))
+BODY = "<body = loop (int64 round, bool go) => (bool going) { going = Identity(go) }>"
+LOOP = (f"x = Loop {BODY} (count, yes)", f", int64 count = {{{1 << 60}}}, bool yes = {{1}}")
+JOINED = "joined0 = Identity(weights)\n" + "".join(
+    f"joined{number + 1} = Concat<axis = 0>(joined{number}, joined{number})\n" for number in range(60)
+)
+DEPENDENT = """largest = ReduceMax<keepdims = 0>(readings)
+    limit = Cast<to = 7>(largest)
+    numbers = Range(start, limit, step)"""
 
 
 def huge(size):
-    return model(
-        helper.make_node("ConstantOfShape", ["size"], ["huge"]), constants=[constant("size", [size])]
-    )
+    return model("huge = ConstantOfShape(size)", f", int64[1] size = {{{size}}}")
 
 
 def outside():
     """Return a model with weights in another file."""
     made = model()
-    (weights,) = [tensor for tensor in made.graph.initializer if tensor.name == "weights"]
+    weights = made.graph.initializer[1]
     weights.ClearField("float_data")
-    weights.data_location = TensorProto.EXTERNAL
+    weights.data_location = onnx.TensorProto.EXTERNAL
     weights.external_data.add(key="location", value="../../../../dev/zero")
     return made
-
-
-def dependent():
-    """Return a model whose need of memory depends on a reading."""
-    return model(
-        helper.make_node("ReduceMax", ["readings"], ["largest"], keepdims=0),
-        helper.make_node("Cast", ["largest"], ["limit"], to=TensorProto.INT64),
-        helper.make_node("Range", ["start", "limit", "step"], ["numbers"]),
-        constants=[
-            helper.make_tensor("start", TensorProto.INT64, [], [0]),
-            helper.make_tensor("step", TensorProto.INT64, [], [1]),
-        ],
-    )
 
 
 @pytest.mark.parametrize(
     ("made", "reason"),
     [
-        (lambda: loop(1 << 60), "it uses the operator Loop"),
-        (lambda: doubled(60), "ONNX Runtime cannot load"),
+        (lambda: model(*LOOP), "it uses the operator Loop"),
+        (lambda: model(f"{JOINED} probability = ReduceMax(joined60)"), "ONNX Runtime cannot load"),
         (lambda: huge(1 << 33), "ONNX Runtime cannot load"),
         (lambda: huge(1 << 60), "ONNX Runtime cannot load"),
         (outside, "it refers to other files"),
-        (dependent, "the size of what Range returns depends on readings"),
-        (
-            lambda: model(helper.make_node("Foreign", ["readings"], ["x"], domain="mine")),
-            "operator mine Foreign",
-        ),
-        (lambda: model(helper.make_node("Relu", ["missing"], ["x"])), "ONNX Runtime cannot load"),
+        (lambda: model(DEPENDENT, ", int64 start = {0}, int64 step = {1}"),
+         "the size of what Range returns depends on readings"),
+        (lambda: model("x = mine.Foreign(readings)", domains=', "mine": 1'), "operator mine Foreign"),
+        (lambda: model("x = Relu(missing)"), "ONNX Runtime cannot load"),
     ],
-)
+)  # fmt: skip
 def test_a_hostile_file_is_refused_soon(tmp_path, made, reason):
     path, start = write(made(), tmp_path / "skin.onnx"), monotonic()
     with pytest.raises(InputError, match=reason):
@@ -181,7 +128,6 @@ def test_what_is_no_file_is_refused(tmp_path):
 
 def test_outputs_that_are_no_probabilities_are_refused(tmp_path):
     made = model()
-    (weights,) = [tensor for tensor in made.graph.initializer if tensor.name == "weights"]
-    weights.float_data[0] = float("nan")
+    made.graph.initializer[1].float_data[0] = float("nan")
     with pytest.raises(InputError, match="does not give probabilities"):
         OnnxModel(write(made, tmp_path / "skin.onnx"))

@@ -223,9 +223,8 @@ def test_layered(law: Law) -> None:
         tolerance = 0.015 if depth >= 0.005 else 0.05
         law.compare(case, ours[radius, sensor, beside], exact[radius, beside], tolerance, errors.max())
     law.remarks.append(
-        "the largest error of each skin, at the sensor and up to 16 mm beside, as a share of the reading "
-        "above it; sensors less deep than a cell is long, 5 mm, err by up to 5 %, because the moments of "
-        "cells do not know the edge of a disc exactly"
+        "the largest error up to 16 mm beside the sensor, of the reading above it; sensors less deep than a "
+        "cell, 5 mm, err by up to 5 %"
     )
 
 
@@ -398,7 +397,7 @@ def test_punch(law: Law) -> None:
 def _mesh_errors(count: int, law: Law) -> str:
     """Return a remark with the errors on one mesh."""
     errors = (f"{100 * (each['ours'] / each['reference'] - 1):+.1f} %" for each in law.findings)
-    return f"with {count} cells over 10 mm: {', '.join(errors)}"
+    return f"{count} cells over 10 mm: {', '.join(errors)}"
 
 
 @cache  # sphere and punches share their blocks

@@ -118,26 +118,24 @@ def publish_study(study: Study, title: str, trials: pd.DataFrame, path: Path) ->
     return publish_page(Page("", shown, data, figure), title, path)
 
 
-def publish_measured(
-    study: Study, measured: Sequence[tuple[Mapping[str, Any], Page]], path: Path
-) -> list[Path]:
+def publish_measured(study: Study, trials: pd.DataFrame, path: Path) -> list[Path]:
     """Write the tables of a measure: of several runs a CSV file, each line behind its trial.
 
     Args:
         study: whose tables they are.
-        measured: row of the trials, and page.
+        trials: with the ``page`` of each.
         path: without an ending.
     """
-    pages = [page for _, page in measured]
-    if len(pages) < (2 if study.has_runs else 1):
+    trials = trials[[isinstance(page, Page) and not page.data.empty for page in trials.page]]
+    if len(trials) < (2 if study.has_runs else 1):
         return []
+    rows = pd.concat([page.data for page in trials.page], keys=range(len(trials)))
     if study.has_runs:
-        keys = [pd.DataFrame([{name: row[name] for name in identity(study)}]) for row, _ in measured]
-        data = [key.merge(page.data, how="cross") for key, page in zip(keys, pages, strict=True)]
-        return [write_csv(pd.concat(data), path.with_name(f"{path.name}.csv"))]
-    rows = pd.concat([page.data for page in pages])
-    about = "\n".join(page.about for page in pages if page.about)
-    figure = next((page.figure for page in pages if page.figure), None)
+        keys = trials[identity(study)].set_axis(range(len(trials)))
+        joined = keys.loc[rows.index.get_level_values(0)].set_axis(rows.index)
+        return [write_csv(pd.concat([joined, rows], axis=1), path.with_name(f"{path.name}.csv"))]
+    about = "\n".join(page.about for page in trials.page if page.about)
+    figure = next((page.figure for page in trials.page if page.figure), None)
     tables = {} if len(rows) < 2 else {"Measured": rows.astype(str)}
     return publish_page(Page(about, tables, rows, figure), f"{study.name}: {study.about}", path)
 
@@ -207,7 +205,7 @@ def differences_table(study: Study, trials: pd.DataFrame) -> pd.DataFrame:
     unit, lines = UNITS.get(study.metrics[0], "points"), []
     for variant, condition, compared, verdict in differences(study, trials) if study.differences else ():
         count = str(compared.seeds if compared else 0)
-        lines.append([variant, condition, _figure(compared, unit), count, verdict])
+        lines.append([variant, condition, figure_text(compared, unit), count, verdict])
     return pd.DataFrame(lines, columns=["variant", "condition", "difference", "n", "verdict"])
 
 
@@ -224,7 +222,7 @@ def comparison_text(conclusion: Conclusion) -> str:
     """Return every comparison of a statement: the mean over paired seeds ± margin."""
     statement, several = conclusion.statement, len(conclusion.compared) > 1
     unit = "times" if statement.ratio else UNITS.get(statement.metric, "points")
-    texts = {name: _figure(comparison, unit) for name, comparison in conclusion.compared.items()}
+    texts = {name: figure_text(comparison, unit) for name, comparison in conclusion.compared.items()}
     return "; ".join(text + f" ({name})" if several else text for name, text in texts.items())
 
 
@@ -249,7 +247,8 @@ def _cell(trials: pd.DataFrame, metric: str, reference: Reference | None = None)
     return f"{mean:.{digits}f}" + (f" ± {margin:.{digits}f}" if several else "") + brackets
 
 
-def _figure(compared: Estimate | None, unit: str) -> str:
+def figure_text(compared: Estimate | None, unit: str) -> str:
+    """Return a comparison with its margin and unit."""
     if compared is None:
         return "no paired runs"
     sign, digits = ("" if unit == "times" else "+"), (2 if unit in ("s", "times") else 1)

@@ -23,7 +23,7 @@ SMALL = ["simulator=naive", "data.gestures=160", "device.test_gestures=64", "eva
 PARTS = [
     "results.parts.table=[['train -m experiment=rules seed=0,1,2,3', 1], "
     "['study study=table study.rows=[rules] study.seeds=[0,1,2,3]', 1]]",
-    "results.parts.studies=[['study study=ensemble study.rows=[rules] study.seeds=[0,1] "
+    "results.parts.studies=[['study study=models study.part=ensemble study.rows=[rules] study.seeds=[0,1] "
     "study.train=false', 1]]",
     "results.parts.table_solid=[]",
     "results.parts.best_fresh_solid=[]",
@@ -74,7 +74,7 @@ def test_a_killed_command_goes_on_where_it_was(run, begin, tmp_path):
 @pytest.mark.slow("trains several rows")
 def test_a_command_that_fails_does_not_stop_the_others(run, tmp_path):
     lines = "['study study=nope', 1], "
-    lines += "['study study=ensemble study.rows=[rules] study.train=false', 1]"
+    lines += "['study study=models study.part=ensemble study.rows=[rules] study.train=false', 1]"
     words = [f"results.parts.studies=[{lines}]", "results.part=studies"]
     done = run(tmp_path, "results", *PARTS, *words, *SMALL)
     assert done.returncode == 1

@@ -60,7 +60,7 @@ def folder(tmp_path_factory, configured):
 @pytest.mark.slow("composes nine runs twice and draws their page")
 def test_finished_runs_are_found_and_judged(run, folder):
     done = run(
-        folder, "study", "study=graphs", "study.part=activation", "study.seeds=[0,1,2]", f"out={folder}/r"
+        folder, "study", "study=models", "study.part=activation", "study.seeds=[0,1,2]", f"out={folder}/r"
     )
     assert done.returncode == 0, done.stderr
     assert "…" not in done.stdout, "nothing was to be trained"
@@ -76,8 +76,7 @@ def test_finished_runs_are_found_and_judged(run, folder):
     [
         ((), "which study"),
         (["study=margin"], "margins"),
-        (["study=layouts", "study.statements.0.maximum=few"], "study.statements[0].maximum=few"),
-        (["study=graphs", "study.statements=[{id: a, says: b}]"], "study.statements[0]"),
+        (["study=models", "study.statements=[{id: a, says: b}]"], "study.statements[0]"),
     ],
 )
 def test_bad_input_ends_with_code_2_and_imports_nothing_heavy(arguments, named, light, tmp_path):
@@ -91,7 +90,7 @@ def test_bad_input_ends_with_code_2_and_imports_nothing_heavy(arguments, named, 
 def test_what_is_missing_is_trained_and_what_failed_is_told(run, tmp_path):
     # graph convolutions know this pooling, the transformer does not
     few = ["smoke=true", "study.seeds=[0]", "simulator=naive", "+model.pooling=attention", "out=r"]
-    done = run(tmp_path, "study", "study=graphs", "study.part=transformer", *few)
+    done = run(tmp_path, "study", "study=models", "study.part=transformer", *few)
     assert done.returncode == 1, done.stderr
     assert done.stdout.count("took") == 1
     assert all(
@@ -214,7 +213,7 @@ def test_a_run_is_probed_beside_graph_embeddings(run, trained):
 def test_every_simulator_against_every_other(run, tmp_path):
     skin = ["body.cells=[8,8]", "layout=grid", "layout.rows=3", "layout.columns=3", "touch.redraws=100",
             "touch.small_area=[0.1,0.3]", "study.rows=[rules]", "study.seeds=[0]", "out=r"]  # fmt: skip
-    done = run(tmp_path, "study", "study=crosscheck", *skin, *SMALL)
+    done = run(tmp_path, "study", "study=mechanics", "study.part=crosscheck", *skin, *SMALL)
     assert done.returncode == 0, done.stderr
     found = lines(tmp_path / "r" / "study_crosscheck.csv")
     names = ["naive", "fem, equation 10", "fem, interface", "solid"]
@@ -226,7 +225,7 @@ def test_every_simulator_against_every_other(run, tmp_path):
 @pytest.mark.slow("trains several rows")
 def test_skins_of_one_study_feel_the_same_touches(run, tmp_path):
     few = ["study.seeds=[0]", "study.rows=[features]", "body.cells=[8,8]", "+simulator.divisions=1"]
-    done = run(tmp_path, "study", "study=direction", *few, *SMALL)
+    done = run(tmp_path, "study", "study=mechanics", "study.part=direction", *few, *SMALL)
     assert done.returncode == 0, done.stderr
     found = lines(tmp_path / "results" / "study_direction.csv")
     assert [line["variant"] for line in found] == [
@@ -238,14 +237,20 @@ def test_skins_of_one_study_feel_the_same_touches(run, tmp_path):
     with closing(sqlite3.connect(tmp_path / "m.db")) as store:
         hashes = store.execute("select distinct value from tags where key = 'data_hash'").fetchall()
     assert len(hashes) == 3
-    again = run(tmp_path, "study", "study=direction", *few, *SMALL)
+    again = run(tmp_path, "study", "study=mechanics", "study.part=direction", *few, *SMALL)
     assert again.returncode == 0, again.stderr
     assert "took" not in again.stdout
 
 
 @pytest.mark.slow("evaluates trained rows")
 def test_rows_decide_together(run, trained):
-    words = ["study=ensemble", "study.rows=[rules,temporal_graph]", "study.seeds=[0]", "trainer.max_epochs=1"]
+    words = [
+        "study=models",
+        "study.part=ensemble",
+        "study.rows=[rules,temporal_graph]",
+        "study.seeds=[0]",
+        "trainer.max_epochs=1",
+    ]
     done = run(trained, "study", *words, *NAIVE, "out=ensemble")
     assert done.returncode == 0, done.stderr
     found = {line["variant"]: line for line in lines(trained / "ensemble" / "study_ensemble.csv")}
@@ -291,7 +296,14 @@ def test_a_row_that_cannot_take_a_skin_is_named_so_also_where_thresholds_are_cho
 
 @pytest.mark.slow("evaluates trained rows")
 def test_a_multirun_of_studies_is_no_run_itself(run, trained):
-    few = ["study=ensemble", "study.train=false", "study.seeds=[0]", "study.rows=[rules]", "out=one,two"]
+    few = [
+        "study=models",
+        "study.part=ensemble",
+        "study.train=false",
+        "study.seeds=[0]",
+        "study.rows=[rules]",
+        "out=one,two",
+    ]
     before = runs(trained)
     done = run(trained, "study", "-m", *few, *NAIVE)
     assert done.returncode == 0, done.stderr

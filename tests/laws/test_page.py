@@ -42,8 +42,8 @@ def test_a_miss_is_written_as_one(tmp_path, error):
     assert [miss.split(":")[0] for miss in law.misses()] == ["this"]
     publish_laws([record(law)], tmp_path)
     text = (tmp_path / "physics.md").read_text()
-    assert f"| [gravity](#gravity) | an apple | {error:.2g} | 0.1 | **fails** |" in text
-    assert f"\n## gravity\n\nThings fall.\n\n- **missed**: this, error {error:.2g}\n- a remark\n" in text
+    assert f"| gravity | Things fall. | an apple | {error:.2g} | 0.1 | **fails** |" in text
+    assert f"\n- gravity, **missed**: this, error {error:.2g}\n- gravity: a remark\n" in text
     assert "that, error" not in text
     table = (tmp_path / "results/physics/physics.csv").read_text().splitlines()
     assert table[1:] == [f"gravity,this,1.2,1,{error:.2g},0.1,no", "gravity,that,1,1,< 1e-06,0.1,yes"]
@@ -78,8 +78,7 @@ def test_the_page_in_the_docs_has_every_law_and_its_pictures():
     names = {name.removeprefix("test_") for name in vars(laws) if name.startswith("test_")}
     for name in names:
         statement, _, source = getattr(laws, f"test_{name}").__doc__.partition("\n\n    Reference: ")
-        assert f"\n## {name}\n\n{' '.join(statement.split())}\n" in text
-        assert f"| [{name}](#{name}) | {source.strip().removesuffix('.')} | " in text
+        assert f"\n| {name} | {' '.join(statement.split())} | {source.strip().removesuffix('.')} | " in text
     for picture in re.findall(r"\((results/physics/[^)]+)\)", text):
         assert (ROOT / "docs" / picture).is_file()
     assert "missed" not in text
@@ -102,7 +101,7 @@ def test_chosen_laws_are_written_where_they_should_be(tmp_path):
     done = subprocess.run([sys.executable, *words], cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout
     text = (tmp_path / "physics.md").read_text()
-    assert re.findall("^## (.*)", text, re.MULTILINE) == ["confined", "locking", "Limits"]
+    assert re.findall(r"^\| (\w+) \| [A-Z]", text, re.MULTILINE) == ["confined", "locking"]
     assert (tmp_path / "results/physics/locking.png").is_file()
 
 

@@ -100,7 +100,6 @@ def test_bounds_are_published_in_a_folder_of_their_own(run, tmp_path):
             "image_representation",
         ),
         (["results.parts.table=[[study, 0]]"], "results.parts="),
-        (["results.optional=[image]"], "results.optional=['image']: there is no part image"),
         (["results.jobs=0"], "results.jobs"),
     ],
 )

@@ -109,3 +109,12 @@ def test_a_worker_that_dies_is_reported(fitted, data):
 def test_unfitted_it_predicts_nothing(data):
     with pytest.raises(RuntimeError, match="fit or load"):
         Rocket().probabilities(data.touches("test"))
+
+
+def test_a_channel_is_a_sensor_and_what_is_not_valid_is_0():
+    readings = torch.randn(2, 10, 4, generator=torch.Generator().manual_seed(0))
+    valid = torch.ones_like(readings, dtype=torch.bool)
+    valid[..., 0] = False
+    found = Rocket().inputs(Touches(readings, valid, torch.zeros(4, 3), None, 10.0))
+    assert torch.equal(found[:, 1:], readings[..., 1:].mT)
+    assert not found[:, 0].any()

@@ -5,34 +5,27 @@
 
 The test ``test_hertz`` checks the law ``hertz``. Its docstring is the law and, behind "Reference:", the
 source of the independent solution. ``--full`` solves finer meshes and more cases, with the same tolerances.
-``--page`` writes physics.md, its numbers and its pictures into a folder.
+``--page`` writes physics.md and its numbers into a folder.
 """
 
 import math
 from collections.abc import Generator, Mapping, Sequence
 from dataclasses import dataclass, field
 from inspect import getdoc
-from itertools import cycle
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pandas as pd
 import pytest
-from matplotlib.figure import Figure
 
 from experiments.studies.pages import write_csv
 from skin.core.files import write
-from skin.plot.figures import MARKS, save_figure
 
 RECORD = "law"
 """Name of the property of a report with the record of its law."""
 
-PICTURES = "results/physics"
-"""Folder of the numbers and the pictures, in that of the page."""
-
-Line = tuple[str, Sequence[float] | np.ndarray, Sequence[float] | np.ndarray, str]
-"""Label, x, y, and ``-`` for a line or ``o`` for points."""
+NUMBERS = "results/physics/physics.csv"
+"""File of all numbers, in the folder of the page."""
 
 
 @dataclass
@@ -42,18 +35,14 @@ class Law:
     Attributes:
         full: whether to solve the meshes and cases that are published; else a few coarse ones.
         name: of the law.
-        pictures: folder of the pictures; None: none are drawn.
         findings: case, our number, the reference, the error and its tolerance, of each comparison.
         remarks: for the page.
-        titles: of the pictures, by the names of their files.
     """
 
     full: bool
     name: str
-    pictures: Path | None = None
     findings: list[dict[str, Any]] = field(default_factory=list)
     remarks: list[str] = field(default_factory=list)
-    titles: dict[str, str] = field(default_factory=dict)
 
     def compare(
         self, case: str, ours: float, reference: float, tolerance: float, error: float | None = None
@@ -77,20 +66,6 @@ class Law:
         ok = "yes" if error <= tolerance else "no"  # one that is not finite is beyond
         self.findings.append({"case": case, **finding, "text": text, "excess": excess, "ok": ok})
 
-    def draw(self, name: str, title: str, x: str, y: str, lines: Sequence[Line], log: bool = False) -> None:
-        """Draw lines with these labels of the axes, which may be logarithmic, as a PNG file of some name."""
-        self.titles[name] = title
-        if self.pictures is None:
-            return
-        figure, scale = Figure(figsize=(5.6, 3.4), layout="constrained"), "log" if log else "linear"
-        axes = figure.add_subplot(xlabel=x, ylabel=y, title=title, xscale=scale, yscale=scale)
-        styles = zip(lines, cycle(MARKS), cycle(("-", "--", "-.", ":")), strict=False)
-        for (label, across, up, kind), mark, dashes in styles:
-            axes.plot(across, up, mark if kind == "o" else dashes, label=label, ms=3.5, lw=1.2)
-        axes.grid(alpha=0.3)
-        axes.legend(fontsize=8)
-        save_figure(figure, self.pictures / f"{name}.png")
-
     def misses(self) -> list[str]:
         """Return each comparison whose error is beyond its tolerance, or not finite, in words."""
         return [
@@ -110,9 +85,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 @pytest.fixture
 def law(request: pytest.FixtureRequest) -> Law:
     """Return what the test records."""
-    page = request.config.getoption("page")
-    name = request.node.name.removeprefix("test_")
-    return Law(request.config.getoption("full"), name, page and page / PICTURES)
+    return Law(request.config.getoption("full"), request.node.name.removeprefix("test_"))
 
 
 @pytest.hookimpl(wrapper=True)
@@ -122,7 +95,7 @@ def pytest_runtest_call(item: pytest.Function) -> Generator[None, None, None]:
     law: Any = item.funcargs["law"]
     statement, _, source = " ".join((getdoc(item.function) or "").split()).partition(" Reference: ")
     words = {"law": law.name, "statement": statement, "source": source.removesuffix(".")}
-    record = words | {"findings": law.findings, "remarks": law.remarks, "titles": law.titles}
+    record = words | {"findings": law.findings, "remarks": law.remarks}
     item.user_properties.append((RECORD, record))
     assert law.findings, "nothing was compared"
     assert not law.misses(), "\n".join(law.misses())
@@ -141,7 +114,7 @@ def pytest_terminal_summary(terminalreporter: Any, config: pytest.Config) -> Non
 
 
 Record = Mapping[str, Any]
-"""Name, statement, source, findings, remarks and titles of pictures of a law."""
+"""Name, statement, source, findings and remarks of a law."""
 
 _PAGE = """# Physics, verified
 
@@ -154,7 +127,6 @@ PyNite.
 |---|---|---|---|---|---|
 {lines}
 {notes}
-{pictures}
 ## Limits
 
 - Only the linear theory is verified; most default gestures strain the skin beyond its
@@ -169,7 +141,7 @@ PyNite.
 
 
 def publish_laws(records: Sequence[Record], folder: Path) -> None:
-    """Write physics.md, and the numbers of all laws beside the pictures, each file whole.
+    """Write physics.md, and the numbers of all laws, each file whole.
 
     The texts of the numbers have digits that do not depend on the processor.
     """
@@ -180,15 +152,13 @@ def publish_laws(records: Sequence[Record], folder: Path) -> None:
     texts["ours"] = texts["ours"].where(findings.reference != 0, findings.text)
     texts |= {"error": findings.text, "tolerance": findings.tolerance.map("{:.2g}".format)}
     table = findings.assign(**texts)
-    write_csv(table.drop(columns=["text", "excess"]), folder / PICTURES / "physics.csv")
-    lines, notes, pictures = list[str](), list[str](), list[str]()
+    write_csv(table.drop(columns=["text", "excess"]), folder / NUMBERS)
+    lines, notes = list[str](), list[str]()
     for record, (name, law) in zip(records, table.groupby("law", sort=False), strict=True):
         worst, missed = law.loc[law.excess.idxmax()], law[law.ok == "no"].itertuples()
         notes += [f"- {name}, **missed**: {finding.case}, error {finding.error}\n" for finding in missed]
         notes += [f"- {name}: {remark}\n" for remark in record["remarks"]]
-        pictures += [f"![{title}]({PICTURES}/{file}.png)\n" for file, title in record["titles"].items()]
         verdict = "holds" if (law.ok == "yes").all() else "**fails**"
         cells = name, record["statement"], record["source"], worst.error, worst.tolerance, verdict
         lines.append(f"| {' | '.join(cells)} |\n")
-    parts = {"lines": lines, "notes": notes, "pictures": pictures}
-    write(_PAGE.format(**{key: "".join(part) for key, part in parts.items()}), folder / "physics.md")
+    write(_PAGE.format(lines="".join(lines), notes="".join(notes)), folder / "physics.md")

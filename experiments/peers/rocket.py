@@ -101,10 +101,7 @@ class Rocket(AbstractLearner):
             raise ValueError(f"it was trained on {labels} labels, not {', '.join(data.task.names)}")
 
     def _array(self, touches: Touches) -> np.ndarray:
-        """Return all inputs, computed in parts to save memory."""
-        local, part = touches.to("cpu"), 8192
-        parts = [self.inputs(local[start : start + part]) for start in range(0, len(local), part)]
-        return torch.cat(parts).to(torch.float32).numpy()
+        return self.inputs(touches.to("cpu")).to(torch.float32).numpy()
 
     def _begin(self) -> None:
         """Start the process with the settings of the model."""

@@ -107,7 +107,8 @@ def compare_samples(
 
 
 def _pair(left: pd.Series, right: pd.Series, ratio: bool) -> pd.Series:
-    return (left / right if ratio else left - right).dropna()
+    first, second = left.align(right, join="inner")
+    return first / second if ratio else first - second
 
 
 def _unpaired(left: pd.Series | np.ndarray, right: pd.Series | np.ndarray, ratio: bool) -> np.ndarray:

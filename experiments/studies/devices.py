@@ -31,6 +31,7 @@ from skin.evaluation.touch_scores import touch_scores
 from skin.live.engine import DebounceSettings, Engine
 from skin.live.engine_builder import engine_settings
 from skin.plot.figures import COLOURS
+from skin.runs.torch_model import load_model
 from skin.touch.labels import TOUCH
 from skin.touch.shapes import Shapes
 from skin.wire.channels import UnitConversion
@@ -115,7 +116,9 @@ class Holds:
     drift: Annotated[float, Ge(0)] = 0.2
 
     def __call__(self, subject: Subject) -> pd.DataFrame:
-        model, rows = subject.reloaded, []
+        trained, rows = subject.trained.run, list[dict[str, Any]]()
+        assert trained is not None
+        model = load_model(trained, subject.config)
         debounce = DebounceSettings(above=model.threshold)
         engine = engine_settings(model, debounce, self.touch, self.drift).build()
         device = model.device.simulated("held touches are simulated").replace(stream=False)
@@ -207,7 +210,8 @@ def play_touch(
     conversion = UnitConversion(np.ones(len(dead)), constants.offset.double().numpy(), dead)
     segment = next(_SEGMENTS)
     time = time + 1e4 * segment  # longer than any course: the time of an engine never goes back
-    begin, *_, end = time[true.any(axis=1)]
+    touched = time[true.any(axis=1)]
+    begin, end = touched[0], touched[-1]  # which are one frame, in a short tap
     engine.reset()
     rows = enumerate(zip(time.tolist(), measured, strict=True))
     frames = (conversion.convert(Frame(number, t, t, row, ~dead, segment)) for number, (t, row) in rows)
@@ -236,15 +240,14 @@ def make_skin(subject: Subject, seed: int | None = None, **settings: Any) -> Sim
     """Return the nominal device, or with a seed one that differs in positions, moduli and gains."""
     body = instantiate(subject.config.body)
     if seed is not None:
-        draw = np.random.default_rng([seed, 1])
-        softness = [draw.uniform(0.8, 1.2) for _ in body.layers]
+        softness = np.random.default_rng([seed, 1]).uniform(0.8, 1.2, len(body.layers)).tolist()
         layers = tuple(
             replace(layer, material=replace(layer.material, young=layer.material.young * factor))
             for layer, factor in zip(body.layers, softness, strict=True)
         )
         body = replace(body, layers=layers)
-        errors: dict[str, Any] = {"gain_spread": 0.3, "noise": 0.1, "dead": 1, "position_error": 0.002}
-        settings = {"seed": seed} | errors | settings
+        errors = {"seed": seed, "gain_spread": 0.3, "noise": 0.1, "dead": 1, "position_error": 0.002}
+        settings = errors | settings
     layout, simulator = instantiate(subject.config.layout), instantiate(subject.config.simulator)
     return Simulated(body=body, layout=layout, simulator=simulator, **settings)
 

@@ -37,7 +37,7 @@ from skin.learning.graph import neighbours
 from skin.learning.learner import AbstractLearner
 from skin.runs.build import build_device
 from skin.runs.configuration import Config
-from skin.runs.torch_model import TorchModel, alarm_source, load_model, load_run
+from skin.runs.torch_model import TorchModel, alarm_source, load_run
 from skin.touch.labels import TOUCH
 
 
@@ -77,12 +77,6 @@ class Subject:
     def learner(self) -> AbstractLearner:
         """What the run learned."""
         return self.trained.learner
-
-    @property
-    def reloaded(self) -> TorchModel:
-        """What the run learned, with the device of the condition."""
-        assert self.trained.run is not None
-        return load_model(self.trained.run, self.config)
 
     def load(self, name: str) -> Any:
         """Return a finished run, pretrained model or exported one for the skin of the configuration."""

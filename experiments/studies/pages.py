@@ -318,7 +318,8 @@ def _strips(study: Study, trials: pd.DataFrame) -> Figure:
     lines = variants if shared else [", ".join(filter(None, key)) for key, _ in groups]
     height = 0.1 * max(len(conditions), 3) if shared else 0.3
     figure = Figure(figsize=(8, 1.2 + height * len(lines)), layout="constrained")
-    axis = figure.subplots()
+    across = f"{_label(metric)}: each run, mean and 95 % interval"
+    axis = figure.add_subplot(ylim=(len(lines) - 0.5, -0.5), xlabel=across)
     for number, ((variant, condition), group) in enumerate(groups):
         if values(group, metric).empty:
             continue
@@ -330,12 +331,10 @@ def _strips(study: Study, trials: pd.DataFrame) -> Figure:
         figures = (1 if metric in UNITS else 100) * group[metric].dropna()
         axis.plot(figures, [height] * len(figures), marker, color=colour, alpha=0.35, ms=4)
         label = condition or "no condition"
-        label = f"_{label}" if label in axis.get_legend_handles_labels()[1] else label  # not in the legend
-        axis.errorbar(mean, height, xerr=margin, fmt=marker if shared else "|", label=label,
+        known = label in axis.get_legend_handles_labels()[1]
+        axis.errorbar(mean, height, xerr=margin, fmt=marker if shared else "|", label="_" * known + label,
                       color=colour if shared else "black", ms=4 if shared else 10, capsize=2)  # fmt: skip
     axis.set_yticks(range(len(lines)), lines, fontsize=8)
-    axis.set_ylim(len(lines) - 0.5, -0.5)
-    axis.set_xlabel(f"{_label(metric)}: each run, mean and 95 % interval")
     axis.set_title(study.about, fontsize=9, wrap=True)
     if shared:
         figure.legend(loc="outside right center", fontsize=7)

@@ -38,9 +38,7 @@ def reproduce_page() -> str:
         parts.append(f"\n## {section['title']}\n\n| statement | command | outcome |\n|---|---|---|\n")
         for name in section["studies"]:
             parts += _study_lines(*studies[name])
-        parts += [
-            _line(*(_stated(line) if "outcome" in line else _tested(line))) for line in section["statements"]
-        ]
+        parts += map(_other_line, section["statements"])
     return "".join(parts)
 
 
@@ -83,33 +81,25 @@ def _study_lines(command: str, study: Study) -> Iterator[str]:
         yield _line(f"{len(study.statements)} on the {study.about}", f"`{command}`", "*not tested*")
         return
     for number, statement in enumerate(study.statements):
-        yield _line(_says(statement), "" if number else f"`{command}`", _outcome(statement, trials))
+        yield _tested(statement, "" if number else f"`{command}`", trials)
 
 
-def _tested(settings: dict[str, Any]) -> tuple[str, str, str]:
-    """Return the cells of a statement that is tested on a published file."""
+def _other_line(settings: dict[str, Any]) -> str:
+    """Return the line of a statement without a study: it states its outcome, or a published file tests it."""
+    if "outcome" in settings:
+        command = settings.get("command", "")
+        quoted = f"`{command}`" if command and not command.startswith("[") else command
+        return _line(settings["says"], quoted, settings["outcome"])
     name = settings.pop("results")
     statement = configured(Statement, {"id": ""} | settings, "statement")
-    link = f"[values](results/study_{name}.csv)"
-    return _says(statement), link, _outcome(statement, published_trials(name))
+    return _tested(statement, f"[values](results/study_{name}.csv)", published_trials(name))
 
 
-def _stated(line: Mapping[str, str]) -> tuple[str, str, str]:
-    command = line.get("command", "")
-    return (
-        line["says"],
-        f"`{command}`" if command and not command.startswith("[") else command,
-        line["outcome"],
-    )
-
-
-def _says(statement: Statement) -> str:
-    return statement.says + (f" ({statement.section})" if statement.section else "")
-
-
-def _outcome(statement: Statement, trials: pd.DataFrame) -> str:
+def _tested(statement: Statement, command: str, trials: pd.DataFrame) -> str:
+    """Return the line of a statement that trials decide."""
+    says = statement.says + (f" ({statement.section})" if statement.section else "")
     result = conclude(statement, trials)
-    return f"{comparison_text(result).replace(' points', '')}: *{result.verdict}*"
+    return _line(says, command, f"{comparison_text(result).replace(' points', '')}: *{result.verdict}*")
 
 
 def _line(*cells: str) -> str:

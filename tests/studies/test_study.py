@@ -22,11 +22,14 @@ LABELS = ("overall", "big", "dynamic", "press", "dangerous")
 KINDS = ("accuracy", "balanced_accuracy", "ece", "alarm_recall", "false_alarm_rate", "degrees")
 SENSORS = "study=sensors", "study.part=sensors_other", "study.seeds=[0]"
 SHARES = ("0-0.2", "0.2-0.4", "0.4-0.6", "0.6-0.8", "0.8-1", "whole")
-STREAMS = {f"share/{fraction}/overall/accuracy" for fraction in SHARES} | {
-    f"gate/{gate}/accuracy" for gate in ("threshold", "learned")
-}
-OTHER = {"train_accuracy", "seconds_per_epoch", "parameters", "same/any/disagreement"} | STREAMS
-OTHER |= {"same/place/rms_mm", "same/force/rms_N", "same/overall/r2"}
+KNOWN = {
+    *(f"{column}/{label}/{kind}" for column in ("same", "holdout", "device_shift", "unseen_layout")
+      for label in (*LABELS, "direction") for kind in KINDS),
+    *(f"share/{fraction}/overall/accuracy" for fraction in SHARES),
+    *(f"train_accuracy_{label}" for label in LABELS), "gate/threshold/accuracy", "gate/learned/accuracy",
+    "train_accuracy", "seconds_per_epoch", "parameters", "same/any/disagreement", "same/place/rms_mm",
+    "same/force/rms_N", "same/overall/r2",
+}  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -74,12 +77,9 @@ def test_a_study_composes_and_says_what_it_is_about(composed, name, part):
     assert len(set(prints)) == len(every)
     if study.differences is None and study.trainings:
         assert study.statements or study.conditions or study.reference or study.name == "real"
-    known = {f"{column}/{label}/{kind}" for column in ("same", "holdout", "device_shift", "unseen_layout")
-             for label in (*LABELS, "direction") for kind in KINDS}  # fmt: skip
-    known |= OTHER | {"same/direction/degrees"} | {f"train_accuracy_{label}" for label in LABELS}
-    assert set(study.metrics) <= known or study.measure is not None  # which may have metrics of its own
+    assert set(study.metrics) <= KNOWN or study.measure is not None  # which may have metrics of its own
     for said in study.statements:
-        assert set(said.metric.split(" - ")) <= known
+        assert set(said.metric.split(" - ")) <= KNOWN
         assert judge(said, Estimate(0.0, 1e9, 4e9, 3)) == "undecided"
         assert said.minimum < said.maximum
         assert bool(said.others) != (said.level is not None)

@@ -400,17 +400,15 @@ def _summary(frame: pd.DataFrame) -> pd.DataFrame:
 
     The mean is over the labels that could be learnt.
     """
-    names, rows = (
-        frame.attrs["labels"],
-        100 * frame.set_index(["attribute", "name", "seed"]).select_dtypes("number"),
-    )
-    summary = rows[[f"accuracy {name}" for name in names]].set_axis(names, axis=1)
-    return summary.assign(mean=summary.mean(axis=1), layout=rows["accuracy layout"]).assign(
-        **{
-            "variance: layout": rows["variance layout"],
-            "variance: best label": rows[[f"variance {name}" for name in names]].max(axis=1),
-        }
-    )
+    rows = 100 * frame.set_index(["attribute", "name", "seed"]).select_dtypes("number")
+    labels = {name: rows[f"accuracy {name}"] for name in frame.attrs["labels"]}
+    columns = labels | {
+        "mean": pd.DataFrame(labels).mean(axis=1),
+        "layout": rows["accuracy layout"],
+        "variance: layout": rows["variance layout"],
+        "variance: best label": rows[[f"variance {name}" for name in labels]].max(axis=1),
+    }
+    return pd.DataFrame(columns)
 
 
 def embeddings_table(frame: pd.DataFrame) -> pd.DataFrame:

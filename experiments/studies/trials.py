@@ -144,9 +144,10 @@ def plan_runs(
         return None, [StudyRun(Variant("", {}, {}), "")]
     store = Store.open(config.tracking)
     runs = find_runs(study, config, store)
-    prints = {run.tags["fingerprint"] for run in runs}
-    chosen = shard.part(prints) if shard else prints
-    return store, [run for run in runs if run.tags["fingerprint"] in chosen]
+    if shard:
+        chosen = shard.part({run.tags["fingerprint"] for run in runs})
+        runs = [run for run in runs if run.tags["fingerprint"] in chosen]
+    return store, runs
 
 
 def _train(study: Study, command: Config, shard: Shard | None, smoke: bool) -> tuple[Store, list[StudyRun]]:

@@ -13,8 +13,10 @@ import platform
 import subprocess
 import sys
 import time
+import timeit
 from argparse import ArgumentParser
 from collections.abc import Callable, Sequence
+from functools import partial
 from importlib.metadata import version
 from itertools import count
 from pathlib import Path
@@ -32,7 +34,6 @@ from skin.core.files import CONF, ROOT, results, write
 from skin.core.messages import quiet
 from skin.device.base import AbstractSimulated
 from skin.device.resampling import Frame
-from skin.learning.data import TouchData
 from skin.learning.network import Network
 from skin.live.engine import Detection, Engine
 from skin.runs.build import TorchModel, build_data, build_device, build_learner
@@ -45,28 +46,13 @@ from skin.wire.protocol import encode_line
 
 Figures = dict[str, float]
 
-ROWS = ("temporal_graph", "temporal_image", "sequence_graph", "sequence_image")
-"""Rows whose epochs are timed."""
-
-
-def benchmarks(repeats: int) -> dict[str, tuple[str, tuple[object, ...]]]:
-    """Return all benchmarks: name -> function of this module and its arguments."""
-    return {
-        **{f"generation.{name}": ("measure_generation", (name, repeats)) for name in ("fem", "solid")},
-        **{f"operator.{name}": ("measure_operator", (name, repeats)) for name in ("fem", "solid")},
-        **{f"training.{row}": ("measure_training", (row, repeats)) for row in ROWS},
-        **{f"live.{row}": ("measure_latency", (row,)) for row in ("best_fresh", "any_skin")},
-        "live.onnx": ("measure_latency", ("best_fresh", True)),
-        "wire": ("measure_decoder", ()),
-    }
-
 
 def main(words: Sequence[str]) -> None:
     """Run the benchmarks and write their figures."""
     parser = ArgumentParser("python -m experiments.benchmarks", description=__doc__)
     parser.add_argument("--repeats", type=int, choices=range(3, 100), default=3, metavar="3, 4, ...")
     parser.add_argument("--out", default="results")
-    parser.add_argument("--only", nargs="+", choices=benchmarks(0), default=list(benchmarks(0)))
+    parser.add_argument("--only", nargs="+", choices=BENCHMARKS, default=list(BENCHMARKS))
     parser.add_argument("--against", type=Path)
     settings = parser.parse_args(words)
     if settings.against and not (settings.against / "skin").is_dir():
@@ -76,10 +62,9 @@ def main(words: Sequence[str]) -> None:
     measured: dict[str, Any] = {"repeats": settings.repeats, "machine": machine, "versions": versions}
     for name in settings.only:
         print(name, file=sys.stderr)
-        task = benchmarks(settings.repeats)[name]
-        measured[name] = run_alone(*task)
+        measured[name] = run_alone(name, settings.repeats)
         if settings.against:
-            baseline = run_alone(*task, settings.against)
+            baseline = run_alone(name, settings.repeats, settings.against)
             ratios = {key: value / baseline[key] for key, value in measured[name].items() if baseline[key]}
             measured[name] = {"here": measured[name], "there": baseline, "ratios": ratios}
     text = json.dumps(measured, indent=2)
@@ -87,26 +72,25 @@ def main(words: Sequence[str]) -> None:
     print(text)
 
 
-def run_alone(function: str, arguments: Sequence[object], checkout: Path = ROOT) -> Figures:
+def run_alone(name: str, repeats: int, checkout: Path = ROOT) -> Figures:
     """Run a benchmark in its own process, so that its peak memory and its threads are its own.
 
     Args:
-        function, arguments: of this module.
+        name: of the benchmark.
+        repeats: of what it measures.
         checkout: folder of the package ``skin`` that is measured.
     """
     code = (
-        "import json, sys; from experiments import benchmarks; "
-        "print(json.dumps(getattr(benchmarks, sys.argv[1])(*json.loads(sys.argv[2]))))"
+        "import json, sys; from experiments.benchmarks import BENCHMARKS; "
+        "print(json.dumps(BENCHMARKS[sys.argv[1]](int(sys.argv[2]))))"
     )
     with TemporaryDirectory() as folder:
         # These benchmarks, and not those of the other checkout.
         (Path(folder) / "experiments").symlink_to(ROOT / "experiments")
-        paths = os.pathsep.join([folder, str(checkout.resolve())])
-        command = [sys.executable, "-P", "-c", code, function, json.dumps(arguments)]
-        env = os.environ | {"PYTHONPATH": paths}
-        return json.loads(
-            subprocess.run(command, env=env, stdout=subprocess.PIPE, text=True, check=True).stdout
-        )
+        env = os.environ | {"PYTHONPATH": os.pathsep.join([folder, str(checkout.resolve())])}
+        command = [sys.executable, "-P", "-c", code, name, str(repeats)]
+        done = subprocess.run(command, env=env, stdout=subprocess.PIPE, text=True, check=True)
+        return json.loads(done.stdout)
 
 
 def training_config(*overrides: str) -> Config:
@@ -117,13 +101,7 @@ def training_config(*overrides: str) -> Config:
 
 def median_seconds(task: Callable[[], object], repeats: int) -> float:
     """Return the median duration of a task, s, after one warm-up call."""
-    task()
-    taken = []
-    for _ in range(repeats):
-        began = time.perf_counter()
-        task()
-        taken.append(time.perf_counter() - began)
-    return median(taken)
+    return median(timeit.repeat(task, number=1, repeat=repeats + 1)[1:])
 
 
 def measure_generation(simulator: str, repeats: int, gestures: int = 4038) -> Figures:
@@ -162,24 +140,28 @@ def measure_training(row: str, repeats: int) -> Figures:
     return {"seconds_per_epoch": learner.seconds_per_epoch}
 
 
-def measure_decoder(rate: float = 1000.0, frames: int = 20_000, sensors: int = 25) -> Figures:
+def measure_decoder(repeats: int, rate: float = 1000.0, sensors: int = 25) -> Figures:
     """Return the fraction of one core that decoding channels at ``rate`` Hz takes."""
-    values = [
-        [(number * (7 + channel) + 31 * channel) % 1024 for channel in range(sensors)]
-        for number in range(frames)
-    ]
-    data = b"".join(
-        encode_line(line, number, round(1e6 * number / rate)) for number, line in enumerate(values)
+    frames, piece = 20 * round(rate), 512  # bytes that a port gives at a time
+    lines = (
+        encode_line(
+            [(n * (7 + channel) + 31 * channel) % 1024 for channel in range(sensors)],
+            n,
+            round(1e6 * n / rate),
+        )
+        for n in range(frames)
     )
-    decoder, decoded, began = Decoder(sensors), 0, time.process_time()
-    piece = 512  # bytes that a port gives at a time
-    for start in range(0, len(data), piece):
-        decoded += len(decoder.feed(data[start : start + piece], start / len(data) * frames / rate))
-    assert decoded == frames
+    data, decoder = b"".join(lines), Decoder(sensors)
+    began = time.process_time()
+    decoded = [
+        len(decoder.feed(data[start : start + piece], start / len(data) * frames / rate))
+        for start in range(0, len(data), piece)
+    ]
+    assert sum(decoded) == frames
     return {"decode_core_share": (time.process_time() - began) / frames * rate}
 
 
-def measure_latency(row: str, onnx: bool = False, frames: int = 3000, rate: float = 100.0) -> Figures:
+def measure_latency(row: str, repeats: int, onnx: bool = False, rate: float = 100.0) -> Figures:
     """Return the time from a frame at ``rate`` Hz to the verdict on it, ms: median and the 99th percentile.
 
     One thread watches a simulated stream of touches and decides twenty times per second. ``core_ms`` is the
@@ -188,77 +170,67 @@ def measure_latency(row: str, onnx: bool = False, frames: int = 3000, rate: floa
 
     Args:
         row: of the table, untrained, because speed does not depend on the weights.
+        repeats: thousands of frames of the stream.
         onnx: whether it is exported, so that torch is not in the engine.
-        frames: of the stream.
         rate: of the device, Hz.
     """
     torch.set_num_threads(1)
-    device, model, data = _untrained(row)
-    if not onnx:
-        return _time_verdicts(device, model, frames, rate)
-    with TemporaryDirectory() as folder:
-        path = Path(folder) / "model.onnx"
-        write_model(model.learner.pipeline(model.sites), model.describe(), data.touches("train"), path)
-        return _time_verdicts(device, OnnxModel(path), frames, rate)
-
-
-def _untrained(row: str) -> tuple[AbstractSimulated, TorchModel, TouchData]:
-    """Return the device of a row, its network with random weights, and a few touches."""
     # A row for any skin is not measured on the default one, but on the largest of its distribution.
-    skin = (
-        ("simulator=solid", "layout=random", "layout.count=64") if row == "any_skin" else ("simulator=naive",)
-    )
+    largest = "simulator=solid", "layout=random", "layout.count=64"
+    skin = largest if row == "any_skin" else ("simulator=naive",)
     config = training_config(*skin, f"experiment={row}", "data.gestures=100")
     device, learner = build_device(config).reference, build_learner(config)
     assert device is not None
     assert isinstance(learner, Network)
     data = build_data(config, device)
     learner.build(data)
-    return device, TorchModel(device, learner, data.example, touch=0.3), data
+    model = TorchModel(device, learner, data.example, touch=0.3)
+    if not onnx:
+        return _time_verdicts(device, model, 1000 * repeats, rate)
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "model.onnx"
+        write_model(learner.pipeline(model.sites), model.describe(), data.touches("train"), path)
+        return _time_verdicts(device, OnnxModel(path), 1000 * repeats, rate)
 
 
-def _time_verdicts(device: AbstractSimulated, model: Model, frames: int, rate: float) -> Figures:
+def _time_verdicts(device: AbstractSimulated, model: Model, count: int, rate: float) -> Figures:
     """Return the times of :func:`measure_latency` for a model on a stream of a device."""
-    detection, warm = Detection(0.3), 50  # N, and verdicts that are not counted
-    engine = Engine(
-        model.probabilities, model.task, len(model.positions), model.window, model.rate, detection
-    )
-    stream = _stream(device, engine, frames + warm, rate)
-    durations = np.array([_seconds(engine, frame) for frame in stream])[warm:]
-    wall, core, _ = 1e3 * durations[durations[:, 2] > 0].T
+    sensors, repeats, warm = len(model.positions), round(rate / device.model_rate), 50  # verdicts not counted
+    engine = Engine(model.probabilities, model.task, sensors, model.window, model.rate, Detection(0.3))  # N
+    conversion = UnitConversion(np.ones(sensors), np.zeros(sensors), np.zeros(sensors, dtype=bool))
+    ahead = repeats * device.window  # frames that fill the window of the engine
+    touches = device.simulate_stream((ahead + count + warm) // repeats + 1).whole.touches
+    values = np.repeat(touches.readings[0].double().numpy(), repeats, axis=0)[: ahead + count + warm]
+    frames = [Frame(n, n / rate, n / rate, row, np.ones(sensors, dtype=bool)) for n, row in enumerate(values)]
+    engine.remember([conversion.convert(frame) for frame in frames[:ahead]])
+    seconds = list[tuple[float, float, int]]()
+    for frame in frames[ahead:]:
+        wall, core = time.perf_counter(), time.thread_time()
+        verdicts = engine.push([conversion.convert(frame)])
+        seconds.append((time.perf_counter() - wall, time.thread_time() - core, len(verdicts)))
+    durations = np.array(seconds)[warm:]
+    wall_ms, core_ms, _ = 1e3 * durations[durations[:, 2] > 0].T
     return {
-        "p50_ms": float(np.median(wall)),
-        "p99_ms": float(np.percentile(wall, 99)),
-        "core_ms": float(np.percentile(core, 99)),
+        "p50_ms": float(np.median(wall_ms)),
+        "p99_ms": float(np.percentile(wall_ms, 99)),
+        "core_ms": float(np.percentile(core_ms, 99)),
         "core_share": float(durations[:, 1].mean() * rate),
         "memory_mb": psutil.Process().memory_info().rss / 1e6,
     }
 
 
-def _stream(device: AbstractSimulated, engine: Engine, count: int, rate: float) -> list[Frame]:
-    """Return frames at ``rate`` Hz, after the engine's window has been filled with frames."""
-    repeats = round(rate / device.model_rate)
-    ahead = repeats * device.window
-    touches = device.simulate_stream((ahead + count) // repeats + 1).whole.touches
-    values = np.repeat(touches.readings[0].double().numpy(), repeats, axis=0)[: ahead + count]
-    valid = np.ones(values.shape[1], dtype=bool)
-    frames = [Frame(n, n / rate, n / rate, row, valid) for n, row in enumerate(values)]
-    engine.remember([_conversion(engine).convert(frame) for frame in frames[:ahead]])
-    return frames[ahead:]
-
-
-def _conversion(engine: Engine) -> UnitConversion:
-    sensors = engine.sensors
-    return UnitConversion(np.ones(sensors), np.zeros(sensors), np.zeros(sensors, dtype=bool))
-
-
-def _seconds(engine: Engine, frame: Frame) -> tuple[float, float, int]:
-    """Return the duration of a frame as wall time and as processor time, s, and its number of verdicts."""
-    conversion = _conversion(engine)
-    wall, core = time.perf_counter(), time.thread_time()
-    verdicts = engine.push([conversion.convert(frame)])
-    return time.perf_counter() - wall, time.thread_time() - core, len(verdicts)
-
+BENCHMARKS: dict[str, Callable[[int], Figures]] = {
+    **{f"generation.{name}": partial(measure_generation, name) for name in ("fem", "solid")},
+    **{f"operator.{name}": partial(measure_operator, name) for name in ("fem", "solid")},
+    **{
+        f"training.{row}": partial(measure_training, row)
+        for row in ("temporal_graph", "temporal_image", "sequence_graph", "sequence_image")
+    },
+    **{f"live.{row}": partial(measure_latency, row) for row in ("best_fresh", "any_skin")},
+    "live.onnx": partial(measure_latency, "best_fresh", onnx=True),
+    "wire": measure_decoder,
+}
+"""Name -> function of the number of repeats."""
 
 if __name__ == "__main__":
     main(sys.argv[1:])

@@ -3,7 +3,7 @@
 python -m experiments.notice
 """
 
-from collections.abc import Iterator
+import re
 from importlib.metadata import PackageNotFoundError, metadata
 from pathlib import Path
 
@@ -37,11 +37,9 @@ def notice(constraints: Path) -> str:
     return _HEAD + "".join(f"{name}: {licence(name)}\n" for name in names(constraints))
 
 
-def names(constraints: Path) -> Iterator[str]:
-    """Yield the names of the dependencies in a file of constraints."""
-    for line in constraints.read_text().splitlines():
-        if "==" in line and not line.startswith("#"):
-            yield line.partition("==")[0].strip()
+def names(constraints: Path) -> list[str]:
+    """Return the names of the dependencies in a file of constraints."""
+    return re.findall(r"^([\w.-]+)==", constraints.read_text(), re.MULTILINE)
 
 
 def licence(name: str) -> str:

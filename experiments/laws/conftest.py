@@ -5,34 +5,27 @@
 
 The test ``test_hertz`` checks the law ``hertz``. Its docstring is the law and, behind "Reference:", the
 source of the independent solution. ``--full`` solves finer meshes and more cases, with the same tolerances.
-``--page`` writes physics.md, its numbers and its pictures into a folder.
+``--page`` writes physics.md and its numbers into a folder.
 """
 
 import math
 from collections.abc import Generator, Mapping, Sequence
 from dataclasses import dataclass, field
 from inspect import getdoc
-from itertools import cycle
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pandas as pd
 import pytest
-from matplotlib.figure import Figure
 
 from experiments.studies.pages import write_csv
 from skin.core.files import write
-from skin.plot.figures import MARKS, save_figure
 
 RECORD = "law"
 """Name of the property of a report with the record of its law."""
 
-PICTURES = "results/physics"
-"""Folder of the numbers and the pictures, in that of the page."""
-
-Line = tuple[str, Sequence[float] | np.ndarray, Sequence[float] | np.ndarray, str]
-"""Label, x, y, and ``-`` for a line or ``o`` for points."""
+NUMBERS = "results/physics/physics.csv"
+"""File of all numbers, in the folder of the page."""
 
 
 @dataclass
@@ -42,18 +35,14 @@ class Law:
     Attributes:
         full: whether to solve the meshes and cases that are published; else a few coarse ones.
         name: of the law.
-        pictures: folder of the pictures; None: none are drawn.
         findings: case, our number, the reference, the error and its tolerance, of each comparison.
         remarks: for the page.
-        titles: of the pictures, by the names of their files.
     """
 
     full: bool
     name: str
-    pictures: Path | None = None
     findings: list[dict[str, Any]] = field(default_factory=list)
     remarks: list[str] = field(default_factory=list)
-    titles: dict[str, str] = field(default_factory=dict)
 
     def compare(
         self, case: str, ours: float, reference: float, tolerance: float, error: float | None = None
@@ -67,31 +56,15 @@ class Law:
             tolerance: the largest error that passes.
             error: None: the difference, relative to the reference if that is not 0.
         """
-        if error is None:
-            error = abs(ours - reference) / (abs(reference) or 1.0)
+        error = abs(ours - reference) / (abs(reference) or 1.0) if error is None else error
         numbers = {"ours": ours, "reference": reference, "error": error, "tolerance": tolerance}
-        self.findings.append({"case": case} | {name: float(number) for name, number in numbers.items()})
-
-    def draw(self, name: str, title: str, x: str, y: str, lines: Sequence[Line], log: bool = False) -> None:
-        """Draw lines with these labels of the axes, which may be logarithmic, as a PNG file of some name."""
-        self.titles[name] = title
-        if self.pictures is None:
-            return
-        figure = Figure(figsize=(5.6, 3.4), layout="constrained")
-        axes = figure.add_subplot()
-        for (label, across, up, kind), mark, dashes in zip(
-            lines, cycle(MARKS), cycle(("-", "--", "-.", ":")), strict=False
-        ):
-            style: dict[str, Any] = (
-                {"marker": mark, "ls": "", "ms": 3.5} if kind == "o" else {"ls": dashes, "lw": 1.2}
-            )
-            axes.plot(across, up, label=label, **style)
-        if log:
-            axes.set(xscale="log", yscale="log")
-        axes.set(xlabel=x, ylabel=y, title=title)
-        axes.grid(alpha=0.3)
-        axes.legend(fontsize=8)
-        save_figure(figure, self.pictures / f"{name}.png")
+        finding: dict[str, Any] = {name: float(number) for name, number in numbers.items()}
+        # A bound of rounding errors, of double precision where the tolerance is as strict.
+        rounding = 1e-10 if tolerance <= 1e-8 else 1e-6
+        text = f"< {rounding:.0e}" if error < rounding else f"{error:.2g}"
+        excess = math.inf if math.isnan(error) else float(max(error, rounding) / tolerance)
+        ok = "yes" if error <= tolerance else "no"  # one that is not finite is beyond
+        self.findings.append({"case": case, **finding, "text": text, "excess": excess, "ok": ok})
 
     def misses(self) -> list[str]:
         """Return each comparison whose error is beyond its tolerance, or not finite, in words."""
@@ -99,13 +72,8 @@ class Law:
             f"{each['case']}: {each['ours']:.6g}, must be {each['reference']:.6g}: "
             f"error {each['error']:.2g}, tolerance {each['tolerance']:g}"
             for each in self.findings
-            if not _holds(each)
+            if each["ok"] == "no"
         ]
-
-
-def _holds(finding: Mapping[str, Any]) -> bool:
-    """Return whether the error is within the tolerance; an error that is not finite is not."""
-    return math.isfinite(finding["error"]) and finding["error"] <= finding["tolerance"]
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -117,9 +85,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 @pytest.fixture
 def law(request: pytest.FixtureRequest) -> Law:
     """Return what the test records."""
-    page = request.config.getoption("page")
-    name = request.node.name.removeprefix("test_")
-    return Law(request.config.getoption("full"), name, page and page / PICTURES)
+    return Law(request.config.getoption("full"), request.node.name.removeprefix("test_"))
 
 
 @pytest.hookimpl(wrapper=True)
@@ -127,10 +93,9 @@ def pytest_runtest_call(item: pytest.Function) -> Generator[None, None, None]:
     """Fail a test of a law that has recorded a miss; its report contains the record."""
     yield
     law: Any = item.funcargs["law"]
-    paragraphs = [" ".join(part.split()) for part in (getdoc(item.function) or "").split("\n\n")]
-    words = {"law": law.name, "statement": paragraphs[0]}
-    words["source"] = paragraphs[1].removeprefix("Reference: ").removesuffix(".")
-    record = words | {"findings": law.findings, "remarks": law.remarks, "titles": law.titles}
+    statement, _, source = " ".join((getdoc(item.function) or "").split()).partition(" Reference: ")
+    words = {"law": law.name, "statement": statement, "source": source.removesuffix(".")}
+    record = words | {"findings": law.findings, "remarks": law.remarks}
     item.user_properties.append((RECORD, record))
     assert law.findings, "nothing was compared"
     assert not law.misses(), "\n".join(law.misses())
@@ -149,95 +114,51 @@ def pytest_terminal_summary(terminalreporter: Any, config: pytest.Config) -> Non
 
 
 Record = Mapping[str, Any]
-"""Name, statement, source, findings, remarks and titles of pictures of a law."""
+"""Name, statement, source, findings and remarks of a law."""
 
-_HEAD = """# Physics, verified
+_PAGE = """# Physics, verified
 
-Written by `make physics`, which exits with code 1 if a law does not hold: each is checked against an
-independent solution; the table has the error nearest to its tolerance.
-[Its numbers](results/physics/physics.csv) have the digits that are the same on every processor; rounding
-errors are an upper bound. `results/physics.xml` holds all digits of one machine.
-`pytest tests/mechanics` checks what small examples can show: balance and reciprocity, `solid` against
-scikit-fem, `fem` against PyNite, relaxation, `naive`, and contact.
+Written by `make physics`, which fails if a law does not hold. Errors are those nearest to their tolerance;
+rounding errors are an upper bound. [All numbers](results/physics/physics.csv) have the digits that are the
+same on every processor. `pytest tests/mechanics` compares small examples, `solid` with scikit-fem, `fem` with
+PyNite.
 
-| law | reference | error | tolerance | |
-|---|---|---|---|---|
-"""
-
-_LIMITS = """
+| law | statement | reference | error | tolerance | |
+|---|---|---|---|---|---|
+{lines}
+{notes}
 ## Limits
 
-- **Only the linear theory is verified.** Most default gestures strain the skin beyond its range; see
-  [limitations](limitations.md).
-- **Surface displacements converge slowly where the skin is thin and nearly incompressible.** Elements as
-  long as the skin is thick restrict the sideways motion of material under a wide object, most of all beside
-  its edge. Readings are more accurate, because the layers transmit the applied force; beside
-  an edge, however, an error of 1 % of the reading under the object can be a large part of a small reading.
-- **The thick block is finite.** It ends at 60 half sides, and its surface moves about 2 % less than that of
-  a half-space, on any mesh.
-- **A tilted sensor at the interface of two layers** interpolates linearly between the stresses above and
-  below. The stress along the layers is discontinuous there: it reads a mean of both sides.
-- **A footprint is defined on the unrolled surface.** Deep in an arm it covers a shorter arc than the sensor
-  (10 % less for the default sleeve). The reading is the mean stress on that arc times the sensor's full
-  area.
-- **Contact is solved without friction.** The tangential traction of a sliding touch is added afterwards.
+- Only the linear theory is verified; most default gestures strain the skin beyond its
+  [range](limitations.md).
+- Surface displacements converge slowly where the skin is thin and nearly incompressible. Readings are more
+  accurate, but an error of 1 % of the reading under an object can be a large part of a reading beside it.
+- The thick block ends at 60 half sides: its surface moves 2 % less than that of a half-space.
+- A tilted sensor at the interface of two layers reads a mean of the stresses above and below.
+- Deep in an arm a footprint covers a shorter arc than the sensor (10 % less for the default sleeve).
+- Contact is solved without friction. The traction of a sliding touch is added afterwards.
 """
 
 
 def publish_laws(records: Sequence[Record], folder: Path) -> None:
-    """Write physics.md, and the numbers of all laws beside the pictures, each file whole."""
-    write_csv(findings_table(records), folder / PICTURES / "physics.csv")
-    parts = [_HEAD, *map(_line, records), *map(_section, records), _LIMITS]
-    write("".join(parts), folder / "physics.md")
+    """Write physics.md, and the numbers of all laws, each file whole.
 
-
-def findings_table(records: Sequence[Record]) -> pd.DataFrame:
-    """Return a line per finding, as texts with digits that do not depend on the processor."""
-    lines = [
-        {
-            "law": record["law"],
-            "case": finding["case"],
-            "ours": f"{finding['ours']:.5g}" if finding["reference"] else _error(finding),
-            "reference": f"{finding['reference']:.5g}",
-            "error": _error(finding),
-            "tolerance": f"{finding['tolerance']:.2g}",
-            "ok": "yes" if _holds(finding) else "no",
-        }
-        for record in records
-        for finding in record["findings"]
-    ]
-    return pd.DataFrame(lines)
-
-
-def _line(record: Record) -> str:
-    """Return the line of the table, with the finding nearest to its tolerance."""
-    worst = max(record["findings"], key=_excess)
-    verdict = "holds" if all(map(_holds, record["findings"])) else "**fails**"
-    name, cells = record["law"], f"{_error(worst)} | {worst['tolerance']:.2g} | {verdict}"
-    return f"| [{name}](#{name}) | {record['source']} | {cells} |\n"
-
-
-def _section(record: Record) -> str:
-    misses = [finding for finding in record["findings"] if not _holds(finding)]
-    notes = [f"- **missed**: {finding['case']}, error {_error(finding)}" for finding in misses]
-    notes += [f"- {remark}" for remark in record["remarks"]]
-    pictures = [f"![{title}]({PICTURES}/{name}.png)" for name, title in record["titles"].items()]
-    parts = [f"\n## {record['law']}", record["statement"], "\n".join(notes), *pictures]
-    return "\n\n".join(filter(None, parts)) + "\n"
-
-
-def _excess(finding: Mapping[str, Any]) -> float:
-    """Return the error, at least that of rounding, over its tolerance."""
-    if math.isnan(finding["error"]):
-        return math.inf
-    return max(finding["error"], _rounding(finding)) / finding["tolerance"]
-
-
-def _rounding(finding: Mapping[str, Any]) -> float:
-    """Return a bound of rounding errors, of double precision where the tolerance is as strict."""
-    return 1e-10 if finding["tolerance"] <= 1e-8 else 1e-6
-
-
-def _error(finding: Mapping[str, Any]) -> str:
-    bound = _rounding(finding)
-    return f"< {bound:.0e}" if finding["error"] < bound else f"{finding['error']:.2g}"
+    The texts of the numbers have digits that do not depend on the processor.
+    """
+    findings = pd.DataFrame(
+        [{"law": each["law"], **finding} for each in records for finding in each["findings"]]
+    )
+    texts = {name: findings[name].map("{:.5g}".format) for name in ("ours", "reference")}
+    texts["ours"] = texts["ours"].where(findings.reference != 0, findings.text)
+    texts |= {"error": findings.text, "tolerance": findings.tolerance.map("{:.2g}".format)}
+    table = findings.assign(**texts)
+    write_csv(table.drop(columns=["text", "excess"]), folder / NUMBERS)
+    lines, notes = list[str](), list[str]()
+    for record, (name, law) in zip(records, table.groupby("law", sort=False), strict=True):
+        worst, missed = law.loc[law.excess.idxmax()], law[law.ok == "no"].itertuples()
+        notes += [f"- {name}, **missed**: {finding.case}, error {finding.error}\n" for finding in missed]
+        notes += [f"- {name}: {remark}\n" for remark in record["remarks"]]
+        verdict = "holds" if (law.ok == "yes").all() else "**fails**"
+        cells = name, record["statement"], record["source"], worst.error, worst.tolerance, verdict
+        lines.append(f"| {' | '.join(cells)} |\n")
+    write(_PAGE.format(lines="".join(lines), notes="".join(notes)), folder / "physics.md")

@@ -4,11 +4,10 @@ import pickle
 import subprocess
 import weakref
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import torch
-from annotated_types import Ge
 from torch import Tensor
 
 from experiments.peers import python
@@ -16,7 +15,6 @@ from skin.core.files import ROOT
 from skin.core.safe_loading import load_npz
 from skin.device.touches import Touches
 from skin.errors import InputError
-from skin.learning.features import above_idle
 from skin.learning.learner import AbstractLearner
 
 if TYPE_CHECKING:
@@ -36,34 +34,21 @@ class Rocket(AbstractLearner):
 
     Args:
         transform: the kernels; ``flat`` are the readings themselves.
-        kernels: their number; None: aeon's default.
-        channels: ``readings`` of each sensor; or ``sorted``: the readings above idle, from the largest to the
-            smallest of each frame, and their sum, which allows any number of sensors.
-        largest: number of sorted readings.
         seed: of the kernels.
     """
 
     def __init__(
         self,
-        transform: Literal["flat", "minirocket", "multirocket", "multirocket_hydra"] = "minirocket",
-        kernels: Annotated[int, Ge(84)] | None = None,
-        channels: Literal["readings", "sorted"] = "readings",
-        largest: Annotated[int, Ge(1)] = 10,
+        transform: Literal["flat", "minirocket", "multirocket_hydra"] = "minirocket",
         seed: int = 0,
     ) -> None:
-        self._seed, self._transform, self._kernels = seed, transform, kernels
-        self._channels, self._largest = channels, largest
+        self._seed, self._transform = seed, transform
         self._process: subprocess.Popen[bytes] | None = None
         self._shape: tuple[int, ...] = ()
 
     def inputs(self, touches: Touches) -> Tensor:
-        """Return the channels, (B, C, T), N."""
-        if self._channels == "readings":
-            return touches.readings.where(touches.valid, 0.0).mT
-        x = above_idle(touches)
-        highest = x.sort(dim=2, descending=True).values[..., : self._largest]
-        highest = torch.nn.functional.pad(highest, (0, self._largest - highest.shape[2]))
-        return torch.cat([highest, x.sum(dim=2, keepdim=True)], dim=2).mT
+        """Return the readings of each sensor, (B, S, T), N; 0 where they are not valid."""
+        return touches.readings.where(touches.valid, 0.0).mT
 
     def check(self, data: "TouchData") -> None:
         """Raise InputError if the environment or labels are not available."""
@@ -116,17 +101,14 @@ class Rocket(AbstractLearner):
             raise ValueError(f"it was trained on {labels} labels, not {', '.join(data.task.names)}")
 
     def _array(self, touches: Touches) -> np.ndarray:
-        """Return all inputs, computed in parts to save memory."""
-        local, part = touches.to("cpu"), 8192
-        parts = [self.inputs(local[start : start + part]) for start in range(0, len(local), part)]
-        return torch.cat(parts).to(torch.float32).numpy()
+        return self.inputs(touches.to("cpu")).to(torch.float32).numpy()
 
     def _begin(self) -> None:
         """Start the process with the settings of the model."""
         command = [_python(), "-m", "experiments.peers.worker"]
         self._process = subprocess.Popen(command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
         weakref.finalize(self, _end, self._process)
-        self._ask("begin", self._seed, torch.get_num_threads(), self._kernels, self._transform)
+        self._ask("begin", self._seed, torch.get_num_threads(), self._transform)
 
     def _ask(self, method: str, *values: Any) -> Any:
         """Return what a method of the process's model returns."""

@@ -34,10 +34,9 @@ class KernelModel:
     bias: np.ndarray
     curves: np.ndarray
 
-    def begin(self, seed: int, jobs: int, kernels: int | None, transform: str) -> None:
+    def begin(self, seed: int, jobs: int, transform: str) -> None:
         """Set the kernels."""
-        settings = {} if kernels is None else {"n_kernels": kernels}
-        self.make = partial(TRANSFORMS[transform], jobs, seed, settings)
+        self.make = partial(make_transform, transform, n_jobs=jobs, random_state=seed)
 
     def fit(
         self,
@@ -91,44 +90,23 @@ class KernelModel:
         return np.concatenate([part @ self.weights + self.bias for part in self._parts(x)])
 
 
-def flat(jobs: int, seed: int, settings: dict[str, int]) -> Pipeline:
-    """Return a transform to the flattened readings, a baseline for the convolution kernels."""
-    return make_pipeline(FunctionTransformer(lambda x: x.reshape(len(x), -1)), StandardScaler())
+def make_transform(name: str, **settings: int) -> Pipeline | FeatureUnion:
+    """Return the transform of one of aeon's classifiers, with its scaling.
 
+    ``minirocket`` is Dempster et al. 2021, ``multirocket_hydra`` Dempster et al. 2023; ``flat`` gives the
+    flattened readings, a baseline for the convolution kernels.
+    """
+    if name == "flat":
+        return make_pipeline(FunctionTransformer(lambda x: x.reshape(len(x), -1)), StandardScaler())
 
-def minirocket(jobs: int, seed: int, settings: dict[str, int]) -> Pipeline:
-    """Return the transform of aeon's MiniRocketClassifier (Dempster et al. 2021), with its scaling."""
-    from aeon.transformations.collection.convolution_based import MiniRocket
-
-    return make_pipeline(
-        MiniRocket(n_jobs=jobs, random_state=seed, **settings), StandardScaler(with_mean=False)
-    )
-
-
-def multirocket(jobs: int, seed: int, settings: dict[str, int]) -> Pipeline:
-    """Return the transform of aeon's MultiRocketClassifier (Tan et al. 2022), with its scaling."""
-    from aeon.transformations.collection.convolution_based import MultiRocket
-
-    single = FunctionTransformer(partial(np.asarray, dtype=np.float32))
-    return make_pipeline(MultiRocket(n_jobs=jobs, random_state=seed, **settings), StandardScaler(), single)
-
-
-def multirocket_hydra(jobs: int, seed: int, settings: dict[str, int]) -> FeatureUnion:
-    """Return the transform of aeon's MultiRocketHydraClassifier (Dempster et al. 2023), with its scaling."""
     from aeon.classification.convolution_based._hydra import _SparseScaler
-    from aeon.transformations.collection.convolution_based import HydraTransformer
+    from aeon.transformations.collection.convolution_based import HydraTransformer, MiniRocket, MultiRocket
 
+    if name == "minirocket":
+        return make_pipeline(MiniRocket(**settings), StandardScaler(with_mean=False))
     single = FunctionTransformer(partial(np.asarray, dtype=np.float32))
-    hydra = HydraTransformer(n_jobs=jobs, random_state=seed), _SparseScaler(), single
-    return make_union(make_pipeline(*hydra), multirocket(jobs, seed, settings))
-
-
-TRANSFORMS = {
-    "flat": flat,
-    "minirocket": minirocket,
-    "multirocket": multirocket,
-    "multirocket_hydra": multirocket_hydra,
-}
+    hydra = make_pipeline(HydraTransformer(**settings), _SparseScaler(), single)
+    return make_union(hydra, make_pipeline(MultiRocket(**settings), StandardScaler(), single))
 
 
 def platt(score: np.ndarray, truth: np.ndarray) -> tuple[float, float]:

@@ -2,8 +2,8 @@
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from statistics import fmean, stdev
-from typing import Any, Literal, NamedTuple
+from statistics import fmean
+from typing import Literal, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -13,8 +13,13 @@ from experiments.studies.study import Statement, Study
 from skin.evaluation.metrics import decodable, decode
 from skin.touch.labels import TOUCH
 
-UNITS = {"seconds_per_epoch": "s", "parameters": "", "same/direction/degrees": "°"}
-UNITS |= {"same/place/rms_mm": "mm", "same/force/rms_N": "N"}
+UNITS = {
+    "seconds_per_epoch": "s",
+    "parameters": "",
+    "same/direction/degrees": "°",
+    "same/place/rms_mm": "mm",
+    "same/force/rms_N": "N",
+}
 """Metrics that are not fractions -> their unit."""
 
 By = Literal["seed", "device"]
@@ -58,12 +63,10 @@ def uncertainty(sample: Sequence[float] | np.ndarray | pd.Series) -> np.ndarray:
     Half of the interval is the error times the quantile of Student's t distribution: 4.30 for three seeds,
     1.96 for 4000 gestures. NaN does not count.
     """
-    values = np.asarray(sample, float)
-    values = values[~np.isnan(values)]
+    values = pd.Series(sample, dtype=float).dropna()
     if len(values) < 2:
         return np.zeros(2)
-    error = stdev(values.tolist()) / math.sqrt(len(values))
-    return error * np.array([1.0, t.interval(0.95, len(values) - 1)[1]])
+    return values.sem() * np.array([1.0, t.interval(0.95, len(values) - 1)[1]])
 
 
 def together(*parts: np.ndarray) -> np.ndarray:
@@ -92,11 +95,10 @@ def compare_samples(
         across: the same by what the first two are not by, device or seed.
         gestures: the same by gesture, in the same unit.
     """
-    pairs = _pair(left, right, ratio)
+    pairs, devices = _pair(left, right, ratio), np.zeros(2)
     if pairs.empty:
         return None
     seeds = uncertainty(pairs) if len(pairs) > 1 else np.full(2, math.inf)
-    devices = np.zeros(2)
     if across is not None and not across[0].empty and not across[1].empty:
         shared = _pair(*across, ratio)
         devices = uncertainty(shared) if len(shared) > 1 else _unpaired(*across, ratio)
@@ -121,13 +123,12 @@ def _over_gestures(left: np.ndarray | None, right: np.ndarray | None, ratio: boo
         return np.zeros(2)
     if len(left) != len(right):
         return _unpaired(left, right, ratio)
-    counted = ~(np.isnan(left) | np.isnan(right))
-    left, right = left[counted], right[counted]
     if not ratio:
         return uncertainty(left - right)
+    counted = ~np.isnan(left + right)
+    first, below = left[counted].mean(), right[counted].mean()
     # The ratio of two means, linearised (delta method).
-    below = right.mean()
-    return uncertainty((left - left.mean() / below * right) / below) if below else np.zeros(2)
+    return uncertainty((left - first / below * right) / below) if below else np.zeros(2)
 
 
 def judge(statement: Statement, compared: Estimate | None) -> str:
@@ -157,19 +158,16 @@ def values(trials: pd.DataFrame, metric: str, by: By = "seed") -> pd.Series:
 
     Args:
         trials: of one line.
-        metric: as logged; fractions come in per cent. ``/error`` is what is missing of ``/accuracy``.
+        metric: as logged; fractions come in per cent.
         by: column of the trials.
     """
     first, *subtracted = (_column(trials, name) for name in metric.split(" - "))
-    figures = first - sum(subtracted)
-    figures = (figures if metric in UNITS else 100 * figures).dropna()
+    figures = ((1 if metric in UNITS else 100) * (first - sum(subtracted))).dropna()
     # fmean is exact: what is halfway between two published digits does not hang on the order of the sum.
     return figures.groupby(trials[by], sort=False).agg(fmean)
 
 
 def _column(trials: pd.DataFrame, metric: str) -> pd.Series:
-    if metric.endswith("/error"):
-        return 1 - _column(trials, metric.removesuffix("error") + "accuracy")
     return trials[metric] if metric in trials else pd.Series(np.nan, trials.index)
 
 
@@ -180,21 +178,19 @@ def by_gesture(trials: pd.DataFrame, metric: str) -> np.ndarray | None:
         trials: of one line.
         metric: one of a run on its test gestures; others have no figures by gesture.
     """
-    codes = [np.frombuffer(outcomes, np.uint8) for outcomes in trials.outcomes if outcomes]
-    wrong = metric.endswith("/error")
-    plain = metric.removeprefix("same/").replace("/error", "/accuracy")
+    codes = [np.frombuffer(outcomes or b"", np.uint8) for outcomes in trials.outcomes]
+    plain = metric.removeprefix("same/")
     if not metric.startswith("same/") or not decodable(plain, TOUCH):
         return None
-    if not codes or len(codes) < len(trials) or len({len(code) for code in codes}) > 1:
+    if not all(map(len, codes)) or len({len(code) for code in codes}) != 1:
         return None
-    figures = 100 * decode(np.stack(codes), plain, TOUCH).mean(axis=0)
-    return 100 - figures if wrong else figures
+    return 100 * decode(np.stack(codes), plain, TOUCH).mean(axis=0)
 
 
 def estimate(trials: pd.DataFrame, metric: str) -> Estimate:
     """Return the mean of a metric over trials, and its error and margin over seeds, devices and gestures."""
     seeds, gestures = values(trials, metric), by_gesture(trials, metric)
-    parts: tuple[Any, ...] = (seeds, values(trials, metric, "device"), () if gestures is None else gestures)
+    parts = seeds, values(trials, metric, "device"), np.zeros(0) if gestures is None else gestures
     error, margin = together(*map(uncertainty, parts))
     return Estimate(fmean(seeds), error, margin, len(seeds))
 
@@ -249,8 +245,11 @@ def differences(study: Study, trials: pd.DataFrame) -> Iterator[tuple[str, str, 
         variant, condition, the comparison, and better, worse or undecided.
     """
     words = {"agree": "better", "disagree": "worse", "undecided": "undecided"}
-    limits: Any = {"minimum" if study.differences == "greater" else "maximum": 0.0}
-    better = Statement("", "", {}, study.metrics[0], **limits)
+    better = (
+        Statement("", "", {}, study.metrics[0], minimum=0)
+        if study.differences == "greater"
+        else (Statement("", "", {}, study.metrics[0], maximum=0))
+    )
     by: By = "device" if study.devices else "seed"
     first = dict[str, pd.DataFrame]()
     for (variant, condition), group in trials.groupby(["variant", "condition"], sort=False):

@@ -9,6 +9,8 @@ left out.
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cache
+from itertools import product
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -94,9 +96,8 @@ class Contact:
             true = press_hands(device, 2 * count, rng)
             contacts = np.zeros((len(true), 0, 4))
         chosen = np.flatnonzero((true > 3 * noise.frame).any(1))[:count]
-        gains = 1 + noise.gain * rng.standard_normal(true.shape[1])
-        readings = gains * true[chosen]
-        readings += np.sqrt(noise.floor) * rng.standard_normal(readings.shape)
+        gains, scatter = 1 + noise.gain * rng.standard_normal(true.shape[1]), np.sqrt(noise.floor)
+        readings = gains * true[chosen] + scatter * rng.standard_normal((len(chosen), len(sensors)))
         posterior = Posterior(device.model, noise, body, prior)
         estimates, seconds = list[Any](), list[float]()
         for values in readings:
@@ -109,7 +110,7 @@ class Contact:
         times = 1e3 * np.quantile(seconds, [0.5, 0.99])
         figures |= {"ms_median": float(times[0]), "ms_p99": float(times[1])}
         texts = {
-            key: f"{value:.4g}" if isinstance(value, float) else str(value) for key, value in figures.items()
+            key: f"{each:.4g}" if isinstance(each, float) else str(each) for key, each in figures.items()
         }
         return pd.DataFrame([{"row": subject.condition} | texts])
 
@@ -224,10 +225,12 @@ def summarise_estimates(
     """Return the figures of estimates for true contacts (B, n, 4), of the touches whose number is right."""
     number, rows = contacts.shape[1], list[dict[str, Any]]()
     right = [estimate.number == number for estimate in estimates]
-    figures: dict[str, Any] = {"touches": len(estimates)}
-    figures["number_right_%"] = 100 * float(np.mean(right)) if number else ""
-    figures["fingertip_%"] = 100 * float(np.mean([estimate.fingertip for estimate in estimates]))
-    figures |= dict.fromkeys(_COLUMNS, "")
+    figures: dict[str, Any] = {
+        "touches": len(estimates),
+        "number_right_%": 100 * float(np.mean(right)) if number else "",
+        "fingertip_%": 100 * float(np.mean([estimate.fingertip for estimate in estimates])),
+        **dict.fromkeys(_COLUMNS, ""),
+    }
     for estimate, truths in zip(estimates, contacts, strict=True):
         if not number or estimate.number != number:
             continue
@@ -237,10 +240,16 @@ def summarise_estimates(
             contact, (*position, radius, force) = estimate.contacts[index], truths[true]
             region, pressure = contact.region(), force * prior.peak(radius)
             low, high = contact.peak_interval
-            rows.append({"square": distances[index, true] ** 2 / 2, "distance": distances[index, true]})
-            rows[-1] |= {"force": abs(contact.force / force - 1), "peak": abs(contact.peak / pressure - 1)}
-            rows[-1] |= {"within": low < pressure < high, "covered": region.contains(np.array(position))}
-            rows[-1]["area"] = region.area
+            row = {
+                "square": distances[index, true] ** 2 / 2,
+                "distance": distances[index, true],
+                "force": abs(contact.force / force - 1),
+                "peak": abs(contact.peak / pressure - 1),
+                "within": low < pressure < high,
+                "covered": region.contains(np.array(position)),
+                "area": region.area,
+            }
+            rows.append(row)
     if not rows:
         return figures
     frame = pd.DataFrame(rows)
@@ -288,8 +297,8 @@ def read_presses(folder: Path, name: str) -> tuple[np.ndarray, np.ndarray]:
         baseline = before.mean(axis=0) if len(before) else readings[inside[0]]
         deep = inside[depth[inside] >= 0.98 * depth[inside].max()]
         presses.append([x[deep[0]], *(readings[deep] - baseline).mean(axis=0)])
-    positions, *columns = np.array(presses).T
-    return positions, np.stack(columns, axis=1)
+    table = np.array(presses)
+    return table[:, 0], table[:, 1:]
 
 
 @dataclass(frozen=True)
@@ -332,6 +341,7 @@ def strip_readings(
     return disc_readings(simulator, body, discs, RIM)
 
 
+@cache
 def build_strip(thickness: float) -> tuple[Sheet, Solid]:
     """Return body and simulator of the strip, with the sensors at its surface.
 
@@ -347,20 +357,22 @@ def calibrate_strip(x: np.ndarray, measured: np.ndarray) -> Strip:
 
     The unknown thickness, radius of the tip and x of the strip at x = 0 of the robot are chosen, too.
     """
-    strips, losses = list[Strip](), list[float]()
-    for thickness in (0.003, 0.004, 0.005, 0.006):
+    best, least = None, np.inf
+    for thickness, radius in product(
+        (0.003, 0.004, 0.005, 0.006), (0.0015, 0.002, 0.0025, 0.003, 0.0035, 0.0045)
+    ):
         body, simulator = build_strip(thickness)
         grid = np.arange(0.001, body.size[0] - 0.001, 2e-4)
-        for radius in (0.0015, 0.002, 0.0025, 0.003, 0.0035, 0.0045):
-            table = strip_readings(body, simulator, grid, radius)
-            for offset in np.arange(0.006, 0.012, 1e-4):
-                at = x / 1e3 + offset
-                simulated = np.stack([np.interp(at, grid, column) for column in table.T], axis=1)
-                gains = (simulated * measured).sum(axis=0) / np.square(simulated).sum(axis=0)
+        table = strip_readings(body, simulator, grid, radius)
+        for offset in np.arange(0.006, 0.012, 1e-4):
+            simulated = np.stack([np.interp(x / 1e3 + offset, grid, column) for column in table.T], axis=1)
+            gains = (simulated * measured).sum(axis=0) / np.square(simulated).sum(axis=0)
+            loss = float(np.square(simulated * gains - measured).mean())
+            if loss < least:
                 error = np.sqrt(np.square(simulated - measured / gains).mean(axis=0))
-                losses.append(float(np.square(simulated * gains - measured).mean()))
-                strips.append(Strip(body, simulator, radius, float(offset), gains, error))
-    return strips[int(np.argmin(losses))]
+                best, least = Strip(body, simulator, radius, float(offset), gains, error), loss
+    assert best is not None  # of many
+    return best
 
 
 @dataclass(frozen=True)
@@ -390,25 +402,29 @@ class Barometers:
             x, measured = x[~chosen], measured[~chosen]
         assert strip is not None
         wrong = np.square(strip.readings(x) * strip.gains - measured).sum(axis=1)
-        whole = np.square(measured).sum(axis=1)
         close = x / 1e3 + strip.offset < LAST + PITCH / 2
         squares = np.square(posterior_errors(strip, x[close], measured[close]))
+        rows = [
+            {"metric": "relative rms of readings, %"}
+            | self._rms(1e4 * wrong, np.square(measured).sum(axis=1), 8),
+            {"metric": "rms of positions, mm"} | self._rms(squares, np.ones_like(squares), 4),
+        ]
         words = f"solid, {1e3 * strip.body.thickness:g} mm thick, tip of {1e3 * strip.radius:g} mm"
         start = {"recording": subject.condition, "training": 20, "strip": words}
-        rows = [
-            {"metric": "relative rms of readings, %", **self._rms(1e4 * wrong, whole, 8)},
-            {"metric": "rms of positions, mm", **self._rms(squares, np.ones_like(squares), 4)},
-        ]
         return pd.DataFrame([start | row for row in rows]).round(3)
 
     def _rms(self, squares: np.ndarray, weights: np.ndarray, stream: int) -> dict[str, float]:
         """Return the root of the weighted mean, and its 95 % interval over presses."""
-        size = (1000, len(squares))
-        draw = np.random.default_rng([self.seed, stream]).integers(len(squares), size=size)
+        count = len(squares)
+        draw = np.random.default_rng([self.seed, stream]).integers(count, size=(1000, count))
         roots = np.sqrt(squares[draw].sum(axis=1) / weights[draw].sum(axis=1))
-        low, high = np.quantile(roots, [0.025, 0.975])
-        value = float(np.sqrt(squares.sum() / weights.sum()))
-        return {"test": len(squares), "value": value, "low": float(low), "high": float(high)}
+        low, high = np.quantile(roots, [0.025, 0.975]).tolist()
+        return {
+            "test": count,
+            "value": float(np.sqrt(squares.sum() / weights.sum())),
+            "low": low,
+            "high": high,
+        }
 
 
 def posterior_errors(strip: Strip, x: np.ndarray, measured: np.ndarray) -> np.ndarray:

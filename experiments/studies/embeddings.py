@@ -6,6 +6,7 @@ embedded together. An SVM tells what is in them, and the variance that labels an
 """
 
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from statistics import fmean, stdev
 from typing import Annotated, Any, Literal
@@ -25,10 +26,10 @@ from sklearn.svm import SVC
 
 from experiments.studies.comparison import combine_verdicts, compare_samples, judge
 from experiments.studies.measures import Subject
-from experiments.studies.pages import Page
+from experiments.studies.pages import Page, figure_text
 from experiments.studies.study import Statement
 from skin.device.balance import report_balance
-from skin.device.base import AbstractDevice
+from skin.device.base import AbstractDevice, AbstractSimulated
 from skin.device.touches import Touches
 from skin.errors import InputError
 from skin.evaluation.report import scattered_devices
@@ -76,8 +77,9 @@ class Embeddings:
         device, learner = subject.device, subject.learner if subject.model else None
         report_balance(device)
         count = (len(self.attributes) * 3 + (learner is not None) + 2) * len(self.seeds)
-        steps = track(self.probe(device, learner), "probing", count, console=Console(stderr=True))
-        frame = pd.DataFrame(steps)
+        frame = pd.DataFrame(
+            track(self.probe(device, learner), "probing", count, console=Console(stderr=True))
+        )
         frame.attrs["labels"] = list(device.task.names)
         return frame
 
@@ -85,45 +87,54 @@ class Embeddings:
         """Yield a row for each input and seed: graph embeddings, a trained encoder, plain readings."""
         if device.task.direction:
             raise InputError("embeddings are probed for labels that hold or not: set data.direction=false")
-        names = device.task.names
         for seed in self.seeds if device.simulation else self.seeds[:1]:
-            touches, mixed = self._touches(device, seed), self._mixed(device, seed)
-            labels = _labels(touches)
-            drawn = self.drawn if seed == self.seeds[0] else 0
-            for (attribute, name), vectors in self._inputs([*touches, *mixed], seed, learner):
+            train, test, *mixed = sets = self._touches(device, seed)
+            labels, others = label_frame([train, test], device), label_frame(mixed, device)
+            others["layout"] = np.repeat(np.arange(len(mixed)), [len(touches) for touches in mixed])
+            order, drawn = np.random.default_rng(seed).permutation(len(others)), seed == self.seeds[0]
+            held = labels[len(train) :].mean()
+            for (attribute, name), vectors in self._inputs(sets, seed, learner):
+                own, scattered = vectors[: len(labels)], vectors[len(labels) :]
                 row: Row = {"attribute": attribute, "name": name, "seed": seed}
-                row |= _probe_labels(vectors[: len(labels)], labels, len(touches[0]), names, drawn)
-                yield row | _probe_layouts(vectors[len(labels) :], mixed, names, seed, drawn)
+                row |= {f"accuracy {key}": svm_accuracy(own, labels[key], len(train)) for key in labels}
+                row |= {f"variance {key}": explained(scattered, others[key]) for key in others}
+                mixture = scattered[order], others.layout[order], len(order) * 2 // 3
+                row |= {
+                    "accuracy layout": svm_accuracy(*mixture),
+                    "chance": np.maximum(held, 1 - held).mean(),
+                }
+                yield row | (self._drawn(own, labels, scattered, others) if drawn else {})
+
+    def _drawn(
+        self, own: np.ndarray, labels: pd.DataFrame, scattered: np.ndarray, others: pd.DataFrame
+    ) -> Row:
+        """Return the panels of the figure, as lists."""
+        order = np.random.default_rng(0).permutation(len(others))[: self.drawn]
+        panels = {"plane": planes(own[: self.drawn]), "classes": labels[: self.drawn].to_numpy()}
+        panels |= {"mixed": planes(scattered[order]), "layouts": others.layout[order].to_numpy()}
+        return {name: panel.ravel().tolist() for name, panel in panels.items()}
 
     def _touches(self, device: AbstractDevice, seed: int) -> list[Touches]:
-        """Return the touches of one layout, those to train the SVM on first."""
-        if device.simulation is not None:
-            settings = {"data_seed": self.first + seed, "gestures": self.train + self.test}
-            drawn = device.simulation.replace(**settings).recording().touches
-            return [drawn[: self.train], drawn[self.train :]]
-        return [device.touches("train")[: self.train], device.touches("test")[: self.test]]
-
-    def _mixed(self, device: AbstractDevice, seed: int) -> list[Touches]:
-        """Return as many other touches on each of some scattered layouts; none where that cannot be."""
-        if device.simulation is None or self.layouts < 2:
-            return []
-        try:
-            others = list(scattered_devices(device.simulation, self.layouts))
-        except InputError:  # this number of sensors cannot form a grid
-            return []
-        draws = (self.first * (2 + number) + seed for number in range(self.layouts))
-        return [
-            other.replace(data_seed=draw, gestures=self.test).recording().touches
-            for other, draw in zip(others, draws, strict=True)
+        """Return touches of one layout, to train and to test the SVM, and those of scattered layouts."""
+        if device.simulation is None:
+            return [device.touches("train")[: self.train], device.touches("test")[: self.test]]
+        simulation = device.simulation.replace(data_seed=self.first + seed, gestures=self.train + self.test)
+        drawn, others = simulation.recording().touches, list[AbstractSimulated]()
+        if self.layouts > 1:
+            with suppress(InputError):  # this number of sensors cannot form a grid
+                others = list(scattered_devices(device.simulation, self.layouts))
+        mixed = [
+            other.replace(data_seed=self.first * (2 + number) + seed, gestures=self.test).recording().touches
+            for number, other in enumerate(others)
         ]
+        return [drawn[: self.train], drawn[self.train :], *mixed]
 
     def _inputs(
         self, sets: Sequence[Touches], seed: int, learner: AbstractLearner | None
     ) -> Iterator[tuple[tuple[str, str], np.ndarray]]:
         """Yield attribute and name, and the vectors (B, E) of all touches."""
         for attribute in self.attributes:
-            for name, vectors in self._graph_vectors(sets, attribute, seed):
-                yield (attribute, name), vectors
+            yield from self._graph_vectors(sets, attribute, seed)
         if learner is not None:
             encoded = [learner.embeddings(touches).numpy() for touches in sets]
             yield ("", "trained encoder"), np.concatenate(encoded)
@@ -133,7 +144,7 @@ class Embeddings:
 
     def _graph_vectors(
         self, sets: Sequence[Touches], attribute: str, seed: int
-    ) -> Iterator[tuple[str, np.ndarray]]:
+    ) -> Iterator[tuple[tuple[str, str], np.ndarray]]:
         """Yield each graph embedding (B, E) of the strongest frames of touches, one layout per set.
 
         GL2Vec gives half its width to the graph and half to its line graph.
@@ -153,12 +164,12 @@ class Embeddings:
             labels = np.split(levels(np.concatenate(frames), self.levels), ends)
         pairs = list(zip(labels, weights, strict=True))
         words = [row for label, matrix in pairs for row in subtrees(label, matrix > 0, self.depth)]
-        yield "Graph2Vec", doc2vec(words, self.width, self.epochs, seed)
+        yield (attribute, "Graph2Vec"), doc2vec(words, self.width, self.epochs, seed)
         lines = [row for pair in pairs for row in subtrees(*line_graph(*pair), self.depth)]
         half = [doc2vec(documents, self.width // 2, self.epochs, seed) for documents in (words, lines)]
-        yield "GL2Vec", np.concatenate(half, axis=1)
+        yield (attribute, "GL2Vec"), np.concatenate(half, axis=1)
         kinds = 1 + max(int(label.max()) for label in labels)
-        yield "IGE", np.concatenate([invariant(label, matrix, kinds) for label, matrix in pairs])
+        yield (attribute, "IGE"), np.concatenate([invariant(label, matrix, kinds) for label, matrix in pairs])
 
     def page(self, frame: pd.DataFrame, title: str) -> Page:
         """Return the table, the verdicts, and figure 5 of the report, of the first seed."""
@@ -168,37 +179,11 @@ class Embeddings:
         return Page(about, {"What an SVM reads in embeddings, accuracy in per cent": table}, table, figure)
 
 
-def _probe_labels(
-    vectors: np.ndarray, labels: np.ndarray, train: int, names: Sequence[str], drawn: int
-) -> Row:
-    row: Row = {
-        f"accuracy {name}": svm_accuracy(vectors, column, train)
-        for name, column in zip(names, labels.T, strict=True)
-    }
-    held = labels[train:].mean(axis=0)
-    row |= {"chance": float(np.maximum(held, 1 - held).mean()), "classes": labels[:drawn].ravel().tolist()}
-    return row | {"plane": planes(vectors[:drawn]).ravel().tolist() if drawn else []}
-
-
-def _labels(sets: Sequence[Touches]) -> np.ndarray:
-    return np.concatenate([touches.known_labels.numpy() for touches in sets]).astype(int)
-
-
-def _probe_layouts(
-    vectors: np.ndarray, sets: Sequence[Touches], names: Sequence[str], seed: int, drawn: int
-) -> Row:
-    if not sets:
-        layout = ["accuracy layout", "variance layout"]
-        empty = dict.fromkeys([*layout, *(f"variance {name}" for name in names)], np.nan)
-        return empty | {"layouts": [], "mixed": []}
-    layouts = np.repeat(np.arange(len(sets)), [len(layout) for layout in sets])
-    columns = dict(zip(names, _labels(sets).T, strict=True)) | {"layout": layouts}
-    row: Row = {f"variance {name}": explained(vectors, classes) for name, classes in columns.items()}
-    order = np.random.default_rng(seed).permutation(len(vectors))
-    row["accuracy layout"] = svm_accuracy(vectors[order], layouts[order], len(order) * 2 // 3)
-    order = np.random.default_rng(0).permutation(len(vectors))[:drawn]
-    mixed = planes(vectors[order]).ravel().tolist() if drawn else []
-    return row | {"layouts": layouts[order].tolist(), "mixed": mixed}
+def label_frame(sets: Sequence[Touches], device: AbstractDevice) -> pd.DataFrame:
+    """Return the labels of all touches, a column each."""
+    labels = [touches.known_labels.numpy().astype(int) for touches in sets]
+    names = device.task.names
+    return pd.DataFrame(np.concatenate([np.zeros((0, len(names)), int), *labels]), columns=list(names))
 
 
 def strongest(touches: Touches) -> np.ndarray:
@@ -207,12 +192,13 @@ def strongest(touches: Touches) -> np.ndarray:
     return readings[np.arange(len(readings)), readings.sum(axis=2).argmax(axis=1)]
 
 
-def svm_accuracy(vectors: np.ndarray, classes: np.ndarray, train: int) -> float:
+def svm_accuracy(vectors: np.ndarray, classes: np.ndarray | pd.Series, train: int) -> float:
     """Return the fraction of ``vectors[train:]`` that an SVM trained on the others puts into its class (B,).
 
     Radial basis functions on standardised vectors, the cost chosen by cross-validation among the training
     ones only (report, 2.2.2). nan where some class is too rare to learn.
     """
+    classes = np.asarray(classes)
     counts = np.unique(classes[:train], return_counts=True)[1]
     if len(counts) < 2 or counts.min() < 3:
         return float("nan")
@@ -220,8 +206,13 @@ def svm_accuracy(vectors: np.ndarray, classes: np.ndarray, train: int) -> float:
     return float(search.fit(vectors[:train], classes[:train]).score(vectors[train:], classes[train:]))
 
 
-def explained(vectors: np.ndarray, classes: np.ndarray) -> float:
-    """Return the fraction of the variance of vectors (B, E) between classes (B,); 0 if all are one."""
+def explained(vectors: np.ndarray, classes: np.ndarray | pd.Series) -> float:
+    """Return the fraction of the variance of vectors (B, E) between classes (B,); 0 if all are one.
+
+    It is nan without vectors.
+    """
+    if not len(vectors):
+        return float("nan")
     centred = vectors - vectors.mean(axis=0)
     parts = [centred[classes == number] for number in np.unique(classes)]
     between = sum(len(part) * (part.mean(axis=0) ** 2).sum() for part in parts)
@@ -371,7 +362,7 @@ def planes(vectors: np.ndarray) -> np.ndarray:
     """Return touches in the plane, (B, 2): PCA to 30 axes, then t-SNE (report, 2.2.2)."""
     few = np.asarray(vectors, dtype=float)
     # Neither method works on vectors that are all equal.
-    if np.ptp(few, axis=0).max() < 1e-9:
+    if not len(few) or np.ptp(few, axis=0).max() < 1e-9:
         return np.zeros((len(few), 2))
     reduced = PCA(min(30, *few.shape), random_state=0).fit_transform(few)
     return TSNE(perplexity=min(30.0, (len(few) - 1) / 3), init="pca", random_state=0).fit_transform(reduced)
@@ -405,30 +396,35 @@ def spaces(frame: pd.DataFrame, names: Sequence[str]) -> Figure:
 
 
 def _summary(frame: pd.DataFrame) -> pd.DataFrame:
-    """Return the columns of the table; the mean is over the labels that could be learnt."""
-    names = frame.attrs["labels"]
-    summary = pd.DataFrame({name: frame[f"accuracy {name}"] for name in names})
-    summary["mean"] = summary.mean(axis=1)
-    summary["layout"], summary["variance: layout"] = frame["accuracy layout"], frame["variance layout"]
-    summary["variance: best label"] = frame[[f"variance {name}" for name in names]].max(axis=1)
-    return summary
+    """Return the columns of the table by attribute, name and seed, %.
+
+    The mean is over the labels that could be learnt.
+    """
+    rows = 100 * frame.set_index(["attribute", "name", "seed"]).select_dtypes("number")
+    labels = {name: rows[f"accuracy {name}"] for name in frame.attrs["labels"]}
+    columns = labels | {
+        "mean": pd.DataFrame(labels).mean(axis=1),
+        "layout": rows["accuracy layout"],
+        "variance: layout": rows["variance layout"],
+        "variance: best label": rows[[f"variance {name}" for name in labels]].max(axis=1),
+    }
+    return pd.DataFrame(columns)
 
 
 def embeddings_table(frame: pd.DataFrame) -> pd.DataFrame:
     """Return accuracies and fractions of variance in per cent, means over seeds and their deviation."""
-    keys = [frame.attribute, frame["name"]]
-    table = _summary(frame).groupby(keys, sort=False).agg(_percent)
+    table = _summary(frame).groupby(["attribute", "name"], sort=False).agg(_mean_and_deviation)
     table.insert(0, "input", [_title(key) for key in table.index])
     return table.reset_index(drop=True)
 
 
 _STATEMENTS: tuple[tuple[str, str, str, Any], ...] = (
     ("variance: layout", "variance: best label",
-     "emphasise the graph's morphology (variance explained by layout over best label)", {"minimum": 0.02}),
+     "emphasise the graph's morphology (variance explained by layout over best label)", {"minimum": 2.0}),
     ("mean", "frame",
      "are not purposeful on a fixed layout (mean accuracy below the readings of the same frame)",
-     {"maximum": 0.02}),
-    ("mean", "chance", "leave an SVM at chance (mean accuracy over the commoner class)", {"maximum": 0.02}),
+     {"maximum": 2.0}),
+    ("mean", "chance", "leave an SVM at chance (mean accuracy over the commoner class)", {"maximum": 2.0}),
 )  # fmt: skip
 """Two columns of the summary, a statement about their difference, and its limit: two points of tolerance."""
 
@@ -439,21 +435,19 @@ def embedding_statements(frame: pd.DataFrame) -> list[str]:
     A statement holds if it holds for each embedding. Agree and disagree need the margin of at least
     three seeds.
     """
-    summary = _summary(frame).assign(attribute=frame.attribute, name=frame["name"], chance=frame.chance)
-    summary.index = frame.seed
-    summary["frame"] = summary.loc[(summary.attribute == "") & (summary["name"] == FRAME), "mean"]
-    lines = []
-    for attribute, group in summary[summary.attribute != ""].groupby("attribute", sort=False):
+    summary, lines = _summary(frame), list[str]()
+    frames = summary["mean"].unstack(["attribute", "name"])["", FRAME]
+    summary["frame"] = frames.reindex(summary.index, level="seed")
+    summary["chance"] = 100 * frame.chance.to_numpy()
+    embedded = summary.drop(index="", level="attribute")
+    for attribute, group in embedded.groupby("attribute", sort=False):
         for first, second, says, limits in _STATEMENTS:
             verdicts, details = [], []
             for name, rows in group.groupby("name", sort=False):
                 pairs = rows[[first, second]].dropna()
                 difference = compare_samples(pairs[first], pairs[second])
                 verdicts.append(judge(Statement("", says, {}, "", **limits), difference))
-                text = "has one layout only"
-                if difference is not None:
-                    spread = f" ± {100 * difference.margin:.1f}" if difference.seeds > 1 else ""
-                    text = f"{100 * difference.mean:+.1f}{spread} points"
+                text = figure_text(difference, "points") if difference else "has one layout only"
                 details.append(f"{name} {text} ({verdicts[-1]})")
             start = f"Nodes labelled by {attribute}: the embeddings {says}"
             lines.append(f"{start}: **{combine_verdicts(verdicts)}**. {'; '.join(details)}.")
@@ -464,9 +458,8 @@ def _title(key: tuple[str, str]) -> str:
     return f"{key[1]}, {key[0]}" if key[0] else key[1]
 
 
-def _percent(values: pd.Series) -> str:
-    """Return the mean of fractions in per cent, with the deviation over seeds if there are several."""
+def _mean_and_deviation(values: pd.Series) -> str:
+    """Return the mean, with the deviation over seeds if there are several; nothing where one is not known."""
     if values.isna().any():
         return ""
-    spread = f" ± {100 * stdev(values):.1f}" if len(values) > 1 else ""
-    return f"{100 * fmean(values):.1f}{spread}"
+    return f"{fmean(values):.1f}" + (f" ± {stdev(values):.1f}" if len(values) > 1 else "")

@@ -8,7 +8,7 @@ not accept the touches). A measure may have ``page(frame, title)``.
 
 import hashlib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, partial
 from importlib import import_module
 from typing import Annotated, Any
@@ -27,17 +27,15 @@ from skin.core.rng import Stream, generator
 from skin.device.base import AbstractDevice, AbstractSimulated
 from skin.device.touches import Recording
 from skin.errors import InputError
-from skin.evaluation.alarm import SAFE_TOUCHES, AlarmSource, choose_alarm_threshold
+from skin.evaluation.alarm import choose_alarm_threshold
 from skin.evaluation.margins import ALARM_NAME, MarginReport, measure_margins
 from skin.evaluation.metrics import compute_metrics, encode
-from skin.evaluation.operating_point import LABEL, OperatingPoint, Reached
+from skin.evaluation.operating_point import OperatingPoint
 from skin.evaluation.settings import StreamSettings, check_evaluation
 from skin.evaluation.streams import WindowReport, evaluate_windows
-from skin.evaluation.touch_scores import decide_touches
 from skin.learning.graph import neighbours
 from skin.learning.learner import AbstractLearner
-from skin.live.engine import DebounceSettings
-from skin.runs.build import TorchModel, alarm_source, build_device, load_model, load_run
+from skin.runs.build import TorchModel, alarm_source, build_device, load_run
 from skin.runs.configuration import Config
 from skin.touch.labels import TOUCH
 
@@ -78,12 +76,6 @@ class Subject:
     def learner(self) -> AbstractLearner:
         """What the run learned."""
         return self.trained.learner
-
-    @property
-    def reloaded(self) -> TorchModel:
-        """What the run learned, with the device of the condition."""
-        assert self.trained.run is not None
-        return load_model(self.trained.run, self.config)
 
     def load(self, name: str) -> Any:
         """Return a finished run, pretrained model or exported one for the skin of the configuration."""
@@ -186,26 +178,21 @@ def margins_frame(report: MarginReport) -> pd.DataFrame:
         for group in report.faint
     ]  # fmt: skip
     frame = pd.DataFrame(rows)
-    frame.attrs |= {"metrics": report.metrics, "about": _summarise_margins(report)}
-    return frame
-
-
-def _summarise_margins(report: MarginReport) -> str:
-    """Return the number of errors close to a threshold or on weak touches, in one line."""
-    wrong = {name: sum(span.wrong for span in report.spans[name]) for name in TOUCH.names}
-    close = {
-        name: sum(span.wrong for span in report.spans[name] if span.low >= 0.9 and span.high <= 1.1)
-        for name in ("big", "dangerous")
-    }
-    weak = sum(group.wrong["dynamic"] for group in report.faint if group.high <= 1.0)  # N
-    clear = [span for span in report.spans[ALARM_NAME] if span.low >= 1.1]
-    return (
-        f"within 10 % of their thresholds lie {close['big']} of {wrong['big']} errors of big and "
-        f"{close['dangerous']} of {wrong['dangerous']} of dangerous; no reading passes 1 N in "
-        f"{weak} of {wrong['dynamic']} errors of dynamic; {sum(span.wrong for span in clear)} of "
-        f"{sum(span.count for span in clear)} touches more than 10 % above the threshold of dangerous raise "
+    low, high = frame.low.astype(float), frame.high.astype(float)
+    spans = frame.by == "threshold"
+    close = frame[spans & (low >= 0.9) & (high <= 1.1)].groupby("label").wrong.sum()
+    weak = frame[~spans & (high <= 1.0)].groupby("label").wrong.sum()  # N
+    wrong = frame[spans].groupby("label").wrong.sum()
+    clear = frame[spans & (frame.label == ALARM_NAME) & (low >= 1.1)]
+    about = (
+        f"within 10 % of their thresholds lie {close.get('big', 0)} of {wrong.big} errors of big and "
+        f"{close.get('dangerous', 0)} of {wrong.dangerous} of dangerous; no reading passes 1 N in "
+        f"{weak.get('dynamic', 0)} of {wrong.dynamic} errors of dynamic; {clear.wrong.sum()} of "
+        f"{clear.touches.sum()} touches more than 10 % above the threshold of dangerous raise "
         f"no alarm; {report.point.sentence()}; {report.reached.sentence()}"
     )
+    frame.attrs |= {"metrics": report.metrics, "about": about}
+    return frame
 
 
 class Streams(StreamSettings):
@@ -259,60 +246,6 @@ def streams_frame(report: WindowReport) -> pd.DataFrame:
     frame = pd.DataFrame(rows, columns=["measure", "name", "at", "value"]).map(str)
     frame.attrs |= {"metrics": report.metrics(), "about": "; ".join(parts)}
     return frame
-
-
-@dataclass(frozen=True)
-class TouchAlarms:
-    """False alarms and recall per touch, as the live view raises alarms, beside those of single windows.
-
-    Thresholds are chosen on other touches of the same device than those that are counted.
-
-    Args:
-        safe, dangerous: number of touches that are counted.
-        seed: of the touches that are counted; it must differ from those of training and thresholds.
-    """
-
-    safe: Annotated[int, Ge(1)] = 10000
-    dangerous: Annotated[int, Ge(1)] = 2000
-    seed: Annotated[int, Ge(0)] = 1_000_003
-
-    def __call__(self, subject: Subject) -> pd.DataFrame:
-        trained, settings = subject.trained, check_evaluation(subject.config.evaluation)
-        device = subject.device.simulated("touches are simulated")
-        rate = float(np.ravel(device.rate)[0])
-        live = trained.live_conditions(rate, DebounceSettings().alarm, rate <= device.model_rate)
-        source = AlarmSource("this run", settings, subject.learner, device=device)
-        touch = choose_alarm_threshold(source, live, anew=True)
-        window = choose_alarm_threshold(source, anew=True)
-        assert touch is not None
-        assert window is not None  # it has the label
-        labels = device.sampler.balanced(2 * max(self.safe, self.dangerous), generator(Stream.TEST, 7))
-        danger = labels[:, TOUCH.names.index(LABEL)]
-        counted = np.concatenate([labels[~danger][: self.safe], labels[danger][: self.dangerous]])
-        few = min(self.safe, SAFE_TOUCHES)
-        alarms = touch.alarm(
-            decide_touches(subject.learner, device, live, counted, self.seed).scores(touch.score)
-        )
-        at_once = replace(live, patience=0.0)
-        single = window.alarm(
-            decide_touches(subject.learner, device, at_once, counted[:few], self.seed).scores(None)
-        )
-        tests = device.touches("test")
-        probabilities = subject.learner.probabilities(tests)
-        raised, false = int(alarms[self.safe :].sum()), int(alarms[: self.safe].sum())
-        reached = {
-            "touch": Reached(self.dangerous, raised, self.safe, false),
-            "window": window.reached(probabilities, tests.known_labels, trained.device.task),
-            "touch_at_window_threshold": Reached(0, 0, few, int(single.sum())),
-        }
-        metrics = {"touch/threshold": touch.threshold, "window/threshold": window.threshold}
-        for name, alarm in reached.items():
-            rates = zip(("rate", "low", "high"), (alarm.false_alarm_rate, *alarm.range), strict=True)
-            metrics |= {f"{name}/false_alarm_{kind}": value for kind, value in rates}
-            metrics |= {f"{name}/recall": alarm.recall} if alarm.dangerous else {}
-        frame = pd.DataFrame([metrics])
-        frame.attrs["about"] = "\n".join(f"{name}: {alarm.sentence()}" for name, alarm in reached.items())
-        return frame
 
 
 @dataclass(frozen=True)

@@ -118,26 +118,24 @@ def publish_study(study: Study, title: str, trials: pd.DataFrame, path: Path) ->
     return publish_page(Page("", shown, data, figure), title, path)
 
 
-def publish_measured(
-    study: Study, measured: Sequence[tuple[Mapping[str, Any], Page]], path: Path
-) -> list[Path]:
+def publish_measured(study: Study, trials: pd.DataFrame, path: Path) -> list[Path]:
     """Write the tables of a measure: of several runs a CSV file, each line behind its trial.
 
     Args:
         study: whose tables they are.
-        measured: row of the trials, and page.
+        trials: with the ``page`` of each.
         path: without an ending.
     """
-    pages = [page for _, page in measured]
-    if len(pages) < (2 if study.has_runs else 1):
+    trials = trials[[isinstance(page, Page) and not page.data.empty for page in trials.page]]
+    if len(trials) < (2 if study.has_runs else 1):
         return []
+    rows = pd.concat([page.data for page in trials.page], keys=range(len(trials)))
     if study.has_runs:
-        keys = [pd.DataFrame([{name: row[name] for name in identity(study)}]) for row, _ in measured]
-        data = [key.merge(page.data, how="cross") for key, page in zip(keys, pages, strict=True)]
-        return [write_csv(pd.concat(data), path.with_name(f"{path.name}.csv"))]
-    rows = pd.concat([page.data for page in pages])
-    about = "\n".join(page.about for page in pages if page.about)
-    figure = next((page.figure for page in pages if page.figure), None)
+        keys = trials[identity(study)].set_axis(range(len(trials)))
+        joined = keys.loc[rows.index.get_level_values(0)].set_axis(rows.index)
+        return [write_csv(pd.concat([joined, rows], axis=1), path.with_name(f"{path.name}.csv"))]
+    about = "\n".join(page.about for page in trials.page if page.about)
+    figure = next((page.figure for page in trials.page if page.figure), None)
     tables = {} if len(rows) < 2 else {"Measured": rows.astype(str)}
     return publish_page(Page(about, tables, rows, figure), f"{study.name}: {study.about}", path)
 
@@ -207,7 +205,7 @@ def differences_table(study: Study, trials: pd.DataFrame) -> pd.DataFrame:
     unit, lines = UNITS.get(study.metrics[0], "points"), []
     for variant, condition, compared, verdict in differences(study, trials) if study.differences else ():
         count = str(compared.seeds if compared else 0)
-        lines.append([variant, condition, _figure(compared, unit), count, verdict])
+        lines.append([variant, condition, figure_text(compared, unit), count, verdict])
     return pd.DataFrame(lines, columns=["variant", "condition", "difference", "n", "verdict"])
 
 
@@ -224,7 +222,7 @@ def comparison_text(conclusion: Conclusion) -> str:
     """Return every comparison of a statement: the mean over paired seeds ± margin."""
     statement, several = conclusion.statement, len(conclusion.compared) > 1
     unit = "times" if statement.ratio else UNITS.get(statement.metric, "points")
-    texts = {name: _figure(comparison, unit) for name, comparison in conclusion.compared.items()}
+    texts = {name: figure_text(comparison, unit) for name, comparison in conclusion.compared.items()}
     return "; ".join(text + f" ({name})" if several else text for name, text in texts.items())
 
 
@@ -249,7 +247,8 @@ def _cell(trials: pd.DataFrame, metric: str, reference: Reference | None = None)
     return f"{mean:.{digits}f}" + (f" ± {margin:.{digits}f}" if several else "") + brackets
 
 
-def _figure(compared: Estimate | None, unit: str) -> str:
+def figure_text(compared: Estimate | None, unit: str) -> str:
+    """Return a comparison with its margin and unit."""
     if compared is None:
         return "no paired runs"
     sign, digits = ("" if unit == "times" else "+"), (2 if unit in ("s", "times") else 1)
@@ -319,7 +318,8 @@ def _strips(study: Study, trials: pd.DataFrame) -> Figure:
     lines = variants if shared else [", ".join(filter(None, key)) for key, _ in groups]
     height = 0.1 * max(len(conditions), 3) if shared else 0.3
     figure = Figure(figsize=(8, 1.2 + height * len(lines)), layout="constrained")
-    axis = figure.subplots()
+    across = f"{_label(metric)}: each run, mean and 95 % interval"
+    axis = figure.add_subplot(ylim=(len(lines) - 0.5, -0.5), xlabel=across)
     for number, ((variant, condition), group) in enumerate(groups):
         if values(group, metric).empty:
             continue
@@ -331,12 +331,10 @@ def _strips(study: Study, trials: pd.DataFrame) -> Figure:
         figures = (1 if metric in UNITS else 100) * group[metric].dropna()
         axis.plot(figures, [height] * len(figures), marker, color=colour, alpha=0.35, ms=4)
         label = condition or "no condition"
-        label = f"_{label}" if label in axis.get_legend_handles_labels()[1] else label  # not in the legend
-        axis.errorbar(mean, height, xerr=margin, fmt=marker if shared else "|", label=label,
+        known = label in axis.get_legend_handles_labels()[1]
+        axis.errorbar(mean, height, xerr=margin, fmt=marker if shared else "|", label="_" * known + label,
                       color=colour if shared else "black", ms=4 if shared else 10, capsize=2)  # fmt: skip
     axis.set_yticks(range(len(lines)), lines, fontsize=8)
-    axis.set_ylim(len(lines) - 0.5, -0.5)
-    axis.set_xlabel(f"{_label(metric)}: each run, mean and 95 % interval")
     axis.set_title(study.about, fontsize=9, wrap=True)
     if shared:
         figure.legend(loc="outside right center", fontsize=7)

@@ -22,26 +22,23 @@ _HEAD = """# Reproduction of the report's statements
 
 Written by `python -m experiments.studies.reproduce` from the statements in `conf/` and the published results.
 
-- `study=…` is short for `skin study study=…`. An empty cell repeats the command above.
-- A commit in parentheses: measured there; no published file has the value.
-- Finite elements, default settings, three or five seeds, unless stated. In parentheses: report sections.
-- Differences are in percentage points.
-- *agree* and *disagree* need a difference beyond the [margin](protocol.md#intervals-and-comparisons) (±) and
-  three seeds (or devices of one training). The pages of `skin study` add the margin over test gestures, which
-  is here only where it decides. With so many statements, some verdicts are due to chance.
+- `study=…` is short for `skin study study=…`. An empty cell repeats the command above. Finite elements,
+  default settings, three or five seeds. In parentheses: report sections.
+- Differences are in percentage points, ± [margin](protocol.md#intervals-and-comparisons). *agree* and
+  *disagree* need three seeds, or devices of one training. Margins over test gestures are here only where they
+  decide. With so many statements, some verdicts are due to chance.
 """
 
 
 def reproduce_page() -> str:
     """Return the page of the committed files."""
-    studies = dict(every_study())
+    studies, parts = dict(every_study()), [_HEAD]
     sections: Any = OmegaConf.to_container(OmegaConf.load(CONF / "statements.yaml"))
-    parts = [_HEAD]
     for section in sections:
         parts.append(f"\n## {section['title']}\n\n| statement | command | outcome |\n|---|---|---|\n")
         for name in section["studies"]:
             parts += _study_lines(*studies[name])
-        parts += [_stated(line) if "outcome" in line else _tested(line) for line in section["statements"]]
+        parts += map(_other_line, section["statements"])
     return "".join(parts)
 
 
@@ -81,30 +78,32 @@ def published_trials(name: str, chosen: Mapping[str, Mapping[str, str]] | None =
 def _study_lines(command: str, study: Study) -> Iterator[str]:
     trials = published_trials(study.name, trained_settings(study))
     if trials.empty:
-        yield f"| {len(study.statements)} on the {study.about} | `{command}` | *not tested* |\n"
+        yield _line(f"{len(study.statements)} on the {study.about}", f"`{command}`", "*not tested*")
         return
     for number, statement in enumerate(study.statements):
-        yield _line(statement, "" if number else f"`{command}`", trials)
+        yield _tested(statement, "" if number else f"`{command}`", trials)
 
 
-def _tested(settings: dict[str, Any]) -> str:
-    """Return the line of a statement that is tested on a published file."""
+def _other_line(settings: dict[str, Any]) -> str:
+    """Return the line of a statement without a study: it states its outcome, or a published file tests it."""
+    if "outcome" in settings:
+        command = settings.get("command", "")
+        quoted = f"`{command}`" if command and not command.startswith("[") else command
+        return _line(settings["says"], quoted, settings["outcome"])
     name = settings.pop("results")
-    link = f"[values](results/study_{name}.csv)"
-    return _line(configured(Statement, {"id": ""} | settings, "statement"), link, published_trials(name))
+    statement = configured(Statement, {"id": ""} | settings, "statement")
+    return _tested(statement, f"[values](results/study_{name}.csv)", published_trials(name))
 
 
-def _line(statement: Statement, command: str, trials: pd.DataFrame) -> str:
+def _tested(statement: Statement, command: str, trials: pd.DataFrame) -> str:
+    """Return the line of a statement that trials decide."""
     says = statement.says + (f" ({statement.section})" if statement.section else "")
     result = conclude(statement, trials)
-    return f"| {says} | {command} | {comparison_text(result).replace(' points', '')}: *{result.verdict}* |\n"
+    return _line(says, command, f"{comparison_text(result).replace(' points', '')}: *{result.verdict}*")
 
 
-def _stated(line: Mapping[str, str]) -> str:
-    command = line.get("command", "")
-    command = f"`{command}`" if command and not command.startswith("[") else command
-    commit = f" ({line['commit']})" if "commit" in line else ""
-    return f"| {line['says']} | {command} | {line['outcome']}{commit} |\n"
+def _line(*cells: str) -> str:
+    return f"| {' | '.join(cells)} |\n"
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
 """Compare variants of trainings, or finished runs under conditions; give verdicts on statements.
 
     skin study study=table
-    skin study study=graphs study.part=norm
-    skin study -m study=graphs,late_early simulator=naive
+    skin study study=models study.part=norm
+    skin study -m study=models study.part=norm,ensemble simulator=naive
     skin study study=robustness study.part=dead study.rows=[features,gru]
     skin study study=margins study.run=latest
     skin study study=known_loads
@@ -128,7 +128,7 @@ def chosen_studies(settings: dict[str, Any]) -> list[Study]:
     option = HydraConfig.get().runtime.choices.get("study")
     if not option:
         options = ", ".join(sorted(path.stem for path in (CONF / "study").glob("*.yaml")))
-        raise InputError(f"which study? choose one of {options}, as in study=graphs")
+        raise InputError(f"which study? choose one of {options}, as in study=models")
     settings = dict(settings)
     parts, part = settings.pop("parts"), settings.pop("part")
     names = [*parts] if part is None else [part] if isinstance(part, str) else part

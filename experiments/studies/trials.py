@@ -89,17 +89,14 @@ def run_study(study: Study, config: Config, folder: Path, smoke: bool) -> bool:
     """Measure the runs of a study, publish the results, and return whether all runs have finished."""
     shard = Shard.parse(config.shard) if config.shard is not None else None
     store, planned = plan_runs(study, config, shard, smoke)
-    trials, measured = list[dict[str, Any]](), list[tuple[dict[str, Any], Page]]()
-    console = Console(stderr=True)
+    trials, console = list[dict[str, Any]](), Console(stderr=True)
     runs = track(planned, "measuring", console=console, transient=True, disable=not console.is_terminal)
-    for row, page, title, name in (trial for run in runs for trial in run_trials(store, run, study, config)):
-        trials.append(row)
-        if page is None or page.data.empty:
-            continue
-        measured.append((row, page))
-        paths = publish_page(page, title, folder / name) if page.tables and store else []
+    for trial in (trial for run in runs for trial in run_trials(store, run, study, config)):
+        trials.append(trial)
+        page: Page = trial["page"]
+        paths = publish_page(page, trial["title"], folder / trial["file"]) if page.tables and store else []
         if page.about:
-            about = f"{row['variant']} ({row['run'][:8]}): {page.about}" if store else page.about
+            about = f"{trial['variant']} ({trial['run'][:8]}): {page.about}" if store else page.about
             print(about, *paths, sep="\n", flush=True)
     complete = not store or all(run.finished for run in planned)
     if shard:
@@ -108,14 +105,12 @@ def run_study(study: Study, config: Config, folder: Path, smoke: bool) -> bool:
     frame = pd.DataFrame([*trials, *votes(study, pd.DataFrame(trials))])
     path = folder / (f"study_{study.name}" if store else study.name)
     if study.metrics and store:
-        words = [word for word in passed_overrides() if not word.startswith("tracking.")]
-        warning, small = (
-            ("SMOKE, one epoch on little data, ignore the scores: ", study.small) if smoke else ("", ())
-        )
-        title = warning + ", ".join([f"{study.name}: {study.about}", *small, *words])
-        paths = publish_study(study, title, frame, path)
+        words = [f"{study.name}: {study.about}", *(study.small if smoke else ())]
+        words += [word for word in passed_overrides() if not word.startswith("tracking.")]
+        warning = "SMOKE, one epoch on little data, ignore the scores: " if smoke else ""
+        paths = publish_study(study, warning + ", ".join(words), frame, path)
     else:
-        paths = publish_measured(study, measured, path)
+        paths = publish_measured(study, frame, path)
     print(*paths, sep="\n")
     if study.report_figures:
         skins = {
@@ -162,23 +157,22 @@ def _train(study: Study, command: Config, shard: Shard | None, smoke: bool) -> t
         for seed, config in variant.configs.items()
     ]
     store = Store.open(next(iter(planned[0][1].variant.configs.values())).tracking)
-    prints = {print_ for print_, _ in planned}
-    if shard:
-        prints = shard.part(prints)
-    planned = [(print_, run) for print_, run in planned if print_ in prints]
+    every = {print_ for print_, _ in planned}
+    prints = shard.part(every) if shard else every
 
     def look() -> Iterator[StudyRun]:
         """Yield the runs, with the newest finished one of each configuration."""
         for print_, run in planned:
-            found = store.find("FINISHED", fingerprint=print_)[:1]
-            for each in found:
-                note_reuse(each)
-            yield replace(run, finished=FinishedRun(store, found[0], command.trust) if found else None)
+            if print_ in prints:
+                found = next(iter(store.find("FINISHED", fingerprint=print_)), None)
+                if found:
+                    note_reuse(found)
+                yield replace(run, finished=FinishedRun(store, found, command.trust) if found else None)
 
     if study.train and any(not run.finished for run in look() if run.variant.trained):
         parallel = ["hydra/launcher=joblib", f"hydra.launcher.n_jobs={study.jobs}"] if study.jobs > 1 else []
+        divided = [f"+hydra.callbacks.sweep.runs={sorted(prints)}"] if shard else []
         for _, line in sweeps(study, study.trainings, smoke):
-            divided = [f"+hydra.callbacks.sweep.runs={sorted(prints)}"] if shard else []
             multirun([*line, *parallel, *divided])
     return store, [run for run in look() if run.finished or run.variant.trained]
 
@@ -251,12 +245,10 @@ def run_command(main: Callable[[Sequence[str]], None], words: Sequence[str]) -> 
     return 0
 
 
-Trial = tuple[dict[str, Any], Page | None, str, str]
-"""Row of the trials, page, and title and name of the page."""
+def run_trials(store: Store | None, run: StudyRun, study: Study, config: Config) -> Iterator[dict[str, Any]]:
+    """Yield the trials of a run, with the ``page`` of each, its ``title`` and the name of its ``file``.
 
-
-def run_trials(store: Store | None, run: StudyRun, study: Study, config: Config) -> Iterator[Trial]:
-    """Yield the trials of a run; measurements that exist are not made again.
+    Measurements that exist are not made again.
 
     Args:
         store: of the run; None: a study without runs.
@@ -267,14 +259,14 @@ def run_trials(store: Store | None, run: StudyRun, study: Study, config: Config)
     variant, tags, finished = run.variant, run.tags, run.finished
     row: dict[str, Any] = {"variant": variant.name, "seed": run.seed, "condition": "", "device": ""}
     row |= {"run": tags.get("fingerprint", ""), "chosen": variant.chosen, "outcomes": None, "cannot": ()}
-    row |= _row_and_simulator(variant)
+    row |= _row_and_simulator(variant) | {"page": Page("")}
     if store and not finished:
-        yield row, None, "", ""
+        yield row
         return
     logged = finished.run.data.metrics if finished and variant.configs else {}
     if finished and study.measure is None and not study.conditions:
         refused = [name.removeprefix("cannot_") for name in tags if name.startswith("cannot_")]
-        yield row | {"outcomes": _load_outcomes(finished), "cannot": refused} | logged, None, "", ""
+        yield row | {"outcomes": _load_outcomes(finished), "cannot": refused} | logged
         return
     # Trainings had these overrides. They change the device of other runs, whose simulator selected them.
     words, selected = passed_overrides(), f"simulator={tags.get('simulator')}"
@@ -282,28 +274,29 @@ def run_trials(store: Store | None, run: StudyRun, study: Study, config: Config)
     # The name of a run, and not its id, which differs between databases.
     name = finished.title if finished else study.name
     title = f"{name}, run {tags.get('fingerprint', finished.identity)[:8]}" if finished else ""
-    for condition, settings in (study.conditions or {"": {}}).items():
-        for number, numbered in numbered_settings(study, settings):
-            own = {key: value for key, value in numbered.items() if not key.startswith(MEASURE)}
-            of_measure = {key.removeprefix(MEASURE): numbered[key] for key in numbered.keys() - own.keys()}
-            measure = replace(study.measure or Accuracy(), **of_measure)
-            line = [*as_overrides({**study.test, **own}), *changes]
-            if finished:
-                general = [word for word in base if word.startswith(("hydra", "tracking"))]
-                changed = finished.configured([*general, *line])
-            else:
-                changed = validate_config(compose("train", [*base, *line]))
-            subject = Subject(changed, condition=condition, changes=as_overrides(own))
-            frame, key = measure_once(study.name, measure, run, subject, config.tracking.resume)
-            cannot = ("same",) if frame.attrs.get("cannot") else ()
-            metrics = frame.attrs.get("metrics", frame.iloc[0].to_dict() if len(frame) == 1 else {})
-            metrics = metrics if store else {}  # rows of a skin have texts
-            results = ({} if condition else logged) | metrics
-            results |= {"condition": condition, "device": number, "cannot": cannot}
-            file = f"{type(measure).__name__.lower()}_" + re.sub(r"\W+", "_", name)
-            if any(not word.startswith("tracking.") for word in line):
-                file += f"_{key[:8]}"
-            yield row | results, _page(measure, frame, title), title, file
+    for condition, number, settings in numbered_settings(study):
+        own = {key: value for key, value in settings.items() if not key.startswith(MEASURE)}
+        of_measure = {key.removeprefix(MEASURE): settings[key] for key in settings.keys() - own.keys()}
+        measure = replace(study.measure or Accuracy(), **of_measure)
+        line = [*as_overrides({**study.test, **own}), *changes]
+        if finished:
+            general = [word for word in base if word.startswith(("hydra", "tracking"))]
+            changed = finished.configured([*general, *line])
+        else:
+            changed = validate_config(compose("train", [*base, *line]))
+        subject = Subject(changed, condition=condition, changes=as_overrides(own))
+        frame, key = measure_once(study.name, measure, run, subject, config.tracking.resume)
+        metrics = frame.attrs.get("metrics", frame.iloc[0].to_dict() if len(frame) == 1 else {})
+        file = f"{type(measure).__name__.lower()}_" + re.sub(r"\W+", "_", name)
+        file += f"_{key[:8]}" if any(not word.startswith("tracking.") for word in line) else ""
+        page = {"page": _page(measure, frame, title), "title": title, "file": file}
+        trial = {
+            "condition": condition,
+            "device": number,
+            "cannot": ("same",) if frame.attrs.get("cannot") else (),
+        }
+        # Rows of a skin have texts.
+        yield row | ({} if condition else logged) | (metrics if store else {}) | trial | page
 
 
 def _row_and_simulator(variant: Variant) -> dict[str, str]:
@@ -335,25 +328,26 @@ def _page(measure: StudyMeasure, frame: pd.DataFrame, title: str) -> Page:
     return Page(frame.attrs.get("about", ""), tables, frame)
 
 
-def numbered_settings(study: Study, condition: Mapping[str, Any]) -> Iterator[tuple[str, Mapping[str, Any]]]:
-    """Yield the settings of each device of a condition, with its number; empty where there is only one.
+def numbered_settings(study: Study) -> Iterator[tuple[str, str, Mapping[str, Any]]]:
+    """Yield each condition, with the number and settings of each device; no number where there is only one.
 
     Raises:
         InputError: lists of different lengths.
     """
-    lists = {
-        key: value
-        for key, value in condition.items()
-        if isinstance(value, list) and not key.startswith(MEASURE)
-    }
-    lists |= {key: list(range(1, study.devices + 1)) for key in study.numbered if study.devices}
-    if not lists:
-        yield "", condition
-        return
-    if len({len(values) for values in lists.values()}) > 1:
-        raise InputError(f"the lists of a condition number its devices, so they need one length, got {lists}")
-    for number, values in enumerate(zip(*lists.values(), strict=True), start=1):
-        yield str(number), {**condition, **dict(zip(lists, values, strict=True))}
+    numbers = {key: list(range(1, study.devices + 1)) for key in study.numbered if study.devices}
+    for name, condition in (study.conditions or {"": {}}).items():
+        settings = condition | numbers
+        lists = {
+            key: each
+            for key, each in settings.items()
+            if isinstance(each, list) and not key.startswith(MEASURE)
+        }
+        if len({len(values) for values in lists.values()}) > 1:
+            raise InputError(
+                f"the lists of a condition number its devices, so they need one length, got {lists}"
+            )
+        for number, values in enumerate(zip(*lists.values(), strict=True) if lists else [()], start=1):
+            yield name, str(number) if lists else "", settings | dict(zip(lists, values, strict=True))
 
 
 def measure_once(

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 
-from skin.body.base import Arm
 from skin.device.files import read_recording, write_recording
 from skin.errors import InputError
 from skin.runs.build import build_data, build_device
@@ -65,20 +64,6 @@ def test_a_recording_keeps_the_size_of_the_arm(configured, tmp_path, name):
     assert build_device(configured(*recorded)).size == pytest.approx((0.125, 0.16))
     with pytest.raises(InputError, match=r"of 0.125 x 0.16 m, the body is 0.1 x 0.16 m: add body.angle=2.5 "):
         build_device(configured(*recorded, "body.angle=2"))
-
-
-def test_a_large_arm_reads_what_a_sheet_reads(configured):
-    """The same skin as a box and as a part of a very large cylinder."""
-    sheet = build_device(configured(*SOLID, "device.noise=0"))
-    # No arm of a configuration is so large.
-    arm = sheet.replace(
-        body=Arm(cells=(10, 10), layers=sheet.body.layers, radius=1000.0, length=0.16, angle=0.16e-3)
-    )
-    flat, bent = (device.touches("test").readings for device in (sheet, arm))
-    torch.testing.assert_close(bent, flat, rtol=1e-3, atol=1e-3)
-    # ... and of a small one it does not.
-    small = build_device(configured("body=arm", *SOLID, "device.noise=0")).touches("test").readings
-    assert (small - flat).abs().max() > 0.01 * flat.abs().max()
 
 
 def test_sensors_on_the_arm_move_and_graphs_follow_them(configured):

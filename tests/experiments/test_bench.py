@@ -4,8 +4,7 @@ import json
 
 import pytest
 
-from experiments import benchmarks as module
-from experiments.benchmarks import benchmarks, main, run_alone
+from experiments.benchmarks import main, run_alone
 from skin.core.files import ROOT
 
 
@@ -13,15 +12,15 @@ from skin.core.files import ROOT
 def test_generation_and_operators_are_timed_with_an_empty_cache(tmp_path, monkeypatch):
     monkeypatch.setenv("SKIN_CACHE", str(tmp_path))
     # A warm operator is there in a hundredth of that.
-    assert run_alone("measure_operator", ["fem", 1])["build_seconds"] > 0.02
+    assert run_alone("operator.fem", 1)["build_seconds"] > 0.02
     assert not list(tmp_path.iterdir())
-    assert run_alone("measure_generation", ["fem", 1])["gestures_per_second"] > 100
+    assert run_alone("generation.fem", 1)["gestures_per_second"] > 100
 
 
 @pytest.mark.slow("measures times of verdicts")
-@pytest.mark.parametrize(("row", "onnx"), [("best_fresh", False), ("any_skin", False), ("best_fresh", True)])
-def test_a_verdict_is_timed_by_the_wall_and_by_the_core(row, onnx):
-    figures = run_alone("measure_latency", [row, onnx, 60])
+@pytest.mark.parametrize("name", ["best_fresh", "any_skin", "onnx"])
+def test_a_verdict_is_timed_by_the_wall_and_by_the_core(name):
+    figures = run_alone(f"live.{name}", 1)
     assert set(figures) == {"p50_ms", "p99_ms", "core_ms", "core_share", "memory_mb"}
     # A frame without a decision takes a fiftieth of that.
     assert 0.2 < figures["p50_ms"] <= figures["p99_ms"]
@@ -46,12 +45,7 @@ def test_another_checkout_is_measured_in_the_same_run(tmp_path, capsys):
 
 @pytest.mark.slow("measures epochs of training")
 def test_the_epochs_of_a_row_are_timed():
-    assert run_alone("measure_training", ["temporal_graph", 1])["seconds_per_epoch"] > 0
-
-
-def test_every_benchmark_is_a_function():
-    for function, _ in benchmarks(3).values():
-        assert callable(getattr(module, function))
+    assert run_alone("training.temporal_graph", 1)["seconds_per_epoch"] > 0
 
 
 @pytest.mark.parametrize(

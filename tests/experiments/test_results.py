@@ -23,13 +23,12 @@ SMALL = ["simulator=naive", "data.gestures=160", "device.test_gestures=64", "eva
 PARTS = [
     "results.parts.table=[['train -m experiment=rules seed=0,1,2,3', 1], "
     "['study study=table study.rows=[rules] study.seeds=[0,1,2,3]', 1]]",
-    "results.parts.studies=[['study study=ensemble study.rows=[rules] study.seeds=[0,1] "
+    "results.parts.studies=[['study study=models study.part=ensemble study.rows=[rules] study.seeds=[0,1] "
     "study.train=false', 1]]",
-    "results.parts.table_solid=[]",
-    "results.parts.best_fresh_solid=[]",
-    "results.parts.sensors=[]",
-    "results.parts.any_skin=[]",
-    "results.parts.design=[]",
+    *(
+        f"results.parts.{part}=[]"
+        for part in ("table_solid", "best_fresh_solid", "sensors", "any_skin", "design")
+    ),
     "results.parts.best_fresh=[]",
     "out=docs",
 ]
@@ -63,7 +62,7 @@ def test_a_killed_command_goes_on_where_it_was(run, begin, tmp_path):
     ]
     assert {"study_table.csv", "study_ensemble.csv"} <= {path.name for path in (tmp_path / "docs").iterdir()}
     again = run(tmp_path, "results", *PARTS, *SMALL)
-    assert (again.returncode, again.stdout.count("took")) == (0, 0), again.stderr
+    assert (again.returncode, again.stdout.count(": done")) == (0, 0), again.stderr
     fresh = run(
         tmp_path, "results", *PARTS, *SMALL, "results.fresh=true", "results.part=studies", store=False
     )
@@ -74,7 +73,7 @@ def test_a_killed_command_goes_on_where_it_was(run, begin, tmp_path):
 @pytest.mark.slow("trains several rows")
 def test_a_command_that_fails_does_not_stop_the_others(run, tmp_path):
     lines = "['study study=nope', 1], "
-    lines += "['study study=ensemble study.rows=[rules] study.train=false', 1]"
+    lines += "['study study=models study.part=ensemble study.rows=[rules] study.train=false', 1]"
     words = [f"results.parts.studies=[{lines}]", "results.part=studies"]
     done = run(tmp_path, "results", *PARTS, *words, *SMALL)
     assert done.returncode == 1
@@ -93,14 +92,8 @@ def test_bounds_are_published_in_a_folder_of_their_own(run, tmp_path):
 @pytest.mark.parametrize(
     ("words", "reason"),
     [
-        (
-            ["results.part=tables"],
-            "results.part=tables is none of all, table, table_solid, best_fresh, best_fresh_solid, sensors, "
-            "any_skin, studies, design, devices, graphs, other_skins, image_head, image_size, "
-            "image_representation",
-        ),
+        (["results.part=tables"], "results.part=tables is none of all, table, table_solid, best_fresh, "),
         (["results.parts.table=[[study, 0]]"], "results.parts="),
-        (["results.optional=[image]"], "results.optional=['image']: there is no part image"),
         (["results.jobs=0"], "results.jobs"),
     ],
 )
@@ -148,18 +141,13 @@ def test_every_command_of_the_plan_composes(line):
                 assert study.about
 
 
-def test_the_plan_takes_a_night_and_each_part_an_evening():
+def test_the_plan_takes_a_night_and_make_help_states_the_hours_of_each_part():
     settings = OmegaConf.load(CONF / "results.yaml").results
     hours = {name: sum(hours for _, hours in steps) for name, steps in settings.parts.items()}
+    every = sum(each for name, each in hours.items() if name not in settings.optional)
     assert max(hours.values()) <= 2.5
-    assert sum(each for name, each in hours.items() if name not in settings.optional) <= 8
-
-
-def test_make_help_states_the_hours_of_each_part():
-    settings = OmegaConf.load(CONF / "results.yaml").results
-    hours = {name: sum(hours for _, hours in steps) for name, steps in settings.parts.items()}
+    assert every <= 8
     (text,) = (line for line in (ROOT / "Makefile").read_text().splitlines() if line.startswith("results:"))
     stated = {name: float(value) for name, value in re.findall(r"(\w+) ([\d.]+) h", text)}
-    every = sum(each for name, each in hours.items() if name not in settings.optional)
     assert stated.pop("in") == pytest.approx(every, rel=0.1)
     assert stated == pytest.approx(hours, rel=0.1)

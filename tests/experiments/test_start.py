@@ -1,8 +1,12 @@
-"""Every command as a person starts it: a mistake is answered at once, in one sentence."""
+"""Commands as a person starts them: scripts are short for verbs, and a mistake is answered at once."""
+
+import subprocess
+import sys
 
 import pytest
 
 from skin.__main__ import verbs
+from skin.core.files import ROOT
 
 
 @pytest.mark.parametrize("verb", verbs())
@@ -11,3 +15,10 @@ def test_a_mistake_waits_for_no_heavy_import(verb, light, tmp_path):
     assert (done.returncode, done.stdout) == (2, "\n"), done.stderr
     assert "typo" in done.stderr
     assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize("script", ["train", "evaluate", "generate", "record", "live", "reproduce_table"])
+def test_a_script_shows_the_help_of_its_command(script):
+    command = [sys.executable, str(ROOT / "experiments" / f"{script}.py"), "--help"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
+    assert f"skin {script.replace('reproduce_table', 'study')}" in done.stdout

@@ -36,7 +36,6 @@ class Payload:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """Return the folder of a store without runs."""
     return tmp_path_factory.mktemp("stranger")
 
 
@@ -137,27 +136,25 @@ def test_a_stored_configuration_cannot_say_that_it_is_trusted(run, folder, put, 
     assert marker.exists()
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        "row: !!python/object/apply:os.mkdir [MARKER]\n",
-        "a: &a [x, x]\nb: &b [*a, *a]\nrow: [*b, *b]\n",
-        "row: " + 2000 * "[",
-        "- row\n",
-        "row: \0",
-    ],
-)
-def test_yaml_makes_no_objects_and_does_not_grow(text, store, put, marker):
-    found = find_run(Tracking(store.uri), put(text=text.replace("MARKER", str(marker))))
-    with pytest.raises(InputError, match=found.identity):
+TEXTS = [
+    "row: !!python/object/apply:os.mkdir [MARKER]\n",
+    "a: &a [x, x]\nb: &b [*a, *a]\nrow: [*b, *b]\n",
+    "row: " + 2000 * "[",
+    "- row\n",
+    "row: \0",
+    "row: x/../../marker\n",
+]
+
+
+@pytest.mark.parametrize("text", TEXTS)
+def test_yaml_makes_no_objects_does_not_grow_and_leads_out_of_no_folder(text, store, put, marker):
+    whole = {"row": "x/../../marker"} if text == TEXTS[-1] else None
+    found = find_run(
+        Tracking(store.uri), put(whole, text=None if whole else text.replace("MARKER", str(marker)))
+    )
+    with pytest.raises(InputError, match="row" if whole else found.identity):
         found.stored  # noqa: B018 - raises
     assert not marker.exists()
-
-
-def test_what_a_run_is_called_leads_out_of_no_folder(store, put):
-    found = find_run(Tracking(store.uri), put({"row": "x/../../marker"}))
-    with pytest.raises(InputError, match="row"):
-        found.stored  # noqa: B018 - raises
 
 
 @pytest.mark.parametrize("learner", ["boosted_trees", "network"])
@@ -188,10 +185,7 @@ def recording(run, tmp_path_factory):
     return folder
 
 
-def copied(run, folder, name):
-    """Read a recording with a command and write what it read."""
-    given = ["device=recording", f"device.path={name}", "out=y.csv"]
-    return run(folder, "generate.py", *SKIN, *given, store=False)
+PLAYED = ["generate.py", *SKIN, "device=recording", "out=y.csv"]
 
 
 def test_a_recording_makes_no_objects(run, recording, tmp_path, marker):
@@ -202,9 +196,7 @@ def test_a_recording_makes_no_objects(run, recording, tmp_path, marker):
     field = pa.field("reading_00", pa.float32(), metadata=kind)
     position = table.schema.get_field_index("reading_00")
     pq.write_table(table.cast(table.schema.set(position, field)), tmp_path / "x.parquet")
-    done = run(
-        tmp_path, "generate.py", *SKIN, "device=recording", "device.path=x.parquet", "out=y.csv", store=False
-    )
+    done = run(tmp_path, *PLAYED, "device.path=x.parquet", store=False)
     assert not marker.exists()
     assert done.returncode == 0, done.stderr
 
@@ -212,10 +204,7 @@ def test_a_recording_makes_no_objects(run, recording, tmp_path, marker):
 def test_a_sidecar_is_json_alone(run, recording, tmp_path, marker):
     (tmp_path / "x.csv").write_bytes((recording / "x.csv").read_bytes())
     (tmp_path / "x.csv.json").write_bytes(pickle.dumps(Payload(marker), 0))
-    done = run(
-        tmp_path, "generate.py", *SKIN, "device=recording", "device.path=x.csv", "out=y.csv", store=False
-    )
-    refused(done, marker, "x.csv")
+    refused(run(tmp_path, *PLAYED, "device.path=x.csv", store=False), marker, "x.csv")
 
 
 def test_a_cache_is_built_anew_where_it_holds_objects(run, tmp_path, marker, monkeypatch):

@@ -5,14 +5,7 @@ import pytest
 from scipy.integrate import quad, solve_ivp
 from scipy.special import j0, j1
 
-from experiments.laws.references import (
-    SQUARE_PUNCH,
-    Discs,
-    HalfSpace,
-    Slab,
-    bonded_layer,
-    waves,
-)
+from experiments.laws.references import SQUARE_PUNCH, Discs, HalfSpace, Slab, bonded_layer, waves
 
 SOFT, HARD = Slab(0.005, 170e3, 0.499), Slab(0.010, 560e3, 0.49)
 
@@ -81,12 +74,8 @@ def test_below_a_disc_layers_are_integrated_adaptively(slabs):
     radius, beside, depth = 0.006, 0.004, 0.0045
 
     def wave(number):
-        return (
-            -waves(np.array([number]), slabs, depth)[0, 1]
-            * radius
-            * j1(number * radius)
-            * j0(number * beside)
-        )
+        motion = waves(np.array([number]), slabs, depth)[0, 1]
+        return -motion * radius * j1(number * radius) * j0(number * beside)
 
     exact = quad(wave, 1e-9, 40 / depth, limit=400)[0]
     assert stress(slabs, radius, beside, depth) == pytest.approx(exact, rel=1e-5)

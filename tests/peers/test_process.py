@@ -1,6 +1,7 @@
 """Peers fit and apply a model in another process."""
 
 import gc
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -48,11 +49,16 @@ def test_it_learns(fitted, data):
 
 def test_touches_of_another_shape_are_refused(fitted, data):
     touches = data.touches("test")
-    fewer = Touches(
-        touches.readings[..., 1:], touches.valid[..., 1:], touches.positions[1:], None, touches.rate
+    fewer = replace(
+        touches,
+        readings=touches.readings[..., 1:],
+        valid=touches.valid[..., 1:],
+        positions=touches.positions[1:],
     )
     with pytest.raises(InputError, match="as many sensors and frames"):
         fitted.probabilities(fewer)
+    with pytest.raises(RuntimeError, match="fit or load"):
+        Rocket().probabilities(touches)
 
 
 def test_a_model_of_other_labels_is_refused(fitted, data, tmp_path):
@@ -64,18 +70,19 @@ def test_a_model_of_other_labels_is_refused(fitted, data, tmp_path):
         Rocket(transform="flat").load(data, path)
 
 
-def test_an_error_of_the_worker_is_passed_on(own_python, data, tmp_path):
-    path = tmp_path / "model.npz"
-    np.savez(path, weights=np.zeros((3, 4)))
-    with pytest.raises(RuntimeError, match=r"KeyError.*first"):
-        Rocket(transform="flat").load(data, path)
-
-
-def test_objects_are_not_read(own_python, data, tmp_path):
-    path = tmp_path / "model.npz"
-    np.savez(path, first=np.array([{}], dtype=object))
-    with pytest.raises(ValueError, match="Object arrays cannot be loaded"):
-        Rocket(transform="flat").load(data, path)
+@pytest.mark.parametrize(
+    ("arrays", "error", "message"),
+    [
+        ({"weights": np.zeros((3, 4))}, RuntimeError, r"KeyError.*first"),
+        ({"first": np.array([{}], dtype=object)}, ValueError, "Object arrays cannot be loaded"),
+    ],
+)
+def test_a_damaged_file_is_refused_and_an_error_of_the_worker_passed_on(
+    own_python, data, tmp_path, arrays, error, message
+):
+    np.savez(tmp_path / "model.npz", **arrays)
+    with pytest.raises(error, match=message):
+        Rocket(transform="flat").load(data, tmp_path / "model.npz")
 
 
 def test_without_its_environment_it_says_what_builds_it(monkeypatch, data, tmp_path):
@@ -106,6 +113,10 @@ def test_a_worker_that_dies_is_reported(fitted, data):
         fitted.probabilities(data.touches("test"))
 
 
-def test_unfitted_it_predicts_nothing(data):
-    with pytest.raises(RuntimeError, match="fit or load"):
-        Rocket().probabilities(data.touches("test"))
+def test_a_channel_is_a_sensor_and_what_is_not_valid_is_0():
+    readings = torch.randn(2, 10, 4, generator=torch.Generator().manual_seed(0))
+    valid = torch.ones_like(readings, dtype=torch.bool)
+    valid[..., 0] = False
+    found = Rocket().inputs(Touches(readings, valid, torch.zeros(4, 3), None, 10.0))
+    assert torch.equal(found[:, 1:], readings[..., 1:].mT)
+    assert not found[:, 0].any()

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from omegaconf import OmegaConf
 
-from experiments.studies.alarm_timing import dangerous_touches, play_touch
+from experiments.studies.devices import dangerous_touches, play_touch
 from skin.core.files import CONF
 from skin.live.engine import DebounceSettings
 from skin.live.engine_builder import engine_settings

@@ -51,10 +51,8 @@ def test_verdicts_follow_the_figures(three):
     words = [line.split("**")[1] for line in embedding_statements(three)]
     # layout against the best label; against readings, 0 ± 5.0; against chance, 0 ± 2.5 and 45 ± 2.5
     assert words == ["agree", "agree", "undecided", "disagree", "undecided", "disagree"]
-
-
-def test_one_seed_decides_nothing(three):
-    assert all("**undecided**" in line for line in embedding_statements(three[:3]))
+    one_seed = embedding_statements(three[:3])
+    assert all("**undecided**" in line for line in one_seed)
 
 
 def test_without_layouts_morphology_is_undecided(three):

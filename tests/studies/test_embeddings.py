@@ -39,14 +39,19 @@ def test_words_tell_apart_the_same_subtrees_as_networkx():
     assert len(set(collected[2][0])) > len(set(collected[1][0])) > 2
 
 
-def test_words_know_nothing_of_the_order_of_nodes():
-    _, weights = network()
-    labels = np.random.default_rng(0).integers(0, 3, (4, 9))
-    order = np.random.default_rng(1).permutation(9)
-    one = subtrees(labels, weights > 0)
-    other = subtrees(labels[:, order], (weights > 0)[np.ix_(order, order)])
-    assert (np.sort(one.reshape(4, 3, 9)) == np.sort(other.reshape(4, 3, 9))).all()
-    assert not (np.sort(one) == np.sort(subtrees(1 - labels, weights > 0))).all()
+@pytest.mark.parametrize("seed", [0, 5])
+def test_words_and_invariants_know_nothing_of_the_order_of_nodes(seed):
+    _, weights = network(seed)
+    labels, order = np.random.default_rng(0).integers(0, 3, (4, 9)), np.random.default_rng(1).permutation(9)
+    other, moved = labels[:, order], weights[np.ix_(order, order)]
+    words, permuted = (
+        np.sort(subtrees(*one).reshape(4, 3, 9)) for one in ((labels, weights > 0), (other, moved > 0))
+    )
+    assert (words == permuted).all()
+    assert not (np.sort(subtrees(1 - labels, weights > 0).reshape(4, 3, 9)) == words).all()
+    embedded = invariant(labels, weights, 3)
+    assert embedded == pytest.approx(invariant(other, moved, 3))
+    assert embedded[0] != pytest.approx(embedded[1])
 
 
 def test_the_line_graph_is_that_of_networkx():
@@ -80,15 +85,6 @@ def test_the_invariant_embedding_of_a_complete_graph_is_known():
     histogram = np.zeros(20)
     histogram[[9, 11]] = 30 / 36, 6 / 36
     assert found[25:] == pytest.approx(histogram)
-
-
-def test_the_invariant_embedding_knows_nothing_of_the_order_of_nodes():
-    _, weights = network(5)
-    labels = np.random.default_rng(0).integers(0, 4, (3, 9))
-    order = np.random.default_rng(1).permutation(9)
-    one = invariant(labels, weights, 4)
-    assert one == pytest.approx(invariant(labels[:, order], weights[np.ix_(order, order)], 4))
-    assert one[0] != pytest.approx(one[1])
 
 
 def test_levels_are_equal_steps():

@@ -44,13 +44,9 @@ def test_a_function_is_scored(subject):
 
 @pytest.mark.parametrize(
     ("predictor", "message"),
-    [("guesses:wrong", "finite probabilities"), ("guesses:missing", "cannot be imported")],
+    [("guesses:wrong", "finite prob"), ("guesses:missing", "cannot be imported"), ("guesses:safe", "frozen")],
 )
-def test_what_cannot_be_scored_is_refused(subject, predictor, message):
+def test_what_cannot_be_scored_and_other_touches_are_refused(subject, predictor, message):
+    known = "0" * 16 if predictor == "guesses:safe" else subject[1]
     with pytest.raises(InputError, match=message):
-        Frozen(predictor, subject[1])(subject[0])
-
-
-def test_other_touches_than_the_frozen_ones_are_refused(subject):
-    with pytest.raises(InputError, match="frozen"):
-        Frozen("guesses:safe", "0" * 16)(subject[0])
+        Frozen(predictor, known)(subject[0])

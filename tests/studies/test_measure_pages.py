@@ -1,8 +1,6 @@
 """What was found on streams, read back from its files."""
 
-import csv
-
-import pytest
+import pandas as pd
 import torch
 from PIL import Image
 
@@ -27,42 +25,27 @@ FOUND = WindowReport(
 )
 
 
-def test_the_line_says_what_matters():
-    about = streams_frame(FOUND).attrs["about"]
+def test_the_files_have_what_was_found(tmp_path):
+    frame = streams_frame(FOUND)
+    about = frame.attrs["about"]
     assert about.startswith(
         "accuracy 50.0 % at share 0-0.2; accuracy 90.0 % at share whole; gate none: 6.0 (1.2"
     )
     assert "7 of 8 dangerous touches and 1 of 9 safe ones raised the alarm" in about
-
-
-@pytest.fixture(scope="module")
-def files(tmp_path_factory):
-    return publish_page(
-        Streams().page(streams_frame(FOUND), "rules fem 0"),
-        "rules fem 0",
-        tmp_path_factory.mktemp("results") / "stream_rules",
+    page, table, picture = publish_page(
+        Streams().page(frame, "rules"), "rules fem 0", tmp_path / "stream_rules"
     )
-
-
-def test_a_person_reads_the_same(files):
-    text = files[0].read_text()
+    text = page.read_text()
     rows = ["press | 0.5000 | 0.9000", " | 40 | 160", "threshold | 180", "overall | 0.8125 | made for 30"]
     assert all(f"| {row} |" in text for row in rows)
     assert text.startswith("# rules fem 0\n\naccuracy 50.0 %")
     assert "trained on whole touches" in text
-
-
-def test_a_program_reads_the_same(files):
-    with files[1].open(newline="") as file:
-        values = {(one["measure"], one["name"], one["at"]): one["value"] for one in csv.DictReader(file)}
+    values = pd.read_csv(table, dtype=str, keep_default_na=False).set_index(["measure", "name", "at"]).value
     assert values["accuracy", "press", "whole"] == "0.9000"
     assert values["idle said touched", "threshold", ""] == "10"
     assert values["alarms false", "none", ""] == "3"
     assert values["window, s", "overall", "6"] == "made for 30"
-
-
-def test_the_picture_is_whole(files):
-    with Image.open(files[2]) as picture:
-        picture.load()
-        assert picture.width > 600
-    assert sorted(path.name for path in files[2].parent.iterdir()) == sorted(path.name for path in files)
+    with Image.open(picture) as image:
+        image.load()
+        assert image.width > 600
+    assert {*tmp_path.iterdir()} == {page, table, picture}

@@ -11,9 +11,7 @@ FREE = "simulator=fem", "simulator.constraint=free", "body.cells=[10,10]", "layo
 
 
 def measure(configured, *settings: str):
-    """Return what is measured of a device."""
-    config = configured(*settings)
-    return Motion(gestures=20)(Subject(config))
+    return Motion(gestures=20)(Subject(configured(*settings)))
 
 
 def test_the_largest_change_is_that_of_two_neighbours(configured):

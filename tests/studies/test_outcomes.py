@@ -35,37 +35,36 @@ FOUND = pd.DataFrame([
 ])  # fmt: skip
 
 
-def test_shares_are_compared_in_points():
-    outcome = conclude(said("mean", minimum=0), FOUND)
+@pytest.mark.parametrize(
+    ("fields", "found", "mean", "verdict"),
+    [
+        # differences 10, 11 and 9 points
+        (said("mean", minimum=0), FOUND, 10, "agree"),
+        (
+            said("mean", metric="seconds_per_epoch", ratio=True),
+            FOUND,
+            (20 / 2 + 21 / 3 + 22 / 4) / 3,
+            "agree",
+        ),
+        (said(level=0.5, minimum=-2, maximum=2), pd.DataFrame(trials("max", 0.50, 0.505, 0.495)), 0, "agree"),
+        (said(level=0.5, minimum=-2, maximum=2), FOUND, 31, "disagree"),
+    ],
+)
+def test_fractions_are_compared_in_points_and_costs_as_they_are(fields, found, mean, verdict):
+    outcome = conclude(fields, found)
     (compared,) = outcome.compared.values()
-    # differences 10, 11 and 9 points: deviation 1, by the root of 3
-    assert (compared.mean, compared.error) == (pytest.approx(10.0), pytest.approx(3**-0.5))
-    assert (outcome.verdict, list(outcome.compared)) == ("agree", ["pooling=mean"])
+    assert (compared.mean, outcome.verdict) == (pytest.approx(mean), verdict)
 
 
 def test_a_statement_about_several_is_as_good_as_its_weakest():
     outcome = conclude(said("mean", "attention", minimum=0), FOUND)
-    assert (outcome.verdict, len(outcome.compared)) == ("undecided", 2)
-
-
-def test_costs_are_compared_as_they_are():
-    outcome = conclude(said("mean", metric="seconds_per_epoch", ratio=True), FOUND)
-    (compared,) = outcome.compared.values()
-    assert compared.mean == pytest.approx((20 / 2 + 21 / 3 + 22 / 4) / 3)
+    assert (outcome.verdict, [*outcome.compared]) == ("undecided", ["pooling=mean", "pooling=attention"])
+    assert outcome.compared["pooling=mean"].error == pytest.approx(3**-0.5)  # deviation 1, by the root of 3
 
 
 def test_a_gap_is_a_difference_of_two_metrics():
     gap = values(FOUND[:3], f"train_accuracy - {ACCURACY}")
     assert dict(gap) == {"0": pytest.approx(10), "1": pytest.approx(8), "2": pytest.approx(9)}
-
-
-def test_a_level_stands_for_the_other():
-    alike = said(level=0.5, minimum=-2, maximum=2)
-    outcome = conclude(alike, pd.DataFrame(trials("max", 0.50, 0.505, 0.495)))
-    (compared,) = outcome.compared.values()
-    assert (compared.mean, outcome.verdict) == (pytest.approx(0.0), "agree")
-    outcome = conclude(alike, FOUND)
-    assert outcome.verdict == "disagree"
 
 
 def test_what_did_not_finish_decides_nothing():
@@ -76,10 +75,8 @@ def test_what_did_not_finish_decides_nothing():
 
 
 def test_a_statement_may_be_about_a_condition():
-    here = [
-        *trials("max", 0.8, 0.8, 0.8, condition="none"),
-        *trials("max", 0.7, 0.7, 0.7, condition="5 dead"),
-    ]
+    here = trials("max", 0.8, 0.8, 0.8, condition="none")
+    here += trials("max", 0.7, 0.7, 0.7, condition="5 dead")
     one = Statement("x", "x", {"condition": "5 dead"}, ACCURACY, others=[{"condition": "none"}], maximum=0)
     outcome = conclude(one, pd.DataFrame(here))
     assert (list(outcome.compared), outcome.verdict) == (["pooling=max, none"], "agree")
@@ -87,14 +84,11 @@ def test_a_statement_may_be_about_a_condition():
 
 def test_conditions_are_compared_over_devices_of_several_trainings():
     """By hand: device n loses n + 2 per cent with a dead sensor, whatever the training."""
-    found = [
-        *(one for n in range(3) for one in trials("max", 0.8, 0.9, condition="0 dead", device=str(n))),
-        *(
-            one
-            for n in range(3)
-            for one in trials("max", 0.78 - n / 100, 0.88 - n / 100, condition="1 dead", device=str(n))
-        ),
-    ]
+    found = []
+    for condition, loss, more in (("0 dead", 0.0, 0.0), ("1 dead", 0.02, 0.01)):
+        for n in range(3):
+            lost = loss + more * n
+            found += trials("max", 0.8 - lost, 0.9 - lost, condition=condition, device=str(n))
     ((_, condition, compared, verdict),) = differences(
         study(devices=3, conditions={"0 dead": {}, "1 dead": {}}, differences="greater"), pd.DataFrame(found)
     )

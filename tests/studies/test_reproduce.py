@@ -1,5 +1,7 @@
 """The page of the statements is that of the committed statements and results."""
 
+from dataclasses import replace
+
 import pytest
 
 from experiments.studies.comparison import conclude
@@ -24,13 +26,12 @@ def test_every_statement_is_on_the_page():
 
 def test_a_margin_over_gestures_counts():
     trials = published_trials("sensors")
-    lines = {"one": {"name": "placed 16", "condition": "above a sensor"}}
-    lines |= {"others": [{"name": "grid 25", "condition": "above a sensor"}]}
-    about = {"metric": "same/overall/accuracy"}
-    (narrow,) = conclude(Statement("a", "b", **lines, **about), trials).compared.values()
-    about["minimum"] = narrow.mean + 1.01 * narrow.margin  # just beyond the margin over trainings
-    sure = conclude(Statement("a", "b", **lines, **about), trials)
-    wide = conclude(Statement("a", "b", **lines, **about, over_gestures=0.2), trials)
+    one, other = ({"name": name, "condition": "above a sensor"} for name in ("placed 16", "grid 25"))
+    statement = Statement("a", "b", one, "same/overall/accuracy", others=[other])
+    (narrow,) = conclude(statement, trials).compared.values()
+    # just beyond the margin over trainings
+    statement = replace(statement, minimum=narrow.mean + 1.01 * narrow.margin)
+    sure, wide = conclude(statement, trials), conclude(replace(statement, over_gestures=0.2), trials)
     (margin,) = wide.compared.values()
     assert (sure.verdict, wide.verdict) == ("disagree", "undecided")
     assert margin.margin == pytest.approx((narrow.margin**2 + 0.2**2) ** 0.5)

@@ -22,11 +22,14 @@ LABELS = ("overall", "big", "dynamic", "press", "dangerous")
 KINDS = ("accuracy", "balanced_accuracy", "ece", "alarm_recall", "false_alarm_rate", "degrees")
 SENSORS = "study=sensors", "study.part=sensors_other", "study.seeds=[0]"
 SHARES = ("0-0.2", "0.2-0.4", "0.4-0.6", "0.6-0.8", "0.8-1", "whole")
-STREAMS = {f"share/{fraction}/overall/accuracy" for fraction in SHARES} | {
-    f"gate/{gate}/accuracy" for gate in ("threshold", "learned")
-}
-OTHER = {"train_accuracy", "seconds_per_epoch", "parameters", "same/any/disagreement"} | STREAMS
-OTHER |= {"same/place/rms_mm", "same/force/rms_N", "same/overall/r2"}
+KNOWN = {
+    *(f"{column}/{label}/{kind}" for column in ("same", "holdout", "device_shift", "unseen_layout")
+      for label in (*LABELS, "direction") for kind in KINDS),
+    *(f"share/{fraction}/overall/accuracy" for fraction in SHARES),
+    *(f"train_accuracy_{label}" for label in LABELS), "gate/threshold/accuracy", "gate/learned/accuracy",
+    "train_accuracy", "seconds_per_epoch", "parameters", "same/any/disagreement", "same/place/rms_mm",
+    "same/force/rms_N", "same/overall/r2",
+}  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -74,12 +77,9 @@ def test_a_study_composes_and_says_what_it_is_about(composed, name, part):
     assert len(set(prints)) == len(every)
     if study.differences is None and study.trainings:
         assert study.statements or study.conditions or study.reference or study.name == "real"
-    known = {f"{column}/{label}/{kind}" for column in ("same", "holdout", "device_shift", "unseen_layout")
-             for label in (*LABELS, "direction") for kind in (*KINDS, "error")}  # fmt: skip
-    known |= OTHER | {"same/direction/degrees"} | {f"train_accuracy_{label}" for label in LABELS}
-    assert set(study.metrics) <= known or study.measure is not None  # which may have metrics of its own
+    assert set(study.metrics) <= KNOWN or study.measure is not None  # which may have metrics of its own
     for said in study.statements:
-        assert set(said.metric.split(" - ")) <= known
+        assert set(said.metric.split(" - ")) <= KNOWN
         assert judge(said, Estimate(0.0, 1e9, 4e9, 3)) == "undecided"
         assert said.minimum < said.maximum
         assert bool(said.others) != (said.level is not None)
@@ -111,24 +111,26 @@ def test_studies_share_the_runs_that_they_have_in_common(composed):
     }
     prints = set()
     for study, name in picked.items():
-        _, every = composed(*words("graphs", study))
+        _, every = composed(*words("models", study))
         prints |= {fingerprint(one.configs["0"]) for one in every if one.name == name}
     assert len(prints) == 1
 
 
 def test_variants_are_named_by_what_tells_them_apart(composed):
-    _, every = composed("study=images", "study.part=image_representation", "study.seeds=[0,1]")
+    _, every = composed("study=models", "study.part=image_representation", "study.seeds=[0,1]")
     assert [one.name for one in every][1:3] == [
         "sequence_image representation=fourier",
         "interp method=nearest",
     ]
     assert {tuple(one.configs) for one in every} == {("0", "1")}
-    _, every = composed("study=crosscheck", "study.seeds=[0]", "study.rows=[features,gru]")
+    _, every = composed(
+        "study=mechanics", "study.part=crosscheck", "study.seeds=[0]", "study.rows=[features,gru]"
+    )
     assert [one.name for one in every][:3] == ["naive features", "naive gru", "fem, equation 10 features"]
 
 
 def test_settings_of_the_command_line_hold_for_every_variant(composed):
-    _, every = composed(*words("graphs", "norm"), "device.noise=0.2", "trainer.max_epochs=3")
+    _, every = composed(*words("models", "norm"), "device.noise=0.2", "trainer.max_epochs=3")
     for one in every:
         config = one.configs["0"]
         assert (config.device["noise"], config.trainer["max_epochs"]) == (0.2, 3)
@@ -145,7 +147,10 @@ def test_settings_of_a_variant_hold_instead_of_the_common_ones(composed):
 
 
 def test_a_common_setting_of_null_is_that_of_a_training(composed):
-    plain, small = composed("study=gestures"), composed("study=gestures", "evaluation.devices=3")
+    plain, small = (
+        composed("study=models", "study.part=gestures"),
+        composed("study=models", "study.part=gestures", "evaluation.devices=3"),
+    )
     for (_, every), devices in ((plain, 10), (small, 3)):
         assert {one.configs["0"].evaluation.devices for one in every} == {devices}
 
@@ -159,13 +164,16 @@ def test_one_row_is_a_list_of_one():
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        ((), "which study.*graphs"),
-        (("study=graphs", "study.part=norms"), "study.part=norms is none of the parts of study=graphs.*norm"),
-        (("study=layouts", "study.part=norm"), "none of the parts of study=layouts: none"),
-        (("study=graphs", "study.name=x"), "study.name=x names one part"),
+        ((), "which study.*models"),
+        (("study=models", "study.part=norms"), "study.part=norms is none of the parts of study=models.*norm"),
+        (
+            ("study=margins", "study.part=norm"),
+            "none of the parts of study=margins: none",
+        ),
+        (("study=models", "study.name=x"), "study.name=x names one part"),
         (("study=table", "study.jobs=0"), "study.jobs=0"),
-        (("study=graphs", "study.seeds=[]"), "study.seeds"),
-        (("study=layouts", "study.seeds=[-1]"), "study.seeds"),
+        (("study=models", "study.seeds=[]"), "study.seeds"),
+        (("study=robustness", "study.part=layouts", "study.seeds=[-1]"), "study.seeds"),
         (("study=robustness", "study.part=dead", "study.devices=-1"), "study.devices=-1"),
         (("study=margins", "study.measure.gestures=0"), "study.measure.gestures=0"),
         (("study=holds", "study.measure.rate=0"), "study.measure.rate=0"),
@@ -183,8 +191,8 @@ def test_settings_that_cannot_be_used_are_refused_by_name(composed, words, said)
 
 def test_the_command_line_counts_for_every_part():
     """Also where the part has the setting itself."""
-    study = chosen("study=robustness", "study.devices=2", "+study.test.device=simulated")
-    assert (study.name, study.devices, study.test) == ("rate", 2, {"device": "simulated"})
+    study = chosen("study=robustness", "study.devices=2", "+study.test.rate=3")
+    assert (study.name, study.devices, study.test["rate"]) == ("touch_alarms", 2, 3)
     study = chosen(*words("robustness", "dead"), "study.devices=2", "+study.test.device=simulated")
     assert (study.devices, study.test["device"], study.test["device.test_gestures"]) == (2, "simulated", 800)
     study = chosen("study=streams", "study.part=streams_trained", "study.measure.windows=[3.0]")

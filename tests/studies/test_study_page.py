@@ -1,6 +1,5 @@
 """A study's tables say what was found, in files and on a narrow terminal."""
 
-import csv
 from dataclasses import replace
 
 import numpy as np
@@ -65,18 +64,9 @@ def table(trials, *settings):
 def test_a_line_per_variant_with_mean_and_margin():
     head, first, second, third = table(FOUND, METRICS)
     # of 0.8 and 0.9: mean 0.85, standard error 0.05, and 12.71 of them with one degree of freedom
-    assert dict(zip(head, first, strict=True)) | {"big": "", "dynamic": "", "press": "", "dangerous": ""} == {
-        "variant": "weight=exp",
-        "overall": "85.0 ± 63.5",
-        "big": "",
-        "dynamic": "",
-        "press": "",
-        "dangerous": "",
-        "recall": "25.0 ± 0.0",
-        "false alarms": "2.0 ± 0.0",
-        "s/epoch": "1.50",
-        "parameters": "105621",
-    }
+    names = ["variant", "overall", "recall", "false alarms", "s/epoch", "parameters"]
+    values = ["weight=exp", "85.0 ± 63.5", "25.0 ± 0.0", "2.0 ± 0.0", "1.50", "105621"]
+    assert [dict(zip(head, first, strict=True))[name] for name in names] == values
     assert second[:2] == ["weight=none (1 failed)", "70.0"]
     assert third[:2] == ["weight=stiffness (1 failed)", "failed"]
 
@@ -99,32 +89,26 @@ def test_conditions_are_columns_or_lines_of_a_single_variant(variants, head, nam
     assert table(trials, METRICS[:2]) == [head, *([name, *cells] for name in names)]
 
 
-@pytest.mark.parametrize(
-    ("fields", "compared", "text"),
-    [
-        ({}, {"a": Estimate(12.345, 0.3, 1.356, 3)}, "+12.3 ± 1.4 points"),
-        (
-            {},
-            {"a": Estimate(-1.0, 0.5, 1.0, 3), "b": Estimate(2.0, 0.5, 1.0, 3)},
-            "-1.0 ± 1.0 points (a); +2.0 ± 1.0 points (b)",
-        ),
-        ({}, {"a": Estimate(1.0, float("inf"), float("inf"), 1)}, "+1.0 points"),
-        ({}, {"a": None}, "no paired runs"),
-        (
-            {"metric": "seconds_per_epoch"},
-            {"a": Estimate(-0.12, 0.01, 0.02, 3)},
-            "-0.12 ± 0.02 s",
-        ),
-        (
-            {"metric": "seconds_per_epoch", "ratio": True},
-            {"a": Estimate(4.44, 0.1, 0.2, 3)},
-            "4.44 ± 0.20 times",
-        ),
-    ],
-)
+TIME = {"metric": "seconds_per_epoch"}
+COMPARED = [
+    ({}, [Estimate(12.345, 0.3, 1.356, 3)], "+12.3 ± 1.4 points"),
+    (
+        {},
+        [Estimate(-1.0, 0.5, 1.0, 3), Estimate(2.0, 0.5, 1.0, 3)],
+        "-1.0 ± 1.0 points (a); +2.0 ± 1.0 points (b)",
+    ),
+    ({}, [Estimate(1.0, float("inf"), float("inf"), 1)], "+1.0 points"),
+    ({}, [None], "no paired runs"),
+    (TIME, [Estimate(-0.12, 0.01, 0.02, 3)], "-0.12 ± 0.02 s"),
+    (TIME | {"ratio": True}, [Estimate(4.44, 0.1, 0.2, 3)], "4.44 ± 0.20 times"),
+]
+
+
+@pytest.mark.parametrize(("fields", "compared", "text"), COMPARED)
 def test_what_was_measured_has_its_unit(fields, compared, text):
     said = Statement(**vars(SAID) | fields)
-    assert comparison_text(Conclusion(said, compared, "undecided")) == text
+    named = dict(zip("ab", compared, strict=False))
+    assert comparison_text(Conclusion(said, named, "undecided")) == text
 
 
 def test_files_and_terminal_say_the_same(tmp_path, capsys):
@@ -132,18 +116,12 @@ def test_files_and_terminal_say_the_same(tmp_path, capsys):
     page = (tmp_path / "study_edges.md").read_text()
     assert page.splitlines()[0] == "# edges, little [data]"
     assert "| 3.2.2 | one [sic] beats the other | +20.0 points | undecided |" in page
-    assert len([line for line in page.splitlines() if line.startswith("| weight=")]) == 3
-    text = capsys.readouterr().out
-    assert all(
-        part in text
-        for part in ("85.0 ± 63.5", "105621", "weight=stiffness (1 failed)", "[sic]", "undecided")
-    )
-    read = list(csv.DictReader((tmp_path / "study_edges.csv").read_text().splitlines()))
-    assert [(line["variant"], line["seed"], line["same/overall/accuracy"]) for line in read] == [
-        ("weight=exp", "0", "0.8"),
-        ("weight=exp", "1", "0.9"),
-        ("weight=none", "1", "0.7"),
-    ]
+    assert page.count("\n| weight=") == 3
+    parts, text = ("85.0 ± 63.5", "105621", "weight=stiffness (1 failed)", "[sic]"), capsys.readouterr().out
+    assert all(part in text for part in parts)
+    read = pd.read_csv(tmp_path / "study_edges.csv")
+    assert read.variant.tolist() == ["weight=exp", "weight=exp", "weight=none"]
+    assert read[["seed", "same/overall/accuracy"]].to_numpy().tolist() == [[0, 0.8], [1, 0.9], [1, 0.7]]
     with Image.open(tmp_path / "study_edges.png") as picture:
         assert picture.size[0] > 500
 
@@ -178,34 +156,23 @@ def test_names_of_several_words_before_the_number_have_a_panel_for_each_beginnin
 def test_several_variants_under_several_conditions_have_a_line_each_and_a_legend():
     found = [trial(name, "0", 0.9, condition=at) for name in ("one", "other") for at in ("", "rough")]
     drawn = study_figure(STUDY, pd.DataFrame(found))
-    (axis,), (legend,) = drawn.axes, drawn.legends
-    assert [text.get_text() for text in axis.get_yticklabels()] == ["one", "other"]
-    assert [text.get_text() for text in legend.get_texts()] == ["no condition", "rough"]
+    assert [text.get_text() for text in drawn.axes[0].get_yticklabels()] == ["one", "other"]
+    assert [text.get_text() for text in drawn.legends[0].get_texts()] == ["no condition", "rough"]
 
 
 def test_tables_of_several_runs_become_one(tmp_path):
-    tables = [
-        (
-            trial("a", str(n), None, run=f"run{n}"),
-            Page("", {}, pd.DataFrame([{"course": "hold, 1 s", "alarms": n}])),
-        )
-        for n in range(2)
-    ]
-    path = tmp_path / "study_edges"
-    assert publish_measured(STUDY, tables[:1], path) == []
-    assert not list(tmp_path.iterdir()), "one table needs no other"
-    assert publish_measured(STUDY, tables, path) == [path.with_suffix(".csv")]
-    assert path.with_suffix(".csv").read_text().splitlines() == [
-        "variant,seed,run,course,alarms",
-        'a,0,run0,"hold, 1 s",0',
-        'a,1,run1,"hold, 1 s",1',
-    ]
+    pages = [Page("", {}, pd.DataFrame([{"course": "hold, 1 s", "alarms": n}])) for n in range(2)]
+    rows = [trial("a", str(n), None, run=f"run{n}", page=page) for n, page in enumerate([*pages, Page("")])]
+    path, trials = tmp_path / "study_edges", pd.DataFrame(rows)
+    assert publish_measured(STUDY, trials[1:], path) == [], "one table needs no other"
+    assert publish_measured(STUDY, trials, path) == [path.with_suffix(".csv")]
+    lines = ["variant,seed,run,course,alarms", 'a,0,run0,"hold, 1 s",0', 'a,1,run1,"hold, 1 s",1']
+    assert path.with_suffix(".csv").read_text().splitlines() == lines
 
 
 def test_a_study_without_runs_writes_the_rows_of_all_conditions(tmp_path):
-    study = replace(STUDY, rows=None)
     pages = [Page("said", {}, pd.DataFrame([{"set": name, "value": n}])) for n, name in enumerate("ab")]
-    paths = publish_measured(study, [({"run": ""}, page) for page in pages], tmp_path / "edges")
+    paths = publish_measured(replace(STUDY, rows=None), pd.DataFrame({"page": pages}), tmp_path / "edges")
     assert [path.name for path in paths] == ["edges.md", "edges.csv"]
     assert paths[1].read_text() == "set,value\na,0\nb,1\n"
     assert "| b | 1 |" in paths[0].read_text()
@@ -240,7 +207,6 @@ def test_the_csv_has_the_reference_and_another_file_may_be_chosen(tmp_path):
     path.write_text("row,simulator,label,value\ngru,fem,overall,0.5\n")
     study = replace(STUDY, reference=str(path), statements=())
     publish_study(study, "t", pd.DataFrame([reported("gru", 0.9), reported("rules", 0.8)]), tmp_path / "s")
-    lines = list(csv.DictReader((tmp_path / "s.csv").read_text().splitlines()))
-    assert [line["reference"] for line in lines] == ["0.5", ""]
+    assert pd.read_csv(tmp_path / "s.csv", keep_default_na=False).reference.tolist() == ["0.5", ""]
     with pytest.raises(InputError, match=r"study\.reference=nowhere"):
         read_reference("nowhere")

@@ -37,31 +37,26 @@ def study(**settings):
     return Study("x", "x", [0], **settings)
 
 
-def test_a_condition_without_lists_has_one_device():
-    assert list(numbered_settings(study(), {"device.noise": 0.1})) == [("", {"device.noise": 0.1})]
-
-
-def test_a_list_gives_each_device_its_value():
-    condition = {"layout": "random", "layout.seed": [7, 8]}
-    assert list(numbered_settings(study(), condition)) == [
-        ("1", {"layout": "random", "layout.seed": 7}),
-        ("2", {"layout": "random", "layout.seed": 8}),
-    ]
-
-
-def test_a_list_for_the_measure_is_one_setting():
-    condition = {"measure.recordings": ["a", "b"]}
-    assert list(numbered_settings(study(), condition)) == [("", condition)]
-
-
-def test_numbered_settings_are_the_number_of_the_device():
-    found = list(numbered_settings(study(devices=2, numbered=["device.seed"]), {"device.dead": 1}))
-    assert found == [("1", {"device.dead": 1, "device.seed": 1}), ("2", {"device.dead": 1, "device.seed": 2})]
+@pytest.mark.parametrize(
+    ("condition", "more", "found"),
+    [
+        ({"device.noise": 0.1}, {}, [("", {"device.noise": 0.1})]),
+        ({"layout": "random", "layout.seed": [7, 8]}, {}, [("1", {"layout": "random", "layout.seed": 7}),
+                                                           ("2", {"layout": "random", "layout.seed": 8})]),
+        ({"measure.recordings": ["a", "b"]}, {}, [("", {"measure.recordings": ["a", "b"]})]),
+        ({"device.dead": 1}, {"devices": 2, "numbered": ["device.seed"]},
+         [("1", {"device.dead": 1, "device.seed": 1}), ("2", {"device.dead": 1, "device.seed": 2})]),
+    ],
+)  # fmt: skip
+def test_lists_of_a_condition_number_its_devices(condition, more, found):
+    expected = [("c", number, settings) for number, settings in found]
+    assert list(numbered_settings(study(conditions={"c": condition}, **more))) == expected
 
 
 def test_lists_of_different_lengths_are_refused():
+    conditions = {"c": {"layout.seed": [1, 2]}}
     with pytest.raises(InputError, match="one length"):
-        list(numbered_settings(study(devices=3, numbered=["device.seed"]), {"layout.seed": [1, 2]}))
+        list(numbered_settings(study(devices=3, numbered=["device.seed"], conditions=conditions)))
 
 
 @dataclass(frozen=True)
@@ -155,13 +150,11 @@ def test_models_vote_by_seed_and_by_equal_other_settings():
     found += [trial("d", "0", [1, 1, 1]), trial("a", "1", [0, 0, 0]), trial("b", "1", None)]
     (vote,) = votes(study(vote=["a", "b", "c"]), pd.DataFrame(found))
     assert (vote["variant"], vote["seed"], vote["run"]) == ("vote", "0", "run_a run_b run_c")
-    assert vote["same/big/accuracy"] == pytest.approx(2 / 3)
-    assert vote["same/dynamic/accuracy"] == 1
-    assert vote["same/any/disagreement"] == pytest.approx(2 / 3)
+    metrics = [vote[f"same/{name}"] for name in ("big/accuracy", "dynamic/accuracy", "any/disagreement")]
+    assert metrics == pytest.approx([2 / 3, 1, 2 / 3])
     assert not list(votes(study(), pd.DataFrame(found)))
-    both = [trial(one["row"], "0", [*one["outcomes"]], simulator=name)
-            for name in ("naive", "fem") for one in found[:3]]  # fmt: skip
-    assert {one["variant"] for one in votes(study(vote="all"), pd.DataFrame(both))} == {
-        "naive vote",
-        "fem vote",
-    }
+    both = [
+        trial(one["row"], "0", [*one["outcomes"]], simulator=name) for name in ("a", "b") for one in found[:3]
+    ]
+    named = [one["variant"] for one in votes(study(vote="all"), pd.DataFrame(both))]
+    assert named == ["a vote", "b vote"]

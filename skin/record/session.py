@@ -25,7 +25,7 @@ from skin.body.base import MOST
 from skin.core import files
 from skin.core.files import json_line
 from skin.core.safe_loading import parse_json, read_file, regular, sha256
-from skin.device.curves import Curves
+from skin.device.calibration import Curves
 from skin.device.resampling import Frame, Window
 from skin.errors import InputError
 from skin.touch.labels import CONTACT

@@ -65,10 +65,13 @@ def test_true_readings_behind_raw_ones():
         ("a: [", "cannot read"),
         ("format: 1\ncount: 2\nsensors: {gian: 1}", "sensors takes gain, .* got gian"),
         ("format: 1\ncount: 2\nsensors: {gain: [1]\n  ,noise: [1, 2]}", "as many numbers"),
-        ("format: 1\ncount: 2\nsensors: {gain: [1, x]}", "gain must be numbers from 0 up"),
-        ("format: 1\ncount: 2\nsensors: {noise: -1}", "noise must be numbers from 0 up"),
-        ("format: 1\ncount: 2\nsensors: {gain: 1}\nranges: {gain: [2, 1]}", r"ranges.gain must be \[low"),
-        ("format: 1\ncount: 2\nsensors: {gain: 1}\nbroken: {dead: [2]}", "breaks sensors 0 to 1"),
+        ("format: 1\ncount: 2\nsensors: {gain: [1, x]}", "must be a valid number, not text"),
+        ("format: 1\ncount: 2\nsensors: {noise: -1}", "noise must be numbers from 0 to"),
+        (
+            "format: 1\ncount: 2\nsensors: {gain: 1}\nranges: {gain: [2, 1]}",
+            r"must be a range \[minimum, maximum\]",
+        ),
+        ("format: 1\ncount: 2\nsensors: {gain: 1}\nbroken: {dead: [2]}", "take sensors 0 to 1"),
     ],
 )
 def test_what_cannot_be_used_is_refused(tmp_path, text, reason):

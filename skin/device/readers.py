@@ -1,44 +1,36 @@
-"""Readers of public data sets that are not plain tables: ``skin convert reader=skin.device.readers.cost``.
+"""Readers of what is no plain table: ``skin convert reader=skin.device.readers.cost``.
 
-They are examples of a function of one's own: it takes the path and its options, and returns a recording.
+Those of public data sets are examples of a function of one's own: it takes the path and its options, and
+returns a recording.
 """
 
+import json
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Annotated
 
 import numpy as np
 import pandas as pd
+import pyarrow as pa
+import pyarrow.csv
+import pyarrow.parquet
 from annotated_types import Ge, Le
 from pydantic import PositiveFloat
 
 from skin.body.layout import tile_centres
 from skin.core.rng import Stream, generator
 from skin.device.conversion import build_recording
+from skin.device.files import read_recording
 from skin.device.formats import parse_numbers, require_columns
 from skin.device.touches import Recording
 from skin.errors import InputError
 
 DOI = "doi:10.4121/uuid:5ef62345-3b3e-479c-8e1d-c922748c9b29"
 COST = f"https://doi.org/{DOI[4:]}"
-GESTURES = (
-    *(
-        "grab",
-        "hit",
-        "massage",
-        "pat",
-        "pinch",
-        "poke",
-        "press",
-        "rub",
-        "scratch",
-        "slap",
-        "squeeze",
-        "stroke",
-    ),
-    *("tap", "tickle"),
-)
+_WORDS = "grab hit massage pat pinch poke press rub scratch slap squeeze stroke tap tickle"
+GESTURES = tuple(_WORDS.split())
 VARIANTS = ("gentle", "normal", "rough")
 """Names of the corpus's numbers, which count from 1."""
 
@@ -164,3 +156,23 @@ def epi(path: Path, frames: int = 100, duration: PositiveFloat = 3.5) -> Recordi
         about="Epi, A. Holmqvist, M. Karlsson and M. Mirstroem, "
         "github.com/axelholmqvist/humanoid-touch-classification, no licence stated",
     )
+
+
+def table(path: Path) -> Recording:
+    """Read a recording of an earlier version: a table in CSV, with its description in ``x.csv.json``.
+
+    Raises:
+        InputError: no such files, or another description or other rows than were written.
+    """
+    try:
+        about = json.loads(path.with_name(f"{path.name}.json").read_text(encoding="utf-8"))
+        about.pop("sha256", None)
+        rows = pa.csv.read_csv(path).replace_schema_metadata({"skin": json.dumps(about)})
+        with TemporaryDirectory() as folder:
+            pa.parquet.write_table(rows, f"{folder}/{path.stem}.parquet")
+            return read_recording(f"{folder}/{path.stem}.parquet")
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+    except (OSError, ValueError, TypeError, AttributeError) as error:
+        reason = " ".join(str(error).split())
+        raise InputError(f"{path} is no recording of an earlier version: {reason}") from error

@@ -23,7 +23,7 @@ from skin.body.layout import tile_centres
 from skin.core.rng import Stream, generator
 from skin.device.conversion import build_recording
 from skin.device.files import read_recording
-from skin.device.formats import parse_numbers, require_columns
+from skin.device.formats import FORCES, parse_numbers, require_columns
 from skin.device.touches import Recording
 from skin.errors import InputError
 
@@ -155,6 +155,52 @@ def epi(path: Path, frames: int = 100, duration: PositiveFloat = 3.5) -> Recordi
         names=_EPI,
         about="Epi, A. Holmqvist, M. Karlsson and M. Mirstroem, "
         "github.com/axelholmqvist/humanoid-touch-classification, no licence stated",
+    )
+
+
+def eflesh(path: Path) -> Recording:
+    """Read presses of eFlesh, magnetometers under a printed lattice; each row is a touch of five frames.
+
+    Targets are the force of the gauge, where there is one, with the label ``dangerous`` above 10 N, an
+    example; or the position of the probe, with the labels ``right`` and ``low``. The group is the session.
+
+    Args:
+        path: a folder of characterization/datasets of github.com/notvenky/eFlesh.
+
+    Raises:
+        InputError: no such files, or files of different lengths.
+    """
+    files = sorted(path.expanduser().glob("*/sensor_post_baselines.csv"))
+    if not files:
+        raise InputError(f"{path} has no file */sensor_post_baselines.csv: give a folder of eFlesh")
+    try:
+        tables = [pd.read_csv(file, header=None) for file in files]
+        states = [pd.read_csv(file.with_name("states.csv"), header=None) for file in files]
+        if list(map(len, tables)) != list(map(len, states)):
+            raise ValueError("states.csv needs as many rows in the same order")
+        fields = pd.concat(tables).to_numpy(dtype=float)[:, 1:]
+        session = np.repeat([file.parent.name for file in files], list(map(len, tables)))
+        _, x, y, _, *gauge = pd.concat(states).to_numpy(dtype=float).T
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path} has no presses of eFlesh: {' '.join(str(error).split())}") from error
+    readings = np.zeros((len(fields), 5, fields.shape[1]), np.float32)
+    readings[:, 2] = 0.1 * fields  # the scale is nominal
+    place = {"x": 1e-3 * (x - 274), "y": 1e-3 * (y + 115)}
+    # Gram is inferred: it reproduces the published error. -1 stands for no value.
+    targets = {"force": FORCES["g"] * np.where(gauge[0] == -1, np.nan, gauge[0])} if gauge else place
+    limits = {"dangerous": ("force", 10.0)} if gauge else {"right": ("x", 0.015), "low": ("y", 0.015)}
+    return build_recording(
+        readings,
+        10.0,  # nominal, of presses without a time
+        targets={name: values.tolist() for name, values in targets.items()},
+        labels={
+            label: [None if np.isnan(value) else int(value > limit) for value in targets[name]]
+            for label, (name, limit) in limits.items()
+        },
+        groups={"session": session.tolist()},
+        about="eFlesh, github.com/notvenky/eFlesh, MIT License, Copyright (c) 2025 Venkatesh Pattabiraman",
+        per_sensor=3,
+        size=None if gauge else (0.03, 0.03),
     )
 
 

@@ -1,6 +1,5 @@
 """`skin convert` as a person runs it, and a training on what it wrote."""
 
-import json
 import sqlite3
 
 import numpy as np
@@ -124,17 +123,17 @@ def two(run, tmp_path_factory):
     write(folder, persons=2, touches=12)
     for path in (folder / "p0").glob("press*"):
         path.unlink()
-    run(folder, "convert", "from=map.yaml", "out=x.csv", store=False)
-    groups = json.loads((folder / "x.csv.json").read_text())["metadata"]["groups"]
+    run(folder, "convert", "from=map.yaml", "out=x.parquet", store=False)
+    groups = read_recording(folder / "x.parquet").metadata["groups"]
     assert groups == {"person": ["p0", "p1"]}
-    return f"device.path={folder}/x.csv"
+    return f"device.path={folder}/x.parquet"
 
 
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["task=classes"], "x.csv has no classes: give task=labels or task=regression"),
-        (["task=regression", "device.targets=[x]"], "x.csv has no target x, it has force"),
+        (["task=classes"], "x.parquet has no classes: give task=labels or task=regression"),
+        (["task=regression", "device.targets=[x]"], "x.parquet has no target x, it has force"),
         (["device.targets=[force]"], "device.targets needs task=regression"),
         (["task=gestures"], "device.task=gestures must be"),
         (["task=regression", "learner=rules"], "learner=rules knows the labels"),

@@ -6,9 +6,9 @@ NAIVE = ("generate", "simulator=naive")
 
 
 def test_writes_a_recording(run, tmp_path):
-    done = run(tmp_path, *NAIVE, "n=32", "out=x.csv", store=False, apart=True)
-    assert "x.csv: 32 gestures" in done.stdout
-    recording = read_recording(tmp_path / "x.csv")
+    done = run(tmp_path, *NAIVE, "n=32", "out=x.parquet", store=False, apart=True)
+    assert "x.parquet: 32 gestures" in done.stdout
+    recording = read_recording(tmp_path / "x.parquet")
     assert len(recording) == 32
     assert recording.metadata["config"]["data"]["gestures"] == 32
     assert len(recording.metadata["config_hash"]) >= 16

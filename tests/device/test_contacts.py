@@ -32,7 +32,7 @@ def recording():
     return device().recording()
 
 
-@pytest.mark.parametrize("name", ["x.parquet", "x.csv"])
+@pytest.mark.parametrize("name", ["x.parquet"])
 def test_a_file_gives_them_back_to_the_last_bit(recording, tmp_path, name):
     path = write_recording(recording, tmp_path / name)
     for complete in (True, False):

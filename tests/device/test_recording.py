@@ -166,7 +166,7 @@ def test_classes_and_targets_replace_the_labels(simulated, tmp_path):
     }
     about = {"groups": {"person": list("abcde")}, "classes": ["pat", "rub", "tap"]}
     stored = str(
-        write_recording(replace(simulated, parameters=parameters, metadata=about), tmp_path / "x.csv")
+        write_recording(replace(simulated, parameters=parameters, metadata=about), tmp_path / "x.parquet")
     )
     classes = Recorded(BODY, LAYOUT, stored, task="classes", test_groups="a")
     assert classes.task == Task(("pat", "rub", "tap"), "exclusive")
@@ -190,7 +190,7 @@ def test_one_class_or_value_to_train_on_is_refused(simulated, tmp_path, name):
     parameters = {name: person.float(), "group_person": person.float()}
     about = {"groups": {"person": ["a", "b"]}, "classes": ["pat", "rub"]}
     stored = str(
-        write_recording(replace(simulated, parameters=parameters, metadata=about), tmp_path / "x.csv")
+        write_recording(replace(simulated, parameters=parameters, metadata=about), tmp_path / "x.parquet")
     )
     task = {"class": "classes", "x": "regression"}[name]
     message = {"class": "pat lacks a class", "x": "x has less than two values"}[name]

@@ -3,10 +3,9 @@
 import logging
 import warnings
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pandas as pd
 import torch
 
 from skin.body.base import AbstractBody
@@ -14,6 +13,9 @@ from skin.device.base import AbstractDevice
 from skin.device.touches import Recording, only_touches
 from skin.touch.labels import ALARM
 from skin.touch.sampler import AbstractSampler
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 _log = logging.getLogger(__name__)
 
@@ -36,7 +38,7 @@ def report_balance(device: AbstractDevice, recording: Recording | None = None, s
     check_label_leakage(balance, sampler.leak)
 
 
-def class_balance(recording: Recording, sampler: AbstractSampler) -> pd.DataFrame:
+def class_balance(recording: Recording, sampler: AbstractSampler) -> "pd.DataFrame":
     """Return a table with two rows per label, the class and its opposite, without those that do not occur.
 
     Args:
@@ -48,6 +50,8 @@ def class_balance(recording: Recording, sampler: AbstractSampler) -> pd.DataFram
         fraction of each shape, %; means of area, %, and of the first position, mm; the median force, N; and
         the fractions of paths with other labels and of bodies that do not fit, of all that were drawn, %.
     """
+    import pandas as pd  # not needed by skin live
+
     touches = pd.DataFrame({name: values.double().numpy() for name, values in recording.parameters.items()})
     shapes, rows = [Path(name).stem for name in sampler.shapes.names], dict[str, dict[str, float]]()
     labels = recording.touches.known_labels.numpy() > 0.5
@@ -94,7 +98,7 @@ def accuracy_from_shape(shape: np.ndarray, holds: np.ndarray) -> tuple[float, fl
     return sum(rates) / 2, float(error)
 
 
-def balance_text(balance: pd.DataFrame) -> str:
+def balance_text(balance: "pd.DataFrame") -> str:
     """Return a class balance as lines."""
     formats = dict.fromkeys(("accuracy", "error"), "{:.2f}".format)
     table = balance.to_string(formatters=formats, float_format="{:.0f}".format, na_rep="", line_width=None)
@@ -104,7 +108,7 @@ def balance_text(balance: pd.DataFrame) -> str:
     )
 
 
-def check_label_leakage(balance: pd.DataFrame, leak: float) -> None:
+def check_label_leakage(balance: "pd.DataFrame", leak: float) -> None:
     """Warn if the shape alone predicts a label.
 
     A label leaks if its balanced accuracy is above ``leak`` by more than two standard errors; the margin

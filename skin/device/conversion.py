@@ -438,22 +438,22 @@ def read_by_function(reader: str, path: Path, options: Mapping[str, Any]) -> Rec
 
 def summarise_conversion(recording: Recording) -> str:
     """Return a line with the numbers of touches, readings, labels that are known, targets and groups."""
-    batch, time, sensors = recording.touches.readings.shape
-    parts = [f"{batch} touches of {time} frames at {recording.touches.rate:.4g} Hz, {sensors} readings"]
-    if (labels := recording.touches.labels) is None:
-        parts.append("no labels")
-    else:
-        parts += [
-            f"{name} in {int(column.nansum())} of {int((~column.isnan()).sum())}"
-            for name, column in zip(recording.task.names, labels.T, strict=True)
-        ]
-    if "classes" in recording.metadata:
-        parts.append(f"classes {', '.join(recording.metadata['classes'])}")
+    touches, metadata = recording.touches, recording.metadata
+    (batch, time, sensors), labels = touches.readings.shape, touches.labels
+    parts = ["no labels"] if labels is None else []
+    for name, column in zip(recording.task.names, () if labels is None else labels.T, strict=False):
+        parts.append(f"{name} in {int(column.nansum())} of {int((~column.isnan()).sum())}")
+    parts += [f"classes {', '.join(metadata['classes'])}"] if "classes" in metadata else []
     parts += [
         f"{name} of {int((~values.isnan()).sum())}"
         for name, values in recording.parameters.items()
         if name != CLASS and not name.startswith(GROUP)
     ]
-    metadata = recording.metadata
     parts += [f"{len(values)} of {name}" for name, values in metadata.get("groups", {}).items()]
-    return ", ".join([*parts, f"positions {metadata.get('positions', 'of the recording')}"])
+    return ", ".join(
+        [
+            f"{batch} touches of {time} frames at {touches.rate:.4g} Hz, {sensors} readings",
+            *parts,
+            f"positions {metadata.get('positions', 'of the recording')}",
+        ]
+    )

@@ -20,7 +20,6 @@ from annotated_types import Ge, Le
 from pydantic import PositiveFloat
 
 from skin.body.layout import tile_centres
-from skin.core.rng import Stream, generator
 from skin.device.conversion import build_recording
 from skin.device.files import read_recording
 from skin.device.formats import FORCES, parse_numbers, require_columns
@@ -39,8 +38,7 @@ def cost(
     path: Path,
     gestures: Sequence[str] = GESTURES,
     variants: bool = False,
-    taxels: Annotated[int, Ge(1), Le(64)] | Sequence[Annotated[int, Ge(1), Le(64)]] = 64,
-    taxel_seed: int = 0,
+    taxels: Sequence[Annotated[int, Ge(1), Le(64)]] = range(1, 65),
     window: Annotated[int, Ge(2)] = 30,
     pitch: PositiveFloat | None = None,
 ) -> Recording:
@@ -54,15 +52,14 @@ def cost(
         path: ``CoST.csv``.
         gestures: those to keep.
         variants: whether gentle, normal and rough are classes of their own.
-        taxels: number of the 64 taxels, spread evenly, or their channels from 1.
-        taxel_seed: seed of the selection.
+        taxels: channels to keep, from 1.
         window: frames per touch.
         pitch: between neighbouring taxels, m; channels 1 to 8 are the upper row. None: unknown positions.
 
     Raises:
         InputError: no such file, or another format.
     """
-    chosen = _spread(taxels, taxel_seed) if isinstance(taxels, int) else np.sort(np.unique(taxels)) - 1
+    chosen = np.unique(taxels) - 1
     try:
         table = pd.read_csv(path.expanduser(), skipinitialspace=True, low_memory=False)
     except (OSError, ValueError) as error:
@@ -95,16 +92,6 @@ def cost(
         size=None if pitch is None else (8 * pitch, 8 * pitch),
         footprint=(0.01, 0.01) if pitch is None else (pitch, pitch),
     )
-
-
-def _spread(count: int, seed: int) -> np.ndarray:
-    """Return the indices of taxels by farthest-point sampling, (S,), from 0, rising; the first is random."""
-    order = generator(Stream.POSITION, seed).permutation(64)
-    points, chosen = tile_centres(8, 8)[order], [0]
-    while len(chosen) < count:
-        apart = np.linalg.norm(points[:, None] - points[chosen], axis=2).min(axis=1)
-        chosen.append(int(apart.argmax()))
-    return np.sort(order[chosen])
 
 
 def _stretch(values: np.ndarray, frames: int) -> np.ndarray:

@@ -39,16 +39,6 @@ def plain(**changes) -> dict:
     return PLAIN | changes
 
 
-def test_units_become_si(tmp_path):
-    recording = convert(tmp_path, PLAIN)
-    gram = 9.80665e-3
-    expected = gram * np.array([[n, 10 * n] for n in range(4)])
-    assert np.allclose(recording.touches.readings[0], expected)
-    assert recording.touches.rate == pytest.approx(10)
-    assert recording.touches.labels is None
-    assert recording.metadata["positions"] == "unknown"
-
-
 def test_sdu_is_a_spreadsheet_whose_places_are_groups(tmp_path):
     pytest.importorskip("openpyxl")
     import pandas as pd
@@ -154,18 +144,7 @@ PRESS = {"press": {"column": "label", "values": {"press": 1, "none": 0}}}
         ({"segments": {"by": "press"}}, "segments.by=press must be 'row', 'file'"),
         ({"positions": [[0, 0]], "size": [0.1, 0.1]}, "readings of 2 sensors, positions are 1"),
         ({"colour": "red"}, "map.yaml has no setting colour"),
-    ],
-)
-def test_a_wrong_mapping_is_one_sentence(tmp_path, changes, message):
-    settings = {name: value for name, value in plain(**changes).items() if value is not None}
-    with pytest.raises(InputError, match=message) as refused:
-        convert(tmp_path, settings)
-    assert "\n" not in str(refused.value)
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
+        # Wrong files:
         ("t,s0,s1\n0,1,1\n200,1,1\n100,1,1\n", "time goes backwards at row 3, from 0.200000 to 0.100000 s"),
         ("t,s0,s1\n0,1,1\n0,1,1\n", "its times do not differ"),
         ("t,s0,s1\n", "has no rows"),
@@ -175,9 +154,11 @@ def test_a_wrong_mapping_is_one_sentence(tmp_path, changes, message):
         ("t,s0,s0 \n0,1,1\n", "several columns are called s0"),
     ],
 )
-def test_a_wrong_file_is_one_sentence(tmp_path, text, message):
+def test_a_wrong_mapping_or_file_is_one_sentence(tmp_path, changes, message):
+    text, changes = (changes, {}) if isinstance(changes, str) else (TABLE, changes)
+    settings = {name: value for name, value in plain(**changes).items() if value is not None}
     with pytest.raises(InputError, match=message) as refused:
-        convert(tmp_path, PLAIN, **{"a.csv": text})
+        convert(tmp_path, settings, **{"a.csv": text})
     assert "\n" not in str(refused.value)
 
 
@@ -200,6 +181,7 @@ def lines(*rows: str, first: str = "t,s0,s1", name: str = "{},{},{}") -> str:
 @pytest.mark.parametrize(
     ("changes", "files"),
     [
+        ({}, {"a.csv": lines()}),
         ({}, {"a.csv": lines().encode("utf-16")}),
         ({"table": {"begin": "^t,"}}, {"a.csv": lines("maker: X", "t0; 1, 2, 3", "")}),
         ({"table": {"units": True}}, {"a.csv": lines(first="t,s0,s1\nms,g,g")}),
@@ -215,13 +197,24 @@ def lines(*rows: str, first: str = "t,s0,s1", name: str = "{},{},{}") -> str:
             {"a.csv": "t,sensor,force\n" + "".join(f"{t},s1,{b}\n{t},s0,{a}\n" for t, a, b in ROWS)},
         ),
     ],
-    ids=["utf-16", "header lines", "row of units", "date times", "local format", "ns", "JSON lines", "long"],
+    ids=[
+        "plain",
+        "utf-16",
+        "header lines",
+        "row of units",
+        "date times",
+        "local format",
+        "ns",
+        "JSON lines",
+        "long",
+    ],
 )
 def test_the_same_readings_are_read_from_every_plain_file(tmp_path, changes, files):
     touches = convert(tmp_path, plain(**changes), **files).touches
     expected = 9.80665e-3 * np.array([[a, b] for _, a, b in ROWS])
     assert np.allclose(touches.readings[0], expected)
     assert touches.rate == pytest.approx(10)
+    assert touches.labels is None
 
 
 @pytest.mark.parametrize(

@@ -365,7 +365,7 @@ class Manifest:
         if not path.is_file():
             raise InputError(
                 f"{folder} is no data set, because it has no {MANIFEST}: give a folder that skin generate "
-                f"n=1000 out={folder.name} made"
+                f"n=1000 out={folder.name} made, or the .parquet file beside the folder of a session"
             )
         try:
             stored = parse_json(read_file(path))

@@ -1,7 +1,6 @@
 """Recordings in files: equal to the last bit, or refused by name."""
 
 import json
-import random
 import resource
 from contextlib import contextmanager
 from dataclasses import replace
@@ -195,51 +194,6 @@ def memory(more: int = 1 << 30):
 
 
 linux = pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="address space is read from /proc")
-JUNK = [None, True, -1, 0, 0.5, 3, 2**31, 2**62, 1e308, float("nan"), "", "x", [], [[]], [1], {}, {"x": [1]}]
-
-
-def altered(about: dict, chance: random.Random) -> dict:
-    """Return a description with one value, at whatever depth, replaced by junk or removed."""
-    about = json.loads(json.dumps(about))
-    inside, key = about, chance.choice(sorted(about.keys() - {"metadata"}))
-    while isinstance(inside[key], dict | list) and inside[key] and chance.random() < 0.5:
-        inside = inside[key]
-        key = chance.randrange(len(inside)) if isinstance(inside, list) else chance.choice(sorted(inside))
-    if chance.random() < 0.2:
-        del inside[key]
-    else:
-        inside[key] = chance.choice(JUNK)
-    return about
-
-
-@linux
-def test_an_altered_description_is_refused_or_read(tmp_path):
-    path, chance = write_recording(recording(), tmp_path / "x.parquet"), random.Random(0)
-    whole, refused = path.read_bytes(), 0
-    with memory():
-        for _ in range(200):
-            path.write_bytes(whole)
-            changed(path, lambda about: altered(about, chance))
-            refused += opened(lambda: read_recording(path)) is None
-    assert refused > 150
-
-
-@linux
-def test_altered_bytes_are_refused_or_mean_nothing(tmp_path):
-    kept = recording()
-    path, chance = write_recording(kept, tmp_path / "x.parquet"), random.Random(0)
-    whole, refused = path.read_bytes(), 0
-    footer = len(whole) - 8 - int.from_bytes(whole[-8:-4], "little")
-    with memory():
-        for number in range(200):
-            content = bytearray(whole)
-            for _ in range(chance.choice([1, 2, 8])):
-                content[chance.randrange(footer if number % 2 else 4, len(whole))] = chance.randrange(256)
-            path.write_bytes(content)
-            found = opened(lambda: read_recording(path))
-            refused += found is None
-            assert found is None or same(found, kept)
-    assert refused > 100
 
 
 @pytest.fixture(scope="module")
@@ -247,19 +201,23 @@ def written(tmp_path_factory):
     return write_recording(recording(parameters={}), tmp_path_factory.mktemp("recording") / "x.parquet")
 
 
+@linux
 @DAMAGED_FILES
 @given(data=st.data())
 def test_damage_never_passes_for_readings(written, data):
     path = written.with_name("damaged.parquet")
     path.write_bytes(data.draw(damaged(written.read_bytes())))
-    known = opened(lambda: read_recording(path))
+    with memory():
+        known = opened(lambda: read_recording(path))
     assert known is None or same(known, recording(parameters={}))
 
 
+@linux
 @DAMAGED_FILES
 @given(data=st.data())
 def test_a_description_by_hand_works_or_is_refused(written, data):
     path = written.with_name("by_hand.parquet")
     path.write_bytes(written.read_bytes())
     changed(path, lambda about: data.draw(mutated(about)))
-    opened(lambda: read_recording(path))
+    with memory():
+        opened(lambda: read_recording(path))

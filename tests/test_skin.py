@@ -70,12 +70,12 @@ def test_a_skin_is_described_simulated_and_differentiated():
 def test_a_run_is_loaded_and_predicts_a_recording(run, tmp_path):
     for arguments in (
         ["train", "experiment=rules", *SMALL],
-        ["generate", *SMALL[:1], "n=20", "out=x.csv"],
+        ["generate", *SMALL[:1], "n=20", "out=x.parquet"],
     ):
         done = run(tmp_path, *arguments, store="train" in arguments[0])
         assert done.returncode == 0, done.stderr
     trained = skin.load_run("latest", f"sqlite:///{tmp_path}/m.db")
-    touches = skin.read_recording(tmp_path / "x.csv").touches
+    touches = skin.read_recording(tmp_path / "x.parquet").touches
     probabilities = trained.predict(touches)
     assert probabilities.shape == (20, len(trained.labels))
     assert trained.labels == ("big", "dynamic", "press", "dangerous")

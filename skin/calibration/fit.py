@@ -24,8 +24,7 @@ from skin.calibration.wiring import (
     find_quantum,
     measure_idle,
 )
-from skin.device.calibration import QUANTITIES, Calibration
-from skin.device.curves import Curves
+from skin.device.calibration import QUANTITIES, Calibration, Curves
 from skin.device.imperfection import Imperfection
 from skin.errors import InputError
 from skin.mechanics.relaxation import first_order_lag, running_peak

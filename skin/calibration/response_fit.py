@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 from scipy.optimize import lsq_linear
 
-from skin.device.curves import Curves, Table
+from skin.device.calibration import Curves, Table
 
 _STEP = 0.06  # of the logarithm of the force: points of a press
 _LOWEST = 0.02  # of the largest true reading

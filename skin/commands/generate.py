@@ -3,9 +3,9 @@
     skin generate n=1000 out=touches.parquet
     skin generate n=1000000 out=touches
 
-A folder is written with flat memory, and a command that was killed continues when it is repeated. A file also
-has the displacements under the sensors. Prints a summary of the touches, and warns if the shape alone
-predicts a label.
+A CSV file has the rows alone, for a spreadsheet. A folder is written with flat memory, and a command that was
+killed continues when it is repeated. A file also has the displacements under the sensors. Prints a summary of
+the touches, and warns if the shape alone predicts a label.
 """
 
 from pathlib import Path

@@ -3,7 +3,7 @@
 import logging
 import warnings
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -11,9 +11,11 @@ import torch
 from skin.body.base import AbstractBody
 from skin.device.base import AbstractDevice
 from skin.device.touches import Recording, only_touches
-from skin.touch.gestures import GestureSettings
 from skin.touch.labels import ALARM
 from skin.touch.sampler import AbstractSampler
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 _log = logging.getLogger(__name__)
 
@@ -29,64 +31,43 @@ def report_balance(device: AbstractDevice, recording: Recording | None = None, s
     if device.simulation is None:
         return
     sampler = device.simulation.sampler
-    balance = class_balance(recording or device.recording(None, complete=False), sampler)
+    recording = only_touches(recording or device.recording(None, complete=False))
+    balance = class_balance(recording, sampler)
     if shown:
-        _log.info("\n".join(balance_table(balance)))
-    check_label_leakage(balance, sampler)
+        _log.info(balance_text(balance))
+    check_label_leakage(balance, sampler.leak)
 
 
-def class_balance(recording: Recording, sampler: AbstractSampler) -> dict[str, Any]:
-    """Return statistics of the gestures of each class, in SI units and fractions of 1.
+def class_balance(recording: Recording, sampler: AbstractSampler) -> "pd.DataFrame":
+    """Return a table with two rows per label, the class and its opposite, without those that do not occur.
 
     Args:
         recording: simulated touches.
         sampler: that drew them; the parameter ``shape`` is an index into its shapes.
 
     Returns:
-        shapes, stretched (fraction of touches that were stretched) and, for each label, opposite, accuracy,
-        error (see :func:`accuracy_from_shape`) and for its classes yes and no: touches, shapes (fraction of
-        each), area, force (N), x and y (m; mean and standard deviation of the first position), rejected
-        (fraction of drawn paths with other labels) and misfits (fraction of drawn bodies that do not fit).
+        accuracy of the label from the shape alone and its standard error (:func:`accuracy_from_shape`); the
+        fraction of each shape, %; means of area, %, and of the first position, mm; the median force, N; and
+        the fractions of paths with other labels and of bodies that do not fit, of all that were drawn, %.
     """
-    recording = only_touches(recording)
-    parameters = {name: values.double().numpy() for name, values in recording.parameters.items()}
-    labels = recording.touches.labels
-    assert labels is not None
-    report: dict[str, Any] = {
-        "shapes": list(sampler.shapes.names),
-        "stretched": float((parameters["stretch"] != 1).mean()),
-        "labels": {},
-    }
-    shape = parameters["shape"].astype(int)
-    for column, name in enumerate(recording.task.names):
-        if name in sampler.labels:
-            holds = labels[:, column].numpy() > 0.5
-            accuracy, error = accuracy_from_shape(shape, holds)
-            report["labels"][name] = {
-                "opposite": sampler.labels[name].opposite,
-                "accuracy": accuracy,
-                "error": error,
-                "yes": _class(parameters, holds, len(sampler.shapes.names)),
-                "no": _class(parameters, ~holds, len(sampler.shapes.names)),
-            }
-    return report
+    import pandas as pd  # not needed by skin live
 
-
-def _class(parameters: dict[str, np.ndarray], rows: np.ndarray, shapes: int) -> dict[str, Any]:
-    count = int(rows.sum())
-    if not count:
-        return {"touches": 0}
-    values = {name: column[rows] for name, column in parameters.items()}
-    return {
-        "touches": count,
-        "shapes": (np.bincount(values["shape"].astype(int), minlength=shapes) / count).tolist(),
-        "area": float(values["area"].mean()),
-        "force": float(np.median(values["force"])),
-        "x": [float(values["x"].mean()), float(values["x"].std())],
-        "y": [float(values["y"].mean()), float(values["y"].std())],
-        "rejected": 1 - count / float(values["draws"].sum()),
-        "misfits": 1 - count / (count + float(values["misfits"].sum())),
-    }
+    touches = pd.DataFrame({name: values.double().numpy() for name, values in recording.parameters.items()})
+    shapes, rows = [Path(name).stem for name in sampler.shapes.names], dict[str, dict[str, float]]()
+    labels = recording.touches.known_labels.numpy() > 0.5
+    for name, holds in zip(recording.task.names, labels.T, strict=True):
+        if name not in sampler.labels:
+            continue
+        scores = accuracy_from_shape(touches["shape"].to_numpy(int), holds)
+        for title, part in ((name, touches[holds]), (sampler.labels[name].opposite, touches[~holds])):
+            if count := len(part):
+                rows[title] = dict(zip(("accuracy", "error"), scores, strict=True)) if title == name else {}
+                rows[title] |= {shape: 100 * (part["shape"] == n).mean() for n, shape in enumerate(shapes)}
+                rows[title] |= {"area %": 100 * part["area"].mean(), "force N": part["force"].median()}
+                rows[title] |= {"x mm": 1e3 * part["x"].mean(), "y mm": 1e3 * part["y"].mean()}
+                rows[title]["paths"] = 100 * (1 - count / part["draws"].sum())
+                rows[title]["bodies"] = 100 * (1 - count / (count + part["misfits"].sum()))
+    return pd.DataFrame.from_dict(rows, orient="index")
 
 
 def accuracy_from_shape(shape: np.ndarray, holds: np.ndarray) -> tuple[float, float]:
@@ -117,52 +98,32 @@ def accuracy_from_shape(shape: np.ndarray, holds: np.ndarray) -> tuple[float, fl
     return sum(rates) / 2, float(error)
 
 
-def balance_table(report: dict[str, Any]) -> list[str]:
-    """Return a class balance as lines of a table, two per label."""
-    names = [Path(shape).stem for shape in report["shapes"]]
-    table = [["", "accuracy", *names, "area %", "force N", "x mm", "y mm", "paths", "bodies"]]
-    for name, entry in report["labels"].items():
-        sides = ((name, f"{entry['accuracy']:.2f}", "yes"), (entry["opposite"], "", "no"))
-        table += [
-            [title, text, *_cells(entry[side])] for title, text, side in sides if entry[side]["touches"]
-        ]
-    widths = [max(map(len, column)) for column in zip(*table, strict=True)]
-    rows = ["  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in table]
-    return [
-        f"balance: {report['stretched']:.0%} of touches were stretched to fit. Shapes are in % of a class, "
-        "paths and bodies in % rejected; accuracy: balanced accuracy of the label from the shape alone",
-        *rows,
-    ]
+def balance_text(balance: "pd.DataFrame") -> str:
+    """Return a class balance as lines."""
+    formats = dict.fromkeys(("accuracy", "error"), "{:.2f}".format)
+    table = balance.to_string(formatters=formats, float_format="{:.0f}".format, na_rep="", line_width=None)
+    return (
+        "balance: shapes are in % of a class, paths and bodies in % rejected; accuracy: balanced accuracy of "
+        f"the label from the shape alone\n{table}"
+    )
 
 
-def _cells(side: dict[str, Any]) -> list[str]:
-    fractions = [f"{100 * fraction:.0f}" for fraction in (*side["shapes"], side["area"])]
-    positions = [f"{1e3 * side[axis][0]:.0f}±{1e3 * side[axis][1]:.0f}" for axis in "xy"]
-    lost = [f"{100 * side[kind]:.0f}" for kind in ("rejected", "misfits")]
-    return [*fractions, f"{side['force']:.0f}", *positions, *lost]
-
-
-def check_label_leakage(report: dict[str, Any], settings: AbstractSampler | GestureSettings) -> None:
+def check_label_leakage(balance: "pd.DataFrame", leak: float) -> None:
     """Warn if the shape alone predicts a label.
 
-    A label leaks if its balanced accuracy is above ``settings.leak`` by more than two standard errors; the
-    margin keeps small data sets from warnings by chance.
+    A label leaks if its balanced accuracy is above ``leak`` by more than two standard errors; the margin
+    keeps small data sets from warnings by chance.
     """
-    leaking = {
-        name: entry["accuracy"]
-        for name, entry in report["labels"].items()
-        if entry["accuracy"] - 2 * entry["error"] > settings.leak
-    }
-    if not leaking:
-        return
-    named = " and ".join(f"{name} ({score:.0%})" for name, score in leaking.items())
-    warnings.warn(
-        f"the shape alone predicts {named} of these gestures, more than touch.leak={settings.leak:g} "
-        "allows: a model may learn the shape instead of the label; give touch.shapes of one kind, raise "
-        "touch.stretch, or give touch.leak=0.5, which fits every shape to the sheet",
-        RuntimeWarning,
-        stacklevel=3,
-    )
+    scores = balance["accuracy"][balance["accuracy"] - 2 * balance["error"] > leak]
+    if len(scores):
+        named = " and ".join(f"{name} ({score:.0%})" for name, score in scores.items())
+        warnings.warn(
+            f"the shape alone predicts {named} of these gestures, more than touch.leak={leak:g} allows: a "
+            "model may learn the shape instead of the label; give touch.shapes of one kind, raise "
+            "touch.stretch, or give touch.leak=0.5, which fits every shape to the sheet",
+            RuntimeWarning,
+            stacklevel=3,
+        )
 
 
 # Summary of a data set in one line: forces, strains, clipped readings, accepted draws.

@@ -18,8 +18,7 @@ from skin.errors import InputError
 from skin.touch.labels import Task
 
 if TYPE_CHECKING:
-    from skin.device.effects import Constants
-    from skin.device.imperfection import Imperfection
+    from skin.device.imperfection import Constants, Imperfection
     from skin.device.touches import TouchStream
     from skin.mechanics.simulator.base import AbstractSimulator
     from skin.touch.sampler import AbstractSampler

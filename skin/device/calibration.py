@@ -1,26 +1,122 @@
-"""Constants of a real device, one per sensor, and ranges to draw others from; their YAML file."""
+"""Constants of a real device, one per sensor, its response curves, and ranges to draw others from.
+
+Their YAML file is that of ``skin calibrate``. A curve is the value that a sensor shows under a force.
+"""
 
 import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from annotated_types import MaxLen, MinLen
+from pydantic import AfterValidator, AllowInfNan, NonNegativeInt, PositiveFloat
 
 from skin.body.base import MOST
 from skin.core import files
-from skin.core.files import candidates
 from skin.core.safe_loading import TEXT, ChecksumError, check_text, parse_yaml, read_file, text_sum
-from skin.device.curves import Curves, Table, read_tables
+from skin.core.settings import RISING, check_settings, checked, configured
 from skin.errors import InputError
 
+_LEAST = 1e-9  # of the reference: below, a power law is a line, whose slope is finite
+
+
+def _check_rising(table: Sequence[Sequence[float]]) -> Sequence[Sequence[float]]:
+    """Refuse a table whose rows have different lengths or do not rise from 0."""
+    if len(table[0]) != len(table[1]) or any(row[0] != 0 or min(np.diff(row)) <= 0 for row in table):
+        raise ValueError("must have two rows, readings and values in N, each rising from 0: [[0,1],[0,2]]")
+    return table
+
+
+_Row = Annotated[Sequence[float], MinLen(2), MaxLen(1000)]
+Table = Annotated[Sequence[_Row], MinLen(2), MaxLen(2), AfterValidator(_check_rising)]
+"""Linear readings and values of a curve, each rising from 0, N."""
+
+
+@dataclass(frozen=True)
+class Curves:
+    """The curves of S sensors: power laws, or tables.
+
+    A linear reading x, the gain times the force, becomes ``at`` (x / ``at``) ^ ``exponent``, or the value of
+    a table, interpolated linearly and continued with its last slope. Below 0, curves are those above it with
+    both signs changed. The exponent of force-sensitive resistors is about 0.5, where the value is the
+    resistance's inverse.
+
+    Attributes:
+        exponent: (S,), or (B, 1, S); 1: linear.
+        at: reading at which linear reading and value are equal, (S,) or a number, N.
+        tables: of sensors, from 0, that follow no power law.
+    """
+
+    exponent: Any
+    at: Any
+    tables: Mapping[int, Table] = field(default_factory=dict)
+
+    def bend(self, linear: Any) -> Any:
+        """Return the values of linear readings (..., S), array or tensor, N."""
+        values = linear * (abs(linear) / self.at).clip(_LEAST) ** (self.exponent - 1)
+        for sensor, (readings, shown) in self.tables.items():
+            values[..., sensor] = _interpolate(linear[..., sensor], readings, shown)
+        return values
+
+    def straighten(self, values: Any) -> Any:
+        """Return the linear readings of values (..., S), array or tensor, N."""
+        linear = values * (abs(values) / self.at).clip(_LEAST) ** (1 / self.exponent - 1)
+        for sensor, (readings, shown) in self.tables.items():
+            linear[..., sensor] = _interpolate(values[..., sensor], shown, readings)
+        return linear
+
+    @property
+    def slopes(self) -> np.ndarray:
+        """Change of the value per change of the linear reading at :attr:`at` within 1 %, (S,); 1: a line."""
+        at = np.broadcast_to(self.at, np.shape(self.exponent)).astype(float)
+        return np.asarray((self.bend((1 + 0.01) * at) - self.bend((1 - 0.01) * at)) / (2 * 0.01 * at))
+
+    def scaled(self, factor: np.ndarray) -> "Curves":
+        """Return these curves for readings and values in another unit; ``factor`` (S,) of that per N."""
+        tables = {n: (np.array(table) * factor[n]).tolist() for n, table in self.tables.items()}
+        return Curves(self.exponent, self.at * factor, tables)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return JSON data from which :meth:`of_json` makes these curves."""
+        tables = {str(n): [list(row) for row in table] for n, table in self.tables.items()}
+        return {"exponent": self.exponent.tolist(), "at": self.at.tolist(), "tables": tables}
+
+    @classmethod
+    def of_json(cls, stored: Mapping[str, Any], sensors: int) -> "Curves":
+        """Return the curves of so many sensors.
+
+        Raises:
+            ValueError: no curves, or those of another number of sensors.
+        """
+        exponent, at = (np.array(stored[name], dtype=float) for name in ("exponent", "at"))
+        tables = {int(number): table for number, table in stored["tables"].items()}
+        check_settings(Calibration, {"tables": tables}, "curves")
+        if not exponent.shape == at.shape == (sensors,) or not set(tables) <= set(range(sensors)):
+            raise ValueError("curves of other sensors")
+        if not np.isfinite([exponent, at]).all() or not (np.array([exponent, at]) > 0).all():
+            raise ValueError("curves need finite numbers above 0")
+        return cls(exponent, at, tables)
+
+
+def _interpolate(values: Any, given: Sequence[float], result: Sequence[float]) -> Any:
+    """Return values of a table, odd, and continued with the last slope."""
+    if not isinstance(values, np.ndarray):
+        import torch  # only here: settings are checked without it
+
+        return torch.from_numpy(_interpolate(values.cpu().numpy(), given, result)).to(values)
+    size = np.abs(values)
+    slope = (result[-1] - result[-2]) / (given[-1] - given[-2])
+    beyond = np.maximum(size - given[-1], 0.0) * slope
+    return np.sign(values) * (np.interp(size, given, result) + beyond)
+
+
+# The file.
+
+
 FORMAT = 1
-_KEYS = (
-    *("format", "sha256", "count", "scale", "zero", "polarity", "channels", "exponent_at", "sensors"),
-    *("tables", "broken", "ranges", "about"),
-)
 QUANTITIES = {
     "gain": 1.0,
     "offset": 0.0,
@@ -32,12 +128,13 @@ QUANTITIES = {
     "quantum": 0.0,
     "exponent": 1.0,
 }
-"""Quantities per sensor, as in :class:`skin.device.effects.Constants`, with defaults."""
-_SIGNED = ("offset", "drift")
+"""Quantities per sensor, as in :class:`skin.device.imperfection.Constants`, with defaults."""
+_LARGEST = 1e12  # of a quantity: a device has less; only a clip may be infinite
 BROKEN = ("dead", "stuck", "saturated")
 """Kinds of broken sensors; ``stuck`` and ``saturated`` ones always read their ``offset``."""
 
 
+@checked("a calibration")
 @dataclass(frozen=True)
 class Calibration:
     """The constants of a device, and ranges from which similar devices are drawn.
@@ -53,7 +150,7 @@ class Calibration:
         polarity: 1 or -1 per sensor: -1 where the raw value falls with force. Readings in N rise with force
             either way. Empty: 1 for all.
         channels: the device's channel, from 0, of every sensor of the layout. Empty: the same order.
-        exponent_at: N, at which the curves of all exponents meet (:class:`skin.device.curves.Curves`). There
+        exponent_at: N, at which the curves of all exponents meet (:class:`Curves`). There
             the noise of a curved sensor has its value: at other readings the curve has other slopes.
         tables: curves of sensors, from 0, that follow no power law.
 
@@ -61,50 +158,55 @@ class Calibration:
         InputError: an unknown name, different lengths, or a number out of range.
     """
 
-    sensors: Mapping[str, Sequence[float | None]]
-    broken: Mapping[str, Sequence[int]] = field(default_factory=dict)
-    ranges: Mapping[str, Sequence[float]] = field(default_factory=dict)
-    scale: float = 1.0
+    sensors: Annotated[Mapping[str, Sequence[Annotated[float, AllowInfNan(True)] | None]], MinLen(1)]
+    broken: Mapping[str, Sequence[NonNegativeInt]] = field(default_factory=dict)
+    ranges: Mapping[str, Annotated[Sequence[float], MinLen(2), MaxLen(2), RISING]] = field(
+        default_factory=dict
+    )
+    scale: PositiveFloat = 1.0
     zero: float = 0.0
-    about: Mapping[str, Any] = field(default_factory=dict)
+    about: dict = field(default_factory=dict)
     polarity: Sequence[int] = ()
-    channels: Sequence[int] = ()
-    exponent_at: float = 1.0
+    channels: Sequence[NonNegativeInt] = ()
+    exponent_at: PositiveFloat = 1.0
     tables: Mapping[int, Table] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        _known(self.sensors, QUANTITIES, "sensors")
-        _known(self.broken, BROKEN, "broken")
-        _known(self.ranges, (*QUANTITIES, "dead"), "ranges")
-        counts = {name: len(values) for name, values in self.sensors.items()}
-        if len(set(counts.values())) != 1:
-            raise InputError(f"a calibration needs as many numbers of every quantity, got {counts or 'none'}")
-        for name, values in self.sensors.items():
-            _check(name, [value for value in values if value is not None])
-        for name, values in self.ranges.items():
-            _check(name, values)
-            if len(values) != 2 or values[0] > values[1] or not math.isfinite(values[1]):
-                raise InputError(f"ranges.{name} must be [low, high], both finite, got {list(values)}")
+        names = {"sensors": (*QUANTITIES,), "broken": BROKEN, "ranges": (*QUANTITIES, "dead")}
+        for group, allowed in names.items():
+            if unknown := getattr(self, group).keys() - set(allowed):
+                raise InputError(f"{group} takes {', '.join(allowed)}, got {', '.join(sorted(unknown))}")
+        for name, values in (*self.sensors.items(), *self.ranges.items()):
+            low = -_LARGEST if name in ("offset", "drift") else 0.0
+            high = math.inf if name == "clip" else _LARGEST
+            if not all(low <= value <= high for value in values if value is not None):
+                raise InputError(
+                    f"{name} must be numbers from {low:g} to {high:g} (a channel whose values fall with "
+                    f"force has polarity: -1), got {str(values)[:80]}"
+                )
+        if len(set(counts := {name: len(values) for name, values in self.sensors.items()}.values())) != 1:
+            raise InputError(f"a calibration needs as many numbers of every quantity, got {list(counts)}")
+        if len(self.signs) != len(self) or not set(self.polarity) <= {1, -1}:
+            raise InputError(
+                f"polarity must be 1 or -1 for each of {len(self)} sensors, got {list(self.polarity)}"
+            )
+        numbers = [*self.tables, *(number for group in self.broken.values() for number in group)]
+        if wrong := [number for number in numbers if number not in range(len(self))]:
+            raise InputError(
+                f"broken and tables of {len(self)} sensors take sensors 0 to {len(self) - 1}, got {wrong}"
+            )
+        if self.channels and sorted(self.channels) != list(range(len(self))):
+            raise InputError(
+                f"channels must hold each of 0 to {len(self) - 1} once, the channel of every sensor, got "
+                f"{list(self.channels)}"
+            )
         if any(number not in range(len(self) + 1) for number in self.ranges.get("dead", ())):
             raise InputError(f"ranges.dead must be whole numbers up to {len(self)} sensors")
-        wrong = [number for group in self.broken.values() for number in group if not self._has(number)]
-        if wrong or not self.scale > 0 or not math.isfinite(self.scale) or not math.isfinite(self.zero):
-            raise InputError(
-                f"a calibration of {len(self)} sensors breaks sensors 0 to {len(self) - 1} and has a scale "
-                f"above 0, got sensors {wrong}, scale {self.scale}, zero {self.zero}"
-            )
-        self._check_wiring()
-        if not 0 < self.exponent_at < math.inf or (self.known("exponent") <= 0).any():
-            raise InputError(
-                "exponent and exponent_at must be above 0, as those of sensors that follow force^0.5"
-            )
-        read_tables(self.tables, len(self))
+        if (self.known("exponent") <= 0).any():
+            raise InputError("exponent must be above 0, as 0.5 of sensors that follow the root of the force")
 
     def __len__(self) -> int:
         return len(next(iter(self.sensors.values())))
-
-    def _has(self, number: Any) -> bool:
-        return isinstance(number, int) and not isinstance(number, bool) and 0 <= number < len(self)
 
     def newtons(self, raw: np.ndarray) -> np.ndarray:
         """Return raw values (..., S), in the layout's order, in N, with offsets and gains.
@@ -125,18 +227,6 @@ class Calibration:
         if not self.tables and (exponent == 1).all():
             return None
         return Curves(exponent, np.full(len(self), self.exponent_at), self.tables)
-
-    def _check_wiring(self) -> None:
-        """Raise InputError unless polarity and channels fit the number of sensors."""
-        if self.polarity and (len(self.polarity) != len(self) or not set(self.polarity) <= {1, -1}):
-            raise InputError(
-                f"polarity must be 1 or -1 for each of {len(self)} sensors, got {list(self.polarity)}"
-            )
-        if self.channels and sorted(self.channels) != list(range(len(self))):
-            raise InputError(
-                f"channels must hold each of 0 to {len(self) - 1} once, the channel of every sensor, got "
-                f"{list(self.channels)}"
-            )
 
     def corrected(self, raw: np.ndarray) -> np.ndarray:
         """Return the true readings of raw values, (..., S), N: no offset, gain 1; NaN for broken sensors."""
@@ -179,13 +269,11 @@ class Calibration:
 
         Quantities without a range keep their values. Broken sensors are drawn as well.
         """
-        own_values, converted = self.values(), dict[str, np.ndarray]()
+        converted = {name: np.broadcast_to(self.known(name), shape).copy() for name in QUANTITIES}
         for name in QUANTITIES:
             low, high = self.ranges.get(name, (0.0, 0.0))
             drawn = generator.uniform(low, high, shape)
-            converted[name] = (
-                drawn if name in self.ranges else np.broadcast_to(own_values[name], shape).copy()
-            )
+            converted[name] = drawn if name in self.ranges else converted[name]
         fewest, maximum = self.ranges.get("dead", (0, 0))
         count = generator.integers(int(fewest), int(maximum), (*shape[:-1], 1), endpoint=True)
         rank = generator.random(shape).argsort(axis=-1).argsort(axis=-1)
@@ -202,7 +290,7 @@ def read_calibration(path: str | Path) -> Calibration:
         InputError: no such file, unreadable, invalid contents, or a line ``sha256`` with the checksum of
             other contents.
     """
-    file = next((candidate for candidate in candidates(path) if candidate.is_file()), None)
+    file = next((candidate for candidate in files.candidates(path) if candidate.is_file()), None)
     if file is None:
         raise InputError(f"no calibration {path}: skin calibrate session=FILE out={path} makes one")
     try:
@@ -217,35 +305,42 @@ def read_calibration(path: str | Path) -> Calibration:
         return _calibration(stored)
     except ChecksumError as error:
         raise InputError(f"{file}: {error}: remove its line sha256 if you changed it by hand") from error
-    except (InputError, KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise InputError(f"{file} is no calibration: {error}") from error
 
 
 def _calibration(stored: Mapping[str, Any]) -> Calibration:
-    """Return the calibration that a file describes; its size is checked before memory is allocated."""
-    _known(stored, _KEYS, "a calibration")
+    """Return the calibration that a file describes; its count is checked before memory is allocated."""
     count = stored["count"]
     if type(count) is not int or not 1 <= count <= MOST:
         raise InputError(f"count must be a whole number from 1 to {MOST}, got {count!r}")
-    sensors = {
-        name: value if isinstance(value, list) else [value] * count
-        for name, value in stored["sensors"].items()
-    }
-    if wrong := [name for name, values in sensors.items() if len(values) != count]:
-        raise InputError(
-            f"a calibration needs as many numbers of every quantity as count says, {count}, got "
-            f"{len(sensors[wrong[0]])} of {wrong[0]}"
-        )
-    broken, ranges, about = (stored.get(name) or {} for name in ("broken", "ranges", "about"))
-    if not isinstance(about, dict):
-        raise InputError(f"about must be settings by name, got {about!r}")
-    scale, zero = float(stored.get("scale", 1.0)), float(stored.get("zero", 0.0))
-    polarity, channels = stored.get("polarity") or [], stored.get("channels") or []
-    polarity = [polarity] * count if isinstance(polarity, int) else polarity
-    if not isinstance(polarity, list) or not isinstance(channels, list):
-        raise InputError("polarity and channels must be lists")
-    curves = float(stored.get("exponent_at", 1.0)), read_tables(stored.get("tables") or {}, count)
-    return Calibration(sensors, broken, ranges, scale, zero, about, tuple(polarity), tuple(channels), *curves)
+
+    def each(value: Any) -> Any:
+        return value if isinstance(value, list) else [value] * count
+
+    settings = {name: value for name, value in stored.items() if name not in ("format", "sha256", "count")}
+    settings = {name: value for name, value in settings.items() if value is not None}
+    settings["sensors"] = {name: each(value) for name, value in stored["sensors"].items()}
+    settings |= {name: tuple(each(settings[name])) for name in {"polarity", "channels"} & settings.keys()}
+    calibration = configured(Calibration, settings, "a calibration")
+    if len(calibration) != count:
+        raise InputError(f"a calibration needs as many numbers as count, {count}, got {len(calibration)}")
+    return calibration
+
+
+_LINES = {
+    "scale": "N per raw unit",
+    "zero": "raw units at 0 N, before offsets",
+    "polarity": "-1: falls with force",
+    "channels": "of the device, by sensor",
+    "exponent_at": "N, where curves of all exponents meet",
+    "tables": "by sensor: linear readings and values, N",
+    "sensors": "",
+    "broken": "",
+    "ranges": "",
+    "about": "",
+}
+"""Settings of a file in their order -> what they are."""
 
 
 def write_calibration(calibration: Calibration, path: str | Path) -> Path:
@@ -254,44 +349,15 @@ def write_calibration(calibration: Calibration, path: str | Path) -> Path:
     Raises:
         InputError: the file cannot be written.
     """
-    groups = {"sensors": calibration.sensors, "broken": calibration.broken, "ranges": calibration.ranges}
     lines = ["# Forces in N, times in s. device.calibration takes this file.", f"format: {FORMAT}"]
-    lines += [f"count: {len(calibration)}", f"scale: {calibration.scale!r}  # N per raw unit"]
-    lines.append(f"zero: {calibration.zero!r}  # raw units at 0 N, before offsets")
-    if calibration.polarity:
-        lines.append(f"polarity: {json.dumps(list(calibration.polarity))}  # -1: falls with force")
-    if calibration.channels:
-        lines.append(f"channels: {json.dumps(list(calibration.channels))}  # of the device, by sensor")
-    if calibration.curves is not None:
-        lines.append(f"exponent_at: {calibration.exponent_at!r}  # N, where curves of all exponents meet")
-    if calibration.tables:
-        lines.append("tables:  # by sensor: linear readings and values, N")
-        lines += [f"  {number}: {json.dumps(table)}" for number, table in calibration.tables.items()]
-    for group, values in groups.items():
-        lines.append(f"{group}:" + ("" if values else " {}"))
-        lines += [f"  {name}: {json.dumps(list(value))}" for name, value in values.items()]
-    lines.append(f"about: {json.dumps(dict(calibration.about))}")
+    lines.append(f"count: {len(calibration)}")
+    for name, comment in _LINES.items():
+        value = getattr(calibration, name)
+        if name in ("tables", "sensors", "broken", "ranges") and value:
+            lines.append(f"{name}:" + f"  # {comment}" * bool(comment))
+            lines += [f"  {key}: {json.dumps(list(part))}" for key, part in value.items()]
+        elif value:  # 0 and nothing are defaults
+            lines.append(f"{name}: {json.dumps(value)}" + f"  # {comment}" * bool(comment))
     # Before the count, which no file lacks: who cuts off the checksum cuts off more than it.
     lines.insert(2, text_sum("\n".join(lines)))
     return files.write("\n".join(lines) + "\n", Path(path).expanduser())
-
-
-def _known(names_given: Mapping[str, Any], names: Sequence[str] | Mapping[str, Any], group: str) -> None:
-    if unknown := set(names_given) - set(names):
-        raise InputError(f"{group} takes {', '.join(names)}, got {', '.join(sorted(map(str, unknown)))}")
-
-
-def _check(name: str, values: Sequence[float]) -> None:
-    numbers = isinstance(values, Sequence) and all(_is_number(name, value) for value in values)
-    if not numbers or (name not in _SIGNED and min(values, default=0) < 0):
-        minimum = "" if name in _SIGNED else " from 0 up"
-        minimum += " (a channel whose values fall with force has polarity: -1)" if name == "gain" else ""
-        text = str(values)
-        raise InputError(f"{name} must be numbers{minimum}, got {text[:80]}")
-
-
-def _is_number(name: str, value: Any, largest: float = 1e12) -> bool:
-    """Return whether a value is a number that a device can have; a limit may be infinite."""
-    if not isinstance(value, int | float) or isinstance(value, bool):
-        return False
-    return abs(value) <= largest or (name == "clip" and value == math.inf)

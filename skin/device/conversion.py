@@ -24,7 +24,6 @@ from skin.device.formats import (
     Column,
     ForeignFormat,
     LabelRule,
-    TargetColumn,
     parse_numbers,
     read_table,
     require_columns,
@@ -61,6 +60,10 @@ def convert_files(
     touches = [touch for path in paths for touch in _read_touches(mapping, path, folder)]
     if not touches:
         raise InputError(f"{folder} has no touch: lower segments.threshold, or segments.frames")
+    parts: dict[str, Any] = {
+        part: {name: [touch[part][name] for touch in touches] for name in touches[0][part]}
+        for part in ("targets", "labels", "groups")
+    }
     kinds, names = [touch["kind"] for touch in touches], None
     if mapping.classes is not None and (given := mapping.classes.names):
         given = given if isinstance(given, dict) else {name: name for name in given}
@@ -69,15 +72,11 @@ def convert_files(
     return build_recording(
         np.stack([touch["frames"] for touch in touches]),
         float(np.median([touch["rate"] for touch in touches])),
-        **{
-            part: {name: [touch[part][name] for touch in touches] for name in touches[0][part]}
-            for part in ("targets", "labels", "groups")
-        },
+        **parts,
         kinds=None if mapping.classes is None else kinds,
         names=names,
         about=mapping.about,
         positions=sensors if mapping.positions == "layout" else mapping.positions,
-        per_sensor=mapping.channels.per_sensor,
         size=size if mapping.size is None else mapping.size,
         footprint=mapping.footprint,
     )
@@ -98,39 +97,45 @@ def _read_touches(mapping: ForeignFormat, path: Path, folder: Path) -> list[_Tou
         values = values - np.nanmedian(values, axis=0)
     elif baseline.kind == "first":
         values = values - _mean(values[: baseline.rows])
-    targets = {name: _target(name, its, table, path) for name, its in (mapping.targets or {}).items()}
-    columns = {
-        name: _joined(rule.column, table, path, f"labels.{name}")
-        for name, rule in (mapping.labels or {}).items()
-        if rule.column is not None
+    targets = {
+        name: TARGETS[name][its.unit] * _numbers(table, its.column, path, f"targets.{name}")
+        for name, its in (mapping.targets or {}).items()
     }
-    classes = None if mapping.classes is None else _joined(mapping.classes.column, table, path, "classes")
-    groups = (
-        mapping.groups if isinstance(mapping.groups, Mapping) else {name: (name,) for name in mapping.groups}
-    )
-    texts = {str(name): _joined(names, table, path, "groups") for name, names in groups.items()}
+    labels, groups = mapping.labels or {}, mapping.groups
+    named = groups if isinstance(groups, Mapping) else {str(name): (name,) for name in groups}
+    sources = {f"labels.{name}": rule.column for name, rule in labels.items() if rule.column is not None}
+    sources |= {"classes": mapping.classes.column} if mapping.classes else {}
+    sources |= {f"groups.{name}": columns for name, columns in named.items()}
+    texts = {what: _joined(columns, table, path, what) for what, columns in sources.items()}
     touches = []
     for rows in _segments(mapping, values):
         frames = np.zeros((mapping.segments.frames, values.shape[1]), dtype=np.float32)
         begin = mapping.segments.before if mapping.segments.by == "row" else 0
         part = values[rows][: len(frames) - begin]
-        offset = _mean(part[: baseline.rows]) if baseline.kind == "segment" else 0
-        frames[begin : begin + len(part)] = part - offset
-        measured = {name: _reduce(name, column[rows]) for name, column in targets.items()}
+        frames[begin : begin + len(part)] = part
         where = f"{path}: rows {rows.start + 1} to {rows.stop}"
-        labels = {
-            name: _label(rule, measured, columns.get(name, classes), rows, mapping, f"{where}: label {name}")
-            for name, rule in (mapping.labels or {}).items()
-        }
-        kind = None if classes is None else _single(classes[rows], mapping, f"{where}: classes")
-        grouped = {name: list(dict.fromkeys(column[rows])) for name, column in texts.items()}
-        for name, found in grouped.items():
-            if len(found) != 1 or found[0] is None:
+        found = {what: [*dict.fromkeys(column[rows])] for what, column in texts.items()}
+        for name in named:
+            if len(one := found[f"groups.{name}"]) != 1 or one[0] is None:
                 raise InputError(
-                    f"{where}: groups: each touch needs one {name}, got {' and '.join(map(str, found[:3]))}"
+                    f"{where}: groups: each touch needs one {name}, got {' and '.join(map(str, one[:3]))}"
                 )
-        known = {"targets": measured, "labels": labels, "groups": {k: v[0] for k, v in grouped.items()}}
-        touches.append(known | {"frames": frames, "rate": rate, "kind": kind})
+        measured = {name: _reduce(name, column[rows]) for name, column in targets.items()}
+        touches.append(
+            {
+                "frames": frames,
+                "rate": rate,
+                "targets": measured,
+                "labels": {
+                    name: _above(rule, measured)
+                    if rule.values is None
+                    else _single(found[f"labels.{name}"], mapping, f"{where}: label {name}", rule.values)
+                    for name, rule in labels.items()
+                },
+                "groups": {name: found[f"groups.{name}"][0] for name in named},
+                "kind": _single(found["classes"], mapping, f"{where}: classes") if mapping.classes else None,
+            }
+        )
     return touches
 
 
@@ -147,8 +152,6 @@ def _readings(mapping: ForeignFormat, table: pd.DataFrame, path: Path) -> np.nda
     factor = np.asarray(its.scale if its.scale is not None else FORCES[its.unit], dtype=float)
     if factor.ndim and len(factor) != len(names):
         raise InputError(f"channels.scale has {len(factor)} numbers, {path} has {len(names)} channels")
-    if len(names) % its.per_sensor:
-        raise InputError(f"{path} has {len(names)} channels, not sensors with {its.per_sensor} each")
     values = np.empty((len(table), len(names)), dtype=np.float32)
     for number, (name, scale) in enumerate(zip(names, np.broadcast_to(factor, len(names)), strict=True)):
         values[:, number] = scale * parse_numbers(table, name, path)
@@ -228,13 +231,10 @@ def _segments(mapping: ForeignFormat, values: np.ndarray) -> list[slice]:
     return [slice(int(begin), int(begin) + its.frames) for begin in begins]
 
 
-def _target(name: str, its: TargetColumn, table: pd.DataFrame, path: Path) -> np.ndarray:
-    """Return a measured quantity of each row, (R,), m or N, NaN where unknown."""
-    require_columns(table, [its.column], path, f"targets.{name}")
-    values = parse_numbers(table, its.column, path)
-    if its.missing is not None:
-        values = np.where(values == its.missing, np.nan, values)
-    return (values - its.offset) * TARGETS[name][its.unit]
+def _numbers(table: pd.DataFrame, name: Column, path: Path, what: str) -> np.ndarray:
+    """Return a column that the setting ``what`` names, (R,), NaN where there is no number."""
+    require_columns(table, [name], path, what)
+    return parse_numbers(table, name, path)
 
 
 def _reduce(name: str, values: np.ndarray) -> float:
@@ -271,13 +271,12 @@ def _joined(columns: Column | Sequence[Column], table: pd.DataFrame, path: Path,
     return np.array([None if None in row else " ".join(row) for row in rows], dtype=object)
 
 
-def _single(texts: np.ndarray, mapping: ForeignFormat, where: str, values: Any = None) -> Any:
+def _single(texts: Sequence[str | None], mapping: ForeignFormat, where: str, values: Any = None) -> Any:
     """Return the text of a touch, or its value among ``values``; None where it is unknown."""
-    known = [text for text in dict.fromkeys(texts) if text is not None]
-    found: list[Any] = known if values is None else [_lookup(values, text) for text in known]
-    found = [value for value in found if value is not None]
-    if len(set(found)) < 2:
-        return found[0] if found else None
+    known = [text for text in texts if text is not None]
+    found = {text if values is None else _lookup(values, text) for text in known} - {None}
+    if len(found) < 2:
+        return next(iter(found), None)
     if mapping.segments.by in ("windows", "contact"):  # its label changes within it
         return None
     raise InputError(
@@ -286,20 +285,10 @@ def _single(texts: np.ndarray, mapping: ForeignFormat, where: str, values: Any =
     )
 
 
-def _label(
-    rule: LabelRule,
-    targets: Mapping[str, float],
-    source: np.ndarray | None,
-    rows: slice,
-    mapping: ForeignFormat,
-    where: str,
-) -> int | None:
-    """Return 0 or 1; None where it is unknown."""
-    if rule.target is None:
-        assert source is not None
-        return _single(source[rows], mapping, where, rule.values)
-    measured = targets[rule.target]
-    strength = abs(measured) if rule.target.startswith("force") else measured
+def _above(rule: LabelRule, targets: Mapping[str, float]) -> int | None:
+    """Return whether a target is above the limit of a label, 0 or 1; None where it is unknown."""
+    measured = targets[str(rule.target)]
+    strength = abs(measured) if str(rule.target).startswith("force") else measured
     return None if np.isnan(measured) else int(strength > (rule.above or 0.0))
 
 
@@ -449,22 +438,22 @@ def read_by_function(reader: str, path: Path, options: Mapping[str, Any]) -> Rec
 
 def summarise_conversion(recording: Recording) -> str:
     """Return a line with the numbers of touches, readings, labels that are known, targets and groups."""
-    batch, time, sensors = recording.touches.readings.shape
-    parts = [f"{batch} touches of {time} frames at {recording.touches.rate:.4g} Hz, {sensors} readings"]
-    if (labels := recording.touches.labels) is None:
-        parts.append("no labels")
-    else:
-        parts += [
-            f"{name} in {int(column.nansum())} of {int((~column.isnan()).sum())}"
-            for name, column in zip(recording.task.names, labels.T, strict=True)
-        ]
-    if "classes" in recording.metadata:
-        parts.append(f"classes {', '.join(recording.metadata['classes'])}")
+    touches, metadata = recording.touches, recording.metadata
+    (batch, time, sensors), labels = touches.readings.shape, touches.labels
+    parts = ["no labels"] if labels is None else []
+    for name, column in zip(recording.task.names, () if labels is None else labels.T, strict=False):
+        parts.append(f"{name} in {int(column.nansum())} of {int((~column.isnan()).sum())}")
+    parts += [f"classes {', '.join(metadata['classes'])}"] if "classes" in metadata else []
     parts += [
         f"{name} of {int((~values.isnan()).sum())}"
         for name, values in recording.parameters.items()
         if name != CLASS and not name.startswith(GROUP)
     ]
-    metadata = recording.metadata
     parts += [f"{len(values)} of {name}" for name, values in metadata.get("groups", {}).items()]
-    return ", ".join([*parts, f"positions {metadata.get('positions', 'of the recording')}"])
+    return ", ".join(
+        [
+            f"{batch} touches of {time} frames at {touches.rate:.4g} Hz, {sensors} readings",
+            *parts,
+            f"positions {metadata.get('positions', 'of the recording')}",
+        ]
+    )

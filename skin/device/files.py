@@ -1,4 +1,4 @@
-"""Recordings as Parquet and CSV files: one row per frame, as in the report (2.1.1).
+"""Recordings as Parquet files: one row per frame, as in the report (2.1.1).
 
 Columns: ``simulation``, ``frame``, one per label, ``reading_00`` ... (N, in the layout's order), ``force``
 (N), ``D_s_00`` ... and ``D_t_00`` ... (m), then ``gesture_*``: each gesture's parameters, repeated in its
@@ -6,15 +6,14 @@ rows, then ``saturated_00`` ...: 1 where a sensor is at its limit, then ``contac
 (m), ``_force`` (N), ``_peak`` (Pa), ``contact_01_x`` ...: fingertips, empty where there is none. What is
 unknown has no column; a reading that means nothing (a dead sensor) is empty and is read back as 0 and
 invalid; an empty label or parameter is unknown, NaN. Everything else (units, layout, rate, seeds, versions)
-is JSON: in the Parquet file's schema under ``skin``, beside ``x.csv`` in ``x.csv.json``.
+is JSON in the file's schema under ``skin``. Of both there is a checksum (:mod:`skin.core.safe_loading`); what
+has none, of older versions or made by hand, is read without.
 
-Both have checksums of everything: a Parquet file as of :mod:`skin.core.safe_loading`, and ``x.csv.json``
-under ``sha256`` of the table and of itself. What has none, of older versions or made by hand, is read
-without.
+The same columns are written to CSV, for a spreadsheet; without the rest, such a table is no recording.
 """
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from itertools import accumulate
@@ -33,14 +32,11 @@ from torch import Tensor
 from skin.body.base import require_memory
 from skin.core import files
 from skin.core.files import MANIFEST, tabular, whole
-from skin.core.safe_loading import ChecksumError, check_seal, file_sha256, read_file, sha256, write_parquet
+from skin.core.safe_loading import check_seal, parse_json, read_file, sha256, write_parquet
 from skin.core.settings import ONCE, check_settings
 from skin.device.touches import Recording, Touches
 from skin.errors import InputError
 from skin.touch.labels import CONTACT, Task
-
-# The schema of recordings, and checks of their JSON metadata before memory is allocated for the rows.
-
 
 FORMAT = 1
 UNITS = {"reading": "N", "force": "N", "D_s": "m", "D_t": "m", "positions": "m", "size": "m", "rate": "Hz"}
@@ -51,7 +47,7 @@ _Extent = Annotated[float, Gt(0), Lt(1e9)]
 
 @dataclass(frozen=True)
 class _Description:
-    """The entries of a description; only a table in CSV has checksums beside it."""
+    """The entries of a description."""
 
     format: int
     units: dict
@@ -69,42 +65,7 @@ class _Description:
     parameters: Annotated[list[str], ONCE]
     metadata: dict
     first: Annotated[int, Ge(0), Le(2**31 - 1)]
-    sha256: Any = None
     contacts: Annotated[int, Ge(0), Le(2**31 - 1)] = 0
-
-
-def check_metadata(about: Any, where: str) -> Task:
-    """Check the metadata of a recording, and return its task.
-
-    Args:
-        about: decoded JSON.
-        where: file, for the message.
-
-    Raises:
-        InputError: a key is missing or has a wrong type; the message names it.
-        ValueError: invalid labels.
-    """
-    check_settings(_Description, about, f"{where}: description", whole=True)
-    check_settings(Task, about["task"], f"{where}: task", whole=True)
-    return Task(**about["task"] | {"names": tuple(about["task"]["names"])})
-
-
-def check_rows(about: Mapping[str, Any], rows: int, columns: int, where: str) -> None:
-    """Check that a file has the rows that its metadata describe, and that they fit into memory.
-
-    Args:
-        about: checked before.
-        rows, columns: that the file has.
-        where: it is, for the message.
-
-    Raises:
-        InputError: more rows than memory allows.
-        ValueError: other rows.
-    """
-    gestures, frames = about["gestures"], about["frames"]
-    if gestures * frames != rows:
-        raise ValueError(f"it has {rows} rows, not {gestures} touches of {frames} frames: is it cut off?")
-    require_memory(16.0 * rows * columns, f"{where}, {rows} rows,", "give a recording of fewer gestures")
 
 
 def describe_recording(recording: Recording, first: int = 0) -> dict[str, Any]:
@@ -132,7 +93,7 @@ def describe_recording(recording: Recording, first: int = 0) -> dict[str, Any]:
     }
 
 
-def numbered(name: str, count: int) -> list[str]:
+def _numbered(name: str, count: int) -> list[str]:
     """Return the columns of a quantity with one value per sensor."""
     digits = max(2, len(str(count - 1)))
     return [f"{name}_{number:0{digits}d}" for number in range(count)]
@@ -146,10 +107,10 @@ def column_types(about: dict[str, Any]) -> dict[str, pa.DataType]:
         binary = set(Task(**task).binary)
         kinds = [pa.int8() if name in binary else pa.float32() for name in task["names"]]
         columns |= dict(zip(task["names"], kinds, strict=True))
-    names = numbered("reading", sensors) + ["force"] * about["force"]
-    limits = numbered("saturated", sensors) if about["saturated"] else []
+    names = _numbered("reading", sensors) + ["force"] * about["force"]
+    limits = _numbered("saturated", sensors) if about["saturated"] else []
     if about["displacement"]:
-        names += numbered("D_s", sensors) + numbered("D_t", sensors)
+        names += _numbered("D_s", sensors) + _numbered("D_t", sensors)
     names += [f"gesture_{name}" for name in about["parameters"]]
     columns |= dict.fromkeys(names, pa.float32()) | dict.fromkeys(limits, pa.int8())
     return columns | dict.fromkeys(_contact_names(about), pa.float32())
@@ -158,7 +119,7 @@ def column_types(about: dict[str, Any]) -> dict[str, pa.DataType]:
 def _contact_names(about: dict[str, Any]) -> list[str]:
     """Return the columns of contacts, one contact after the other."""
     count = about.get("contacts", 0)
-    return [f"{contact}_{name}" for contact in numbered("contact", count) for name in CONTACT]
+    return [f"{contact}_{name}" for contact in _numbered("contact", count) for name in CONTACT]
 
 
 _EACH_FRAME = ("reading_", "force", "D_s_", "D_t_", "contact_")
@@ -169,7 +130,7 @@ def write_recording(recording: Recording, path: str | Path, first: int = 0) -> P
 
     Args:
         recording: to write.
-        path: ``x.parquet`` or ``x.csv``.
+        path: ``x.parquet``, or ``x.csv`` for its rows alone.
         first: number of its first touch in the column ``simulation``.
 
     Raises:
@@ -179,38 +140,86 @@ def write_recording(recording: Recording, path: str | Path, first: int = 0) -> P
     about = describe_recording(recording, first)
     table = _table(recording, about)
     with whole(path) as partial:
-        if path.suffix == ".parquet":
+        if path.suffix == ".csv":
+            pa.csv.write_csv(table, partial)
+        else:
             text = files.json_line(about)
             table = table.replace_schema_metadata({"skin": text, "skin_sha256": sha256(text.encode())})
             # A dictionary of noisy readings would take most of the time and save no space.
             dictionary = [name for name in table.column_names if not name.startswith(_EACH_FRAME)]
             write_parquet(table, partial, compression="zstd", use_dictionary=dictionary)
-        else:
-            pa.csv.write_csv(table, partial)
-            # The table is moved last, because the sidecar is useless without it.
-            sums = {"sha256": {"table": file_sha256(partial), "description": _description_sum(about)}}
-            files.write(files.json_line(about | sums, indent=1) + "\n", _sidecar(path))
     return path
+
+
+def _table(recording: Recording, about: dict[str, Any]) -> pa.Table:
+    touches, moves = recording.touches, recording.displacement
+    batch, time, _ = touches.readings.shape
+
+    def of_frames(values: Tensor | None) -> np.ndarray:
+        return (
+            np.empty((batch * time, 0)) if values is None else values.reshape(batch * time, -1).cpu().numpy()
+        )
+
+    def of_gestures(values: Tensor | None) -> np.ndarray:
+        return of_frames(None if values is None else values[:, None].expand(-1, time, -1))
+
+    parameters = torch.stack([*recording.parameters.values()], 1) if recording.parameters else None
+    parts = (
+        np.stack(_rows(about), axis=1),
+        np.ma.masked_invalid(of_gestures(touches.labels)),
+        np.ma.masked_array(of_frames(touches.readings), ~of_frames(touches.valid)),
+        of_frames(recording.force),
+        of_frames(None if moves is None else moves.movedim(3, 2)),
+        np.ma.masked_invalid(of_gestures(parameters)),
+        of_frames(touches.saturated),
+        np.ma.masked_invalid(of_frames(touches.contacts)),
+    )
+    arrays = (column for part in parts for column in part.T)
+    return pa.table(
+        {
+            name: pa.array(np.ma.getdata(array), kind, mask=np.ma.getmaskarray(array), safe=False)
+            for (name, kind), array in zip(column_types(about).items(), arrays, strict=True)
+        }
+    )
+
+
+def _rows(about: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the columns ``simulation`` and ``frame``."""
+    batch, time = about["gestures"], about["frames"]
+    return np.repeat(np.arange(batch) + about["first"], time), np.tile(np.arange(time), batch)
 
 
 def read_recording(path: str | Path, complete: bool = True) -> Recording:
     """Read a recording of :func:`write_recording`; equal to the last bit.
 
     Args:
-        path: ``x.parquet`` or ``x.csv``.
+        path: ``x.parquet``.
         complete: read force, displacements and parameters too.
 
     Raises:
         InputError: no such file, not a recording, damaged, or rows that are not whole touches.
     """
     path = tabular(path, "a recording")
+    if path.suffix == ".csv":
+        raise InputError(
+            f"{path} is a table without layout and rate: give {path.with_suffix('.parquet')}; one of an "
+            f"earlier version, beside {path.name}.json, is converted by skin convert "
+            "reader=skin.device.readers.table"
+        )
     with _refused(path):
-        if path.suffix == ".parquet":
-            check_seal(path)
-        about, task = _described(path)
+        check_seal(path)
+        about, task = _describe(path)
         if not complete:
             about |= {"force": False, "displacement": False, "parameters": []}
-        return _recording(_read_table(path, about), about, task)
+        columns = column_types(about)
+        with pa.parquet.ParquetFile(path, page_checksum_verification=True) as file:
+            rows, touches = file.metadata.num_rows, f"{about['gestures']} touches of {about['frames']} frames"
+            if about["gestures"] * about["frames"] != rows:
+                raise ValueError(f"it has {rows} rows, not {touches}: is it cut off?")
+            needed = 16.0 * rows * len(columns)
+            require_memory(needed, f"{path}, {rows} rows,", "give a recording of fewer gestures")
+            table = file.read(columns=list(columns)).cast(pa.schema(columns.items()))
+        return _recording(table, about, task)
 
 
 def read_description(path: Path) -> dict[str, Any]:
@@ -220,7 +229,7 @@ def read_description(path: Path) -> dict[str, Any]:
         InputError: as of :func:`read_recording`; the rows are not read.
     """
     with _refused(path):
-        return _described(path)[0]
+        return _describe(path)[0]
 
 
 @contextmanager
@@ -237,133 +246,58 @@ def _refused(path: Path) -> Iterator[None]:
         raise InputError(f"{path} is damaged or no recording of this project: {reason}") from error
 
 
-def _described(path: Path) -> tuple[dict[str, Any], Task]:
-    about = _read_about(path)
-    if isinstance(about, dict) and "started_unix" in about:
-        raise InputError(
-            f"{path} is a session of skin record: give its recording, {path.with_suffix('.parquet')}"
-        )
-    if isinstance(about, dict) and about.get("format") != FORMAT:
-        raise ValueError(f"it has format {about.get('format')}, this version reads format {FORMAT}")
-    task = check_metadata(about, str(path))
-    sums = about.pop("sha256", None)
-    if sums is not None and sums != {"table": file_sha256(path), "description": _description_sum(about)}:
-        raise ChecksumError(f"remove sha256 from {_sidecar(path).name} if you changed it or the table")
-    return about, task
-
-
-def _description_sum(about: dict[str, Any]) -> str:
-    """Return the checksum of a description, whatever its spacing and order."""
-    return sha256(files.json_line(about, sort_keys=True).encode())
-
-
-def _sidecar(path: Path) -> Path:
-    return path.with_name(path.name + ".json")
-
-
-def _table(recording: Recording, about: dict[str, Any]) -> pa.Table:
-    touches = recording.touches
-    batch, time, sensors = touches.readings.shape
-
-    def per_gesture(values: Tensor) -> np.ma.MaskedArray:
-        return np.ma.masked_invalid(np.repeat(values.cpu().numpy(), time))
-
-    arrays = [np.repeat(np.arange(batch) + about["first"], time), np.tile(np.arange(time), batch)]
-    arrays += [] if touches.labels is None else [per_gesture(column) for column in touches.labels.unbind(1)]
-    readings = touches.readings.reshape(-1, sensors).cpu().numpy()
-    invalid = ~touches.valid.reshape(-1, sensors).cpu().numpy()
-    arrays += [np.ma.masked_array(readings[:, s], invalid[:, s]) for s in range(sensors)]
-    if recording.force is not None:
-        arrays.append(recording.force.flatten().cpu().numpy())
-    if recording.displacement is not None:
-        arrays += list(recording.displacement.permute(3, 2, 0, 1).reshape(2 * sensors, -1).cpu().numpy())
-    arrays += [per_gesture(values) for values in recording.parameters.values()]
-    if touches.saturated is not None:
-        arrays += list(touches.saturated.reshape(-1, sensors).T.cpu().numpy())
-    if touches.contacts is not None:
-        arrays += map(np.ma.masked_invalid, touches.contacts.flatten(2).flatten(0, 1).T.cpu().numpy())
-    columns = column_types(about)
-    return pa.table(
-        {
-            name: pa.array(np.ma.getdata(array), kind, mask=np.ma.getmaskarray(array), safe=False)
-            for (name, kind), array in zip(columns.items(), arrays, strict=True)
-        }
-    )
-
-
-def _read_about(path: Path) -> dict[str, Any]:
-    if path.suffix == ".csv":
-        sidecar = _sidecar(path)
-        if not sidecar.is_file():
-            raise ValueError(f"it needs {sidecar.name} beside it: units, layout and rate are there")
-        return json.loads(read_file(sidecar))
+def _describe(path: Path) -> tuple[dict[str, Any], Task]:
     stored = pa.parquet.read_schema(path).metadata or {}
     if b"skin" not in stored:
         raise ValueError("its schema has no units, layout and rate under 'skin'")
-    # Older files have no checksum.
-    if stored.get(b"skin_sha256", sha256(stored[b"skin"]).encode()) != sha256(stored[b"skin"]).encode():
+    digest = sha256(stored[b"skin"]).encode()
+    if stored.get(b"skin_sha256", digest) != digest:  # older files have none
         raise ValueError("its units, layout and rate are not those that were written")
-    return json.loads(stored[b"skin"])
-
-
-def _read_table(path: Path, about: dict[str, Any]) -> pa.Table:
-    columns = column_types(about)
-    if path.suffix == ".csv":
-        convert = pa.csv.ConvertOptions(column_types=columns, include_columns=list(columns))
-        table = pa.csv.read_csv(path, convert_options=convert)
-        check_rows(about, len(table), len(columns), str(path))
-        return table
-    with pa.parquet.ParquetFile(path, page_checksum_verification=True) as file:
-        check_rows(about, file.metadata.num_rows, len(columns), str(path))
-        return file.read(columns=list(columns)).cast(pa.schema(columns.items()))
+    about = json.loads(stored[b"skin"])
+    if isinstance(about, dict) and about.get("format") != FORMAT:
+        raise ValueError(f"it has format {about.get('format')}, this version reads format {FORMAT}")
+    check_settings(_Description, about, f"{path}: description", whole=True)
+    check_settings(Task, about["task"], f"{path}: task", whole=True)
+    if about["units"] != UNITS:
+        raise ValueError(f"it has the units {about['units']}, needed are {UNITS}: convert it before")
+    return about, Task(**about["task"] | {"names": tuple(about["task"]["names"])})
 
 
 def _recording(table: pa.Table, about: dict[str, Any], task: Task) -> Recording:
-    if about["units"] != UNITS:
-        raise ValueError(f"it has the units {about['units']}, needed are {UNITS}: convert it before")
-    batch, time, sensors = about["gestures"], about["frames"], len(about["positions"])
-    rows = np.stack([table[name].to_numpy() for name in ("simulation", "frame")], axis=1)
-    whole = np.stack(
-        [np.repeat(np.arange(batch) + about["first"], time), np.tile(np.arange(time), batch)], axis=1
-    )
-    if len(wrong := np.flatnonzero((rows != whole).any(axis=1))):
-        raise ValueError(
-            f"row {wrong[0] + 1}: simulation and frame are {rows[wrong[0]].tolist()}, expected "
-            f"{whole[wrong[0]].tolist()}: every touch needs its {time} frames in order"
-        )
+    shape, sensors = (about["gestures"], about["frames"], -1), len(about["positions"])
+    for name, expected in zip(("simulation", "frame"), _rows(about), strict=True):
+        if len(wrong := np.flatnonzero(table[name].to_numpy() != expected)):
+            raise ValueError(
+                f"row {wrong[0] + 1}: {name} is {table[name][wrong[0]]}, expected {expected[wrong[0]]}: "
+                "every touch needs its frames in order"
+            )
 
-    def column(name: str) -> Tensor:
-        return torch.from_numpy(table[name].fill_null(0).to_numpy().astype(np.float32)).view(batch, time)
+    def numbers(names: Sequence[str], unknown: float = 0.0) -> Tensor:
+        columns = [table[name].cast(pa.float32()).fill_null(unknown).to_numpy() for name in names]
+        return torch.from_numpy(np.stack(columns, axis=-1)).view(shape)
 
-    def per_gesture(name: str) -> Tensor:
-        values = np.array(table[name].cast(pa.float32()).to_numpy())  # null becomes NaN
-        return torch.from_numpy(values).view(batch, time)[:, 0].clone()
+    def of_sensors(name: str) -> Tensor:
+        return numbers(_numbered(name, sensors))
 
-    def columns(name: str) -> Tensor:
-        return torch.stack([column(column_name) for column_name in numbered(name, sensors)], dim=-1)
-
-    contacts = [
-        column(name).where(torch.from_numpy(table[name].is_valid().to_numpy()).view(batch, time), nan)
-        for name in _contact_names(about)
-    ]
-    present = [table[name].is_valid().to_numpy() for name in numbered("reading", sensors)]
+    valid = np.stack([table[name].is_valid().to_numpy() for name in _numbered("reading", sensors)], axis=-1)
+    contacts = _contact_names(about)
     touches = Touches(
-        columns("reading"),
-        torch.from_numpy(np.stack(present, axis=-1)).view(batch, time, sensors),
+        of_sensors("reading"),
+        torch.from_numpy(valid).view(shape),
         torch.tensor(about["positions"], dtype=torch.float32),
-        torch.stack([per_gesture(name) for name in task.names], dim=1) if about["labelled"] else None,
+        numbers(task.names, nan)[:, 0].clone() if about["labelled"] else None,
         about["rate"],
-        saturated=columns("saturated") > 0.5 if about["saturated"] else None,
-        contacts=torch.stack(contacts, dim=-1).unflatten(-1, (-1, len(CONTACT))) if contacts else None,
+        saturated=of_sensors("saturated") > 0.5 if about["saturated"] else None,
+        contacts=numbers(contacts, nan).unflatten(-1, (-1, len(CONTACT))) if contacts else None,
     )
     return Recording(
         touches,
         task,
         tuple(about["size"]),
         tuple(about["footprint"]),
-        column("force") if about["force"] else None,
-        torch.stack([columns("D_s"), columns("D_t")], dim=-1) if about["displacement"] else None,
-        {name: per_gesture(f"gesture_{name}") for name in about["parameters"]},
+        numbers(["force"])[..., 0] if about["force"] else None,
+        torch.stack([of_sensors("D_s"), of_sensors("D_t")], dim=-1) if about["displacement"] else None,
+        {name: numbers([f"gesture_{name}"], nan)[:, 0, 0].clone() for name in about["parameters"]},
         about["metadata"],
     )
 
@@ -434,16 +368,16 @@ class Manifest:
                 f"n=1000 out={folder.name} made, or the .parquet file beside the folder of a session"
             )
         try:
-            stored = json.loads(path.read_text(encoding="utf-8"))
-        except (OSError, ValueError, RecursionError) as error:
+            stored = parse_json(read_file(path))
+        except (OSError, ValueError) as error:
             raise InputError(f"{path} is damaged: {error}: restore it, or generate the data again") from error
-        if isinstance(stored, dict) and stored.get("version", FORMAT) != FORMAT:
+        check_settings(cls, stored, str(path), whole=True)
+        manifest = cls(**stored)
+        if manifest.version != FORMAT:
             raise InputError(
-                f"{path} has schema version {stored['version']}, this program reads version {FORMAT}: "
+                f"{path} has schema version {manifest.version}, this program reads version {FORMAT}: "
                 "use the program that wrote it, or generate the data again"
             )
-        check_settings(cls, stored, str(path), whole=True)
-        manifest = cls(**{name: value for name, value in stored.items() if name in cls.__annotations__})
         if manifest.units != UNITS or sum(manifest.shards) != manifest.gestures:
             raise InputError(
                 f"{path} is damaged: its units or counts are not those that were written: generate the data "

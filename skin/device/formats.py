@@ -47,7 +47,6 @@ class TableFormat:
         begin: regular expression that the first line of the table contains; lines before it are skipped.
         header: whether the first line names the columns.
         units: whether the row below the header holds units, and is skipped.
-        names: of the columns, instead of a header.
         encoding: of the text; UTF-16 is recognised by its byte order mark.
         decimal: sign before the decimals.
         comment: sign that begins a comment.
@@ -57,29 +56,15 @@ class TableFormat:
     """
 
     delimiter: str = ","
-    begin: str | None = None
+    begin: str = ""
     header: bool = True
     units: bool = False
-    names: Sequence[str] = ()
     encoding: str = "utf-8-sig"
     decimal: str = "."
     comment: str | None = None
     sheet: int | str = 0
     missing: Sequence[str | float] = ()
     long: tuple[Column, Column] | None = None
-
-
-@dataclass(frozen=True)
-class JoinedFile:
-    """A second file for each file, with as many rows in the same order.
-
-    Attributes:
-        file: its path from the folder of the first; ``{name}`` stands for a field of the first one's path.
-        table: how it is written. Columns that the first file has, too, need other ``names``.
-    """
-
-    file: str
-    table: TableFormat = TableFormat()
 
 
 @dataclass(frozen=True)
@@ -99,13 +84,11 @@ class ChannelColumns:
         columns: in the order of the sensors; or a pattern such as ``ch*``.
         unit: a force (N, mN, kN, g, gf, kg, kgf, lbf), or any other with ``scale``.
         scale: N per unit, one or one per column. A nominal one makes readings nominal.
-        per_sensor: 3 where x, y and z of a sensor follow each other.
     """
 
     columns: Annotated[Sequence[Column], MinLen(1)] | str
     unit: str
     scale: float | Sequence[float] | None = None
-    per_sensor: Literal[1, 3] = 1
 
 
 @dataclass(frozen=True)
@@ -113,12 +96,11 @@ class BaselineRule:
     """What is subtracted from the readings.
 
     Attributes:
-        kind: ``none``; the mean of the ``first`` rows of a file; its median, where it is ``idle`` most of the
-            time; or the mean of the first rows of each ``segment``.
+        kind: ``none``; the mean of the ``first`` rows of a file; or its median, if it is ``idle`` most of it.
         rows: number of first rows.
     """
 
-    kind: Literal["none", "first", "idle", "segment"] = "none"
+    kind: Literal["none", "first", "idle"] = "none"
     rows: Annotated[int, Ge(1)] = 20
 
 
@@ -175,14 +157,10 @@ class TargetColumn:
     Attributes:
         column: of the file.
         unit: of lengths m, cm, mm, um or in; of forces as in :class:`ChannelColumns`.
-        missing: value that stands for none.
-        offset: value that stands for 0, in the unit.
     """
 
     column: Column
     unit: str
-    missing: float | None = None
-    offset: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -196,7 +174,6 @@ class ForeignFormat:
         about: origin and licence, in words.
         fields: regular expression that the path of each file contains; its named groups become columns.
         table: how files are written.
-        join: a second file; None: there is none.
         time: column of the time; None: there is none, or it means nothing.
         rate: Hz, to which rows are resampled where there is a time; otherwise their rate. None: the median
             rate of the rows.
@@ -217,7 +194,6 @@ class ForeignFormat:
     about: str = ""
     fields: str | None = None
     table: TableFormat = TableFormat()
-    join: JoinedFile | None = None
     time: TimeColumn | None = None
     rate: Annotated[float, Gt(0)] | None = None
     baseline: BaselineRule = BaselineRule()
@@ -237,7 +213,6 @@ class ForeignFormat:
 
 _PARTS: dict[str, type] = {
     "table": TableFormat,
-    "join": JoinedFile,
     "time": TimeColumn,
     "channels": ChannelColumns,
     "baseline": BaselineRule,
@@ -324,36 +299,19 @@ def _check(mapping: ForeignFormat, name: str) -> None:
 
 
 def read_table(mapping: ForeignFormat, path: Path, folder: Path) -> pd.DataFrame:
-    """Return the rows of a file with its time, the fields of its path and the columns of its second file."""
-    table, named = _read(path, mapping.table), dict[str, str]()
-    if mapping.fields is not None:
-        text = path.relative_to(folder).as_posix() if folder.is_dir() else path.as_posix()
-        match = re.search(mapping.fields, text)
-        if match is None:
-            raise InputError(f"{text} does not fit the regular expression fields: {mapping.fields}")
-        named = {name: value for name, value in match.groupdict().items() if value is not None}
+    """Return the rows of a file with its time and the fields of its path."""
+    table = _read(path, mapping.table)
     if mapping.table.long is not None:
         table = _widen(table, mapping, path)
     if mapping.time is not None:
         table[TIME] = _times(table, mapping.time, path)
-    if (join := mapping.join) is not None:
-        try:
-            beside = path.parent / join.file.format(**named)
-        except (LookupError, ValueError) as error:
-            names = ", ".join(named) or "no names"
-            raise InputError(f"join.file={join.file}: fields gives {names}") from error
-        second = _read(beside, join.table)
-        if shared := [name for name in second.columns if name in table.columns]:
-            raise InputError(
-                f"{path.name} and {beside} both have a column {shared[0]}: give join.table.names"
-            )
-        if len(second) != len(table):
-            raise InputError(
-                f"{path} has {len(table)} rows, {beside} has {len(second)}: a second file needs as many in "
-                "the same order; others are read by a function, reader=package.function"
-            )
-        table = pd.concat([table, second], axis=1)
-    return table.assign(**named)
+    if mapping.fields is None:
+        return table
+    text = path.relative_to(folder).as_posix() if folder.is_dir() else path.as_posix()
+    match = re.search(mapping.fields, text)
+    if match is None:
+        raise InputError(f"{text} does not fit the regular expression fields: {mapping.fields}")
+    return table.assign(**{name: value for name, value in match.groupdict().items() if value is not None})
 
 
 def _read(path: Path, its: TableFormat) -> pd.DataFrame:
@@ -368,18 +326,14 @@ def _read(path: Path, its: TableFormat) -> pd.DataFrame:
             table = pd.read_excel(path, sheet_name=its.sheet, **rows)
         elif path.suffix.lower() in (".jsonl", ".ndjson"):
             lines = path.read_text(encoding=its.encoding).splitlines()
-            table = pd.DataFrame([json.loads(line) for line in lines if line.strip()])
-            for name in [name for name in table if isinstance(table[name].iloc[0], list)]:
-                parts = pd.DataFrame(table.pop(name).tolist()).add_prefix(str(name))
-                table = pd.concat([table, parts], axis=1)
+            table = pd.DataFrame([_flatten(json.loads(line)) for line in lines if line.strip()])
         else:
-            with path.open("rb") as file:
-                marked = file.read(2) in (BOM_UTF16_LE, BOM_UTF16_BE)
+            marked = path.read_bytes()[:2] in (BOM_UTF16_LE, BOM_UTF16_BE)
             text = path.read_text(encoding="utf-16" if marked else its.encoding)
-            if its.begin is not None:
-                text = text[_line_with(its.begin, text, path) :]
+            if (begin := re.search(its.begin, text, re.M)) is None:
+                raise ValueError(f"it has no line with table.begin: {its.begin}")
             table = pd.read_csv(
-                StringIO(text),
+                StringIO(text[text.rfind("\n", 0, begin.start()) + 1 :]),
                 sep=r"\s+" if its.delimiter == "whitespace" else its.delimiter,
                 decimal=its.decimal,
                 comment=its.comment,
@@ -389,13 +343,11 @@ def _read(path: Path, its: TableFormat) -> pd.DataFrame:
             )
     except ImportError as error:
         raise InputError(f"{path}: spreadsheets need openpyxl: pip install 'tactile-skin[data]'") from error
-    except (OSError, ValueError, LookupError, zipfile.BadZipFile) as error:
+    except (OSError, ValueError, LookupError, AttributeError, zipfile.BadZipFile) as error:
         raise InputError(
             f"cannot read {path}: {' '.join(str(error).split())}; table.begin skips lines before the table"
         ) from error
-    if its.names and len(its.names) != table.shape[1]:
-        raise InputError(f"{path} has {table.shape[1]} columns, names are {len(its.names)}")
-    names = its.names or (table.columns if its.header else range(1, table.shape[1] + 1))
+    names = table.columns if its.header else range(1, table.shape[1] + 1)
     table.columns = pd.Index([str(name).strip() for name in names])
     if table.columns.has_duplicates:
         raise InputError(f"{path}: several columns are called {table.columns[table.columns.duplicated()][0]}")
@@ -404,12 +356,11 @@ def _read(path: Path, its: TableFormat) -> pd.DataFrame:
     return table
 
 
-def _line_with(pattern: str, text: str, path: Path) -> int:
-    """Return where the first line that contains a pattern begins."""
-    match = re.search(pattern, text, re.M)
-    if match is None:
-        raise InputError(f"{path} has no line with table.begin: {pattern}")
-    return text.rfind("\n", 0, match.start()) + 1
+def _flatten(line: dict[str, Any]) -> dict[str, Any]:
+    """Return the entries of a line with those of lists beside each other, as s0, s1, ..."""
+    lists = {name: value if isinstance(value, list) else None for name, value in line.items()}
+    flat = {name: value for name, value in line.items() if lists[name] is None}
+    return flat | {f"{name}{n}": part for name, parts in lists.items() for n, part in enumerate(parts or ())}
 
 
 def _widen(table: pd.DataFrame, mapping: ForeignFormat, path: Path) -> pd.DataFrame:

@@ -1,44 +1,35 @@
-"""Readers of public data sets that are not plain tables: ``skin convert reader=skin.device.readers.cost``.
+"""Readers of what is no plain table: ``skin convert reader=skin.device.readers.cost``.
 
-They are examples of a function of one's own: it takes the path and its options, and returns a recording.
+Those of public data sets are examples of a function of one's own: it takes the path and its options, and
+returns a recording.
 """
 
+import json
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Annotated
 
 import numpy as np
 import pandas as pd
+import pyarrow as pa
+import pyarrow.csv
+import pyarrow.parquet
 from annotated_types import Ge, Le
 from pydantic import PositiveFloat
 
 from skin.body.layout import tile_centres
-from skin.core.rng import Stream, generator
 from skin.device.conversion import build_recording
-from skin.device.formats import parse_numbers, require_columns
+from skin.device.files import read_recording
+from skin.device.formats import FORCES, parse_numbers, require_columns
 from skin.device.touches import Recording
 from skin.errors import InputError
 
 DOI = "doi:10.4121/uuid:5ef62345-3b3e-479c-8e1d-c922748c9b29"
 COST = f"https://doi.org/{DOI[4:]}"
-GESTURES = (
-    *(
-        "grab",
-        "hit",
-        "massage",
-        "pat",
-        "pinch",
-        "poke",
-        "press",
-        "rub",
-        "scratch",
-        "slap",
-        "squeeze",
-        "stroke",
-    ),
-    *("tap", "tickle"),
-)
+_WORDS = "grab hit massage pat pinch poke press rub scratch slap squeeze stroke tap tickle"
+GESTURES = tuple(_WORDS.split())
 VARIANTS = ("gentle", "normal", "rough")
 """Names of the corpus's numbers, which count from 1."""
 
@@ -47,8 +38,7 @@ def cost(
     path: Path,
     gestures: Sequence[str] = GESTURES,
     variants: bool = False,
-    taxels: Annotated[int, Ge(1), Le(64)] | Sequence[Annotated[int, Ge(1), Le(64)]] = 64,
-    taxel_seed: int = 0,
+    taxels: Sequence[Annotated[int, Ge(1), Le(64)]] = range(1, 65),
     window: Annotated[int, Ge(2)] = 30,
     pitch: PositiveFloat | None = None,
 ) -> Recording:
@@ -62,15 +52,14 @@ def cost(
         path: ``CoST.csv``.
         gestures: those to keep.
         variants: whether gentle, normal and rough are classes of their own.
-        taxels: number of the 64 taxels, spread evenly, or their channels from 1.
-        taxel_seed: seed of the selection.
+        taxels: channels to keep, from 1.
         window: frames per touch.
         pitch: between neighbouring taxels, m; channels 1 to 8 are the upper row. None: unknown positions.
 
     Raises:
         InputError: no such file, or another format.
     """
-    chosen = _spread(taxels, taxel_seed) if isinstance(taxels, int) else np.sort(np.unique(taxels)) - 1
+    chosen = np.unique(taxels) - 1
     try:
         table = pd.read_csv(path.expanduser(), skipinitialspace=True, low_memory=False)
     except (OSError, ValueError) as error:
@@ -103,16 +92,6 @@ def cost(
         size=None if pitch is None else (8 * pitch, 8 * pitch),
         footprint=(0.01, 0.01) if pitch is None else (pitch, pitch),
     )
-
-
-def _spread(count: int, seed: int) -> np.ndarray:
-    """Return the indices of taxels by farthest-point sampling, (S,), from 0, rising; the first is random."""
-    order = generator(Stream.POSITION, seed).permutation(64)
-    points, chosen = tile_centres(8, 8)[order], [0]
-    while len(chosen) < count:
-        apart = np.linalg.norm(points[:, None] - points[chosen], axis=2).min(axis=1)
-        chosen.append(int(apart.argmax()))
-    return np.sort(order[chosen])
 
 
 def _stretch(values: np.ndarray, frames: int) -> np.ndarray:
@@ -164,3 +143,69 @@ def epi(path: Path, frames: int = 100, duration: PositiveFloat = 3.5) -> Recordi
         about="Epi, A. Holmqvist, M. Karlsson and M. Mirstroem, "
         "github.com/axelholmqvist/humanoid-touch-classification, no licence stated",
     )
+
+
+def eflesh(path: Path) -> Recording:
+    """Read presses of eFlesh, magnetometers under a printed lattice; each row is a touch of five frames.
+
+    Targets are the force of the gauge, where there is one, with the label ``dangerous`` above 10 N, an
+    example; or the position of the probe, with the labels ``right`` and ``low``. The group is the session.
+
+    Args:
+        path: a folder of characterization/datasets of github.com/notvenky/eFlesh.
+
+    Raises:
+        InputError: no such files, or files of different lengths.
+    """
+    files = sorted(path.expanduser().glob("*/sensor_post_baselines.csv"))
+    if not files:
+        raise InputError(f"{path} has no file */sensor_post_baselines.csv: give a folder of eFlesh")
+    try:
+        tables = [pd.read_csv(file, header=None) for file in files]
+        states = [pd.read_csv(file.with_name("states.csv"), header=None) for file in files]
+        if list(map(len, tables)) != list(map(len, states)):
+            raise ValueError("states.csv needs as many rows in the same order")
+        fields = pd.concat(tables).to_numpy(dtype=float)[:, 1:]
+        session = np.repeat([file.parent.name for file in files], list(map(len, tables)))
+        _, x, y, _, *gauge = pd.concat(states).to_numpy(dtype=float).T
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path} has no presses of eFlesh: {' '.join(str(error).split())}") from error
+    readings = np.zeros((len(fields), 5, fields.shape[1]), np.float32)
+    readings[:, 2] = 0.1 * fields  # the scale is nominal
+    place = {"x": 1e-3 * (x - 274), "y": 1e-3 * (y + 115)}
+    # Gram is inferred: it reproduces the published error. -1 stands for no value.
+    targets = {"force": FORCES["g"] * np.where(gauge[0] == -1, np.nan, gauge[0])} if gauge else place
+    limits = {"dangerous": ("force", 10.0)} if gauge else {"right": ("x", 0.015), "low": ("y", 0.015)}
+    return build_recording(
+        readings,
+        10.0,  # nominal, of presses without a time
+        targets={name: values.tolist() for name, values in targets.items()},
+        labels={
+            label: [None if np.isnan(value) else int(value > limit) for value in targets[name]]
+            for label, (name, limit) in limits.items()
+        },
+        groups={"session": session.tolist()},
+        about="eFlesh, github.com/notvenky/eFlesh, MIT License, Copyright (c) 2025 Venkatesh Pattabiraman",
+        per_sensor=3,
+        size=None if gauge else (0.03, 0.03),
+    )
+
+
+def table(path: Path) -> Recording:
+    """Read a recording of an earlier version: a table in CSV, with its description in ``x.csv.json``.
+
+    Raises:
+        InputError: no such files, or another description or other rows than were written.
+    """
+    try:
+        about = json.loads(path.with_name(f"{path.name}.json").read_text(encoding="utf-8"))
+        about.pop("sha256", None)
+        rows = pa.csv.read_csv(path).replace_schema_metadata({"skin": json.dumps(about)})
+        with TemporaryDirectory() as folder:
+            pa.parquet.write_table(rows, f"{folder}/{path.stem}.parquet")
+            return read_recording(f"{folder}/{path.stem}.parquet")
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+    except (OSError, ValueError, TypeError, AttributeError) as error:
+        reason = " ".join(str(error).split())
+        raise InputError(f"{path} is no recording of an earlier version: {reason}") from error

@@ -35,7 +35,7 @@ class Recorded(AbstractDevice):
     32,768 gestures each.
 
     Args:
-        path: ``x.parquet``, ``x.csv`` or the folder of a data set (:mod:`skin.device.files`).
+        path: ``x.parquet`` or the folder of a data set (:mod:`skin.device.files`).
         body: the sheet; it is compared with the file's.
         layout: positions of the sensors; they are compared with the file's.
         split_seed: seed of the split.
@@ -81,50 +81,44 @@ class Recorded(AbstractDevice):
         self._stored = _File(path) if self._whole else DataSet(path)
         self._what, self._targets = task, targets
         self._learned: Task | None = None
-        count = sum(self._stored.counts)
-        if count < 10 and test == "holdout":
+        if (count := sum(self._stored.counts)) < 10 and test == "holdout":
             raise InputError(
                 f"{path} has {count} touches: 80/10/10 needs at least 10, or a "
                 "run that was trained on others and device.test=all"
             )
         self._example = self._read(0)[torch.tensor([0])]  # a copy: a slice would keep the whole
-        self._groups: dict[Split, Tensor] = {}
-        if self._example.metadata.get("positions") in ("unknown", "stated"):
-            positions = self._example.touches.positions.double().numpy()
-            self.sensors, self.size = Sensors(positions, self._example.footprint), self._example.size
-            self.configured = False
-        else:
-            self.sensors, self.surface, self.size = layout.sensors(body), body, body.size
-            self._compare(body)
+        touches = self._example.touches
+        self.sensors, self.size = (
+            Sensors(touches.positions.double().numpy(), self._example.footprint),
+            self._example.size,
+        )
+        self.configured = self._example.metadata.get("positions") not in ("unknown", "stated")
+        if self.configured:
+            self._compare(body, layout.sensors(body))
+            self.sensors, self.surface = layout.sensors(body), body
         self.name, self.task = str(self._stored.path(0)), self._example.task
-        self._divide(group, test_groups)
-        self.rate, self.window = self._example.touches.rate, self._example.touches.readings.shape[1]
-
-    def _divide(self, group: str | None, test_groups: str | Sequence[str | int] | None) -> None:
-        """Assign the groups of the file, if it has any, to the splits."""
+        self.rate, self.window = touches.rate, touches.readings.shape[1]
+        self._groups: dict[Split, Tensor] = {}
         groups: dict[str, list[str]] = self._example.metadata.get("groups", {})
-        if self._test == "all":
-            self.split = "none: all touches are for the test"
-            return
         name = next(iter(groups), "gesture") if group is None else group
-        if name != "gesture" and name not in groups:
+        if test == "all":
+            self.split = "none: all touches are for the test"
+        elif name in groups:
+            tested = [test_groups] if isinstance(test_groups, str) else [*map(str, test_groups or ())]
+            self._divide(name, groups[name], tested)
+        elif name != "gesture":
             raise InputError(
                 f"{self.path} has no group {name}: give device.group={', '.join([*groups, 'gesture'])}"
             )
-        if name == "gesture":
-            if test_groups is not None:
-                raise InputError(
-                    "device.test_groups needs a recording with groups, and not device.group=gesture"
-                )
-            return
-        values = groups[name]
+        elif test_groups is not None:
+            raise InputError("device.test_groups needs a recording with groups, and not device.group=gesture")
+
+    def _divide(self, name: str, values: list[str], tested: list[str]) -> None:
+        """Assign the groups of a name to the splits; without ``tested``, those of the test are drawn."""
         if len(values) < 2:
             raise InputError(
                 f"{self.path} has the single {name} {values[0]}: device.group=gesture splits it by gesture"
             )
-        tested = (
-            [test_groups] if isinstance(test_groups, str) else [str(value) for value in test_groups or ()]
-        )
         if unknown := [value for value in tested if value not in values]:
             raise InputError(
                 f"device.test_groups: {self.path} has no {name} {unknown[0]}, it has {_few(values)}"
@@ -132,16 +126,14 @@ class Recorded(AbstractDevice):
         if len(set(tested)) == len(values):
             raise InputError(f"device.test_groups has every {name}: leave out some to train on")
         numbers = self._stored.read(0).parameters[GROUP + name].long()
-        chosen = [values.index(value) for value in tested] or None
-        self._groups = split_groups(numbers, self.split_seed, chosen)
+        self._groups = split_groups(
+            numbers, self.split_seed, [values.index(value) for value in tested] or None
+        )
         trained, held, judged = (
-            [values[number] for number in numbers[self._groups[split]].unique()]
-            for split in ("train", "validation", "holdout")
+            [values[number] for number in numbers[rows].unique()] for rows in self._groups.values()
         )
         apart = (
-            f"{len(held)} for validation"
-            if not set(trained) & set(held)
-            else "a tenth of their touches validates"
+            "a tenth of their touches validates" if {*trained} & {*held} else f"{len(held)} for validation"
         )
         self.split = f"by {name}: {len(trained)} to train ({apart}), {len(judged)} to test ({_few(judged)})"
 
@@ -155,25 +147,25 @@ class Recorded(AbstractDevice):
                     "device.test_groups, or device.group=gesture"
                 )
 
-    def _compare(self, body: AbstractBody) -> None:
-        stored, size = self._example.touches.positions, self._example.size
+    def _compare(self, body: AbstractBody, sensors: Sensors) -> None:
+        """Raise InputError where the file is of another skin than the configuration."""
+        stored, size = self._example.touches.positions.numpy(), self._example.size
+        layout = "give the layout it was recorded with, as in layout=file layout.path=FILE.csv"
         if not np.allclose(size, body.size):
             raise InputError(
                 f"{self.path} was recorded on a skin of {size[0]:g} x {size[1]:g} m, the body is "
                 f"{body.size[0]:g} x {body.size[1]:g} m: add {body.resized(size)}"
             )
-        if len(stored) != len(self.sensors):
+        if len(stored) != len(sensors):
             raise InputError(
-                f"{self.path} has {len(stored)} sensors, the layout has {len(self.sensors)}: give the layout "
-                "it was recorded with, as in layout=file layout.path=FILE.csv"
+                f"{self.path} has {len(stored)} sensors, the layout has {len(sensors)}: {layout}"
             )
-        apart = np.abs(stored.numpy() - self.sensors.positions).max(axis=1)
+        apart = np.abs(stored - sensors.positions).max(axis=1)
         if apart.max() > 1e-6:  # m: the file's positions are float32
             number = int(apart.argmax())
             raise InputError(
                 f"{self.path} has sensor {number} at {stored[number].tolist()} m, the layout at "
-                f"{self.sensors.positions[number].tolist()} m: give the layout it was recorded with, as in "
-                "layout=file layout.path=FILE.csv"
+                f"{sensors.positions[number].tolist()} m: {layout}"
             )
 
     def touches(self, split: Split, epoch: int = 0) -> Touches:
@@ -222,11 +214,8 @@ class Recorded(AbstractDevice):
             "train a network, which reads shard by shard, or generate fewer gestures",
         )
         recording = concatenate([part.make() for part in parts] or [self._example[:0]])
-        # The summary is of one shard.
-        return replace(
-            recording,
-            metadata={name: content for name, content in recording.metadata.items() if name != "summary"},
-        )
+        metadata = {name: content for name, content in recording.metadata.items() if name != "summary"}
+        return replace(recording, metadata=metadata)  # the summary is of one shard
 
     def parts(self, split: Split | None = None) -> list[Part] | None:
         """Return the shards of a data set, or what a split has of each; None for a file."""
@@ -236,15 +225,16 @@ class Recorded(AbstractDevice):
         counts = self._stored.counts
         if split is None or (split == "test" and self._test == "all"):
             return [Part(count, partial(self._read, n, complete)) for n, count in enumerate(counts)]
-        part: Split = "holdout" if split == "test" else split
-        seed = self.split_seed
-        if self._groups:
-            rows = self._groups[part]
-            if part == "train":
-                self._check_classes(self._rows(0, complete, rows).touches.labels)
-            return [Part(len(rows), partial(self._rows, 0, complete, rows))]
-        parts = [(0, split_rows(part, counts[0], seed))] if self._whole else split_shards(part, counts, seed)
-        return [Part(len(selected), partial(self._rows, n, complete, selected)) for n, selected in parts]
+        name: Split = "holdout" if split == "test" else split
+        if self._whole:
+            rows = self._groups[name] if self._groups else split_rows(name, counts[0], self.split_seed)
+            shards = iter([(0, rows)])
+        else:
+            shards = split_shards(name, counts, self.split_seed)
+        parts = [Part(len(rows), partial(self._rows, n, complete, rows)) for n, rows in shards]
+        if self._groups and name == "train":
+            self._check_classes(parts[0].make().touches.labels)
+        return parts
 
     def _rows(self, number: int, complete: bool, rows: Tensor) -> Recording:
         return self._read(number, complete)[rows]

@@ -9,8 +9,7 @@ from scipy.sparse import csr_array
 from scipy.special import ndtri
 from torch import Tensor
 
-from skin.device.effects import Constants
-from skin.device.imperfection import Imperfection
+from skin.device.imperfection import Constants, Imperfection
 from skin.device.resampling import frame_ages, highest_each, resample
 
 _NUMBERS = tuple(np.geomspace(1, 1000, 61).tolist())  # of frames in an interval; between them, 0.001 s.d.

@@ -265,25 +265,22 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
             yield self.simulate_stream(max(1, round(seconds * self.model_rate)), number=number).whole.touches
 
     def _split(self, split: Split | None, epoch: int, complete: bool) -> Recording:
-        if split == "test":
-            return self._keep("test", complete, self._batches(complete, Stream.TEST, self.test_gestures))
         if split == "train" and self.fresh:
             count = split_slices(self.gestures)["train"].stop
             return joined(self._batches(complete, Stream.FRESH, count, self.data_seed, epoch))
-        budget = self._keep("budget", complete, self._budget(complete))
-        if split is None:
-            return budget
+        name = "test" if split == "test" else "budget"
+        recording = None if complete else self._kept.get(name)
+        if recording is None:
+            tested = self._batches(complete, Stream.TEST, self.test_gestures) if split == "test" else None
+            recording = joined(self._budget(complete) if tested is None else tested)
+        if not complete:
+            self._kept[name] = recording
+        if split in ("test", None):
+            return recording
         # Windows of a stream overlap, so each split has streams of its own.
         if self.stream:
-            return budget[split_slices(self.gestures)[split]]
-        return budget[split_rows(split, self.gestures, self.data_seed)]
-
-    def _keep(self, name: str, complete: bool, batches: Sequence[Part]) -> Recording:
-        if complete:
-            return joined(batches)
-        if name not in self._kept:
-            self._kept[name] = joined(batches)
-        return self._kept[name]
+            return recording[split_slices(self.gestures)[split]]
+        return recording[split_rows(split, self.gestures, self.data_seed)]
 
     def parts(self, split: Split | None = None) -> list[Part] | None:
         """Return the budget in parts, together ``recording(complete=False)``; None for a split.

@@ -15,6 +15,7 @@ from rich.console import Console
 from rich.progress import track
 from scipy.spatial import cKDTree
 from torch import Tensor
+from torch.nn.functional import pad
 
 from skin.body.arm import Arm
 from skin.body.base import GEOMETRY, AbstractBody, Layer, Sensors
@@ -451,31 +452,25 @@ def join_skins(parts: Sequence[Touches]) -> Touches:
     Args:
         parts: each with positions (S, 3) and geometry (S, G) of its own.
     """
-    maximum = max(part.readings.shape[2] for part in parts)
-    first = parts[0]
+    counts = [part.readings.shape[2] for part in parts]
 
-    def together(name: str, axis: int) -> Tensor:
-        return torch.cat([_widen(getattr(part, name), maximum, axis) for part in parts])
-
-    def expanded(name: str) -> Tensor:
+    def joined(name: str, after: int = 0) -> Tensor:
+        """Join tensors with so many dimensions after the one of the sensors, as wide as the widest."""
+        further = (0, 0) * after
         return torch.cat(
-            [_widen(getattr(part, name), maximum, 0).expand(len(part), -1, -1) for part in parts]
+            [
+                pad(getattr(part, name), (*further, 0, max(counts) - count)).expand(len(part), -1, -1)
+                for part, count in zip(parts, counts, strict=True)
+            ]
         )
 
     return Touches(
-        together("readings", 2),
-        together("valid", 2),
-        expanded("positions"),
+        joined("readings"),
+        joined("valid"),
+        joined("positions", after=1),
         torch.cat([part.known_labels for part in parts]),
-        first.rate,
-        saturated=together("saturated", 2),
-        geometry=expanded("geometry"),
+        parts[0].rate,
+        saturated=joined("saturated"),
+        geometry=joined("geometry", after=1),
         contacts=join_contacts([part.contacts for part in parts]),
     )
-
-
-def _widen(values: Tensor, sensors: int, axis: int) -> Tensor:
-    """Return values with zeros, or False, for further sensors along an axis."""
-    shape = list(values.shape)
-    shape[axis] = sensors - shape[axis]
-    return torch.cat([values, values.new_zeros(shape)], dim=axis)

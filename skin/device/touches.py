@@ -58,15 +58,17 @@ class Touches:
         if self.valid.dtype != torch.bool:
             raise ValueError(f"valid must be bool, got {self.valid.dtype}")
         batch, time, sensors = self.readings.shape
-        scalars, moving = (batch, time, sensors), (batch, time, sensors, 3)
-        geometry_shape = (sensors, len(GEOMETRY))
-        _expect(self.valid, "valid", scalars)
-        _expect(self.positions, "positions", (sensors, 3), (batch, sensors, 3), moving)
-        _expect(self.geometry, "geometry", geometry_shape, (batch, *geometry_shape))
-        _expect(self.motion, "motion", moving)
-        _expect(self.saturated, "saturated", scalars)
-        if self.contacts is not None:
-            _expect(self.contacts, "contacts", (batch, time, *self.contacts.shape[2:3], len(CONTACT)))
+        each, contacts = (batch, time, sensors), () if self.contacts is None else self.contacts.shape[2:3]
+        shapes: dict[str, tuple[tuple[int, ...], ...]] = {
+            "valid": (each,),
+            "positions": ((sensors, 3), (batch, sensors, 3), (*each, 3)),
+            "geometry": ((sensors, len(GEOMETRY)), (batch, sensors, len(GEOMETRY))),
+            "motion": ((*each, 3),),
+            "saturated": (each,),
+            "contacts": ((batch, time, *contacts, len(CONTACT)),),
+        }
+        for name, allowed in shapes.items():
+            _expect(getattr(self, name), name, *allowed)
         if self.labels is not None and (self.labels.ndim != 2 or len(self.labels) != batch):
             raise ValueError(f"labels must be (B, L), B = {batch}, got {tuple(self.labels.shape)}")
 
@@ -75,17 +77,13 @@ class Touches:
 
     def __getitem__(self, index: Tensor | slice) -> "Touches":
         """Return the touches that ``index`` selects; positions common to all touches stay common."""
-        return Touches(
-            self.readings[index],
-            self.valid[index],
-            self.positions if self.positions.ndim == 2 else self.positions[index],
-            None if self.labels is None else self.labels[index],
-            self.rate,
-            None if self.motion is None else self.motion[index],
-            None if self.saturated is None else self.saturated[index],
-            self.geometry if self.geometry is None or self.geometry.ndim == 2 else self.geometry[index],
-            None if self.contacts is None else self.contacts[index],
-        )
+        common = {"positions": 2, "geometry": 2}  # dimensions where they are common to all touches
+        selected = {
+            name: value[index]
+            for name, value in vars(self).items()
+            if isinstance(value, Tensor) and value.ndim != common.get(name)
+        }
+        return replace(self, **selected)  # type: ignore[arg-type]
 
     @property
     def known_labels(self) -> Tensor:
@@ -184,18 +182,12 @@ def concatenate(parts: Sequence[Recording]) -> Recording:
         present = [tensor for tensor in tensors if tensor is not None]
         return torch.cat(present) if present else None
 
-    touches = replace(
-        first.touches,
-        readings=torch.cat([part.touches.readings for part in parts]),
-        valid=torch.cat([part.touches.valid for part in parts]),
-        labels=together(part.touches.labels for part in parts),
-        motion=together(part.touches.motion for part in parts),
-        saturated=together(part.touches.saturated for part in parts),
-        contacts=join_contacts([part.touches.contacts for part in parts]),
-    )
+    names = ("readings", "valid", "labels", "motion", "saturated")
+    joined = {name: together(getattr(part.touches, name) for part in parts) for name in names}
+    contacts = join_contacts([part.touches.contacts for part in parts])
     return replace(
         first,
-        touches=touches,
+        touches=replace(first.touches, contacts=contacts, **joined),  # type: ignore[arg-type]
         force=together(part.force for part in parts),
         displacement=together(part.displacement for part in parts),
         parameters={name: torch.cat([part.parameters[name] for part in parts]) for name in first.parameters},

@@ -397,10 +397,10 @@ def _snapped(live: LiveConditions, device: "AbstractSimulated") -> LiveCondition
 
 def _sources() -> list[Path]:
     """Return the files that the thresholds kept on disk depend on."""
-    from skin.device import effects, imperfection, sampling
+    from skin.device import imperfection, sampling
     from skin.evaluation import decisions, operating_point, touch_scores
 
-    modules = (effects, imperfection, sampling, decisions, operating_point, touch_scores)
+    modules = (imperfection, sampling, decisions, operating_point, touch_scores)
     return [Path(__file__), *(Path(str(module.__file__)) for module in modules)]
 
 

@@ -28,7 +28,7 @@ from filelock import FileLock, Timeout
 
 from skin.core import files
 from skin.core.safe_loading import json_sum, parse_json, read_file, read_parts, write_parquet
-from skin.device.curves import Curves
+from skin.device.calibration import Curves
 from skin.device.files import numbered
 from skin.device.resampling import After, Frame, Resampled, Window
 from skin.errors import InputError

@@ -113,7 +113,7 @@ def generate_file(device: AbstractDevice, settings: Mapping[str, Any], path: Pat
 
     Args:
         device, settings: as of :func:`generate_data_set`.
-        path: ``x.parquet`` or ``x.csv``.
+        path: ``x.parquet``, or ``x.csv`` for the rows alone.
 
     Raises:
         InputError: the touches do not fit into memory, or the file cannot be written.

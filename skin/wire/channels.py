@@ -8,8 +8,7 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 from scipy.special import betainc
 
-from skin.device.calibration import Calibration
-from skin.device.curves import Curves
+from skin.device.calibration import Calibration, Curves
 from skin.device.resampling import Frame
 from skin.errors import InputError
 from skin.wire.protocol import Header

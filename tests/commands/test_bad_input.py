@@ -22,7 +22,7 @@ PORT = "device.port=/dev/ttyACM77"
         ("convert from=none.yaml out=x.csv", "cannot read the mapping none.yaml"),
         (
             "convert from=efles out=x.csv",
-            "from=efles is no format: give map.yaml, or one of eflesh_force",
+            "from=efles is no format: give map.yaml, or one of folder, sdu",
         ),
         ("convert from=sdu out=x.csv", "from=sdu needs path=FOLDER"),
         ("design out=x design.radii=[0.01,0.002]", "must be a range [minimum, maximum]"),

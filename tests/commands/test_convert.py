@@ -1,7 +1,7 @@
 """`skin convert` as a person runs it, and a training on what it wrote."""
 
-import json
 import sqlite3
+from itertools import product
 
 import numpy as np
 import pytest
@@ -12,6 +12,7 @@ from tests.budget import free
 
 MAPPING = {
     "files": "*/*.csv",
+    "table": {"missing": ["-1.000"]},
     "fields": "(?P<person>[^/]+)/(?P<gesture>[a-z]+)",
     "time": {"column": "time", "unit": "ms"},
     "channels": {"columns": "s*", "unit": "N"},
@@ -20,31 +21,25 @@ MAPPING = {
         "press": {"column": "gesture", "values": {"press": 1, "tap": 0}},
         "dangerous": {"target": "force", "above": 5.0},
     },
-    "targets": {"force": {"column": "gauge", "unit": "N", "missing": -1}},
+    "targets": {"force": {"column": "gauge", "unit": "N"}},
     "groups": ["person"],
 }
 
 
-def write(folder, persons=6, touches=24):
+def write(folder, persons=6, touches=24, **mapping):
     """Write touches of persons: a press lasts longer; who pats has neither label of press."""
     random = np.random.default_rng(0)
-    for person in range(persons):
-        position = folder / f"p{person}"
-        position.mkdir(parents=True)
-        for number in range(touches):
-            gesture = ("press", "tap", "pat")[number % 3]
-            force, frames = random.uniform(1, 10), 8 if gesture == "press" else 2
-            rows = ["time,s0,s1,s2,gauge"]
-            for frame in range(12):
-                value = force if 2 <= frame < 2 + frames else 0.0
-                noise = random.normal(0, 0.02, 3)
-                gauge = value if number % 4 else -1
-                readings = ",".join(
-                    f"{value * part + error:.3f}" for part, error in zip((1, 0.5, 0.1), noise, strict=True)
-                )
-                rows.append(f"{100 * frame},{readings},{gauge}")
-            (position / f"{gesture}_{number:02d}.csv").write_text("\n".join(rows))
-    (folder / "map.yaml").write_text(yaml.safe_dump(MAPPING, sort_keys=False))
+    for person, number in product(range(persons), range(touches)):
+        gesture = ("press", "tap", "pat")[number % 3]
+        force = np.zeros(12)
+        force[2 : 10 if gesture == "press" else 4] = random.uniform(1, 10)
+        readings = force[:, None] * [1, 0.5, 0.1] + random.normal(0, 0.02, (12, 3))
+        gauge = force if number % 4 else np.full(12, -1.0)
+        (folder / f"p{person}").mkdir(exist_ok=True)
+        path = folder / f"p{person}" / f"{gesture}_{number:02d}.csv"
+        rows = np.c_[100 * np.arange(12), readings, gauge]
+        np.savetxt(path, rows, "%.3f", ",", header="time,s0,s1,s2,gauge", comments="")
+    (folder / "map.yaml").write_text(yaml.safe_dump(MAPPING | mapping, sort_keys=False))
 
 
 @pytest.fixture(scope="module")
@@ -56,8 +51,7 @@ def converted(run, tmp_path_factory):
         if (key := tuple(more)) not in known:
             with free():
                 folder = tmp_path_factory.mktemp("converted")
-                write(folder)
-                (folder / "map.yaml").write_text(yaml.safe_dump(MAPPING | more, sort_keys=False))
+                write(folder, **more)
                 done = run(folder, "convert", "from=map.yaml", "out=x.parquet", store=False)
                 known[key] = folder / "x.parquet", done.stdout
         return known[key]
@@ -126,17 +120,17 @@ def two(run, tmp_path_factory):
     write(folder, persons=2, touches=12)
     for path in (folder / "p0").glob("press*"):
         path.unlink()
-    run(folder, "convert", "from=map.yaml", "out=x.csv", store=False)
-    groups = json.loads((folder / "x.csv.json").read_text())["metadata"]["groups"]
+    run(folder, "convert", "from=map.yaml", "out=x.parquet", store=False)
+    groups = read_recording(folder / "x.parquet").metadata["groups"]
     assert groups == {"person": ["p0", "p1"]}
-    return f"device.path={folder}/x.csv"
+    return f"device.path={folder}/x.parquet"
 
 
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["task=classes"], "x.csv has no classes: give task=labels or task=regression"),
-        (["task=regression", "device.targets=[x]"], "x.csv has no target x, it has force"),
+        (["task=classes"], "x.parquet has no classes: give task=labels or task=regression"),
+        (["task=regression", "device.targets=[x]"], "x.parquet has no target x, it has force"),
         (["device.targets=[force]"], "device.targets needs task=regression"),
         (["task=gestures"], "device.task=gestures must be"),
         (["task=regression", "learner=rules"], "learner=rules knows the labels"),

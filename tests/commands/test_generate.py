@@ -6,9 +6,9 @@ NAIVE = ("generate", "simulator=naive")
 
 
 def test_writes_a_recording(run, tmp_path):
-    done = run(tmp_path, *NAIVE, "n=32", "out=x.csv", store=False, apart=True)
-    assert "x.csv: 32 gestures" in done.stdout
-    recording = read_recording(tmp_path / "x.csv")
+    done = run(tmp_path, *NAIVE, "n=32", "out=x.parquet", store=False, apart=True)
+    assert "x.parquet: 32 gestures" in done.stdout
+    recording = read_recording(tmp_path / "x.parquet")
     assert len(recording) == 32
     assert recording.metadata["config"]["data"]["gestures"] == 32
     assert len(recording.metadata["config_hash"]) >= 16
@@ -38,8 +38,8 @@ def test_tells_the_balance_and_warns_where_a_shape_is_the_label(run, tmp_path):
     done = run(tmp_path, *NAIVE, "n=160", "out=x.csv", *ONE_SIZE, store=False)
     title, header, big, small = done.stderr.splitlines()[:4]
     assert title.startswith("balance: ")
-    assert header.split()[:3] == ["accuracy", "disc", "bar"]
-    assert [big.split()[0], *big.split()[2:4]] == ["big", "100", "0"]
+    assert header.split()[:4] == ["accuracy", "error", "disc", "bar"]
+    assert [big.split()[0], *big.split()[3:5]] == ["big", "100", "0"]
     assert small.split()[0] == "small"
     assert "warning: the shape alone predicts big (" in done.stderr
 

@@ -17,7 +17,7 @@ from skin.evaluation.operating_point import OperatingPoint
 from skin.evaluation.report import touch_sets
 from skin.evaluation.settings import Evaluation
 from skin.evaluation.streams import evaluate_windows
-from skin.record.serial import Serial, open_source
+from skin.record.serial import open_source
 from skin.runs.build import build_device
 from skin.runs.configuration import validate_config
 
@@ -50,31 +50,21 @@ def test_other_devices_have_tests_of_their_own():
     assert all(any((room / f"test_{name}.py").is_file() for room in rooms) for name in others)
 
 
-def test_splits_have_one_form(device):
-    for split in ("train", "validation", "holdout", "test"):
-        touches = device.touches(split)
+def test_splits_have_one_form_and_are_80_10_10_by_gesture(device):
+    splits = {split: device.touches(split) for split in ("train", "validation", "holdout", "test")}
+    for touches in splits.values():
         assert touches.readings.shape == (len(touches), 30, 25)
         assert touches.readings.dtype == touches.labels.dtype == torch.float32
         assert torch.isfinite(touches.readings).all()
         assert touches.labels.shape == (len(touches), len(device.task))
         assert touches.positions.shape == (25, 3)
         assert touches.rate == 10.0
-    assert device.size == (0.16, 0.16)
-
-
-def test_the_budget_is_split_80_10_10_by_gesture(device):
-    parts = [device.touches(split).readings for split in ("train", "validation", "holdout")]
+    parts = [splits.pop(split).readings for split in ("train", "validation", "holdout")]
     assert [len(part) for part in parts] == [40, 5, 5]
     assert len(torch.cat(parts).flatten(1).unique(dim=0)) == 50
-
-
-def test_fixed_touches_stay_the_same(device):
-    assert torch.equal(device.touches("train").readings, device.touches("train", epoch=3).readings)
-
-
-def test_only_a_simulated_device_says_that_it_is_one(device):
+    assert torch.equal(parts[0], device.touches("train", epoch=3).readings)
+    assert device.size == (0.16, 0.16)
     assert device.simulation is (device if isinstance(device, Simulated) else None)
-    assert not isinstance(device, Serial)
     assert len(device.recording("holdout", complete=False)) == 5
 
 

@@ -32,9 +32,8 @@ def recording():
     return device().recording()
 
 
-@pytest.mark.parametrize("name", ["x.parquet", "x.csv"])
-def test_a_file_gives_them_back_to_the_last_bit(recording, tmp_path, name):
-    path = write_recording(recording, tmp_path / name)
+def test_a_file_gives_them_back_to_the_last_bit(recording, tmp_path):
+    path = write_recording(recording, tmp_path / "x.parquet")
     for complete in (True, False):
         assert same(read_recording(path, complete).touches.contacts, recording.touches.contacts)
 

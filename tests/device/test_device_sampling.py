@@ -19,11 +19,7 @@ def touches():
     return force
 
 
-def test_at_the_rate_of_the_model_nothing_changes():
-    assert torch.equal(between_frames(touches(), 10.0, 10.0), touches())
-
-
-@pytest.mark.parametrize("rate", [30.0, 50.0, 70.0])
+@pytest.mark.parametrize("rate", [10.0, 30.0, 50.0, 70.0])
 def test_the_middle_of_an_interval_is_the_frame(rate):
     number = round(rate / 10)
     fine = between_frames(touches(), 10.0, rate)
@@ -74,32 +70,22 @@ def test_a_touch_begins_and_ends_at_the_edges_of_its_frames(rate):
     assert rising[0, 1].item() == pytest.approx(2.0 / number)
 
 
-@pytest.mark.parametrize("rate", [10.0, 20.0, 50.0, 100.0])
+@pytest.mark.parametrize("rate", [9.6, 10.0, 20.0, 50.0, 100.0])
 def test_a_simulated_device_reads_like_a_real_one(rate):
     """The frames of a device at a rate, added one by one to the window of a live skin."""
     device = Imperfection(rate=rate, dead=1, **ROUGH)
     constants = device.constants(3, np.random.default_rng(0))
-    readings, valid, saturated = measure(device, constants, touches(), 10.0, np.random.default_rng(1))
+    found = measure(device, constants, touches(), 10.0, np.random.default_rng(1))
     noise = np.random.default_rng(1)
-    fine = touches() if rate == 10.0 else between_frames(touches(), 10.0, rate, noise.random(2))
+    fine = touches() if rate <= 10.0 else between_frames(touches(), 10.0, rate, noise.random(2))
     values, works, limited = (one.numpy() for one in device.apply(fine, constants, noise))
     for gesture in range(2):
         window = Window(12, 10.0, 3)
         for number, row in enumerate(values[gesture]):
             frame = Frame(number, number / rate, 0.0, row, works[gesture, number])
             window.add(frame._replace(saturated=limited[gesture, number]))
-        seen = window.read()
-        np.testing.assert_array_equal(readings[gesture].numpy(), seen.values)
-        np.testing.assert_array_equal(valid[gesture].numpy(), seen.valid)
-        np.testing.assert_array_equal(saturated[gesture].numpy(), seen.saturated)
-
-
-def test_a_device_slower_by_five_percent_gives_a_frame_to_each_interval():
-    device = Imperfection(rate=9.6)
-    constants = device.constants(3, np.random.default_rng(0))
-    found = measure(device, constants, touches(), 10.0, np.random.default_rng(1))
-    expected = device.apply(touches(), constants, np.random.default_rng(1))
-    assert all(torch.equal(one, other) for one, other in zip(found, expected, strict=True))
+        for measured, seen in zip(found, window.read(), strict=False):
+            np.testing.assert_array_equal(measured[gesture].numpy(), seen)
 
 
 @pytest.mark.parametrize("rate", [20.0, 100.0, 500.0])

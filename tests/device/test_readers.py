@@ -1,17 +1,21 @@
 """Readers of public data sets, on files in their exact format, and functions of one's own."""
 
 import csv
-from itertools import combinations, product
+from itertools import product
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from skin.device.conversion import build_recording, read_by_function
-from skin.device.readers import GESTURES, VARIANTS, cost, epi
+from skin.core.files import ROOT, json_line
+from skin.device.conversion import build_recording, convert_files, read_by_function
+from skin.device.files import describe_recording, read_recording, write_recording
+from skin.device.formats import read_format
+from skin.device.readers import GESTURES, VARIANTS, cost, eflesh, epi, table
 from skin.errors import InputError
 
+REAL = ROOT.parent / "shared" / "real"
 SUBJECTS = (1, 2, 3, 5, 8, 13, 21, 31)
 HEADER = "subject, variant, gesture, frame, " + ", ".join(f"ch{number}" for number in range(1, 65))
 
@@ -69,23 +73,13 @@ def test_classes_and_subjects_are_those_of_the_file(corpus, gestures, variants):
         assert int(subjects[number]) == subject
 
 
-def test_taxels_are_channels_or_spread_evenly(corpus):
+def test_taxels_are_channels(corpus):
     whole = cost(corpus, pitch=0.02)
     assert whole.size == pytest.approx((0.16, 0.16))
     part = cost(corpus, taxels=[64, 1, 8, 57], pitch=0.02)
     assert torch.equal(part.touches.readings, whole.touches.readings[:, :, [0, 7, 56, 63]])
     corners = [[0.01, 0.01, 0], [0.15, 0.01, 0], [0.01, 0.15, 0], [0.15, 0.15, 0]]
     assert np.allclose(part.touches.positions, corners)
-    random, every = np.random.default_rng(0), whole.touches.positions.numpy()
-
-    def closest(positions: np.ndarray) -> float:
-        return min(float(np.linalg.norm(one - other)) for one, other in combinations(positions, 2))
-
-    views = [cost(corpus, taxels=12, taxel_seed=seed, pitch=0.02).touches.positions for seed in (0, 0, 1)]
-    assert torch.equal(views[0], views[1])
-    assert not torch.equal(views[0], views[2])
-    at_random = max(closest(every[random.choice(64, 12, replace=False)]) for _ in range(300))
-    assert closest(views[0].numpy()) > at_random
 
 
 def changed(line: int, column: int, value: str):
@@ -140,6 +134,78 @@ def test_epi_has_a_touch_in_each_row(tmp_path):
     assert recording.parameters["class"].tolist() == list(range(10, -1, -1))
     with pytest.raises(InputError, match="has no touches of Epi"):
         epi(tmp_path / "none")
+
+
+def write_eflesh(folder: Path, states: list[list[float]]) -> None:
+    """Write two sessions as eFlesh has them: two files without a header, joined by row."""
+    for number in range(2):
+        (session := folder / f"2025040{number}_probe").mkdir()
+        fields = [[1e9 + row, *(10 * row + np.arange(15))] for row in range(len(states))]
+        for name, rows in (("sensor_post_baselines", fields), ("states", states)):
+            (session / f"{name}.csv").write_text("\n".join(",".join(map(str, row)) for row in rows))
+
+
+def test_eflesh_has_forces_in_every_other_row(tmp_path):
+    write_eflesh(tmp_path, [[1e9 + row, 315, -100, 288, -1 if row % 2 else 300.0 * row] for row in range(10)])
+    recording = eflesh(tmp_path)
+    assert recording.touches.readings.shape == (20, 5, 15)
+    assert torch.allclose(recording.touches.readings[3, 2], 0.1 * (30 + torch.arange(15.0)))
+    assert not recording.touches.readings[:, [0, 1, 3, 4]].any()
+    assert torch.equal(recording.touches.positions[0], recording.touches.positions[2])
+    force, label = recording.parameters["force"][:10], recording.touches.labels[:10, 0]
+    assert force[4] == pytest.approx(1.2 * 9.80665)
+    assert label.nan_to_num(-1).tolist() == [0, -1, 0, -1, 1, -1, 1, -1, 1, -1]  # 10 N are 1020 g
+    assert force.isnan().tolist() == label.isnan().tolist()
+    assert recording.metadata["groups"] == {"session": ["20250400_probe", "20250401_probe"]}
+    assert recording.parameters["group_session"].tolist() == [0] * 10 + [1] * 10
+    stored = read_recording(write_recording(recording, tmp_path / "x.parquet"))
+    assert torch.equal(stored.touches.labels.isnan(), recording.touches.labels.isnan())
+    for name, values in recording.parameters.items():
+        assert torch.equal(stored.parameters[name].nan_to_num(-1), values.nan_to_num(-1)), name
+
+
+def test_eflesh_places_begin_at_zero(tmp_path):
+    with pytest.raises(InputError, match=r"has no file \*/sensor_post_baselines.csv"):
+        eflesh(tmp_path)
+    write_eflesh(tmp_path, [[row, 274 + 10 * row, -115 + 20 * row, 142] for row in range(3)])
+    recording = eflesh(tmp_path)
+    assert recording.parameters["x"][:3].tolist() == pytest.approx([0, 0.01, 0.02])
+    assert recording.parameters["y"][:3].tolist() == pytest.approx([0, 0.02, 0.04])
+    assert (recording.task.names, recording.size) == (("right", "low"), (0.03, 0.03))
+    next(tmp_path.glob("*/states.csv")).write_text("1,2,3,4\n")
+    with pytest.raises(InputError, match=r"states\.csv needs as many rows"):
+        eflesh(tmp_path)
+
+
+def test_a_table_of_an_earlier_version_is_converted(tmp_path):
+    recording = build_recording(np.ones((2, 3, 4), np.float32), 10.0, labels={"press": [1, None]})
+    path = write_recording(recording, tmp_path / "x.csv")
+    with pytest.raises(InputError, match=r"give \S+x.parquet; .* reader=skin.device.readers.table"):
+        read_recording(path)
+    with pytest.raises(InputError, match=r"x.csv is no recording of an earlier version: .*No such file"):
+        table(path)
+    about = describe_recording(recording) | {"sha256": {"table": "0", "description": "1"}}
+    path.with_name("x.csv.json").write_text(json_line(about))
+    read = table(path)
+    assert torch.equal(read.touches.readings, recording.touches.readings)
+    assert read.touches.labels.nan_to_num(-1).tolist() == [[1], [-1]]
+    for wrong in ("[]", "3", "{", json_line(about | {"gestures": 3})):
+        path.with_name("x.csv.json").write_text(wrong)
+        with pytest.raises(InputError, match=r"x.csv"):
+            table(path)
+
+
+@pytest.mark.slow("converts recordings that are large")
+@pytest.mark.skipif(not REAL.is_dir(), reason="needs the real recordings")
+def test_real_recordings_are_converted():
+    pytest.importorskip("openpyxl")
+    recordings = [eflesh(REAL / "eflesh" / name) for name in ("normal_force", "spatial_resolution")]
+    recordings.append(convert_files(read_format("sdu"), REAL / "sdu_fsi"))
+    shapes = [tuple(recording.touches.readings.shape) for recording in recordings]
+    assert shapes == [(10800, 5, 15), (9610, 5, 15), (15376, 5, 4)]
+    known = [int((~recording.touches.labels[:, 0].isnan()).sum()) for recording in recordings]
+    assert known == [5580, 9610, 15376]
+    assert all(recording.touches.valid.all() for recording in recordings)
 
 
 OWN = """

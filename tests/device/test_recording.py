@@ -24,49 +24,9 @@ def simulated():
     return Simulated(body=BODY, layout=LAYOUT, simulator=Naive, gestures=50).recording()
 
 
-@pytest.fixture(scope="module", params=["parquet", "csv"])
-def path(request, simulated, tmp_path_factory) -> str:
-    return str(write_recording(simulated, tmp_path_factory.mktemp("files") / f"x.{request.param}"))
-
-
-def test_yields_what_was_written(path, simulated):
-    device = Recorded(BODY, LAYOUT, path)
-    parts = [device.touches(split) for split in ("train", "validation", "test")]
-    readings = torch.cat([part.readings for part in parts]).flatten(1)
-    written = simulated.touches.readings.flatten(1)
-    assert torch.equal(readings.unique(dim=0), written.unique(dim=0))
-    assert (device.window, device.rate, device.task) == (30, 10.0, simulated.task)
-
-
-def test_the_test_part_is_the_holdout(path):
-    device = Recorded(BODY, LAYOUT, path)
-    assert torch.equal(device.touches("test").readings, device.touches("holdout").readings)
-
-
-def test_another_split_seed_is_another_split(path):
-    one, other = (Recorded(BODY, LAYOUT, path, split_seed=seed).touches("test") for seed in (0, 1))
-    assert not torch.equal(one.readings, other.readings)
-
-
-@pytest.mark.parametrize(
-    ("body", "layout", "message"),
-    [
-        (BODY, Grid(4, 4), r"has 25 sensors, the layout has 16"),
-        (BODY, Scattered(5, 5, seed=1), r"has sensor \d+ at .*the layout at"),
-        (Sheet([0.2, 0.16], [16, 16], LAYER), LAYOUT, r"add body.size=\[0.16,0.16\]"),
-    ],
-)
-def test_another_skin_is_refused(path, body, layout, message):
-    with pytest.raises(InputError, match=message):
-        Recorded(body, layout, path)
-
-
-def test_no_file_and_too_few_touches_are_refused(simulated, tmp_path):
-    with pytest.raises(InputError, match=r"add device.path=x.parquet"):
-        Recorded(BODY, LAYOUT)
-    few = write_recording(simulated[:9], tmp_path / "few.parquet")
-    with pytest.raises(InputError, match=r"has 9 touches: 80/10/10 needs at least 10"):
-        Recorded(BODY, LAYOUT, str(few))
+@pytest.fixture(scope="module")
+def path(simulated, tmp_path_factory) -> str:
+    return str(write_recording(simulated, tmp_path_factory.mktemp("files") / "x.parquet"))
 
 
 def data_set(simulated, folder) -> str:
@@ -86,13 +46,40 @@ def folder(simulated, tmp_path_factory) -> str:
     return data_set(simulated, tmp_path_factory.mktemp("sets") / "touches")
 
 
-def test_a_data_set_is_split_by_gesture(folder, simulated):
-    device = Recorded(BODY, LAYOUT, folder)
+@pytest.mark.parametrize("stored", ["path", "folder"])
+def test_a_file_and_a_data_set_are_split_by_gesture(request, stored, simulated):
+    stored = request.getfixturevalue(stored)
+    device, again, other = (Recorded(BODY, LAYOUT, stored, split_seed=seed) for seed in (0, 0, 1))
     parts = [device.touches(split) for split in ("train", "validation", "test")]
     assert [len(part) for part in parts] == [40, 5, 5]
     readings = torch.cat([part.readings for part in parts]).flatten(1)
     assert torch.equal(readings.unique(dim=0), simulated.touches.readings.flatten(1).unique(dim=0))
     assert (device.window, device.rate, device.task) == (30, 10.0, simulated.task)
+    for twin in (device.touches("holdout"), again.touches("test")):
+        assert torch.equal(parts[2].readings, twin.readings)
+    assert not torch.equal(parts[2].readings, other.touches("test").readings)
+
+
+@pytest.mark.parametrize("stored", ["path", "folder"])
+@pytest.mark.parametrize(
+    ("body", "layout", "message"),
+    [
+        (BODY, Grid(4, 4), r"has 25 sensors, the layout has 16"),
+        (BODY, Scattered(5, 5, seed=1), r"has sensor \d+ at .*the layout at"),
+        (Sheet([0.2, 0.16], [16, 16], LAYER), LAYOUT, r"add body.size=\[0.16,0.16\]"),
+    ],
+)
+def test_another_skin_is_refused(request, stored, body, layout, message):
+    with pytest.raises(InputError, match=message):
+        Recorded(body, layout, request.getfixturevalue(stored))
+
+
+def test_no_file_and_too_few_touches_are_refused(simulated, tmp_path):
+    with pytest.raises(InputError, match=r"add device.path=x.parquet"):
+        Recorded(BODY, LAYOUT)
+    few = write_recording(simulated[:9], tmp_path / "few.parquet")
+    with pytest.raises(InputError, match=r"has 9 touches: 80/10/10 needs at least 10"):
+        Recorded(BODY, LAYOUT, str(few))
 
 
 def test_a_data_set_is_made_in_parts(folder):
@@ -105,12 +92,6 @@ def test_a_data_set_is_made_in_parts(folder):
         assert torch.equal(joined, device.touches(split).readings)
     assert len(device.parts("train")) > 1
     assert [part.count for part in device.parts()] == [20, 20, 10]
-
-
-def test_another_split_seed_splits_a_data_set_otherwise(folder):
-    one, again, other = (Recorded(BODY, LAYOUT, folder, split_seed=s).touches("test") for s in (0, 0, 1))
-    assert torch.equal(one.readings, again.readings)
-    assert not torch.equal(one.readings, other.readings)
 
 
 def test_no_more_is_held_out_than_needed(folder, monkeypatch):
@@ -132,11 +113,6 @@ def test_more_than_memory_is_refused_before_it_is_read(folder, monkeypatch):
     monkeypatch.setattr("skin.device.recording._BYTES", 1e12)
     with pytest.raises(InputError, match=r"touches, 40 gestures at once, needs about .* GB of memory"):
         device.touches("train")
-
-
-def test_a_data_set_of_another_skin_is_refused(folder):
-    with pytest.raises(InputError, match=r"has 25 sensors, the layout has 16"):
-        Recorded(BODY, Grid(4, 4), folder)
 
 
 def test_a_folder_that_is_no_data_set_is_refused(tmp_path):
@@ -166,7 +142,7 @@ def test_classes_and_targets_replace_the_labels(simulated, tmp_path):
     }
     about = {"groups": {"person": list("abcde")}, "classes": ["pat", "rub", "tap"]}
     stored = str(
-        write_recording(replace(simulated, parameters=parameters, metadata=about), tmp_path / "x.csv")
+        write_recording(replace(simulated, parameters=parameters, metadata=about), tmp_path / "x.parquet")
     )
     classes = Recorded(BODY, LAYOUT, stored, task="classes", test_groups="a")
     assert classes.task == Task(("pat", "rub", "tap"), "exclusive")
@@ -190,7 +166,7 @@ def test_one_class_or_value_to_train_on_is_refused(simulated, tmp_path, name):
     parameters = {name: person.float(), "group_person": person.float()}
     about = {"groups": {"person": ["a", "b"]}, "classes": ["pat", "rub"]}
     stored = str(
-        write_recording(replace(simulated, parameters=parameters, metadata=about), tmp_path / "x.csv")
+        write_recording(replace(simulated, parameters=parameters, metadata=about), tmp_path / "x.parquet")
     )
     task = {"class": "classes", "x": "regression"}[name]
     message = {"class": "pat lacks a class", "x": "x has less than two values"}[name]

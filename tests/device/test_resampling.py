@@ -34,8 +34,10 @@ def by_loop(frames, intervals, rate, period):
     return readings
 
 
-def test_at_the_models_rate_the_window_is_the_last_frames():
-    window, frames = Window(8, 10.0, SENSORS), stream(10.0, 40)
+@pytest.mark.parametrize("rate", [9.7, 10.0])
+def test_near_the_models_rate_the_window_is_the_last_frames(rate):
+    """A clock that is wrong by a few per cent is no slower stream."""
+    window, frames = Window(8, 10.0, SENSORS), stream(rate, 40)
     for number, one in enumerate(frames):
         window.add(one)
         seen = window.read()
@@ -84,14 +86,7 @@ def test_a_slower_stream_is_refused_with_both_rates():
         window.add(one)
     with pytest.raises(InputError, match=r"sends 5 frames a second, the model needs 10: .*touch.rate=5"):
         window.read()
-
-
-def test_a_clock_that_is_wrong_by_a_few_per_cent_is_no_slower_stream():
-    window, frames = Window(6, 10.0, SENSORS), stream(9.7, 40)
-    for one in frames:
-        window.add(one)
-    expected = np.stack([one.values for one in frames[-6:]])
-    np.testing.assert_array_equal(window.read().values, expected)
+    check_rate(9.9, 10.0)
 
 
 def test_a_gap_is_flagged_and_not_filled():
@@ -128,10 +123,7 @@ def test_a_pause_of_a_device_that_does_not_count_is_no_slow_stream():
     for number in range(5):
         window.add(frame(8 + 0.1 * number, np.ones(SENSORS)))
     assert window.read().gap is False
-    window = Window(4, 10.0, SENSORS)
-    for one in stream(10.0, 20):
-        window.add(one)
-    window.add(frame(2.2, np.ones(SENSORS)))
+    window.add(frame(8.8, np.ones(SENSORS)))
     assert window.read().gap
 
 
@@ -182,9 +174,3 @@ def test_the_largest_of_each_interval_of_a_window_that_began():
         window.add(frame(number / 100, [number % 7, -number]))
     by_hand = [[max(n % 7 for n in range(k, k + 10)), -k] for k in range(20, 70, 10)]
     assert window.since(0.2).values.tolist() == by_hand
-
-
-def test_a_slower_device_is_refused_with_both_rates():
-    check_rate(9.9, 10.0)
-    with pytest.raises(InputError, match=r"sends 5 frames a second, the model needs 10"):
-        check_rate(5.0, 10.0)

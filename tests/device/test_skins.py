@@ -38,6 +38,9 @@ def test_an_epoch_is_new_and_repeatable_and_validation_stays(device):
     assert torch.equal(first.readings, device.touches("train", 1).readings)
     assert not torch.equal(first.readings, second.readings)
     assert device.touches("validation", 1) is device.touches("validation", 2)
+    sizes = {skin.body.size for skin in device.training_skins}
+    assert not sizes & {skin.body.size for skin in device.unseen_skins}
+    assert len(device.touches("test")) == 32
 
 
 def test_training_skins_may_have_other_touches(configured):
@@ -49,12 +52,6 @@ def test_training_skins_may_have_other_touches(configured):
         assert (skin.sampler.settings.second, skin.sampler.settings.frames.press) == (0.0, (4, 20))
     with pytest.raises(InputError, match=r"touch\.window"):
         build_device(configured(*SMALL, "+device.training_touch.window=4.0"))
-
-
-def test_test_skins_are_not_training_skins(device):
-    sizes = {skin.body.size for skin in device.training_skins}
-    assert not sizes & {skin.body.size for skin in device.unseen_skins}
-    assert len(device.touches("test")) == 32
 
 
 def test_no_stream_defines_a_skin_and_orders_an_epoch(configured, monkeypatch):

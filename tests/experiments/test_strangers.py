@@ -204,7 +204,8 @@ def test_a_recording_makes_no_objects(run, recording, tmp_path, marker):
 def test_a_sidecar_is_json_alone(run, recording, tmp_path, marker):
     (tmp_path / "x.csv").write_bytes((recording / "x.csv").read_bytes())
     (tmp_path / "x.csv.json").write_bytes(pickle.dumps(Payload(marker), 0))
-    refused(run(tmp_path, *PLAYED, "device.path=x.csv", store=False), marker, "x.csv")
+    table = ["reader=skin.device.readers.table", "path=x.csv", "out=y.parquet"]
+    refused(run(tmp_path, "convert", *table, store=False), marker, "x.csv")
 
 
 def test_a_cache_is_built_anew_where_it_holds_objects(run, tmp_path, marker, monkeypatch):

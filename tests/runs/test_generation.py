@@ -161,8 +161,8 @@ def test_a_file_larger_than_memory_is_refused(tmp_path):
 
 
 def test_a_recording_becomes_a_data_set(tmp_path):
-    generate(tmp_path / "x.csv")
-    said = generate(tmp_path / "touches", "device=recording", f"device.path={tmp_path / 'x.csv'}")
+    generate(tmp_path / "x.parquet")
+    said = generate(tmp_path / "touches", "device=recording", f"device.path={tmp_path / 'x.parquet'}")
     assert said.startswith("80 gestures in 1 shards")
     whole, found = build_device(composed()).recording(), DataSet(tmp_path / "touches").read(0)
     assert torch.equal(found.touches.readings, whole.touches.readings)

@@ -93,7 +93,7 @@ def describe_recording(recording: Recording, first: int = 0) -> dict[str, Any]:
     }
 
 
-def _numbered(name: str, count: int) -> list[str]:
+def numbered(name: str, count: int) -> list[str]:
     """Return the columns of a quantity with one value per sensor."""
     digits = max(2, len(str(count - 1)))
     return [f"{name}_{number:0{digits}d}" for number in range(count)]
@@ -107,10 +107,10 @@ def column_types(about: dict[str, Any]) -> dict[str, pa.DataType]:
         binary = set(Task(**task).binary)
         kinds = [pa.int8() if name in binary else pa.float32() for name in task["names"]]
         columns |= dict(zip(task["names"], kinds, strict=True))
-    names = _numbered("reading", sensors) + ["force"] * about["force"]
-    limits = _numbered("saturated", sensors) if about["saturated"] else []
+    names = numbered("reading", sensors) + ["force"] * about["force"]
+    limits = numbered("saturated", sensors) if about["saturated"] else []
     if about["displacement"]:
-        names += _numbered("D_s", sensors) + _numbered("D_t", sensors)
+        names += numbered("D_s", sensors) + numbered("D_t", sensors)
     names += [f"gesture_{name}" for name in about["parameters"]]
     columns |= dict.fromkeys(names, pa.float32()) | dict.fromkeys(limits, pa.int8())
     return columns | dict.fromkeys(_contact_names(about), pa.float32())
@@ -119,7 +119,7 @@ def column_types(about: dict[str, Any]) -> dict[str, pa.DataType]:
 def _contact_names(about: dict[str, Any]) -> list[str]:
     """Return the columns of contacts, one contact after the other."""
     count = about.get("contacts", 0)
-    return [f"{contact}_{name}" for contact in _numbered("contact", count) for name in CONTACT]
+    return [f"{contact}_{name}" for contact in numbered("contact", count) for name in CONTACT]
 
 
 _EACH_FRAME = ("reading_", "force", "D_s_", "D_t_", "contact_")
@@ -277,9 +277,9 @@ def _recording(table: pa.Table, about: dict[str, Any], task: Task) -> Recording:
         return torch.from_numpy(np.stack(columns, axis=-1)).view(shape)
 
     def of_sensors(name: str) -> Tensor:
-        return numbers(_numbered(name, sensors))
+        return numbers(numbered(name, sensors))
 
-    valid = np.stack([table[name].is_valid().to_numpy() for name in _numbered("reading", sensors)], axis=-1)
+    valid = np.stack([table[name].is_valid().to_numpy() for name in numbered("reading", sensors)], axis=-1)
     contacts = _contact_names(about)
     touches = Touches(
         of_sensors("reading"),

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 pytest.importorskip("fcntl", reason="file limits need a POSIX system")
 
 from skin.calibration.bench import load_table, read_bench_session
-from skin.device.curves import Curves
+from skin.device.calibration import Curves
 from skin.device.resampling import Frame, Window
 from skin.errors import InputError
 from skin.record.session import SessionLog, locked, read_session

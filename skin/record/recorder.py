@@ -302,7 +302,7 @@ def record_session(
         InputError: another process records to the file, or it cannot be written; its content is kept.
     """
     with locked(path):
-        skin, listener = device.wire.open(reconnect=True)
+        skin = device.wire.open(reconnect=True)
         with skin:
             first, conversion = device.wire.warm_up(skin, notify)
             log = SessionLog(path, _about(device, skin.header), len(device.sensors))
@@ -314,7 +314,7 @@ def record_session(
                 begin = log.time - (first[-1].t - first[0].t)
                 if log.done:
                     notify(f"{path} has {len(log.done)} gestures: going on")
-                segmenter = device.segmenter(listener, conversion, first, log.done)
+                segmenter = device.segmenter(skin.announcements, conversion, first, log.done)
                 if free:
                     segmenter = ContinuousSegmenter(segmenter.window, max(log.done, default=-1) + 1)
                 number = None if free else device.gestures

@@ -1,6 +1,7 @@
 """Touches from a real or emulated skin, gesture by gesture."""
 
 import sys
+from collections import deque
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from itertools import chain
@@ -20,11 +21,11 @@ from skin.errors import InputError
 from skin.touch.labels import TOUCH, TOUCH_OR_NOT
 from skin.touch.paths import TouchSettings, model_window
 from skin.wire.channels import UnitConversion
+from skin.wire.protocol import Announcement
 from skin.wire.reader import Port, SkinDisconnected, SkinTimeout
 from skin.wire.segmentation import (
     AbstractSegmenter,
     AnnouncedSegmenter,
-    AnnouncementListener,
     ContinuousSegmenter,
     PromptedSegmenter,
     RecordedGesture,
@@ -135,7 +136,7 @@ class Serial(AbstractDevice):
 
     def segmenter(
         self,
-        listener: AnnouncementListener,
+        announcements: deque[Announcement],
         conversion: UnitConversion,
         first: Sequence[Frame],
         done: Collection[int] = (),
@@ -143,7 +144,7 @@ class Serial(AbstractDevice):
         """Return the segmenter of a stream that ``labels`` selects.
 
         Args:
-            listener: collects announcements.
+            announcements: of the skin, that have not been used yet.
             conversion: of the values to N.
             first: frames read before.
             done: numbers of gestures that are already recorded.
@@ -152,7 +153,7 @@ class Serial(AbstractDevice):
         for frame in first:
             window.add(frame)
         if self.labels == "announced":
-            return AnnouncedSegmenter(window, listener, self.task)
+            return AnnouncedSegmenter(window, announcements, self.task)
         if self.labels == "none":
             valid = np.ones(len(self.sensors), dtype=bool)
             return ContinuousSegmenter(
@@ -201,10 +202,9 @@ class Serial(AbstractDevice):
     def _record(self) -> Recording:
         """Read gestures until there are enough, the skin stops sending, or the user ends it."""
         gestures: list[RecordedGesture] = []
-        skin, listener = self.wire.open()
-        with skin:
+        with self.wire.open() as skin:
             first, conversion = self.wire.warm_up(skin, _print)
-            segmenter = self.segmenter(listener, conversion, first)
+            segmenter = self.segmenter(skin.announcements, conversion, first)
             _print(f"waiting for {self.gestures} gestures, labels {self.labels}")
             try:
                 for frame in skin:

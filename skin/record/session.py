@@ -30,7 +30,7 @@ from skin.device.resampling import Frame, Window
 from skin.errors import InputError
 from skin.touch.labels import CONTACT
 from skin.wire.channels import UnitConversion
-from skin.wire.contact_lines import MOST_CONTACTS
+from skin.wire.protocol import MOST_CONTACTS
 from skin.wire.segmentation import RecordedGesture
 
 _SUM = ', "sum": "'

@@ -41,7 +41,7 @@ from skin.wire.lines import (
     learn_keys,
     number_pattern,
 )
-from skin.wire.protocol import INVALID, OVER, SEPARATORS, Format, Line, parse_header, parse_words
+from skin.wire.protocol import INVALID, OVER, SEPARATORS, Line, parse_header, parse_words
 
 _RUN = 12  # frames alike that show a format: that noise rises as often by chance is improbable
 
@@ -53,7 +53,6 @@ class Adapter:
     Attributes:
         kind: ``protocol`` (ours, docs/hardware.md), ``text``, ``json`` (one value per line), ``binary``, or
             ``auto``: to be proposed by ``skin listen``.
-        format: of our protocol: ``auto``, ``text`` or ``binary``.
         separator: text between fields; None: comma, semicolon, tab or blanks.
         decimal: ``.`` or ``,``.
         thousands: sign between groups of three digits.
@@ -89,7 +88,6 @@ class Adapter:
     """
 
     kind: Literal["protocol", "text", "json", "binary", "auto"] = "protocol"
-    format: Format = "auto"
     separator: str | None = None
     decimal: Literal[".", ","] = "."
     thousands: str = ""
@@ -230,10 +228,9 @@ class Adapter:
             data: from the first byte on; an incomplete piece at the end is ignored.
             sensors: S, or None to detect it.
         """
-        protocol, seen = self.kind == "protocol", DetectedFormat()
-        if protocol and self.format != "text":
-            seen = detect_binary(data, sensors)
-        if seen.frame_format or (protocol and self.format == "binary"):
+        protocol = self.kind == "protocol"
+        seen = detect_binary(data, sensors) if protocol else DetectedFormat()
+        if seen.frame_format:
             return seen
         for layout in self.layouts(data):
             # Without a checksum, the first line may be half of one.

@@ -1,7 +1,7 @@
 """Decode bytes into frames, without input or output, and count what goes wrong."""
 
 import re
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from math import inf
@@ -14,7 +14,7 @@ from skin.errors import InputError
 from skin.wire.adapter import Adapter
 from skin.wire.clocks import UNITS, FrameClock
 from skin.wire.formats import FrameFormat
-from skin.wire.protocol import Format, Header, RawFrame, parse_header
+from skin.wire.protocol import Announcement, Header, RawFrame, parse_announcement, parse_header
 
 Identity = Literal["known", "missing", "other", "changed"]
 """Of the device by its headers: known; none since it was connected again; another; another without that."""
@@ -132,7 +132,6 @@ class Decoder:
 
     Args:
         sensors: S; None: taken from the header or from eight lines.
-        format: ``auto``, ``text`` or ``binary``.
         channels: the device's channel, from 0, of every sensor; empty: frames keep the device's order.
         polarity: 1 or -1 per sensor, -1 where values fall with force; empty: 1 for all.
         adapter: describes the frames; None: our protocol.
@@ -140,18 +139,18 @@ class Decoder:
     Attributes:
         stats: numbers of frames and errors; kept by :meth:`restart`.
         frame_format: the format, once it is known.
+        announcements: of an emulated skin, since it was connected; the latest 64.
     """
 
     def __init__(
         self,
         sensors: int | None = None,
-        format: Format = "auto",
         channels: Sequence[int] = (),
         polarity: Sequence[int] = (),
         adapter: Adapter | None = None,
     ) -> None:
-        self.sensors, self.adapter = sensors, adapter or Adapter(format=format)
-        self.stats = Stats()
+        self.sensors, self.adapter = sensors, adapter or Adapter()
+        self.stats, self.announcements = Stats(), deque[Announcement](maxlen=64)
         self._compared_at: float | None = None
         self._good = self._bad = 0
         self._latest_bad = FrameError("")
@@ -169,6 +168,7 @@ class Decoder:
 
     def _begin(self) -> None:
         self.frame_format: FrameFormat | None = None
+        self.announcements.clear()
         self.stats.format = self.stats.check = ""
         self._buffer = b""
         self._count_seen: int | None = None
@@ -268,6 +268,7 @@ class Decoder:
             if isinstance(raw, bytes):
                 if raw.startswith(b"#"):
                     self._update_header(parse_header(raw))
+                    self.announcements.extend(filter(None, [parse_announcement(raw)]))
                 elif raw:
                     self.stats.ignored[kind_of_line(raw)] += 1
                 return None

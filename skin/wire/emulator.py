@@ -23,7 +23,6 @@ from skin.core.rng import Stream, generator
 from skin.device.base import AbstractSimulated
 from skin.device.resampling import Check
 from skin.errors import InputError
-from skin.wire.contact_lines import contact_lines, encode_contact_line
 from skin.wire.protocol import (
     EMULATED,
     Announcement,
@@ -542,10 +541,10 @@ class Emulator:
         self._on_event(self._number / rate, f"gesture {number}: {label_text(gesture.labels)}")
         if self.settings.announce and not self.binary:
             seq, frames = self._number - self._zero, round(len(gesture.force) * rate / self.device.model_rate)
-            self._send(encode_announcement(Announcement(number, seq, frames, gesture.labels)))
-            if gesture.contacts is not None:
-                for line in contact_lines(number, gesture.contacts, self.device.model_rate):
-                    self._send(encode_contact_line(line))
+            announcement = Announcement(
+                number, seq, frames, gesture.labels, self.device.model_rate, gesture.contacts
+            )
+            self._send(encode_announcement(announcement))
 
     def _silence(self) -> None:
         self._on_event(self._number / self.settings.rate, f"silent for {self.faults.silent:g} s")

@@ -13,7 +13,7 @@ import numpy as np
 from skin.device.resampling import Check, FrameError
 from skin.errors import InputError
 from skin.wire.lines import Reader
-from skin.wire.protocol import Header, Line, RawFrame, decode_comment, decode_frame, frames_ahead
+from skin.wire.protocol import Header, Line, RawFrame, decode_frame, frames_ahead
 
 
 @dataclass(frozen=True)
@@ -231,10 +231,9 @@ class BinaryFormat:
 
     def read(self, piece: bytes) -> RawFrame | bytes:
         """Return the frame between two zeros, or the text of a comment; else raise FrameError."""
-        comment = decode_comment(piece) if piece else b""
-        if comment is not None:
-            return comment
-        frame = decode_frame(piece)
+        frame = decode_frame(piece) if piece else b""
+        if isinstance(frame, bytes):
+            return frame
         if len(frame.values) != self.sensors:
             raise FrameError("fields", len(frame.values))
         return frame
@@ -273,7 +272,8 @@ def detect_binary(data: bytes, sensors: int | None, frames: int = 2) -> Detected
     counts = list[int]()
     for piece in data.split(b"\0")[:-1]:
         with suppress(FrameError):
-            counts.append(len(decode_frame(piece).values))
+            if isinstance(frame := decode_frame(piece), RawFrame):
+                counts.append(len(frame.values))
     often = [count for count in counts if counts.count(count) >= frames and sensors in (None, count)]
     return DetectedFormat(BinaryFormat(often[0]) if often else None, counts[-1] if counts else None)
 

@@ -7,7 +7,7 @@ import socket
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
 from itertools import count
 from math import inf
 from time import sleep
@@ -22,7 +22,6 @@ from skin.errors import InputError
 from skin.wire.adapter import Adapter, read_adapter
 from skin.wire.channels import ChannelHealth, Limits, Reason
 from skin.wire.decoder import Decoder
-from skin.wire.protocol import Format
 
 if TYPE_CHECKING:
     from skin.device.touches import Touches
@@ -45,7 +44,6 @@ class Port:
     Args:
         port: ``/dev/ttyACM0``, ``COM3`` or ``socket://host:number``.
         baudrate: bits per second, for serial ports.
-        format: of our protocol.
         adapter: describes what the board sends: an option of ``conf/adapter/``, a YAML file, or the settings
             of :class:`skin.wire.adapter.Adapter`.
         limits: smallest and largest value of a channel, as in
@@ -71,7 +69,6 @@ class Port:
 
     port: str | None = None
     baudrate: PositiveInt = 115200
-    format: Format = "auto"
     adapter: str | Mapping[str, Any] = "protocol"
     limits: Annotated[Limits, AfterValidator(_check_order)] | None = None
     timeout: PositiveFloat = 6.0
@@ -84,10 +81,7 @@ class Port:
     frames: Adapter = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        frames = read_adapter(self.adapter)
-        if frames.kind == "protocol" and frames.format == "auto":
-            frames = replace(frames, format=self.format)
-        object.__setattr__(self, "frames", frames)
+        object.__setattr__(self, "frames", read_adapter(self.adapter))
 
     @classmethod
     def select(cls, device: Mapping[str, Any]) -> "Port":

@@ -21,7 +21,7 @@ from skin.device.resampling import Frame, check_rate
 from skin.errors import InputError
 from skin.wire.channels import RawRange, UnitConversion, check_sensitivity, unit_conversion
 from skin.wire.decoder import Decoder, Stats
-from skin.wire.protocol import Header
+from skin.wire.protocol import Announcement, Header
 from skin.wire.reader import (
     ByteStream,
     PlaybackFeed,
@@ -31,7 +31,6 @@ from skin.wire.reader import (
     WireFeed,
     open_stream,
 )
-from skin.wire.segmentation import AnnouncementListener
 from skin.wire.tare import HEADER, PATIENCE, SkinTouched, Tare, take_baseline
 
 if TYPE_CHECKING:
@@ -182,6 +181,11 @@ class Skin:
     def channels(self) -> tuple[str, ...]:
         """State of each channel at the last frame; empty if channels are not checked."""
         return self._feed.states
+
+    @property
+    def announcements(self) -> deque[Announcement]:
+        """Announcements of an emulated skin that have not been read yet."""
+        return self._decoder.announcements if self._decoder else deque()
 
     @property
     def stats(self) -> Stats:
@@ -426,24 +430,21 @@ class SerialSource:
             return self._calibration.polarity
         return [-1] * self._sensors if (self.settings.scale or 0) < 0 else ()
 
-    def open(self, reconnect: bool = False) -> tuple[Skin, AnnouncementListener]:
-        """Open the port and collect its announcements; ``reconnect`` waits for an unplugged skin."""
+    def open(self, reconnect: bool = False) -> Skin:
+        """Open the port; ``reconnect`` waits for an unplugged skin."""
         if self.settings.port is None:
             raise InputError("device=serial needs a port, device.port=/dev/ttyACM0; skin emulate makes one")
-        listener = AnnouncementListener(partial(open_stream, self.settings.port, self.settings.baudrate))
-        skin = open_skin(
+        return open_skin(
             self.settings,
             range(self._sensors),
-            opener=listener,
             reconnect=reconnect,
             channels=self.channels,
             polarity=self.polarity,
         )
-        return skin, listener
 
     def open_source(self) -> Source:
         """Open the port as a stream of frames; wait for an unplugged skin."""
-        skin, _ = self.open(reconnect=True)
+        skin = self.open(reconnect=True)
         return Source(str(self.settings.port), skin, self.tare(skin), self)
 
     def tare(self, skin: Skin) -> Tare:

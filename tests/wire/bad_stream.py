@@ -46,7 +46,7 @@ def fuzz(count: int, spoken: WireFormat, sensors: int, seed: int) -> dict[str, i
     """
     rng, decoder = (
         Random(f"{spoken} {sensors} {seed}"),
-        Decoder(sensors, "binary" if spoken == "binary" else "text"),
+        Decoder(sensors),
     )
     stream = _Stream(rng, spoken, sensors)
     oracle = _Oracle(stream)

@@ -83,14 +83,6 @@ def test_one_byte_at_a_time_gives_the_same():
     assert (single.stats, len(whole)) == (together.stats, 25)
 
 
-@pytest.mark.parametrize("format", ["text", "binary"])
-def test_a_format_that_was_demanded_is_the_only_one(format):
-    binary = b"".join(encode_frame([1, 2, 3, 4], number, number) for number in range(4))
-    streams = {"text": b"".join(lines(4)), "binary": binary}
-    for spoken, data in streams.items():
-        assert len(Decoder(4, format).feed(data)) == (4 if spoken == format else 0)
-
-
 @pytest.mark.parametrize("spoken", ["text", "binary"])
 def test_another_number_of_sensors_is_refused_with_both_counts(spoken):
     decoder = Decoder(25)

@@ -9,8 +9,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from skin.wire.decoder import Decoder
-from skin.wire.protocol import encode_frame, encode_line, parse_line
+from skin.wire.protocol import encode_frame, encode_line
 from tests.wire import bad_stream, independent_frames
+from tests.wire.memory import parse_line
 
 quickly = settings(
     max_examples=60, deadline=None, derandomize=True, database=None, suppress_health_check=list(HealthCheck)
@@ -29,11 +30,10 @@ def cut(data, cuts):
     return [data[first:last] for first, last in pairwise(positions)]
 
 
-@pytest.mark.parametrize("format", ["auto", "text", "binary"])
 @given(pieces=st.lists(st.binary(max_size=300), max_size=12), sensors=st.sampled_from([None, 1, 3]))
 @quickly
-def test_nothing_raises(format, pieces, sensors):
-    decoder = Decoder(sensors, format)
+def test_nothing_raises(pieces, sensors):
+    decoder = Decoder(sensors)
     for now, piece in enumerate(pieces):
         for frame in decoder.feed(piece, float(now)):
             assert np.isfinite(frame.values).all()

@@ -8,8 +8,9 @@ import pytest
 from skin.device.resampling import FrameError
 from skin.wire.decoder import Decoder
 from skin.wire.monitor import PortMonitor
-from skin.wire.protocol import crc16, encode_frame, parse_line
+from skin.wire.protocol import crc16, encode_frame
 from skin.wire.skin import open_skin
+from tests.wire.memory import parse_line
 
 WORDS = [
     *(b"nan", b"NaN", b"-nan", b"inf", b"-INF", b"1e400", b"-1e999", b"ovf", b"OVF", b"err", b"ERROR"),

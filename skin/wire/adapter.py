@@ -18,16 +18,18 @@ from skin.core.safe_loading import load_yaml
 from skin.core.settings import check_settings
 from skin.device.resampling import FrameError
 from skin.errors import InputError
-from skin.wire.columns import Columns, cycles, find_roles, resolve
 from skin.wire.formats import (
     DetectedFormat,
     FieldFormat,
     Roles,
     RowsFormat,
     SensorCountError,
+    cycles,
     detect_binary,
+    find_roles,
     fixed_length,
     protocol_roles,
+    resolve,
     split_at,
 )
 from skin.wire.lines import (
@@ -311,7 +313,7 @@ class Adapter:
 
     def _columns(
         self, rows: Sequence[Line], reader: Reader, sensors: int | None, *index: int
-    ) -> Columns | int | None:
+    ) -> Roles | int | None:
         """Return the roles of the fields of lines; None: a word stands in a field that is not dropped."""
         names = reader.names(len(rows[0].fields))
         dropped = [*resolve(self.drop, names, len(rows[0].fields)), *index]
@@ -345,7 +347,7 @@ class Adapter:
             if run and (len(run[-1].fields), run[-1].check) != (len(read.fields), read.check):
                 run = []
             run = [*run[1 - _RUN :], read]
-            found: Columns | Roles | int | None = None
+            found: Roles | int | None = None
             if layout.plain:
                 found = protocol_roles(run[-8:], sensors, header and header.n)
             elif len(run) == _RUN:
@@ -353,9 +355,7 @@ class Adapter:
             if isinstance(found, int):
                 count_seen = found
             elif found is not None:
-                roles, unit, summary = found if isinstance(found, Columns) else (found, None, "")
-                detected = replace(layout, roles=roles, check=read.check)
-                return DetectedFormat(detected, None, header, unit, summary)
+                return DetectedFormat(replace(layout, roles=found, check=read.check), None, header)
         return DetectedFormat(count_seen=count_seen, header=header)
 
     def _detect_rows(
@@ -379,11 +379,10 @@ class Adapter:
         columns = self._columns(starts, layout.reader, None, *([] if index is None else [index]))
         if columns is None or isinstance(columns, int):
             return DetectedFormat(count_seen=columns)
-        total = count * columns.roles.sensors
+        total = count * columns.sensors
         if sensors not in (None, total):
             return DetectedFormat(count_seen=total)
-        detected = RowsFormat(replace(layout, roles=columns.roles), count, index, first)
-        return DetectedFormat(detected, None, None, columns.unit, columns.summary)
+        return DetectedFormat(RowsFormat(replace(layout, roles=columns), count, index, first))
 
     def _find_index(self, rows: Sequence[Line], reader: Reader) -> int | None:
         """Return the field that numbers the rows; None if there is none."""

@@ -10,7 +10,7 @@ import numpy as np
 
 from skin.wire.adapter import Adapter, is_text, read_adapter
 from skin.wire.clocks import UNITS
-from skin.wire.columns import counts, runs
+from skin.wire.formats import counts, runs
 
 SAME = 0.98
 """Part of the bytes or characters that repeat from frame to frame; others are damaged."""

@@ -6,7 +6,6 @@ import socket
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
 from dataclasses import dataclass
 from itertools import count, islice
 from pathlib import Path
@@ -217,26 +216,25 @@ class _Pty(AbstractPort):
                 "this system has no pseudo-terminals: add port=tcp:5555, and read it with "
                 "device.port=socket://127.0.0.1:5555"
             ) from error
-        if self._link and self._link.exists():
-            used = f"leads to {self._link.resolve()}, which is in use: end the other skin emulate, or"
-            what = used if self._link.is_symlink() else "would replace a file:"
-            raise InputError(f"link={self._link} {what} give another name")
         with self._lock:
             self._master, slave = os.openpty()
             tty.setraw(slave)
             os.set_blocking(self._master, False)
-            self._name = os.ttyname(slave)
+            name = os.ttyname(slave)
             # Opened and closed once, it signals when a reader opens it.
             os.close(slave)
-        self.address = self._name if self._link is None else str(self._link)
-        if self._link is not None:
-            partial = self._link.with_name(self._link.name + ".part")
-            try:
-                partial.unlink(missing_ok=True)
-                partial.symlink_to(self._name)
-                partial.replace(self._link)
-            except OSError as error:
-                raise InputError(f"cannot make link={self._link}: {error}") from error
+        self.address = str(self._link or name)
+        if self._link is None:
+            return
+        try:
+            if self._link.is_symlink() and not self._link.exists():  # left by an emulator that was killed
+                self._link.unlink()
+            self._link.symlink_to(name)
+        except OSError as error:
+            raise InputError(
+                f"cannot make link={self._link}, which may be in use: {error.strerror}; end the other skin "
+                "emulate, or give another name"
+            ) from error
 
     def connected(self) -> bool:
         with self._lock:
@@ -249,8 +247,8 @@ class _Pty(AbstractPort):
     def unplug(self) -> None:
         with self._lock:
             if self._master >= 0:
-                if self._link and self._link.is_symlink() and os.readlink(self._link) == self._name:
-                    self._link.unlink()
+                if self._link:
+                    self._link.unlink(missing_ok=True)
                 os.close(self._master)
                 self._master = -1
 
@@ -277,13 +275,18 @@ class _Tcp(AbstractPort):
 
     def connected(self) -> bool:
         with self._lock:
-            if self._client is not None and self._left(self._client):
-                self._client.close()
-                self._client = None
-            if self._client is None:
-                with suppress(OSError):  # no reader, or unplugged
+            try:
+                if self._client is None:
                     self._client, _ = self._server.accept()
                     self._client.setblocking(False)
+                elif not self._client.recv(4096):
+                    raise ConnectionResetError
+            except BlockingIOError:  # nobody connects, or nothing was sent to the skin
+                pass
+            except OSError:  # the reader has left, or the port is unplugged
+                if self._client is not None:
+                    self._client.close()
+                self._client = None
             return self._client is not None
 
     def unplug(self) -> None:
@@ -291,15 +294,6 @@ class _Tcp(AbstractPort):
             for end in filter(None, (self._client, self._server)):
                 end.close()
             self._client = None
-
-    @staticmethod
-    def _left(client: socket.socket) -> bool:
-        try:
-            return not client.recv(4096)
-        except BlockingIOError:
-            return False
-        except OSError:
-            return True
 
     def _send(self, data: bytes) -> int:
         return self._client.send(data) if self._client else len(data)

@@ -51,7 +51,7 @@ def test_every_frame_of_the_sketch_is_read(said):
     assert [frame.seq for frame in frames] == list(range(1200))
     assert decoder.frame_format.check == "crc16"
     assert decoder.header == Header(1, 6, 100.0, "adc", 10, "uno")
-    assert decoder.stats.bad.total() + decoder.stats.gaps + decoder.stats.resets == 0
+    assert decoder.stats.bad.total() + decoder.stats.lost + decoder.stats.resets == 0
     values = np.stack([frame.values for frame in frames])
     assert values[:, 5] - values[:, 0] == pytest.approx(500, abs=97)
     steps = np.diff([frame.t for frame in frames])

@@ -7,9 +7,8 @@ import pytest
 
 from skin.device.resampling import FrameError
 from skin.wire.decoder import Decoder
-from skin.wire.monitor import PortMonitor
 from skin.wire.protocol import crc16, encode_frame
-from skin.wire.skin import open_skin
+from skin.wire.skin import PortMonitor, open_skin
 from tests.wire.memory import parse_line
 
 WORDS = [

@@ -411,60 +411,46 @@ class SerialSource:
         check_sensitivity(conversion, self.settings.sensitivity)
         return conversion
 
-    def warm_up(self, skin: Skin, notify: Callable[[str], None]) -> tuple[list[Frame], UnitConversion]:
+    def warm_up(
+        self, skin: Skin, notify: Callable[[str], None], minimum: float = 1.0
+    ) -> tuple[list[Frame], UnitConversion]:
         """Read frames until rate, conversion and device are known; return all of them, and the conversion.
+
+        Args:
+            skin: just opened.
+            notify: called with each message for the user.
+            minimum: s over which the rate is measured.
 
         Raises:
             InputError: no frames arrive, the device is too slow, or the scale is unknown.
             SkinTouched: the skin was still touched after a minute.
         """
-        try:
-            frames, conversion = warm_up(skin, self.tare(skin), self._rate, self.settings.tare, notify)
-            known = self.settings.frames.kind != "protocol"  # other formats have no header
-            while skin.header is None and not known and frames[-1].t_host - frames[0].t_host < HEADER:
+        tare, frames, measured = self.tare(skin), list[Frame](), False
+        minimum = max(self.settings.tare, minimum)
+        # Other formats than our protocol have no header.
+        patience = HEADER if self.settings.frames.kind == "protocol" else 0.0
+        notify("reading the untouched skin: keep off" if self.settings.tare else "reading the rate")
+        while True:
+            try:
                 frames += skin.read(1)
-            return frames, conversion
-        except (SkinTimeout, SkinDisconnected) as error:
-            raise InputError(f"{self.settings.port}: {error}") from error
-
-
-def warm_up(
-    skin: Skin, tare: Tare, rate: float, seconds: float, notify: Callable[[str], None], minimum: float = 1.0
-) -> tuple[list[Frame], UnitConversion]:
-    """Read frames until rate and conversion are known; return all frames read, and the conversion.
-
-    Args:
-        skin: just opened.
-        tare: gets every frame.
-        rate: of the model, Hz: a slower device is refused.
-        seconds: of the tare.
-        notify: called with each message for the user.
-        minimum: s over which the rate is measured.
-
-    Raises:
-        InputError: the device is too slow, or the scale is unknown.
-        SkinTouched: the skin was still touched after a minute.
-    """
-    notify("reading the untouched skin: keep off" if seconds else "reading the rate")
-    frames, minimum, measured = list[Frame](), max(seconds, minimum), False
-    while True:
-        frames += skin.read(1)
-        if frames[-1].segment != frames[0].segment:
-            del frames[:-1]
-        tare.add(frames[-1])
-        passed = frames[-1].t - frames[0].t
-        if len(frames) < 3 or passed < minimum:
-            continue
-        if not measured:
-            # By the device's clock, with lost frames.
-            check_rate((len(frames) - 1 + sum(frame.lost for frame in frames[1:])) / passed, rate)
-        if tare.conversion is not None:
-            return frames, tare.conversion
-        if not measured and tare.state in ("touched", "limited"):
-            notify("the skin is touched: let go")
-        measured = True
-        if passed > minimum + PATIENCE:
-            raise SkinTouched(tare.status)
+            except (SkinTimeout, SkinDisconnected) as error:
+                raise InputError(f"{self.settings.port}: {error}") from error
+            if frames[-1].segment != frames[0].segment:
+                del frames[:-1]
+            tare.add(frames[-1])
+            passed = frames[-1].t - frames[0].t
+            if len(frames) < 3 or passed < minimum:
+                continue
+            if not measured:
+                # By the device's clock, with lost frames.
+                check_rate((len(frames) - 1 + sum(frame.lost for frame in frames[1:])) / passed, self._rate)
+            if tare.conversion is not None and (skin.header is not None or passed >= patience):
+                return frames, tare.conversion
+            if not measured and tare.state in ("touched", "limited"):
+                notify("the skin is touched: let go")
+            measured = True
+            if tare.conversion is None and passed > minimum + PATIENCE:
+                raise SkinTouched(tare.status)
 
 
 class PortMonitor:

@@ -2,7 +2,6 @@
 
 import os
 import time
-from threading import Thread
 
 import pytest
 
@@ -51,35 +50,6 @@ def test_it_knows_who_listens_and_is_heard(plugged):
         assert gone(stream)
     finally:
         stream.close()
-
-
-def test_writing_while_it_is_unplugged_and_plugged_in(plugged):
-    """One thread writes, with a full buffer most of the time; another unplugs and plugs in."""
-    failures = []
-
-    def write():
-        try:
-            while not done:
-                plugged.write(bytes(1 << 16))
-        except BaseException as error:
-            failures.append(error)
-
-    done = []
-    writing = Thread(target=write)
-    writing.start()
-    try:
-        for _ in range(100):
-            stream = open_stream(plugged.address, 115200)
-            hear(stream, 1)
-            plugged.unplug()
-            stream.close()
-            plugged.plug()
-    finally:
-        done.append(True)
-        plugged.unplug()
-        writing.join(20)
-    assert not failures
-    assert not writing.is_alive()
 
 
 @pytest.fixture

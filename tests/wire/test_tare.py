@@ -8,7 +8,8 @@ from skin.device.resampling import Frame
 from skin.errors import InputError
 from skin.wire.channels import unit_conversion
 from skin.wire.protocol import Header
-from skin.wire.skin import warm_up
+from skin.wire.reader import Port
+from skin.wire.skin import SerialSource
 from skin.wire.tare import SkinTouched, Tare
 
 REST = np.array([512.0, 300.0, 40.0])
@@ -123,7 +124,7 @@ class Played:
             Frame(n, n / rate, n / rate, row, np.ones(2, dtype=bool), segment=int(segment))
             for n, (row, segment) in enumerate(zip(values, segments, strict=True))
         ]
-        self.taken = 0
+        self.taken, self.header = 0, Header()
 
     def read(self, count):
         self.taken += count
@@ -132,9 +133,9 @@ class Played:
 
 def settled(played, seconds, said=None):
     """Return the frames that settling took, and the baseline."""
-    tare = Tare(lambda baseline, header: unit_conversion(2, baseline, 1.0, None, header), seconds, RATE)
+    source = SerialSource(Port(scale=1.0, tare=seconds), 2, RATE)
     tell = (lambda _: None) if said is None else said.append
-    frames, conversion = warm_up(played, tare, RATE, seconds, tell)
+    frames, conversion = source.warm_up(played, tell)
     return frames, conversion.zero
 
 

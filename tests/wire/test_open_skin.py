@@ -104,50 +104,6 @@ def test_iterating():
         assert (numbers(islice(skin, 5)), skin.header.id) == ([0, 1, 2, 3, 4], "arm-L")
 
 
-BAUD = b"\x00\xff503,50", b"4*1F\nets Jun  8 2016\r\nrst:0x1 (POWERON)\r\n\xff\xfe\x00\n"
-
-
-@pytest.mark.parametrize(
-    ("pieces", "found", "counts"),
-    [
-        ((*BAUD, lines(*range(5))), [(n, 0, "", 0) for n in range(5)], {"skipped": 4, "bad_frames": 0}),
-        ((lines(0, 1, 2, 3, 7, 8),), [(3, 0, "", 0), (7, 3, "gap", 0), (8, 0, "", 0)], {"lost": 3}),
-        (
-            (lines(700, 701, 702), b"booted\n", lines(0, 1)),
-            [(702, 0, "", 0), (0, 0, "reset", 1), (1, 0, "", 1)],
-            {"resets": 1},
-        ),
-    ],
-)
-def test_frames_are_placed_and_counted(pieces, found, counts):
-    """What comes when a port is opened is skipped; a gap is flagged, not filled; a restart is a segment."""
-    with opened(*pieces) as skin:
-        frames = skin.read(sum(piece.count(b"*") for piece in pieces) - (BAUD[1] in pieces), timeout=PATIENT)
-        stats = skin.stats
-    said = [(frame.seq, frame.lost, frame.after, frame.segment) for frame in frames]
-    assert said[-len(found) :] == found
-    assert {name: getattr(stats, name) for name in counts} == counts
-
-
-@pytest.mark.parametrize(
-    ("damaged", "reason"),
-    [
-        (b"5,50000,1,2,3\n", "fields"),
-        (b"5,50000,one,two,three,4\n", "number"),
-        (b"5,nan,1,2,3,4\n", "number"),
-        (line(5).replace(b"501", b"511"), "checksum"),
-        (b"9" * 70_000 + b"\n", "long"),
-    ],
-)
-def test_a_bad_line_costs_itself_only(damaged, reason):
-    # Where every line has a checksum, one without is bad for that.
-    check = "crc16" if reason == "checksum" else "none"
-    with opened(lines(*range(5), check=check), damaged, lines(6, 7, check=check)) as skin:
-        frames = skin.read(7 if check == "crc16" else 6, timeout=PATIENT)
-        assert (numbers(frames[-3:]), frames[-2].lost) == ([4, 6, 7], 1)
-        assert skin.stats.bad == {reason: 1}
-
-
 def test_bad_lines_are_logged_once_a_second_with_their_reason(caplog):
     caplog.set_level(logging.WARNING, "skin.wire")
     feed = WireFeed(Sent, Decoder(4))

@@ -25,7 +25,6 @@ from skin.wire.formats import (
     RowsFormat,
     SensorCountError,
     cycles,
-    detect_binary,
     find_roles,
     fixed_length,
     protocol_roles,
@@ -33,6 +32,7 @@ from skin.wire.formats import (
     split_at,
 )
 from skin.wire.lines import (
+    CobsReader,
     JsonReader,
     NumberWords,
     PatternReader,
@@ -230,10 +230,7 @@ class Adapter:
             data: from the first byte on; an incomplete piece at the end is ignored.
             sensors: S, or None to detect it.
         """
-        protocol = self.kind == "protocol"
-        seen = detect_binary(data, sensors) if protocol else DetectedFormat()
-        if seen.frame_format:
-            return seen
+        protocol, seen = self.kind == "protocol", DetectedFormat()
         for layout in self.layouts(data):
             # Without a checksum, the first line may be half of one.
             pieces = layout.split(data)[0][layout.frame is None and not protocol :]
@@ -265,6 +262,9 @@ class Adapter:
         else:
             lines = [line for line in self._lines(data) if not (ignore and ignore.fullmatch(line))]
             plain = self.kind == "protocol"
+            if plain:
+                whole = re.compile(b".*", re.DOTALL)
+                yield FieldFormat(partial(split_at, b"\0"), CobsReader(), "binary", frame=whole, plain=True)
             cut = partial(split_at, self._delimiter(data))
             yield FieldFormat(cut, self._reader(lines), "text" if plain else self.kind, ignore, plain=plain)
 
@@ -336,20 +336,21 @@ class Adapter:
         self, layout: FieldFormat, pieces: Sequence[bytes], sensors: int | None
     ) -> DetectedFormat:
         header, count_seen, run = None, None, list[Line]()
+        binary = layout.plain and layout.frame is not None
         for piece in pieces:
             read = _numeric(layout, piece)
             if isinstance(read, bytes) and (read or not layout.plain):
                 header = parse_header(read) or header
                 continue
             if not isinstance(read, Line):
-                run = []
+                run = run if binary else []  # a CRC shows frames among noise
                 continue
             if run and (len(run[-1].fields), run[-1].check) != (len(read.fields), read.check):
                 run = []
             run = [*run[1 - _RUN :], read]
             found: Roles | int | None = None
             if layout.plain:
-                found = protocol_roles(run[-8:], sensors, header and header.n)
+                found = protocol_roles(run[-8:], sensors, header and header.n, binary)
             elif len(run) == _RUN:
                 found = self._columns(run, layout.reader, sensors)
             if isinstance(found, int):

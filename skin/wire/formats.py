@@ -15,7 +15,7 @@ from skin.device.resampling import Check, FrameError
 from skin.errors import InputError
 from skin.wire.clocks import UNITS
 from skin.wire.lines import Reader
-from skin.wire.protocol import Header, Line, RawFrame, decode_frame, frames_ahead
+from skin.wire.protocol import Header, Line, RawFrame, frames_ahead
 
 
 @dataclass(frozen=True)
@@ -135,8 +135,8 @@ class FieldFormat:
         reader: of the fields of a piece.
         name: word for the user.
         ignore: regular expression of the lines that are no frames.
-        frame: regular expression of a frame of a fixed length; None: pieces are lines.
-        plain: the lines are those of our protocol, in which no byte is left out.
+        frame: regular expression of a frame of bytes; None: pieces are lines.
+        plain: the frames are those of our protocol, in which no byte is left out.
         roles: of the fields; None: not known yet.
         check: kind of checksum.
     """
@@ -164,7 +164,7 @@ class FieldFormat:
         elif not self.frame.fullmatch(piece):
             raise FrameError("structure")
         read = self.reader(piece)
-        if self.roles is None:
+        if isinstance(read, bytes) or self.roles is None:
             return read
         if read.check != self.check:
             raise FrameError("checksum")
@@ -224,30 +224,7 @@ class RowsFormat:
         return RawFrame(frames[0].seq, frames[0].ticks, values, all(frame.finite for frame in frames))
 
 
-@dataclass(frozen=True)
-class BinaryFormat:
-    """COBS frames of our protocol."""
-
-    sensors: int
-    name: ClassVar[str] = "binary"
-    check: ClassVar[Check] = "crc16"
-    roles: ClassVar[Roles | None] = None
-
-    def split(self, data: bytes) -> tuple[list[bytes], bytes]:
-        """Return what stands between zeros, and what is left."""
-        return split_at(b"\0", data)
-
-    def read(self, piece: bytes) -> RawFrame | bytes:
-        """Return the frame between two zeros, or the text of a comment; else raise FrameError."""
-        frame = decode_frame(piece) if piece else b""
-        if isinstance(frame, bytes):
-            return frame
-        if len(frame.values) != self.sensors:
-            raise FrameError("fields", len(frame.values))
-        return frame
-
-
-FrameFormat = FieldFormat | RowsFormat | BinaryFormat
+FrameFormat = FieldFormat | RowsFormat
 """Cuts bytes into pieces, and reads the frames that end with them."""
 
 
@@ -265,39 +242,31 @@ class DetectedFormat(NamedTuple):
     header: Header | None = None
 
 
-def detect_binary(data: bytes, sensors: int | None, frames: int = 2) -> DetectedFormat:
-    """Return the binary format of our protocol, if ``frames`` of one size with a correct CRC show it.
+def protocol_roles(
+    run: Sequence[Line], sensors: int | None, n: int | None, binary: bool
+) -> Roles | int | None:
+    """Return the fields of our protocol: seq and t_us before the values, or the values alone.
+
+    Two binary frames, whose CRC is right, show S. Three lines show one of S sensors; noise may count by
+    chance, so eight are needed where S is unknown.
 
     Args:
-        data: from the first byte on; an incomplete piece at the end is ignored.
-        sensors: S, or None to detect it.
-        frames: to be seen.
-    """
-    counts = list[int]()
-    for piece in data.split(b"\0")[:-1]:
-        with suppress(FrameError):
-            if isinstance(frame := decode_frame(piece), RawFrame):
-                counts.append(len(frame.values))
-    often = [count for count in counts if counts.count(count) >= frames and sensors in (None, count)]
-    return DetectedFormat(BinaryFormat(often[0]) if often else None, counts[-1] if counts else None)
-
-
-def protocol_roles(run: Sequence[Line], sensors: int | None, n: int | None) -> Roles | int | None:
-    """Return the fields of lines of our protocol: seq and t_us before the values, or the values alone.
-
-    Three lines show one of S sensors; noise may count by chance, so eight are needed where S is unknown.
-
-    Args:
-        run: lines alike; the last eight.
+        run: frames alike; the last eight.
         sensors: S, or None to detect it.
         n: number of sensors of the header, or None.
+        binary: they are binary frames.
 
     Returns:
         the roles; None: more lines are needed; a number: that of the values of lines of another number.
     """
+    count, expected = len(run[-1].fields), sensors or n
+    if binary and (sensors not in (None, count - 2) or count < 3):
+        return count - 2
+    if binary and len(run) > 1:
+        return Roles(count, tuple(range(2, count)), 0, 1)
     if len(run) < 3:
         return None
-    count, expected, counted = len(run[-1].fields), sensors or n, _count(run[-3:])
+    counted = _count(run[-3:])
     if not (count == expected or (counted and count - 2 == expected)):
         if sensors is not None or len(run) < 8:
             return count - 2 * counted

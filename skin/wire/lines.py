@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from skin.device.resampling import FrameError
-from skin.wire.protocol import Line, parse_words, split_words, verify_line
+from skin.wire.protocol import Line, decode_frame, parse_words, split_words, verify_line
 
 _DAYTIME = re.compile(rb"(?:\d{4}-\d\d-\d\d[T ])?(\d{1,2}):(\d\d):(\d\d(?:\.\d+)?)")
 _HEX = re.compile(rb"(?i)(?:0x)?[0-9a-f]+")
@@ -240,8 +240,20 @@ class StructReader:
         return [name for name, size in sizes.items() for _ in range(size)] * self.repeat
 
 
-Reader = SeparatedReader | PatternReader | JsonReader | StructReader
-"""Returns the :class:`skin.wire.protocol.Line` of a piece, or raises FrameError."""
+class CobsReader:
+    """Binary frames of our protocol, and comments between them."""
+
+    def __call__(self, piece: bytes) -> Line | bytes:
+        """Return number, clock and values of a frame; or the text of a comment."""
+        return decode_frame(piece) if piece else b""
+
+    def names(self, count: int) -> Sequence[str]:
+        """Return no names."""
+        return ()
+
+
+Reader = CobsReader | SeparatedReader | PatternReader | JsonReader | StructReader
+"""Returns the :class:`skin.wire.protocol.Line` of a piece, or bytes of a comment, or raises FrameError."""
 
 
 def label_pattern(label: str) -> str:

@@ -149,7 +149,7 @@ def parse_words(
         over: those that it sends beyond the range of the converter.
     """
     try:
-        fields = [float(word) for word in words]
+        fields = [nan] if b"_" in b"".join(words) else [float(word) for word in words]
     except ValueError:
         fields = [nan]
     finite, strange = all(map(isfinite, fields)), dict[int, bytes]()
@@ -158,7 +158,7 @@ def parse_words(
         for position, word in enumerate(words):
             text = word.strip().lower()
             try:
-                value = float(text)
+                value = float(text.replace(b"_", b"x"))  # valid in Python's grammar only
             except ValueError:
                 value = inf if text in over else nan
                 if text not in over and text not in invalid:
@@ -166,9 +166,7 @@ def parse_words(
             else:
                 value = value if isfinite(value) else nan
             fields.append(value)
-    if b"_" in b"".join(words):  # valid in Python's grammar only
-        strange |= {position: word for position, word in enumerate(words) if b"_" in word}
-    return Line(fields, check, finite and not strange, strange)
+    return Line(fields, check, finite, strange)
 
 
 def split_words(body: bytes, marks: Sequence[bytes] = SEPARATORS, trailing: bool = True) -> list[bytes]:
@@ -284,8 +282,8 @@ def encode_frame(values: Sequence[float] | np.ndarray, seq: int, t_us: int, kind
     return stuff(body + _TAIL.pack(crc16(body))) + b"\0"
 
 
-def decode_frame(data: bytes) -> RawFrame | bytes:
-    """Decode the bytes between two zeros: a frame, or the text of a comment.
+def decode_frame(data: bytes) -> Line | bytes:
+    """Decode the bytes between two zeros: number, clock and values of a frame, or the text of a comment.
 
     Raises:
         FrameError: ``structure`` (no COBS, too short, unknown type), ``checksum`` or ``fields``.
@@ -303,8 +301,8 @@ def decode_frame(data: bytes) -> RawFrame | bytes:
     kind = _TYPE[number]
     if len(body) != _HEAD.size + count * kind.itemsize + _TAIL.size:
         raise FrameError("fields", (len(body) - _HEAD.size - _TAIL.size) // kind.itemsize)
-    values = np.frombuffer(body, kind, count, _HEAD.size).astype(np.float64)
-    return RawFrame(seq, t_us, values, bool(np.isfinite(values).all()))
+    values = np.frombuffer(body, kind, count, _HEAD.size)
+    return Line([seq, t_us, *values.tolist()], "crc16", bool(np.isfinite(values).all()))
 
 
 def encode_comment(text: bytes) -> bytes:

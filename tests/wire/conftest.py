@@ -3,7 +3,6 @@
 import os
 from collections.abc import Callable, Sequence
 from contextlib import contextmanager, suppress
-from itertools import count
 from threading import Event, Thread
 from time import monotonic
 
@@ -34,27 +33,6 @@ class Plug:
             self._open = False
             os.close(self.master)
             os.close(self.slave)
-
-    @contextmanager
-    def streaming(self, encode: Callable[[int], bytes], pause: float):
-        """Send ``encode(0)``, ``encode(1)``, ... in the background, with a pause in s behind each."""
-        stop = Event()
-
-        def run() -> None:
-            with suppress(OSError):
-                for number in count():
-                    if stop.wait(pause):
-                        return
-                    self.send(encode(number))
-
-        thread = Thread(target=run, daemon=True)
-        thread.start()
-        try:
-            yield
-        finally:
-            stop.set()
-            self.unplug()
-            thread.join(5)
 
     @contextmanager
     def sending(self, values: Callable[[int], Sequence[float]], rate: float = 200.0, restart: int = 2**32):

@@ -46,7 +46,8 @@ def opened(*pieces, layout=4, end=False, **settings):
 
 def parse_line(line):
     """Return the numbers of a line of our protocol; FrameError if it holds anything else."""
-    read = next(Adapter().layouts(3 * (line + b"\n"))).reader(line)
+    *_, layout = Adapter().layouts(3 * (line + b"\n"))
+    read = layout.reader(line)
     if read.strange:
         raise FrameError("number")
     return read

@@ -127,6 +127,7 @@ def test_two_seconds_of_receiving_are_enough_but_a_slow_start_is_none():
         (b"nan,3000,1,2,3,4\n", "number"),
         (b"-3,3000,1,2,3,4\n", "number"),
         (b"3.5,3000,1,2,3,4\n", "number"),
+        (b"3_0,3000,1,2,3,4\n", "number"),
         (b"3,3000,1,2,3,4*0000\n", "checksum"),
         (b"3" * 70000 + b"\n", "long"),
     ],

@@ -32,6 +32,8 @@ from skin.wire.formats import (
     split_at,
 )
 from skin.wire.lines import (
+    LABEL,
+    NUMBER,
     CobsReader,
     JsonReader,
     NumberWords,
@@ -39,9 +41,7 @@ from skin.wire.lines import (
     Reader,
     SeparatedReader,
     StructReader,
-    label_pattern,
     learn_keys,
-    number_pattern,
 )
 from skin.wire.protocol import INVALID, OVER, SEPARATORS, Line, parse_header, parse_words
 
@@ -295,8 +295,8 @@ class Adapter:
         bodies = [line.rpartition(b"*")[0 if b"*" in line else 2].rstrip(b" \r") for line in lines]
         ends = sum(body.endswith(tuple(marks)) for body in bodies)
         split = SeparatedReader(self._words, marks, self.names, 2 * ends > len(bodies))
-        pattern = self.pattern or (label_pattern(self.label) if self.label else None)
-        pattern = pattern or (number_pattern(self.number) if self.number else None)
+        pattern = self.pattern or (self.label and LABEL % re.escape(self.label))
+        pattern = pattern or (self.number and NUMBER % self.number)
         if pattern is None:
             return split
         named = PatternReader(re.compile(pattern.encode()), split)

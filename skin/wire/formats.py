@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
+from functools import cached_property
 from itertools import pairwise
 from math import inf, nan
 from typing import ClassVar, Literal, NamedTuple
@@ -47,10 +48,10 @@ class Roles:
         """S."""
         return len(self.values) // (3 if self.magnitude else 1)
 
-    def __post_init__(self) -> None:
+    @cached_property
+    def _take(self) -> slice | list[int]:
         first, last = self.values[0], self.values[-1] + 1
-        contiguous = self.values == tuple(range(first, last))
-        object.__setattr__(self, "_take", slice(first, last) if contiguous else list(self.values))
+        return slice(first, last) if self.values == tuple(range(first, last)) else list(self.values)
 
     def frame(self, line: Line) -> RawFrame:
         """Return the frame of a line with ``count`` fields.
@@ -68,7 +69,7 @@ class Roles:
             ticks is not None and not 0 <= ticks < inf
         ):
             raise FrameError("number")
-        values = np.array(fields, dtype=np.float64)[self._take]  # type: ignore[attr-defined]
+        values = np.array(fields, dtype=np.float64)[self._take]
         if not finite:
             strange = [word for position, word in line.strange.items() if position in self.values]
             words_alone = all(word.isalpha() or not word.strip(b"0123456789abcdefABCDEF") for word in strange)

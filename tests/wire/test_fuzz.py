@@ -19,7 +19,7 @@ from tests.wire.memory import parse_line
 quickly = settings(
     max_examples=60, deadline=None, derandomize=True, database=None, suppress_health_check=list(HealthCheck)
 )
-CHUNKS = int(os.environ.get("FUZZ_CHUNKS", 5000))  # 0.2 s; a million takes 40
+CHUNKS = int(os.environ.get("FUZZ_CHUNKS", 5000))
 ENCODERS = {"text": (encode_line, b"\n"), "binary": (encode_frame, b"\0")}
 
 

@@ -3,6 +3,7 @@
 import os
 from collections.abc import Callable, Sequence
 from contextlib import contextmanager, suppress
+from itertools import count
 from threading import Event, Thread
 from time import monotonic
 
@@ -35,18 +36,16 @@ class Plug:
             os.close(self.slave)
 
     @contextmanager
-    def sending(self, values: Callable[[int], Sequence[float]], rate: float = 200.0, restart: int = 2**32):
-        """Send frames in the background; the device starts anew after each ``restart`` frames."""
+    def streaming(self, encode: Callable[[int], bytes], pause: float):
+        """Send ``encode(0)``, ``encode(1)``, ... in the background, with a pause in s behind each."""
         stop = Event()
 
         def run() -> None:
-            number, start = 0, monotonic()
             with suppress(OSError):
-                while not stop.wait(1 / rate):
-                    if number == restart:
-                        number, start = 0, monotonic()
-                    self.send(encode_line(values(number), number, round((monotonic() - start) * 1e6)))
-                    number += 1
+                for number in count():
+                    if stop.wait(pause):
+                        return
+                    self.send(encode(number))
 
         thread = Thread(target=run, daemon=True)
         thread.start()
@@ -54,7 +53,19 @@ class Plug:
             yield
         finally:
             stop.set()
+            self.unplug()
             thread.join(5)
+
+    def sending(self, values: Callable[[int], Sequence[float]], rate: float = 200.0, restart: int = 2**32):
+        """Send frames in the background; the device starts anew after each ``restart`` frames."""
+        starts = [monotonic()]
+
+        def encode(number: int) -> bytes:
+            if number % restart == 0:
+                starts[0] = monotonic()
+            return encode_line(values(number), number % restart, round((monotonic() - starts[0]) * 1e6))
+
+        return self.streaming(encode, 1 / rate)
 
 
 @pytest.fixture

@@ -32,7 +32,7 @@ def main(config: Config, weight: float | None, base: float | None, seconds: Anno
     model = build_skin(config).simulator(device.body, device.sensors)
     expected = load.force * base_readings(model, device.body, device.sensors, load.base)
     try:
-        with device.wire.open()[0] as skin:
+        with device.wire.open() as skin:
             first, conversion = device.wire.warm_up(skin, notify)
             notify(
                 f"put {load.weight:g} kg on {min(3, len(expected))} sensors in turn, far from each other and "

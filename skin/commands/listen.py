@@ -32,9 +32,8 @@ def main(config: Config, n: int | None, seconds: float | None, adapter: Any) -> 
         )
 
     from skin.wire.formats import SensorCountError
-    from skin.wire.monitor import PortMonitor
     from skin.wire.reader import Port, SkinDisconnected, SkinTimeout
-    from skin.wire.skin import open_skin
+    from skin.wire.skin import PortMonitor, open_skin
 
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     settings = Port.select(device)

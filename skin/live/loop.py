@@ -373,7 +373,7 @@ class LiveLoop:
         if now - self._updated_at >= self._status:
             self._updated_at = now
             self._display.line = self.line
-            if not self._skin.stats.clock_trusted:
+            if not self._skin.stats.timing.trusted:
                 self._display.add_note(Note("clock", detail=self._skin.stats.clock))
 
     def _wait(self, reason: str) -> None:

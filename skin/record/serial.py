@@ -2,6 +2,7 @@
 
 import logging
 import sys
+from collections import deque
 from collections.abc import Callable, Collection, Mapping, Sequence
 from datetime import UTC, datetime
 from itertools import chain
@@ -26,12 +27,11 @@ from skin.record.session import FORMAT, SessionLog, StoredSession, Taken, check_
 from skin.touch.labels import TOUCH, TOUCH_OR_NOT
 from skin.touch.paths import TouchSettings, model_window
 from skin.wire.channels import UnitConversion
-from skin.wire.protocol import Header
+from skin.wire.protocol import Announcement, Header
 from skin.wire.reader import Port, SkinDisconnected, SkinTimeout
 from skin.wire.segmentation import (
     AbstractSegmenter,
     AnnouncedSegmenter,
-    AnnouncementListener,
     ContinuousSegmenter,
     PromptedSegmenter,
     label_plan,
@@ -149,7 +149,7 @@ class Serial(AbstractDevice):
 
     def segmenter(
         self,
-        listener: AnnouncementListener,
+        announcements: deque[Announcement],
         conversion: UnitConversion,
         first: Sequence[Frame],
         done: Collection[int] = (),
@@ -157,7 +157,7 @@ class Serial(AbstractDevice):
         """Return the segmenter of a stream that ``labels`` selects.
 
         Args:
-            listener: collects announcements.
+            announcements: of the skin, that have not been used yet.
             conversion: of the values to N.
             first: frames read before.
             done: numbers of gestures that are already recorded.
@@ -166,7 +166,7 @@ class Serial(AbstractDevice):
         for frame in first:
             window.add(frame)
         if self.labels == "announced":
-            return AnnouncedSegmenter(window, listener, self.task)
+            return AnnouncedSegmenter(window, announcements, self.task)
         if self.labels == "none":
             valid = np.ones(len(self.sensors), dtype=bool)
             return ContinuousSegmenter(
@@ -220,7 +220,7 @@ def record_session(
         InputError: another process records to the folder, or it cannot be written; its content is kept.
     """
     with locked(path):
-        skin, listener = device.wire.open(reconnect)
+        skin = device.wire.open(reconnect)
         with skin:
             first, conversion = device.wire.warm_up(skin, notify)
             log = SessionLog(path, _describe(device, skin.header))
@@ -230,7 +230,7 @@ def record_session(
             begin = log.frames[0][0]
             if log.done:
                 notify(f"{path} has {len(log.done)} gestures: going on")
-            segmenter = device.segmenter(listener, conversion, first, log.done)
+            segmenter = device.segmenter(skin.announcements, conversion, first, log.done)
             if free:
                 segmenter = ContinuousSegmenter(segmenter.window, max(log.done, default=-1) + 1)
             number = None if free else device.gestures

@@ -18,30 +18,32 @@ from skin.core.safe_loading import load_yaml
 from skin.core.settings import check_settings
 from skin.device.resampling import FrameError
 from skin.errors import InputError
-from skin.wire.columns import Columns, cycles, find_roles, resolve
 from skin.wire.formats import (
     DetectedFormat,
     FieldFormat,
     Roles,
     RowsFormat,
     SensorCountError,
-    detect_binary,
+    cycles,
+    find_roles,
     fixed_length,
     protocol_roles,
+    resolve,
     split_at,
 )
 from skin.wire.lines import (
+    LABEL,
+    NUMBER,
+    CobsReader,
     JsonReader,
     NumberWords,
     PatternReader,
     Reader,
     SeparatedReader,
     StructReader,
-    label_pattern,
     learn_keys,
-    number_pattern,
 )
-from skin.wire.protocol import INVALID, OVER, SEPARATORS, Format, Line, parse_header, parse_words
+from skin.wire.protocol import INVALID, OVER, SEPARATORS, Line, parse_header, parse_words
 
 _RUN = 12  # frames alike that show a format: that noise rises as often by chance is improbable
 
@@ -53,7 +55,6 @@ class Adapter:
     Attributes:
         kind: ``protocol`` (ours, docs/hardware.md), ``text``, ``json`` (one value per line), ``binary``, or
             ``auto``: to be proposed by ``skin listen``.
-        format: of our protocol: ``auto``, ``text`` or ``binary``.
         separator: text between fields; None: comma, semicolon, tab or blanks.
         decimal: ``.`` or ``,``.
         thousands: sign between groups of three digits.
@@ -89,7 +90,6 @@ class Adapter:
     """
 
     kind: Literal["protocol", "text", "json", "binary", "auto"] = "protocol"
-    format: Format = "auto"
     separator: str | None = None
     decimal: Literal[".", ","] = "."
     thousands: str = ""
@@ -231,10 +231,6 @@ class Adapter:
             sensors: S, or None to detect it.
         """
         protocol, seen = self.kind == "protocol", DetectedFormat()
-        if protocol and self.format != "text":
-            seen = detect_binary(data, sensors)
-        if seen.frame_format or (protocol and self.format == "binary"):
-            return seen
         for layout in self.layouts(data):
             # Without a checksum, the first line may be half of one.
             pieces = layout.split(data)[0][layout.frame is None and not protocol :]
@@ -266,6 +262,9 @@ class Adapter:
         else:
             lines = [line for line in self._lines(data) if not (ignore and ignore.fullmatch(line))]
             plain = self.kind == "protocol"
+            if plain:
+                whole = re.compile(b".*", re.DOTALL)
+                yield FieldFormat(partial(split_at, b"\0"), CobsReader(), "binary", frame=whole, plain=True)
             cut = partial(split_at, self._delimiter(data))
             yield FieldFormat(cut, self._reader(lines), "text" if plain else self.kind, ignore, plain=plain)
 
@@ -296,8 +295,8 @@ class Adapter:
         bodies = [line.rpartition(b"*")[0 if b"*" in line else 2].rstrip(b" \r") for line in lines]
         ends = sum(body.endswith(tuple(marks)) for body in bodies)
         split = SeparatedReader(self._words, marks, self.names, 2 * ends > len(bodies))
-        pattern = self.pattern or (label_pattern(self.label) if self.label else None)
-        pattern = pattern or (number_pattern(self.number) if self.number else None)
+        pattern = self.pattern or (self.label and LABEL % re.escape(self.label))
+        pattern = pattern or (self.number and NUMBER % self.number)
         if pattern is None:
             return split
         named = PatternReader(re.compile(pattern.encode()), split)
@@ -314,7 +313,7 @@ class Adapter:
 
     def _columns(
         self, rows: Sequence[Line], reader: Reader, sensors: int | None, *index: int
-    ) -> Columns | int | None:
+    ) -> Roles | int | None:
         """Return the roles of the fields of lines; None: a word stands in a field that is not dropped."""
         names = reader.names(len(rows[0].fields))
         dropped = [*resolve(self.drop, names, len(rows[0].fields)), *index]
@@ -337,28 +336,27 @@ class Adapter:
         self, layout: FieldFormat, pieces: Sequence[bytes], sensors: int | None
     ) -> DetectedFormat:
         header, count_seen, run = None, None, list[Line]()
+        binary = layout.plain and layout.frame is not None
         for piece in pieces:
             read = _numeric(layout, piece)
             if isinstance(read, bytes) and (read or not layout.plain):
                 header = parse_header(read) or header
                 continue
             if not isinstance(read, Line):
-                run = []
+                run = run if binary else []  # a CRC shows frames among noise
                 continue
             if run and (len(run[-1].fields), run[-1].check) != (len(read.fields), read.check):
                 run = []
             run = [*run[1 - _RUN :], read]
-            found: Columns | Roles | int | None = None
+            found: Roles | int | None = None
             if layout.plain:
-                found = protocol_roles(run[-8:], sensors, header and header.n)
+                found = protocol_roles(run[-8:], sensors, header and header.n, binary)
             elif len(run) == _RUN:
                 found = self._columns(run, layout.reader, sensors)
             if isinstance(found, int):
                 count_seen = found
             elif found is not None:
-                roles, unit, summary = found if isinstance(found, Columns) else (found, None, "")
-                detected = replace(layout, roles=roles, check=read.check)
-                return DetectedFormat(detected, None, header, unit, summary)
+                return DetectedFormat(replace(layout, roles=found, check=read.check), None, header)
         return DetectedFormat(count_seen=count_seen, header=header)
 
     def _detect_rows(
@@ -382,11 +380,10 @@ class Adapter:
         columns = self._columns(starts, layout.reader, None, *([] if index is None else [index]))
         if columns is None or isinstance(columns, int):
             return DetectedFormat(count_seen=columns)
-        total = count * columns.roles.sensors
+        total = count * columns.sensors
         if sensors not in (None, total):
             return DetectedFormat(count_seen=total)
-        detected = RowsFormat(replace(layout, roles=columns.roles), count, index, first)
-        return DetectedFormat(detected, None, None, columns.unit, columns.summary)
+        return DetectedFormat(RowsFormat(replace(layout, roles=columns), count, index, first))
 
     def _find_index(self, rows: Sequence[Line], reader: Reader) -> int | None:
         """Return the field that numbers the rows; None if there is none."""

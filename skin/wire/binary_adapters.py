@@ -8,9 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from skin.wire.adapter import Adapter, is_text, read_adapter
+from skin.wire.adapter import Adapter, is_text, read_adapter, try_fields
 from skin.wire.clocks import UNITS
-from skin.wire.columns import counts, runs
+from skin.wire.formats import counts, runs
+from skin.wire.protocol import Line
 
 SAME = 0.98
 """Part of the bytes or characters that repeat from frame to frame; others are damaged."""
@@ -63,8 +64,8 @@ def _chips(data: bytes) -> Iterator[Adapter]:
     """Yield the adapter of chips of which each sends four floats, the first its temperature."""
     chips = read_adapter("anyskin_binary")
     for layout in chips.layouts(data):
-        pieces = [piece for piece in layout.split(data)[0] if layout.frame and layout.frame.fullmatch(piece)]
-        table = np.array([layout.reader(piece).fields for piece in pieces])
+        reads = (try_fields(layout, piece) for piece in layout.split(data)[0])
+        table = np.array([read.fields for read in reads if isinstance(read, Line)])
         temperatures = np.median(table, axis=0)[::4]
         if len(temperatures) > 1 and np.ptp(temperatures) < 3 and (abs(temperatures - 30) < 20).all():
             yield chips

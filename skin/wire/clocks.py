@@ -145,8 +145,8 @@ class FrameClock:
         deliveries: int = 4,
         coarsest: float = 0.05,
         caught_up: float = 0.2,
-    ) -> bool:
-        """Return whether the device's clock stops being trusted with a delivery: its frames have been placed.
+    ) -> None:
+        """Stop trusting the device's clock if it and the host's disagree; after the frames of a delivery.
 
         Over the longer of a span and some deliveries it must advance by half to twice as much as the host's,
         and in fine steps if the frames are. What was buffered while host or bridge were suspended arrives at
@@ -165,18 +165,16 @@ class FrameClock:
         since, t, frames, steps = self._deliveries[0]
         passed = now - since
         if len(self._deliveries) <= deliveries or passed < span or not self.trusted:
-            return False
+            return
         advanced, steps = (self._t - t) / speed, self._steps - steps
         coarse = advanced > coarsest * steps and self._frames - frames >= 2 * steps
         if not coarse and passed / 2 <= advanced <= 2 * passed:
             self._doubtful_since = None
         elif self._doubtful_since is None:
             self._doubtful_since = now
-        if self._doubtful_since is None or now - self._doubtful_since < caught_up:
-            return False
-        self.trusted = False
-        self.cut("reset")
-        return True
+        if self._doubtful_since is not None and now - self._doubtful_since >= caught_up:
+            self.trusted = False
+            self.cut("reset")
 
     def _begin(self, ticks: float, now: float) -> FramePosition:
         after, self._after, self._wrapped, self._t = self._after, "", 0.0, ticks * self.unit

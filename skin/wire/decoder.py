@@ -1,7 +1,7 @@
 """Decode bytes into frames, without input or output, and count what goes wrong."""
 
 import re
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from math import inf
@@ -14,7 +14,7 @@ from skin.errors import InputError
 from skin.wire.adapter import Adapter
 from skin.wire.clocks import UNITS, FrameClock
 from skin.wire.formats import FrameFormat
-from skin.wire.protocol import Format, Header, RawFrame, parse_header
+from skin.wire.protocol import Announcement, Header, RawFrame, parse_announcement, parse_header
 
 Identity = Literal["known", "missing", "other", "changed"]
 """Of the device by its headers: known; none since it was connected again; another; another without that."""
@@ -29,22 +29,16 @@ class Stats:
         frames: good frames.
         bad: reason -> number of frames that could not be decoded.
         skipped: pieces before the first good frame of a connection: half a line, a banner, noise.
-        resyncs: good frames after bad ones.
-        gaps: interruptions by missing frames.
         lost: missing frames, according to frame numbers.
         resets: restarts of the device.
         invalid: values in good frames for which the device sent no number, such as ``nan`` or ``ovf``.
-        weak: frames accepted without a CRC, which may have wrong values.
         dropped: good frames dropped from a full queue.
         reconnects: reconnections.
         rate_hz: frames per second by the device's clock, Hz; 0 if unknown.
         format: ``text`` or ``binary``; empty if not known yet, or if the source sends no bytes.
         check: ``crc16``, ``xor`` or ``none``; empty likewise.
         ignored: kind of line, with # for its numbers -> number of those lines, which are no frames.
-        clock_unit: s per tick of the device's clock; 0 as long as nothing has shown it.
-        clock_witness: what showed it.
-        modulus: number at which the counter begins again; None: unknown.
-        clock_trusted: False: the host's clock is used instead.
+        timing: the device's clock and its counter.
         identity: whether the device is the one of the first header.
         header, other_header: the first header, and one that differs.
         bad_fraction: number of bad frames and of all in 2 s, reason of the latest bad one, and number of its
@@ -55,22 +49,16 @@ class Stats:
     frames: int = 0
     bad: Counter[str] = field(default_factory=Counter)
     skipped: int = 0
-    resyncs: int = 0
-    gaps: int = 0
     lost: int = 0
     resets: int = 0
     invalid: int = 0
-    weak: int = 0
     dropped: int = 0
     reconnects: int = 0
     rate_hz: float = 0.0
     format: str = ""
     check: str = ""
     ignored: Counter[str] = field(default_factory=Counter)
-    clock_unit: float = 0.0
-    clock_witness: Literal["", "rate", "host"] = ""
-    modulus: int | None = None
-    clock_trusted: bool = True
+    timing: FrameClock = field(default_factory=FrameClock, compare=False, repr=False)
     identity: Identity = "known"
     header: Header | None = None
     other_header: Header | None = None
@@ -84,14 +72,15 @@ class Stats:
     @property
     def clock(self) -> str:
         """What the device's clock and its counter were found to count; empty: as they should, or unknown."""
-        if not self.clock_trusted:
+        timing = self.timing
+        if not timing.trusted:
             return "the device's clock cannot be trusted: the host's is used"
-        if not self.clock_witness:
+        if not timing.witness:
             return ""
-        unit = next(name for name, unit in UNITS.items() if unit == self.clock_unit)
+        unit = next(name for name, unit in UNITS.items() if unit == timing.unit)
         rate = f"the header's rate={self.header.rate:g}" if self.header and self.header.rate else ""
-        witness = rate if self.clock_witness == "rate" else "the host's clock"
-        modulus = f", its counter wraps at {self.modulus}" if self.modulus else ""
+        witness = rate if timing.witness == "rate" else "the host's clock"
+        modulus = f", its counter wraps at {timing.modulus}" if timing.modulus else ""
         return f"the device's clock counts {unit}, by {witness}{modulus}"
 
     @property
@@ -132,7 +121,6 @@ class Decoder:
 
     Args:
         sensors: S; None: taken from the header or from eight lines.
-        format: ``auto``, ``text`` or ``binary``.
         channels: the device's channel, from 0, of every sensor; empty: frames keep the device's order.
         polarity: 1 or -1 per sensor, -1 where values fall with force; empty: 1 for all.
         adapter: describes the frames; None: our protocol.
@@ -140,23 +128,23 @@ class Decoder:
     Attributes:
         stats: numbers of frames and errors; kept by :meth:`restart`.
         frame_format: the format, once it is known.
+        announcements: of an emulated skin, since it was connected; the latest 64.
     """
 
     def __init__(
         self,
         sensors: int | None = None,
-        format: Format = "auto",
         channels: Sequence[int] = (),
         polarity: Sequence[int] = (),
         adapter: Adapter | None = None,
     ) -> None:
-        self.sensors, self.adapter = sensors, adapter or Adapter(format=format)
-        self.stats = Stats()
+        self.sensors, self.adapter = sensors, adapter or Adapter()
+        self.stats, self.announcements = Stats(), deque[Announcement](maxlen=64)
         self._compared_at: float | None = None
         self._good = self._bad = 0
         self._latest_bad = FrameError("")
         self._changed_at = inf  # s, when another header came on an open connection
-        self._clock = FrameClock(modulus=self.adapter.modulus)
+        self._clock = self.stats.timing = FrameClock(modulus=self.adapter.modulus)
         self._latest = np.zeros(sensors or 0)
         self._channels = np.array(channels) if len(channels) else None
         self._polarity = np.array(polarity, dtype=float) if min(polarity, default=1) < 0 else None
@@ -169,6 +157,7 @@ class Decoder:
 
     def _begin(self) -> None:
         self.frame_format: FrameFormat | None = None
+        self.announcements.clear()
         self.stats.format = self.stats.check = ""
         self._buffer = b""
         self._count_seen: int | None = None
@@ -181,7 +170,7 @@ class Decoder:
         self._begin()
         self._clock.restart(after)
         self.stats.identity, self._changed_at = "missing" if self.header else "known", inf
-        self.stats.bad_fraction, self.stats.clock_trusted = None, True
+        self.stats.bad_fraction = None
 
     def feed(self, data: bytes, now: float = 0.0) -> list[Frame]:
         """Return the frames that end in ``data``.
@@ -204,10 +193,8 @@ class Decoder:
         pieces, self._buffer = self.frame_format.split(self._buffer)
         good, bad = self.stats.frames, self.stats.bad_frames
         frames = [frame for piece in pieces if (frame := self._frame(piece, now))]
-        clock, stats = self._clock, self.stats
-        stats.clock_unit, stats.clock_witness, stats.modulus = clock.unit, clock.witness, clock.modulus
         if frames and self._clocked:
-            self.stats.clock_trusted = not self._clock.judge(now, (self.header and self.header.speed) or 1.0)
+            self._clock.judge(now, (self.header and self.header.speed) or 1.0)
         if len(self._buffer) > _LONGEST:
             self._buffer, self._overlong = b"", True
         self._compare(now, self.stats.frames - good, self.stats.bad_frames - bad)
@@ -249,8 +236,8 @@ class Decoder:
         self._update_header(detected.header)
         self.sensors = self.frame_format.sensors
         self.stats.format, self.stats.check = self.frame_format.name, self.frame_format.check
-        if detected.unit is not None:
-            self._clock.expect(detected.unit, self.adapter.time_unit is not None)
+        if (roles := self.frame_format.roles) and roles.unit is not None:
+            self._clock.expect(roles.unit, self.adapter.time_unit is not None)
         self._all_valid = np.ones(self.sensors, dtype=bool)
         self._all_valid.flags.writeable = False
         if len(self._latest) != self.sensors:
@@ -268,6 +255,7 @@ class Decoder:
             if isinstance(raw, bytes):
                 if raw.startswith(b"#"):
                     self._update_header(parse_header(raw))
+                    self.announcements.extend(filter(None, [parse_announcement(raw)]))
                 elif raw:
                     self.stats.ignored[kind_of_line(raw)] += 1
                 return None
@@ -303,11 +291,8 @@ class Decoder:
         self._clocked = raw.ticks is not None and clock.trusted
         t, t_host, segment, lost, after = clock.place(raw.seq, raw.ticks, now, self._missing, rate)
         stats.frames += 1
-        stats.resyncs += self._missing > 0
         stats.lost += lost
-        stats.gaps += after == "gap"
         stats.resets += after == "reset"
-        stats.weak += stats.check != "crc16"
         self._synchronous, self._missing = True, 0
         if self._channels is not None:
             raw = raw._replace(values=raw.values[self._channels])

@@ -6,11 +6,10 @@ import socket
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
 from dataclasses import dataclass
 from itertools import count, islice
 from pathlib import Path
-from threading import Event, RLock
+from threading import Event
 from time import monotonic, sleep
 from typing import Annotated
 
@@ -23,7 +22,6 @@ from skin.core.rng import Stream, generator
 from skin.device.base import AbstractSimulated
 from skin.device.resampling import Check
 from skin.errors import InputError
-from skin.wire.contact_lines import contact_lines, encode_contact_line
 from skin.wire.protocol import (
     EMULATED,
     Announcement,
@@ -139,17 +137,13 @@ def upsample(force: np.ndarray, model_rate: float, rate: float, ramp: float = 0.
 
 
 class AbstractPort(ABC):
-    """Base class of ports; one thread may write while another unplugs the port.
+    """Base class of ports, for one thread.
 
     Attributes:
         address: value for ``device.port``.
     """
 
     address: str
-
-    def __init__(self) -> None:
-        # Held by every method that uses or replaces what is open.
-        self._lock = RLock()
 
     @abstractmethod
     def connected(self) -> bool:
@@ -165,23 +159,18 @@ class AbstractPort(ABC):
 
     @abstractmethod
     def _send(self, data: bytes) -> int:
-        """Write part of ``data`` without waiting and return its length; the lock is held."""
+        """Write part of ``data`` without waiting and return its length."""
 
     def write(self, data: bytes, patience: float = 1.0) -> None:
         """Write; bytes that are not read within ``patience`` s are lost, as without flow control."""
         deadline = monotonic() + patience
-        while data and monotonic() < deadline:
-            with self._lock:
-                if not self.connected():
-                    return
-                try:
-                    data = data[self._send(data) :]
-                    continue
-                except BlockingIOError:
-                    pass
-                except OSError:
-                    return
-            sleep(0.002)  # until a full buffer is tried again
+        while data and monotonic() < deadline and self.connected():
+            try:
+                data = data[self._send(data) :]
+            except BlockingIOError:
+                sleep(0.002)  # until a full buffer is tried again
+            except OSError:
+                return
 
 
 def open_port(port: str, link: str | None) -> AbstractPort:
@@ -206,7 +195,6 @@ def open_port(port: str, link: str | None) -> AbstractPort:
 
 class _Pty(AbstractPort):
     def __init__(self, link: str | None) -> None:
-        super().__init__()
         self._link, self._master = None if link is None else Path(link).expanduser().absolute(), -1
         self.plug()
 
@@ -218,42 +206,38 @@ class _Pty(AbstractPort):
                 "this system has no pseudo-terminals: add port=tcp:5555, and read it with "
                 "device.port=socket://127.0.0.1:5555"
             ) from error
-        if self._link and self._link.exists():
-            used = f"leads to {self._link.resolve()}, which is in use: end the other skin emulate, or"
-            what = used if self._link.is_symlink() else "would replace a file:"
-            raise InputError(f"link={self._link} {what} give another name")
-        with self._lock:
-            self._master, slave = os.openpty()
-            tty.setraw(slave)
-            os.set_blocking(self._master, False)
-            self._name = os.ttyname(slave)
-            # Opened and closed once, it signals when a reader opens it.
-            os.close(slave)
-        self.address = self._name if self._link is None else str(self._link)
-        if self._link is not None:
-            partial = self._link.with_name(self._link.name + ".part")
-            try:
-                partial.unlink(missing_ok=True)
-                partial.symlink_to(self._name)
-                partial.replace(self._link)
-            except OSError as error:
-                raise InputError(f"cannot make link={self._link}: {error}") from error
+        self._master, slave = os.openpty()
+        tty.setraw(slave)
+        os.set_blocking(self._master, False)
+        name = os.ttyname(slave)
+        # Opened and closed once, it signals when a reader opens it.
+        os.close(slave)
+        self.address = str(self._link or name)
+        if self._link is None:
+            return
+        try:
+            if self._link.is_symlink() and not self._link.exists():  # left by an emulator that was killed
+                self._link.unlink()
+            self._link.symlink_to(name)
+        except OSError as error:
+            raise InputError(
+                f"cannot make link={self._link}, which may be in use: {error.strerror}; end the other skin "
+                "emulate, or give another name"
+            ) from error
 
     def connected(self) -> bool:
-        with self._lock:
-            if self._master < 0:
-                return False
-            watch = select.poll()
-            watch.register(self._master, 0)
-            return not any(event & select.POLLHUP for _, event in watch.poll(0))
+        if self._master < 0:
+            return False
+        watch = select.poll()
+        watch.register(self._master, 0)
+        return not any(event & select.POLLHUP for _, event in watch.poll(0))
 
     def unplug(self) -> None:
-        with self._lock:
-            if self._master >= 0:
-                if self._link and self._link.is_symlink() and os.readlink(self._link) == self._name:
-                    self._link.unlink()
-                os.close(self._master)
-                self._master = -1
+        if self._master >= 0:
+            if self._link:
+                self._link.unlink(missing_ok=True)
+            os.close(self._master)
+            self._master = -1
 
     def _send(self, data: bytes) -> int:
         return os.write(self._master, data)
@@ -261,46 +245,38 @@ class _Pty(AbstractPort):
 
 class _Tcp(AbstractPort):
     def __init__(self, number: int) -> None:
-        super().__init__()
         self._number = number
         self.plug()
 
     def plug(self) -> None:
-        with self._lock:
-            try:
-                self._server = socket.create_server(("127.0.0.1", self._number))
-            except OSError as error:
-                raise InputError(f"cannot listen on tcp:{self._number}: {error}; as in port=tcp:0") from error
-            self._server.setblocking(False)
-            self._number = self._server.getsockname()[1]
-            self.address = f"socket://127.0.0.1:{self._number}"
-            self._client: socket.socket | None = None
+        try:
+            self._server = socket.create_server(("127.0.0.1", self._number))
+        except OSError as error:
+            raise InputError(f"cannot listen on tcp:{self._number}: {error}; as in port=tcp:0") from error
+        self._server.setblocking(False)
+        self._number = self._server.getsockname()[1]
+        self.address = f"socket://127.0.0.1:{self._number}"
+        self._client: socket.socket | None = None
 
     def connected(self) -> bool:
-        with self._lock:
-            if self._client is not None and self._left(self._client):
-                self._client.close()
-                self._client = None
+        try:
             if self._client is None:
-                with suppress(OSError):  # no reader, or unplugged
-                    self._client, _ = self._server.accept()
-                    self._client.setblocking(False)
-            return self._client is not None
+                self._client, _ = self._server.accept()
+                self._client.setblocking(False)
+            elif not self._client.recv(4096):
+                raise ConnectionResetError
+        except BlockingIOError:  # nobody connects, or nothing was sent to the skin
+            pass
+        except OSError:  # the reader has left, or the port is unplugged
+            if self._client is not None:
+                self._client.close()
+            self._client = None
+        return self._client is not None
 
     def unplug(self) -> None:
-        with self._lock:
-            for end in filter(None, (self._client, self._server)):
-                end.close()
-            self._client = None
-
-    @staticmethod
-    def _left(client: socket.socket) -> bool:
-        try:
-            return not client.recv(4096)
-        except BlockingIOError:
-            return False
-        except OSError:
-            return True
+        for end in filter(None, (self._client, self._server)):
+            end.close()
+        self._client = None
 
     def _send(self, data: bytes) -> int:
         return self._client.send(data) if self._client else len(data)
@@ -542,10 +518,10 @@ class Emulator:
         self._on_event(self._number / rate, f"gesture {number}: {label_text(gesture.labels)}")
         if self.settings.announce and not self.binary:
             seq, frames = self._number - self._zero, round(len(gesture.force) * rate / self.device.model_rate)
-            self._send(encode_announcement(Announcement(number, seq, frames, gesture.labels)))
-            if gesture.contacts is not None:
-                for line in contact_lines(number, gesture.contacts, self.device.model_rate):
-                    self._send(encode_contact_line(line))
+            announcement = Announcement(
+                number, seq, frames, gesture.labels, self.device.model_rate, gesture.contacts
+            )
+            self._send(encode_announcement(announcement))
 
     def _silence(self) -> None:
         self._on_event(self._number / self.settings.rate, f"silent for {self.faults.silent:g} s")

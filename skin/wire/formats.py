@@ -3,17 +3,20 @@
 import re
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from fnmatch import fnmatchcase
+from functools import cached_property
 from itertools import pairwise
 from math import inf, nan
-from typing import ClassVar, NamedTuple
+from typing import ClassVar, Literal, NamedTuple
 
 import numpy as np
 
 from skin.device.resampling import Check, FrameError
 from skin.errors import InputError
+from skin.wire.clocks import UNITS
 from skin.wire.lines import Reader
-from skin.wire.protocol import Header, Line, RawFrame, decode_comment, decode_frame, frames_ahead
+from skin.wire.protocol import Header, Line, RawFrame, frames_ahead
 
 
 @dataclass(frozen=True)
@@ -27,6 +30,8 @@ class Roles:
         time: the field with the device's clock; None: none has it.
         invalid: numbers that firmware sends instead of a value.
         magnitude: whether three values in a row are the axes of one sensor, whose value is their length.
+        unit: s per tick of the clock, as far as the fields tell; None: they do not.
+        summary: what was inferred, in words.
     """
 
     count: int
@@ -35,16 +40,18 @@ class Roles:
     time: int | None = None
     invalid: frozenset[float] = frozenset()
     magnitude: bool = False
+    unit: float | None = None
+    summary: str = ""
 
     @property
     def sensors(self) -> int:
         """S."""
         return len(self.values) // (3 if self.magnitude else 1)
 
-    def __post_init__(self) -> None:
+    @cached_property
+    def _take(self) -> slice | list[int]:
         first, last = self.values[0], self.values[-1] + 1
-        contiguous = self.values == tuple(range(first, last))
-        object.__setattr__(self, "_take", slice(first, last) if contiguous else list(self.values))
+        return slice(first, last) if self.values == tuple(range(first, last)) else list(self.values)
 
     def frame(self, line: Line) -> RawFrame:
         """Return the frame of a line with ``count`` fields.
@@ -62,7 +69,7 @@ class Roles:
             ticks is not None and not 0 <= ticks < inf
         ):
             raise FrameError("number")
-        values = np.array(fields, dtype=np.float64)[self._take]  # type: ignore[attr-defined]
+        values = np.array(fields, dtype=np.float64)[self._take]
         if not finite:
             strange = [word for position, word in line.strange.items() if position in self.values]
             words_alone = all(word.isalpha() or not word.strip(b"0123456789abcdefABCDEF") for word in strange)
@@ -129,8 +136,8 @@ class FieldFormat:
         reader: of the fields of a piece.
         name: word for the user.
         ignore: regular expression of the lines that are no frames.
-        frame: regular expression of a frame of a fixed length; None: pieces are lines.
-        plain: the lines are those of our protocol, in which no byte is left out.
+        frame: regular expression of a frame of bytes; None: pieces are lines.
+        plain: the frames are those of our protocol, in which no byte is left out.
         roles: of the fields; None: not known yet.
         check: kind of checksum.
     """
@@ -158,7 +165,7 @@ class FieldFormat:
         elif not self.frame.fullmatch(piece):
             raise FrameError("structure")
         read = self.reader(piece)
-        if self.roles is None:
+        if isinstance(read, bytes) or self.roles is None:
             return read
         if read.check != self.check:
             raise FrameError("checksum")
@@ -191,6 +198,7 @@ class RowsFormat:
         self._partial: list[Line] = []
         self._open, self._reported = False, True
         self.sensors, self.check, self.split = rows * line.sensors, line.check, line.split
+        self.roles = line.roles
 
     def read(self, piece: bytes) -> RawFrame | bytes:
         """Return the frame whose last row this line is; bytes within a frame; else raise FrameError."""
@@ -217,30 +225,7 @@ class RowsFormat:
         return RawFrame(frames[0].seq, frames[0].ticks, values, all(frame.finite for frame in frames))
 
 
-@dataclass(frozen=True)
-class BinaryFormat:
-    """COBS frames of our protocol."""
-
-    sensors: int
-    name: ClassVar[str] = "binary"
-    check: ClassVar[Check] = "crc16"
-
-    def split(self, data: bytes) -> tuple[list[bytes], bytes]:
-        """Return what stands between zeros, and what is left."""
-        return split_at(b"\0", data)
-
-    def read(self, piece: bytes) -> RawFrame | bytes:
-        """Return the frame between two zeros, or the text of a comment; else raise FrameError."""
-        comment = decode_comment(piece) if piece else b""
-        if comment is not None:
-            return comment
-        frame = decode_frame(piece)
-        if len(frame.values) != self.sensors:
-            raise FrameError("fields", len(frame.values))
-        return frame
-
-
-FrameFormat = FieldFormat | RowsFormat | BinaryFormat
+FrameFormat = FieldFormat | RowsFormat
 """Cuts bytes into pieces, and reads the frames that end with them."""
 
 
@@ -251,49 +236,38 @@ class DetectedFormat(NamedTuple):
         frame_format: None if it is not known yet.
         count_seen: number of values in readable frames that do not match the layout; or None.
         header: the last one received.
-        unit: s per tick of the device's clock, as far as the bytes tell; None: they do not.
-        summary: what was inferred, in words.
     """
 
     frame_format: FrameFormat | None = None
     count_seen: int | None = None
     header: Header | None = None
-    unit: float | None = None
-    summary: str = ""
 
 
-def detect_binary(data: bytes, sensors: int | None, frames: int = 2) -> DetectedFormat:
-    """Return the binary format of our protocol, if ``frames`` of one size with a correct CRC show it.
+def protocol_roles(
+    run: Sequence[Line], sensors: int | None, n: int | None, binary: bool
+) -> Roles | int | None:
+    """Return the fields of our protocol: seq and t_us before the values, or the values alone.
 
-    Args:
-        data: from the first byte on; an incomplete piece at the end is ignored.
-        sensors: S, or None to detect it.
-        frames: to be seen.
-    """
-    counts = list[int]()
-    for piece in data.split(b"\0")[:-1]:
-        with suppress(FrameError):
-            counts.append(len(decode_frame(piece).values))
-    often = [count for count in counts if counts.count(count) >= frames and sensors in (None, count)]
-    return DetectedFormat(BinaryFormat(often[0]) if often else None, counts[-1] if counts else None)
-
-
-def protocol_roles(run: Sequence[Line], sensors: int | None, n: int | None) -> Roles | int | None:
-    """Return the fields of lines of our protocol: seq and t_us before the values, or the values alone.
-
-    Three lines show one of S sensors; noise may count by chance, so eight are needed where S is unknown.
+    Two binary frames, whose CRC is right, show S. Three lines show one of S sensors; noise may count by
+    chance, so eight are needed where S is unknown.
 
     Args:
-        run: lines alike; the last eight.
+        run: frames alike; the last eight.
         sensors: S, or None to detect it.
         n: number of sensors of the header, or None.
+        binary: they are binary frames.
 
     Returns:
         the roles; None: more lines are needed; a number: that of the values of lines of another number.
     """
+    count, expected = len(run[-1].fields), sensors or n
+    if binary and (sensors not in (None, count - 2) or count < 3):
+        return count - 2
+    if binary and len(run) > 1:
+        return Roles(count, tuple(range(2, count)), 0, 1)
     if len(run) < 3:
         return None
-    count, expected, counted = len(run[-1].fields), sensors or n, _count(run[-3:])
+    counted = _count(run[-3:])
     if not (count == expected or (counted and count - 2 == expected)):
         if sensors is not None or len(run) < 8:
             return count - 2 * counted
@@ -329,3 +303,176 @@ class SensorCountError(InputError):
             f"the device sends {sent} values per frame, the layout has {sensors} sensors: give its own "
             "layout, as in layout=file layout.path=FILE.csv"
         )
+
+
+Field = int | str
+"""A field by its number from 0, or by its name with ``*``."""
+_AXES = 3  # values of a sensor that measures along x, y, z
+_CLOCKS = re.compile(r"(?i)t|t.?(s|ms|us|sec|micros|millis)|ms|us|micros|millis|clock|.*time.*|.*stamp.*")
+_COUNTERS = re.compile(r"(?i)n|i|seq|count|counter|frame|sample|packet|num|nr|.*(seq|count|frame|sample).*")
+_NAMED_UNITS = {
+    "us": re.compile(r"(?i).*(micro|[^a-z]us\b|^us$|_us|µs).*"),
+    "ms": re.compile(r"(?i).*(milli|[^a-z]ms\b|^ms$|_ms).*"),
+    "s": re.compile(r"(?i).*([^a-z]s\b|_s$|sec).*"),
+}
+
+
+def last_part(name: str) -> str:
+    """Return a name without the names of the objects around it, and without its unit in brackets."""
+    return re.sub(r"\s*[\[(].*[\])]$", "", name).rpartition(".")[2]
+
+
+def resolve(selected: Sequence[Field], names: Sequence[str], count: int) -> list[int]:
+    """Return the numbers of fields that are given by number or by name, in order.
+
+    Raises:
+        InputError: there is no such field.
+    """
+    positions = list[int]()
+    for field in selected:
+        if isinstance(field, int):
+            hits = [field] if 0 <= field < count else []
+        else:
+            hits = [
+                position for position, name in enumerate(names) if name == field or fnmatchcase(name, field)
+            ]
+        if not hits:
+            listed = f"their names are {', '.join(dict.fromkeys(names))}" if names else "they have no names"
+            sent = f"the board sends {count} fields, 0 to {count - 1}"
+            raise InputError(f"the adapter names a field {field}, {sent}; {listed}")
+        positions += [position for position in hits if position not in positions]
+    return positions
+
+
+def find_roles(
+    table: np.ndarray,
+    names: Sequence[str],
+    sensors: int | None,
+    *,
+    drop: Sequence[Field] = (),
+    values: Sequence[Field] | None = None,
+    counter: Field | None = "auto",
+    time: Field | None = "auto",
+    axes: Literal["plain", "normal", "magnitude"] = "plain",
+    time_unit: str | None = None,
+    invalid: frozenset[float] = frozenset(),
+) -> Roles | int:
+    """Return the roles of fields; the number of values seen where it is not that of the sensors.
+
+    Args:
+        table: (L, C), fields of consecutive frames; NaN where there was no number.
+        names: of the C fields; empty: they have none.
+        sensors: S, or None for as many as there are.
+        drop, values, counter, time, axes, time_unit: of :class:`skin.wire.adapter.Adapter`.
+        invalid: numbers that mean no value.
+    """
+    count = table.shape[1]
+    names = names if len(names) == count else ()
+    free = [position for position in range(count) if position not in resolve(drop, names, count)]
+    if values is not None:
+        chosen = resolve(values, names, count)
+    # As many fields as sensors: none is a counter.
+    each = 1 if axes == "plain" else _AXES
+    closed = sensors == (len(free) / each if values is None else -1) and not names
+    roles: dict[str, int | None] = {}
+    for role, setting, behaves, pattern in (
+        ("counter", counter, counts, _COUNTERS),
+        ("time", time, runs, _CLOCKS),
+    ):
+        if setting is None or (closed and setting == "auto"):
+            roles[role] = None
+        elif setting != "auto":
+            roles[role] = resolve([setting], names, count)[0]
+        else:
+            taken = [position for position in free if position not in roles.values()]
+            roles[role] = _recognise(table, names, taken, behaves, pattern)
+    others = [position for position in free if position not in roles.values()]
+    picked = others if values is None else chosen
+    if len(picked) % each:
+        raise InputError(
+            f"device.adapter.axes={axes} takes x, y, z of each place, but {len(picked)} values "
+            "are left: leave out the others by drop"
+        )
+    if axes == "normal":
+        picked, each = picked[_AXES - 1 :: _AXES], 1
+    if not picked or (sensors is not None and len(picked) != sensors * each):
+        return len(picked) // each
+    found = Roles(count, tuple(picked), roles["counter"], roles["time"], invalid, axes == "magnitude")
+    return _with_unit(found, table, names, time_unit)
+
+
+def counts(column: np.ndarray, mostly: float = 0.75, wraps: bool = False) -> bool:
+    """Return whether a field (L,) numbers the frames.
+
+    Args:
+        column: the field.
+        mostly: part of the steps that must be one; a few frames may be missing.
+        wraps: whether it may begin again often, at 0 or 1, as one of three bits or more.
+    """
+    if len(column) < 3 or not np.isfinite(column).all() or (column < 0).any() or (column % 1).any():
+        return False
+    steps = np.diff(column)
+    if wraps and column.min() in (0, 1) and column.max() >= 7:
+        steps = steps % (column.max() - column.min() + 1)
+    return bool(np.mean(steps == 1) >= mostly and np.count_nonzero(steps <= 0) <= 1)
+
+
+def runs(column: np.ndarray, mostly: float = 0.75, regular: float = 10.0) -> bool:
+    """Return whether a field (L,) is a clock.
+
+    Args:
+        column: the field.
+        mostly: part of the steps that must be upwards, of which one may be a wrap.
+        regular: times the median step that most steps may be larger or smaller.
+    """
+    if len(column) < 3 or not np.isfinite(column).all() or (column < 0).any():
+        return False
+    steps = np.diff(column)
+    rising = steps[steps > 0]
+    if len(rising) < mostly * len(steps) or np.count_nonzero(steps < 0) > 1:
+        return False
+    middle = np.median(rising)
+    return bool(np.mean((rising >= middle / regular) & (rising <= middle * regular)) >= mostly)
+
+
+def cycles(column: np.ndarray, maximum: int = 64) -> bool:
+    """Return whether a field (L,) numbers rows: from 0 or 1 to at most ``maximum``, again and again."""
+    first, last, steps = column.min(), column.max(), np.diff(column)
+    numbers = first in (0, 1) and first < last < maximum and not (column % 1).any()
+    return bool(numbers and np.mean((steps == 1) | (steps == first - last)) > 0.9)
+
+
+def _recognise(
+    table: np.ndarray,
+    names: Sequence[str],
+    free: Sequence[int],
+    behaves: Callable[[np.ndarray], bool],
+    pattern: re.Pattern[str],
+    leading: int = 2,
+) -> int | None:
+    """Return the field that behaves as a counter or a clock: by its name, or one of the ``leading``."""
+    named = [position for position in free if names and pattern.fullmatch(last_part(names[position]))]
+    first = [position for position in free if position < leading and (not names or names[position].isdigit())]
+    return next((position for position in [*named, *first] if behaves(table[:, position])), None)
+
+
+def _with_unit(
+    roles: Roles, table: np.ndarray, names: Sequence[str], unit: str | None, usual: float = 0.01
+) -> Roles:
+    """Return the roles of fields (L, C) with the unit of the clock, and what was inferred, in words.
+
+    Without a name, the unit is taken whose steps are nearest to ``usual`` s, until the host's clock tells.
+    """
+    words = [f"field {roles.counter} counts frames"] if roles.counter is not None else []
+    if roles.time is None:
+        return replace(roles, summary="; ".join(words))
+    steps = np.diff(table[:, roles.time])
+    step = float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
+    name, source = names[roles.time].rpartition(".")[2] if names else "", "the adapter"
+    if unit is None:
+        unit, source = next((u for u in _NAMED_UNITS if _NAMED_UNITS[u].fullmatch(name)), None), "its name"
+    if unit is None:
+        source = f"its steps of {step:.4g}"
+        unit = min(UNITS, key=lambda unit: abs(np.log10((step * UNITS[unit] or usual) / usual)))
+    words.append(f"field {roles.time} is the time in {unit}, by {source}")
+    return replace(roles, unit=UNITS[unit], summary="; ".join(words))

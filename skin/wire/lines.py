@@ -11,15 +11,18 @@ from typing import Any
 import numpy as np
 
 from skin.device.resampling import FrameError
-from skin.wire.protocol import Line, parse_words, split_words, verify_line
+from skin.wire.protocol import Line, decode_frame, parse_words, split_words, verify_line
 
 _DAYTIME = re.compile(rb"(?:\d{4}-\d\d-\d\d[T ])?(\d{1,2}):(\d\d):(\d\d(?:\.\d+)?)")
 _HEX = re.compile(rb"(?i)(?:0x)?[0-9a-f]+")
 # Each blank is matched in one way, or blanks would take a time as the square of their number.
-_LABEL = (
+LABEL = (
     r"\s*+(?P<name>[^\s,;\d.+-](?:[^\s,;=:]|[^\S\t]++(?![\s,;=:]))*?)\s*%s"
     r"\s*+(?P<value>[^\s,;]*+)\s*+[,;]?\s*+"
 )
+"""Pattern of one field with a name, as in ``A0: 12``, for the text between both."""
+NUMBER = r"(?P<value>%s)[ \t,;]*+"
+"""Pattern of one number, with anything of a separator after it, for that of its digits."""
 
 
 @dataclass(frozen=True)
@@ -240,18 +243,20 @@ class StructReader:
         return [name for name, size in sizes.items() for _ in range(size)] * self.repeat
 
 
-Reader = SeparatedReader | PatternReader | JsonReader | StructReader
-"""Returns the :class:`skin.wire.protocol.Line` of a piece, or raises FrameError."""
+class CobsReader:
+    """Binary frames of our protocol, and comments between them."""
+
+    def __call__(self, piece: bytes) -> Line | bytes:
+        """Return number, clock and values of a frame; or the text of a comment."""
+        return decode_frame(piece) if piece else b""
+
+    def names(self, count: int) -> Sequence[str]:
+        """Return no names."""
+        return ()
 
 
-def label_pattern(label: str) -> str:
-    """Return the pattern of one field with a name, as in ``A0: 12``."""
-    return _LABEL % re.escape(label)
-
-
-def number_pattern(number: str) -> str:
-    """Return the pattern of one number of a given shape, with anything of a separator after it."""
-    return rf"(?P<value>{number})[ \t,;]*+"
+Reader = CobsReader | SeparatedReader | PatternReader | JsonReader | StructReader
+"""Returns the :class:`skin.wire.protocol.Line` of a piece, or bytes of a comment, or raises FrameError."""
 
 
 def learn_keys(read: Callable[[bytes], Mapping[str, Any]], lines: Sequence[bytes]) -> tuple[str, ...]:

@@ -18,9 +18,8 @@ from skin.device.resampling import FrameError
 from skin.errors import InputError
 from skin.wire.adapter import Adapter, is_text, read_adapter, try_fields
 from skin.wire.binary_adapters import SAME, binary_adapters
-from skin.wire.columns import counts, cycles, last_part, runs
 from skin.wire.decoder import Decoder, kind_of_line
-from skin.wire.formats import RowsFormat
+from skin.wire.formats import RowsFormat, counts, cycles, last_part, runs
 from skin.wire.protocol import INVALID, OVER, Line, split_words
 
 Pieces = Sequence[tuple[float, bytes]]
@@ -152,7 +151,7 @@ def _read(adapter: Adapter, pieces: Pieces, data: bytes) -> Proposal:
     if adapter.kind == "protocol" and stats.check == "none" and decoder.header is None:
         raise FrameError("structure")
     values = np.array([np.where(frame.valid, frame.values, np.nan) for frame in frames])
-    if not stats.clock_trusted:
+    if not stats.timing.trusted:
         raise _ImplausibleError("a field that rises is no clock in s, ms or us")
     score += bad / len(frames) + _judge_values(values, decoder.frame_format)
     passed = frames[-1].t_host - frames[0].t_host
@@ -164,7 +163,7 @@ def _read(adapter: Adapter, pieces: Pieces, data: bytes) -> Proposal:
     levels = ", ".join(f"{np.median(column) if len(column) else 0:.4g}" for column in numbers[:64])
     words = [
         f"{decoder.sensors} values{rate}",
-        adapter.detect(data, None).summary,
+        decoder.frame_format.roles.summary if decoder.frame_format.roles else "",
         stats.clock,
         *notes,
         f"medians {levels}",

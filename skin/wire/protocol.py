@@ -8,15 +8,15 @@ u16 seq, u32 t_us, u16 n, n values, u16 CRC-16/CCITT-FALSE of all before it. A c
 u8 0xA5, u8 type 35 (``#``), a comment line of the text protocol without its checksum, u16 CRC. COBS: Cheshire
 and Baker, "Consistent overhead byte stuffing", IEEE/ACM ToN 7 (1999).
 
-Notes: comments of the text protocol with JSON and CRC-16, in which an emulated skin announces its next
-gesture, ``# gesture {"number": 0, ...}*HHHH``; for its contacts see :mod:`skin.wire.contact_lines`.
+An emulated skin announces its next gesture in a comment of the text protocol that is JSON with a CRC-16,
+``# {"number": 0, ...}*HHHH``.
 """
 
 import binascii
 import json
 import struct
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import reduce
 from math import inf, isclose, isfinite, nan
 from operator import xor
@@ -25,6 +25,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from skin.device.resampling import Check, FrameError
+from skin.touch.labels import CONTACT
 
 
 def crc16(data: bytes) -> int:
@@ -133,19 +134,6 @@ def encode_header(header: Header, check: Check = "crc16") -> bytes:
     return _checked(f"# skin {header}", check)
 
 
-def parse_line(line: bytes) -> Line:
-    """Parse a line without its end; fields are separated by comma, semicolon, tab or blanks.
-
-    Raises:
-        FrameError: ``checksum`` is wrong or unknown, or a field is no ``number`` and not one of ``INVALID``.
-    """
-    body, check = verify_line(line)
-    read = parse_words(split_words(body), check)
-    if read.strange:
-        raise FrameError("number", word=next(iter(read.strange.values())).decode("ascii", "replace"))
-    return read
-
-
 def parse_words(
     words: Sequence[bytes],
     check: Check = "none",
@@ -161,7 +149,7 @@ def parse_words(
         over: those that it sends beyond the range of the converter.
     """
     try:
-        fields = [float(word) for word in words]
+        fields = [nan] if b"_" in b"".join(words) else [float(word) for word in words]
     except ValueError:
         fields = [nan]
     finite, strange = all(map(isfinite, fields)), dict[int, bytes]()
@@ -170,7 +158,7 @@ def parse_words(
         for position, word in enumerate(words):
             text = word.strip().lower()
             try:
-                value = float(text)
+                value = float(text.replace(b"_", b"x"))  # valid in Python's grammar only
             except ValueError:
                 value = inf if text in over else nan
                 if text not in over and text not in invalid:
@@ -178,9 +166,7 @@ def parse_words(
             else:
                 value = value if isfinite(value) else nan
             fields.append(value)
-    if b"_" in b"".join(words):  # valid in Python's grammar only
-        strange |= {position: word for position, word in enumerate(words) if b"_" in word}
-    return Line(fields, check, finite and not strange, strange)
+    return Line(fields, check, finite, strange)
 
 
 def split_words(body: bytes, marks: Sequence[bytes] = SEPARATORS, trailing: bool = True) -> list[bytes]:
@@ -198,11 +184,6 @@ def split_words(body: bytes, marks: Sequence[bytes] = SEPARATORS, trailing: bool
     return body.split()
 
 
-def ends_with_separator(line: bytes) -> bool:
-    """Return whether a separator ends the line: its last field is empty, or firmware always writes one."""
-    return line.rpartition(b"*")[0 if b"*" in line else 2].rstrip(b" \r")[-1:] in SEPARATORS
-
-
 def parse_header(line: bytes) -> Header | None:
     """Return the header if this comment is one whose checksum, where it has one, is right; else None."""
     try:
@@ -214,11 +195,11 @@ def parse_header(line: bytes) -> Header | None:
         return None
     words_by_name = dict(word.split("=", 1) for word in words[1:] if "=" in word)
     return Header(
-        _whole(words_by_name.get("proto")) or 1,
-        _whole(words_by_name.get("n")),
+        _positive(words_by_name.get("proto"), int) or 1,
+        _positive(words_by_name.get("n"), int),
         _positive(words_by_name.get("rate")),
         words_by_name.get("unit"),
-        _whole(words_by_name.get("bits")),
+        _positive(words_by_name.get("bits"), int),
         words_by_name.get("id"),
         _positive(words_by_name.get("speed")),
     )
@@ -251,16 +232,13 @@ def _number(value: object) -> str:
     return f"{value:.9g}" if isinstance(value, float) else str(value)
 
 
-def _whole(word: str | None) -> int | None:
-    return int(word) if word and word.isascii() and word.isdigit() and len(word) < 10 else None
-
-
-def _positive(word: str | None) -> float | None:
+def _positive(word: str | None, kind: type[float] = float) -> Any:
+    """Return a number above 0; None if the word is none."""
     try:
-        value = float(word or "")
+        value = kind(word or "")
     except ValueError:
         return None
-    return value if isfinite(value) and value > 0 else None
+    return value if 0 < value < 1e9 else None
 
 
 Kind = Literal["u16", "i16", "f32"]
@@ -304,39 +282,33 @@ def encode_frame(values: Sequence[float] | np.ndarray, seq: int, t_us: int, kind
     return stuff(body + _TAIL.pack(crc16(body))) + b"\0"
 
 
-def decode_frame(data: bytes) -> RawFrame:
-    """Decode the bytes between two zeros.
+def decode_frame(data: bytes) -> Line | bytes:
+    """Decode the bytes between two zeros: number, clock and values of a frame, or the text of a comment.
 
     Raises:
         FrameError: ``structure`` (no COBS, too short, unknown type), ``checksum`` or ``fields``.
     """
     body = unstuff(data)
-    if len(body) < _HEAD.size + _TAIL.size or body[0] != _MAGIC or body[1] not in _TYPE:
+    if len(body) < 4 or body[0] != _MAGIC or body[1] not in (*_TYPE, _COMMENT):
         raise FrameError("structure")
     if crc16(body[:-2]) != _TAIL.unpack(body[-2:])[0]:
         raise FrameError("checksum")
+    if body[1] == _COMMENT:
+        return body[2:-2]
+    if len(body) < _HEAD.size + _TAIL.size:
+        raise FrameError("structure")
     _, number, seq, t_us, count = _HEAD.unpack_from(body)
     kind = _TYPE[number]
     if len(body) != _HEAD.size + count * kind.itemsize + _TAIL.size:
         raise FrameError("fields", (len(body) - _HEAD.size - _TAIL.size) // kind.itemsize)
-    values = np.frombuffer(body, kind, count, _HEAD.size).astype(np.float64)
-    return RawFrame(seq, t_us, values, bool(np.isfinite(values).all()))
+    values = np.frombuffer(body, kind, count, _HEAD.size)
+    return Line([seq, t_us, *values.tolist()], "crc16", bool(np.isfinite(values).all()))
 
 
 def encode_comment(text: bytes) -> bytes:
     """Return a comment, such as ``# skin proto=1 n=25 bits=10``, encoded, with 0x00 at its end."""
     body = bytes((_MAGIC, _COMMENT)) + text
     return stuff(body + _TAIL.pack(crc16(body))) + b"\0"
-
-
-def decode_comment(data: bytes) -> bytes | None:
-    """Return the comment between two zeros; None if it is no comment, or a damaged one."""
-    try:
-        body = unstuff(data)
-    except FrameError:
-        return None
-    sound = body[:2] == bytes((_MAGIC, _COMMENT)) and _TAIL.pack(crc16(body[:-2])) == body[-2:]
-    return body[2:-2] if sound else None
 
 
 def stuff(data: bytes) -> bytes:
@@ -373,55 +345,74 @@ def unstuff(data: bytes) -> bytes:
     return bytes(out)
 
 
-def encode_note(name: str, content: Mapping[str, Any]) -> bytes:
-    """Return ``# name {JSON}*HHHH``, LF at its end."""
-    return _checked(f"# {name} {json.dumps(content)}", "crc16")
-
-
-def parse_note(name: str, line: bytes) -> dict[str, Any] | None:
-    """Return the content of a note without its end; None for other lines and wrong checksums."""
-    body, _, tail = line.removesuffix(b"\r").rpartition(b"*")
-    start = b"# %s {" % name.encode()
-    if not body.startswith(start) or tail != b"%04X" % crc16(body):
-        return None
-    try:
-        return dict(json.loads(body[len(start) - 1 :]))
-    except ValueError:
-        return None
+MOST_CONTACTS = 100
+"""Contacts at a time that an announcement or a session may have."""
+_MOST_FRAMES = 100_000  # of a window: a damaged or foreign line must not allocate more
 
 
 @dataclass(frozen=True)
 class Announcement:
-    """The labels and the window of the gesture that follows.
+    """The labels, the window and the contacts of the gesture that follows.
 
     Attributes:
         number: of the gesture, from 0.
         seq: number of the frame in which its window begins.
         frames: of the device in its window.
         labels: name -> 0 or 1.
+        rate: of the model, Hz; 0: unknown.
+        contacts: (T, K, 5) at that rate, as of :class:`skin.device.touches.Touches`; None if unknown.
     """
 
     number: int
     seq: int
     frames: int
     labels: Mapping[str, int] = field(default_factory=dict)
+    rate: float = 0.0
+    contacts: np.ndarray | None = None
 
 
 def encode_announcement(announcement: Announcement) -> bytes:
-    """Return ``# gesture {"number": 0, "seq": 300, "frames": 300, "labels": {"big": 1, ...}}*HHHH``."""
-    return encode_note("gesture", asdict(announcement))
+    """Return ``# {"number": 0, "seq": 300, ..., "contacts": {"shape": [T, K], "rows": [...]}}*HHHH``.
+
+    A row is a contact: frame, number of the contact, x, y, radius (m), force (N) and peak pressure (Pa).
+    """
+    content, contacts = vars(announcement), announcement.contacts
+    if contacts is not None:
+        present = np.argwhere(np.isfinite(contacts).all(axis=2)).tolist()
+        rows = [[*position, *contacts[tuple(position)].tolist()] for position in present]
+        content = content | {"contacts": {"shape": contacts.shape[:2], "rows": rows}}
+    return _checked(f"# {json.dumps(content)}", "crc16")
 
 
 def parse_announcement(line: bytes) -> Announcement | None:
     """Return the announcement in a line without its end; None for other lines and wrong checksums."""
-    content = parse_note("gesture", line)
+    body, _, tail = line.removesuffix(b"\r").rpartition(b"*")
+    if not body.startswith(b"# {") or tail != b"%04X" % crc16(body):
+        return None
     try:
-        return None if content is None else Announcement(**content)
-    except TypeError:
+        announcement = Announcement(**json.loads(body[2:]))
+        described: Any = announcement.contacts
+        return replace(announcement, contacts=None if described is None else _read_contacts(**described))
+    except (IndexError, TypeError, ValueError):
         return None
 
 
-Format = Literal["auto", "text", "binary"]
+def _read_contacts(shape: tuple[int, int], rows: Sequence[Sequence[float]]) -> np.ndarray:
+    """Return contacts (T, K, 5); IndexError, TypeError or ValueError if they are invalid."""
+    frames, maximum = shape
+    table = np.array(rows, dtype=float).reshape(-1, 2 + len(CONTACT))
+    if (
+        frames > _MOST_FRAMES
+        or maximum > MOST_CONTACTS
+        or not np.isfinite(table).all()
+        or (table[:, :2] < 0).any()
+    ):
+        raise ValueError("no contacts of a gesture")
+    contacts = np.full((frames, maximum, len(CONTACT)), nan)
+    frame, position = table[:, :2].T.astype(int)
+    contacts[frame, position] = table[:, 2:]
+    return contacts
+
 
 _WRAPS = (2**16, 2**32)  # of seq: what firmware counts in
 _ACROSS = 4096  # frames that may be missing where seq wraps

@@ -7,7 +7,7 @@ import socket
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
 from itertools import count
 from math import inf
 from time import sleep
@@ -22,7 +22,6 @@ from skin.errors import InputError
 from skin.wire.adapter import Adapter, read_adapter
 from skin.wire.channels import ChannelHealth, Limits, Reason
 from skin.wire.decoder import Decoder
-from skin.wire.protocol import Format
 
 if TYPE_CHECKING:
     from skin.device.touches import Touches
@@ -45,7 +44,6 @@ class Port:
     Args:
         port: ``/dev/ttyACM0``, ``COM3`` or ``socket://host:number``.
         baudrate: bits per second, for serial ports.
-        format: of our protocol.
         adapter: describes what the board sends: an option of ``conf/adapter/``, a YAML file, or the settings
             of :class:`skin.wire.adapter.Adapter`.
         limits: smallest and largest value of a channel, as in
@@ -71,7 +69,6 @@ class Port:
 
     port: str | None = None
     baudrate: PositiveInt = 115200
-    format: Format = "auto"
     adapter: str | Mapping[str, Any] = "protocol"
     limits: Annotated[Limits, AfterValidator(_check_order)] | None = None
     timeout: PositiveFloat = 6.0
@@ -84,10 +81,7 @@ class Port:
     frames: Adapter = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        frames = read_adapter(self.adapter)
-        if frames.kind == "protocol" and frames.format == "auto":
-            frames = replace(frames, format=self.format)
-        object.__setattr__(self, "frames", frames)
+        object.__setattr__(self, "frames", read_adapter(self.adapter))
 
     @classmethod
     def select(cls, device: Mapping[str, Any]) -> "Port":
@@ -117,8 +111,6 @@ class SkinDisconnected(_TooFewFramesError, ConnectionError):  # noqa: N818
 
 _WAIT = 0.1  # s that one read waits for bytes
 _CONNECT = 5.0  # s
-# A reader does not notice that the other side lost its power; by default the system checks after two hours.
-_KEEPALIVE = {"TCP_KEEPIDLE": 10, "TCP_KEEPINTVL": 5, "TCP_KEEPCNT": 3}  # s, s, attempts
 _MOST = 65536  # bytes at once
 
 
@@ -202,18 +194,12 @@ class _Socket:
             self._socket = socket.create_connection(_address(port), timeout=_CONNECT)
         except OSError as error:
             raise InputError(f"cannot reach {port}: {error}; does anything listen there?") from error
-        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-        for name, value in _KEEPALIVE.items():
-            if hasattr(socket, name):
-                self._socket.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
         self._socket.settimeout(_WAIT)
 
     def read(self) -> bytes:
         try:
             data = self._socket.recv(_MOST)
-        except TimeoutError as error:
-            if error.errno is not None:  # ETIMEDOUT: no answer to keepalive
-                raise
+        except TimeoutError:
             return b""
         if not data:
             raise ConnectionResetError("the other side closed the connection")
@@ -288,12 +274,7 @@ class WireFeed:
         silence: s without a byte after which the stream counts as gone.
         again: s between two attempts to start a board, which may take seconds to boot.
         unanswered: s without an answer after which a board is polled again.
-
-    Attributes:
-        patient: the feed can wait, so no frame needs to be dropped.
     """
-
-    patient = False
 
     def __init__(
         self,
@@ -401,7 +382,7 @@ class WireFeed:
         """Warn once of a weak checksum; set limits from the header as soon as it arrives."""
         stats, header = self._decoder.stats, self._decoder.header
         if stats.clock != self._logged_clock:
-            (_log.info if stats.clock_trusted else _log.warning)("%s", stats.clock)
+            (_log.info if stats.timing.trusted else _log.warning)("%s", stats.clock)
             self._logged_clock = stats.clock
         if not self._warned and stats.check in _WEAK:
             _log.warning("frames carry %s; let the firmware send *HHHH", _WEAK[stats.check])
@@ -430,20 +411,17 @@ class WireFeed:
 
 
 class PlaybackFeed:
-    """Frames from memory, in real time or as fast as they are read.
+    """Frames from memory, in real time.
 
     Args:
         strips: touches in N, all with one rate; a window should not span two of them.
-        realtime: False: as fast as they are read.
-        at_once: frames, where time does not matter.
     """
 
     states: tuple[str, ...] = ()  # the frames of a file already have masks of valid values
     unanswered = ""
 
-    def __init__(self, strips: "Iterable[Touches]", realtime: bool = True, at_once: int = 256) -> None:
-        self.patient, self._at_once, self._start = not realtime, at_once, inf
-        self._frames = self._play(strips)
+    def __init__(self, strips: "Iterable[Touches]") -> None:
+        self._start, self._frames = inf, self._play(strips)
         self._next = next(self._frames, None)
 
     def _play(self, strips: "Iterable[Touches]") -> Iterator[Frame]:
@@ -472,10 +450,9 @@ class PlaybackFeed:
         if self._next is None:
             raise EOFError("the recording has ended")
         self._start = min(self._start, clock())
-        if not self.patient:
-            sleep(min(_WAIT, max(0.0, self._start + self._next.t - clock())))
-        frames, due = list[Frame](), inf if self.patient else clock() - self._start
-        while self._next and len(frames) < self._at_once and self._next.t <= due:
+        sleep(min(_WAIT, max(0.0, self._start + self._next.t - clock())))
+        frames, due = list[Frame](), clock() - self._start
+        while self._next and self._next.t <= due:
             frames.append(self._next._replace(t_host=self._start + self._next.t))
             self._next = next(self._frames, None)
         return frames
@@ -483,5 +460,4 @@ class PlaybackFeed:
     def open(self) -> None:
         """Do nothing: memory is never disconnected."""
 
-    def close(self) -> None:
-        """Do nothing: there is no port."""
+    close = open

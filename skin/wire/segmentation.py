@@ -15,9 +15,7 @@ from skin.core.rng import Stream, generator
 from skin.device.resampling import Frame, Resampled, Window
 from skin.errors import InputError
 from skin.touch.labels import OPPOSITE, Task
-from skin.wire.contact_lines import ContactLine, join_contact_lines, parse_contact_line
-from skin.wire.protocol import Announcement, parse_announcement
-from skin.wire.reader import ByteStream
+from skin.wire.protocol import Announcement
 
 Labels = Mapping[str, int]
 
@@ -74,49 +72,6 @@ def typed_lines(file: int) -> Iterator[str]:
         yield from (line.decode(errors="replace") for line in lines)
 
 
-class AnnouncementListener:
-    """An opener for ``open_skin`` that passes bytes through and collects the announcements among them.
-
-    Args:
-        opener: opens the stream of bytes.
-        longest: bytes of a line.
-        kept: announcements that are kept unread.
-
-    Attributes:
-        announcements: announcements that have not been read yet.
-        contacts: lines of contacts that have not been read yet.
-    """
-
-    def __init__(self, opener: Callable[[], ByteStream], longest: int = 4096, kept: int = 64) -> None:
-        self._opener, self._longest = opener, longest
-        self.announcements: deque[Announcement] = deque(maxlen=kept)
-        self.contacts: deque[ContactLine] = deque(maxlen=kept * longest)
-
-    def __call__(self) -> ByteStream:
-        """Open the stream; called again after each disconnection."""
-        self._stream, self._rest = self._opener(), b""
-        self.announcements.clear()
-        self.contacts.clear()
-        return self
-
-    def read(self) -> bytes:
-        """Return the received bytes."""
-        data = self._stream.read()
-        *lines, self._rest = (self._rest + data).split(b"\n")
-        self._rest = self._rest[-self._longest :]
-        self.announcements.extend(filter(None, map(parse_announcement, lines)))
-        self.contacts.extend(filter(None, map(parse_contact_line, lines)))
-        return data
-
-    def write(self, data: bytes) -> None:
-        """Send bytes."""
-        self._stream.write(data)
-
-    def close(self) -> None:
-        """Close the stream."""
-        self._stream.close()
-
-
 class AbstractSegmenter(ABC):
     """Segments a stream of frames into gestures.
 
@@ -168,7 +123,7 @@ class AnnouncedSegmenter(AbstractSegmenter):
 
     Args:
         window: as in :class:`AbstractSegmenter`.
-        listener: collects the announcements.
+        announcements: that have not been used yet.
         task: the required labels; ``touch`` is always 1.
         late: fraction of a window that may be missed at its beginning.
 
@@ -177,11 +132,10 @@ class AnnouncedSegmenter(AbstractSegmenter):
     """
 
     def __init__(
-        self, window: Window, listener: AnnouncementListener, task: Task, late: float = 0.25
+        self, window: Window, announcements: deque[Announcement], task: Task, late: float = 0.25
     ) -> None:
         super().__init__(window)
-        self._announcements, self._task, self._late = listener.announcements, task, late
-        self._contacts = listener.contacts
+        self._announcements, self._task, self._late = announcements, task, late
 
     def _begin(self, frame: Frame) -> RecordedGesture | None:
         if frame.seq is None:
@@ -198,6 +152,10 @@ class AnnouncedSegmenter(AbstractSegmenter):
                 labels = {"touch": 1} | dict(announced.labels)
                 if missing := [name for name in self._task.names if name not in labels]:
                     raise InputError(f"the skin announces no {missing[0]}: give device.labels=prompted")
+                fits = announced.contacts is not None and (len(announced.contacts), announced.rate) == (
+                    self.window.frames,
+                    self.window.rate,
+                )
                 task_labels = {name: labels[name] for name in self._task.names}
                 return RecordedGesture(
                     announced.number,
@@ -205,17 +163,9 @@ class AnnouncedSegmenter(AbstractSegmenter):
                     begin,
                     frame.segment,
                     lost=late,
-                    contacts=self._take_contacts(announced.number),
+                    contacts=announced.contacts if fits else None,
                 )
         return None
-
-    def _take_contacts(self, number: int) -> np.ndarray | None:
-        """Return the contacts of a gesture, and forget those of the gestures before it."""
-        while self._contacts and self._contacts[0].number < number:
-            self._contacts.popleft()
-        # Those of the next gesture may be there where the reader is late.
-        lines = [line for line in self._contacts if line.number == number]
-        return join_contact_lines(lines, self.window.frames, self.window.rate)
 
 
 class PromptedSegmenter(AbstractSegmenter):

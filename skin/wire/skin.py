@@ -15,13 +15,14 @@ from time import monotonic
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from scipy.ndimage import maximum_filter1d
 
 from skin.device.calibration import read_calibration
 from skin.device.resampling import Frame, check_rate
 from skin.errors import InputError
-from skin.wire.channels import RawRange, UnitConversion, check_sensitivity, unit_conversion
+from skin.wire.channels import RawRange, UnitConversion, check_sensitivity, fails_in_contact, unit_conversion
 from skin.wire.decoder import Decoder, Stats
-from skin.wire.protocol import Header
+from skin.wire.protocol import Announcement, Header
 from skin.wire.reader import (
     ByteStream,
     PlaybackFeed,
@@ -31,12 +32,10 @@ from skin.wire.reader import (
     WireFeed,
     open_stream,
 )
-from skin.wire.segmentation import AnnouncementListener
 from skin.wire.tare import HEADER, PATIENCE, SkinTouched, Tare, take_baseline
 
 if TYPE_CHECKING:
     from skin.body.base import Layer
-    from skin.device.base import AbstractDevice
     from skin.device.touches import Touches
 
 
@@ -145,18 +144,15 @@ class Skin:
                         raise self._explain(count, timeout, frames)
                     self._fresh.wait(min(left, self._wake))
                 frames.append(self._frames.popleft())
-                self._fresh.notify_all()
             self._stats.frames += self._decoder is None
         return frames
 
-    def tare(self, seconds: float = 1.0, force: bool = False, touch: float | None = None) -> np.ndarray:
+    def tare(self, seconds: float = 1.0, force: bool = False) -> np.ndarray:
         """Set the baseline to the readings of the untouched skin, and return it, (S,).
 
         Args:
             seconds: of frames from now on.
             force: set it even if the skin seems touched.
-            touch: smallest shift against the old baseline that is a touch, in the device's units; None: 2 %
-                of the range, if the header gives the bits.
 
         Raises:
             InputError: the skin is touched or was restarted meanwhile, or too few frames arrived; the old
@@ -167,8 +163,7 @@ class Skin:
             frames += [frame for frame in self.read(1) if frame.t_host >= start]
         if len({frame.segment for frame in frames}) > 1:
             raise InputError("the skin was restarted meanwhile: tare again; the old baseline is kept")
-        if touch is None:
-            touch = 0.02 * 2**self.header.bits if self.header and self.header.bits else 0.0
+        touch = 0.02 * 2**self.header.bits if self.header and self.header.bits else 0.0
         values, valid = (np.stack([getattr(frame, name) for frame in frames]) for name in ("values", "valid"))
         self.baseline = take_baseline(values, valid, self.baseline, touch, force)
         return self.baseline
@@ -182,6 +177,11 @@ class Skin:
     def channels(self) -> tuple[str, ...]:
         """State of each channel at the last frame; empty if channels are not checked."""
         return self._feed.states
+
+    @property
+    def announcements(self) -> deque[Announcement]:
+        """Announcements of an emulated skin that have not been read yet."""
+        return self._decoder.announcements if self._decoder else deque()
 
     @property
     def stats(self) -> Stats:
@@ -200,20 +200,14 @@ class Skin:
             return SkinDisconnected(str(error), frames)
         if error is not None:
             return error
-        foreign = self._decoder is not None and self._decoder.adapter.kind != "protocol"
         if self.away:
             reason = "the skin is unplugged; trying again"
-        elif self._feed.unanswered:
-            reason = self._feed.unanswered
-        elif stats.frames:
-            reason = stats.trouble or "the device stopped sending"
+        elif self._feed.unanswered or self._decoder is None or stats.frames:
+            reason = self._feed.unanswered or stats.trouble or "the device stopped sending"
         elif not stats.bytes:
             reason = "port open, nothing received; is the device sending?"
-        elif self._decoder is not None and foreign:
-            reason = str(self._decoder.explain())
         else:
-            trouble = stats.trouble or "no format shows yet; wrong baud rate?"
-            reason = f"{stats.bytes} bytes but no frame: {trouble}"
+            reason = stats.trouble or str(self._decoder.explain())
         return SkinTimeout(f"{len(frames)} of {count} frames arrived within {timeout:g} s: {reason}", frames)
 
     def _run(self) -> None:
@@ -227,7 +221,7 @@ class Skin:
                 if frames:
                     self._wait = self._backoff[0]
                     self._push(frames)
-                    self._stop.wait(0 if self._feed.patient else self._pause)
+                    self._stop.wait(self._pause)
         except Exception as error:
             with self._fresh:
                 self._error = error
@@ -254,8 +248,6 @@ class Skin:
                 if frame.after not in ("", "gap"):
                     self._times.clear()
                 self._times.append(frame.t)
-                while self._feed.patient and len(self._frames) >= self._maximum and not self._stop.is_set():
-                    self._fresh.wait(self._wake)
                 self._frames.append(frame)
                 if len(self._frames) > self._maximum:
                     dropped = self._frames.popleft()
@@ -269,29 +261,24 @@ def open_skin(
     layout: Sized | None = None,
     *,
     opener: Callable[[], ByteStream] | None = None,
-    device: "AbstractDevice | None" = None,
     baseline: np.ndarray | None = None,
     channels: Sequence[int] = (),
     polarity: Sequence[int] = (),
     queue: int = 4096,
     reconnect: bool = False,
-    realtime: bool = True,
     **settings: Any,
 ) -> Skin:
     """Open a skin; use it in a ``with`` statement.
 
     Args:
-        port: ``/dev/ttyACM0``, ``COM3``, ``socket://host:number``, a recording (``x.parquet``, ``x.csv``) or
-            ``simulated``; or the settings of a port.
+        port: ``/dev/ttyACM0``, ``COM3`` or ``socket://host:number``; or the settings of a port.
         layout: the sensors (anything with a length); None: their number is detected.
         opener: opens the stream of bytes instead of ``port``, and again after each disconnection.
-        device: the device that ``simulated`` plays.
         baseline: (S,), from an earlier tare.
         channels: the device's channel of every sensor, as in a calibration; empty: the same order.
         polarity: 1 or -1 per sensor, -1 where values fall with force; empty: 1 for all.
         queue: number of frames that are buffered.
         reconnect: wait for an unplugged skin; its next frame has ``after="reconnect"``.
-        realtime: False plays a recording or the simulator as fast as frames are read.
         settings: baudrate, adapter, limits, timeout, backoff and silence, as in :class:`Port`.
 
     Raises:
@@ -303,12 +290,6 @@ def open_skin(
     if not (isinstance(queue, int) and queue > 0):
         raise InputError(f"queue={queue} must be a whole number above 0: leave it out for 4096")
     address, sensors = str(about.port), None if layout is None else len(layout)
-    if opener is None and address == "simulated":
-        if device is None:
-            raise InputError("simulated needs a device: open_skin('simulated', device=build_device(config))")
-        return play(device.strips(), baseline, queue, realtime, about)
-    if opener is None and address.endswith((".parquet", ".csv")):
-        return play([_read_touches(address, sensors)], baseline, queue, realtime, about)
     if about.frames.kind == "auto":
         raise InputError("skin listen adapter=auto proposes an adapter: give device.adapter=FILE.yaml of it")
     decoder = Decoder(sensors, channels=channels, polarity=polarity, adapter=about.frames)
@@ -321,36 +302,9 @@ def open_skin(
     return Skin(feed, decoder, about, baseline, queue, reconnect)
 
 
-def play(
-    strips: "Iterable[Touches]",
-    baseline: np.ndarray | None = None,
-    queue: int = 4096,
-    realtime: bool = True,
-    settings: Port | None = None,
-) -> Skin:
-    """Return touches in N, all with one rate, as the frames of an open skin.
-
-    Args:
-        strips: the touches; each is a segment.
-        baseline, queue, realtime: as in :func:`open_skin`.
-        settings: with the timeout.
-    """
-    return Skin(PlaybackFeed(strips, realtime), None, settings or Port(), baseline, queue)
-
-
-def _read_touches(path: str, sensors: int | None) -> "Touches":
-    """Return the touches of a recording, which must have as many sensors as the layout."""
-    # Imported here because it imports torch, which reading a port does not need.
-    from skin.device.files import read_recording
-
-    touches = read_recording(path).touches
-    count = touches.readings.shape[2]
-    if sensors not in (None, count):
-        raise InputError(
-            f"{path} has {count} sensors, the layout has {sensors}: give the layout it was recorded with, "
-            "as in layout=file layout.path=FILE.csv"
-        )
-    return touches
+def play(strips: "Iterable[Touches]") -> Skin:
+    """Return touches in N, all with one rate, as frames in real time, each a segment."""
+    return Skin(PlaybackFeed(strips), None, Port(), None, 4096)
 
 
 @dataclass(frozen=True)
@@ -426,24 +380,21 @@ class SerialSource:
             return self._calibration.polarity
         return [-1] * self._sensors if (self.settings.scale or 0) < 0 else ()
 
-    def open(self, reconnect: bool = False) -> tuple[Skin, AnnouncementListener]:
-        """Open the port and collect its announcements; ``reconnect`` waits for an unplugged skin."""
+    def open(self, reconnect: bool = False) -> Skin:
+        """Open the port; ``reconnect`` waits for an unplugged skin."""
         if self.settings.port is None:
             raise InputError("device=serial needs a port, device.port=/dev/ttyACM0; skin emulate makes one")
-        listener = AnnouncementListener(partial(open_stream, self.settings.port, self.settings.baudrate))
-        skin = open_skin(
+        return open_skin(
             self.settings,
             range(self._sensors),
-            opener=listener,
             reconnect=reconnect,
             channels=self.channels,
             polarity=self.polarity,
         )
-        return skin, listener
 
     def open_source(self) -> Source:
         """Open the port as a stream of frames; wait for an unplugged skin."""
-        skin, _ = self.open(reconnect=True)
+        skin = self.open(reconnect=True)
         return Source(str(self.settings.port), skin, self.tare(skin), self)
 
     def tare(self, skin: Skin) -> Tare:
@@ -460,57 +411,121 @@ class SerialSource:
         check_sensitivity(conversion, self.settings.sensitivity)
         return conversion
 
-    def warm_up(self, skin: Skin, notify: Callable[[str], None]) -> tuple[list[Frame], UnitConversion]:
+    def warm_up(
+        self, skin: Skin, notify: Callable[[str], None], minimum: float = 1.0
+    ) -> tuple[list[Frame], UnitConversion]:
         """Read frames until rate, conversion and device are known; return all of them, and the conversion.
+
+        Args:
+            skin: just opened.
+            notify: called with each message for the user.
+            minimum: s over which the rate is measured.
 
         Raises:
             InputError: no frames arrive, the device is too slow, or the scale is unknown.
             SkinTouched: the skin was still touched after a minute.
         """
-        try:
-            frames, conversion = warm_up(skin, self.tare(skin), self._rate, self.settings.tare, notify)
-            known = self.settings.frames.kind != "protocol"  # other formats have no header
-            while skin.header is None and not known and frames[-1].t_host - frames[0].t_host < HEADER:
+        tare, frames, measured = self.tare(skin), list[Frame](), False
+        minimum = max(self.settings.tare, minimum)
+        # Other formats than our protocol have no header.
+        patience = HEADER if self.settings.frames.kind == "protocol" else 0.0
+        notify("reading the untouched skin: keep off" if self.settings.tare else "reading the rate")
+        while True:
+            try:
                 frames += skin.read(1)
-            return frames, conversion
-        except (SkinTimeout, SkinDisconnected) as error:
-            raise InputError(f"{self.settings.port}: {error}") from error
+            except (SkinTimeout, SkinDisconnected) as error:
+                raise InputError(f"{self.settings.port}: {error}") from error
+            if frames[-1].segment != frames[0].segment:
+                del frames[:-1]
+            tare.add(frames[-1])
+            passed = frames[-1].t - frames[0].t
+            if len(frames) < 3 or passed < minimum:
+                continue
+            if not measured:
+                # By the device's clock, with lost frames.
+                check_rate((len(frames) - 1 + sum(frame.lost for frame in frames[1:])) / passed, self._rate)
+            if tare.conversion is not None and (skin.header is not None or passed >= patience):
+                return frames, tare.conversion
+            if not measured and tare.state in ("touched", "limited"):
+                notify("the skin is touched: let go")
+            measured = True
+            if tare.conversion is None and passed > minimum + PATIENCE:
+                raise SkinTouched(tare.status)
 
 
-def warm_up(
-    skin: Skin, tare: Tare, rate: float, seconds: float, notify: Callable[[str], None], minimum: float = 1.0
-) -> tuple[list[Frame], UnitConversion]:
-    """Read frames until rate and conversion are known; return all frames read, and the conversion.
+class PortMonitor:
+    """Collects statistics of an open skin.
 
     Args:
-        skin: just opened.
-        tare: gets every frame.
-        rate: of the model, Hz: a slower device is refused.
-        seconds: of the tare.
-        notify: called with each message for the user.
-        minimum: s over which the rate is measured.
-
-    Raises:
-        InputError: the device is too slow, or the scale is unknown.
-        SkinTouched: the skin was still touched after a minute.
+        skin: open.
+        kept: frames for the statistics of channels.
+        far, near: times the noise, and s, that make a touch.
     """
-    notify("reading the untouched skin: keep off" if seconds else "reading the rate")
-    frames, minimum, measured = list[Frame](), max(seconds, minimum), False
-    while True:
-        frames += skin.read(1)
-        if frames[-1].segment != frames[0].segment:
-            del frames[:-1]
-        tare.add(frames[-1])
-        passed = frames[-1].t - frames[0].t
-        if len(frames) < 3 or passed < minimum:
-            continue
-        if not measured:
-            # By the device's clock, with lost frames.
-            check_rate((len(frames) - 1 + sum(frame.lost for frame in frames[1:])) / passed, rate)
-        if tare.conversion is not None:
-            return frames, tare.conversion
-        if not measured and tare.state in ("touched", "limited"):
-            notify("the skin is touched: let go")
-        measured = True
-        if passed > minimum + PATIENCE:
-            raise SkinTouched(tare.status)
+
+    def __init__(self, skin: Skin, kept: int = 10_000, far: float = 10.0, near: float = 0.5) -> None:
+        self._skin, self._far, self._near = skin, far, near
+        self._frames: deque[Frame] = deque(maxlen=kept)
+
+    def lines(self, seconds: float | None) -> Iterator[str]:
+        """Yield a line each second, and the last one after ``seconds`` s; None: without end."""
+        start = printed = monotonic()
+        for frame in self._skin:
+            self._frames.append(frame)
+            now = monotonic()
+            over = now - start >= (inf if seconds is None else seconds)
+            if over or now - printed >= 1:
+                printed = now
+                yield f"{now - start:6.1f} s  {self._line()}"
+            if over:
+                return
+
+    def _line(self) -> str:
+        stats, sensors = self._skin.stats, len(self._frames[-1].values)
+        counts = stats.list_counts(
+            bad_frames="bad", lost="lost", skipped="skipped", resets="resets", invalid="invalid values"
+        )
+        reasons = ", ".join(f"{count} {reason}" for reason, count in sorted(stats.bad.items()))
+        frames = ", ".join([f"{stats.frames} frames", *counts]) + (f" ({reasons})" if reasons else "")
+        checksum = f"checksum {stats.check}" if stats.check != "none" else "NO CHECKSUM"
+        line = f"{stats.format}, {checksum}, {sensors} sensors, {stats.rate_hz:.4g} Hz, {frames}"
+        return "; ".join(filter(None, (line, stats.clock, stats.trouble)))
+
+    def summary(self) -> str:
+        """Return the header, and the minimum, median, maximum, noise and state of each channel."""
+        if not self._frames:
+            return "nothing received"
+        values = np.stack([frame.values for frame in self._frames])
+        valid = np.stack([frame.valid for frame in self._frames])
+        states = self._skin.channels or ("ok",) * values.shape[1]
+        touched = self._find_contact(values, valid)
+        # Of a channel that is never valid, the values that it repeats.
+        rows = [row[mask] if mask.any() else row for row, mask in zip(values.T, valid.T, strict=True)]
+        lines = [f"header: {self._skin.header or 'none'}", "channel     least    median   largest     noise"]
+        for channel, (row, state, fraction) in enumerate(zip(rows, states, valid.mean(axis=0), strict=True)):
+            middle = np.median(row)
+            noise = 1.4826 * np.median(np.abs(row - middle))  # as of a normal distribution
+            text = state if fraction == 1 else f"{state}, invalid in {1 - fraction:.0%}"
+            if fraction == 0 and state == "ok":
+                text = "no value"
+            elif _fails_under_touch(~valid[:, channel], touched):
+                text += ", more often in contact than at rest: beyond its range?"
+            numbers = f"{channel:7d}{row.min():10.5g}{middle:10.5g}{row.max():10.5g}{noise:10.3g}"
+            lines.append(f"{numbers}  {text}")
+        if _fails_under_touch(np.array([frame.lost > 0 for frame in self._frames]), touched):
+            lines.append(
+                "more frames are unreadable or lost in contact than at rest: values beyond the range?"
+            )
+        return "\n".join(lines)
+
+    def _find_contact(self, values: np.ndarray, valid: np.ndarray) -> np.ndarray:
+        """Return the frames (F,), bool, within half a second of which a channel is far from its median."""
+        away, noise = np.abs(values - np.median(values, axis=0)), np.abs(np.diff(values, axis=0)).mean(axis=0)
+        touched = ((away > self._far * noise) & valid).any(axis=1)
+        near = 2 * round(self._near * self._skin.stats.rate_hz) + 1
+        return np.asarray(maximum_filter1d(touched, near))
+
+
+def _fails_under_touch(failed: np.ndarray, touched: np.ndarray) -> bool:
+    """Return whether frames (F,) fail more often while the skin is touched, (F,)."""
+    counts = (int(part.sum()) for part in (failed & touched, touched, failed & ~touched, ~touched))
+    return fails_in_contact(*counts)

@@ -40,7 +40,6 @@ PORT = "device.port=/dev/ttyACM77"
         ("generate n=16 out=x.parquet touch=fingertips touch.force=50", "touch.force=50 N is more than"),
         ("listen", "device.port is missing: add device.port="),
         (f"listen {PORT}", "no port /dev/ttyACM77"),
-        (f"listen {PORT} device.format=xml", "device.format=xml must be 'auto', 'text' or 'binary'"),
         ("live demo=true run=none", "no finished training run none"),
         ("live demo=true device=serial", "leave out device=serial, or demo=true"),
         ("live live.top=0", "live.top=0 must be greater than 0"),

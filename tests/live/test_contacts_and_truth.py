@@ -11,7 +11,6 @@ from urllib.request import urlopen
 import numpy as np
 import pytest
 
-from skin.wire.contact_lines import parse_contact_line
 from skin.wire.protocol import parse_announcement
 
 PATIENCE = 300  # s, on a machine that is busy with other things
@@ -71,12 +70,11 @@ class Tap:
 
     def _note(self, line):
         if (gesture := parse_announcement(line)) is not None:
-            self._starts[gesture.number] = gesture.seq / RATE
-        elif (told := parse_contact_line(line)) is not None:
-            contacts = np.array([told.contacts[position] for position in sorted(told.contacts)])
-            begin = self._starts[told.number] + told.frame / told.rate
+            begin, present = gesture.seq / RATE, np.isfinite(gesture.contacts).all(axis=2)
             with self._lock:
-                self.truth[round(begin * told.rate)] = contacts
+                for frame in np.flatnonzero(present.any(axis=1)):
+                    contacts = gesture.contacts[frame, present[frame]]
+                    self.truth[round(begin * gesture.rate) + frame] = contacts
 
     def held(self, time):
         """Return contacts (K, 5) that were the same over the readings of an estimate at ``time``, s, or None.

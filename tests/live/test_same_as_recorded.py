@@ -163,7 +163,7 @@ def test_the_header_counts_whenever_it_comes_and_given_limits_win_over_it(sent, 
     """At most 1023: with the header after frame 5 as with the header before frame 0."""
     for late, limits, expected in ((0, None, 30), (5, None, 30), (40, None, 30), (3, [None, 2000.0], 0)):
         sent(_adc(late, binary))
-        with serial(limits=limits, gestures=1).wire.open()[0] as skin:
+        with serial(limits=limits, gestures=1).wire.open() as skin:
             frames = skin.read(200, 10)
             assert (skin.header.bits, skin.stats.bad_frames) == (10, 0)
         assert np.array([frame.saturated for frame in frames[50:]]).sum(axis=0).tolist() == [

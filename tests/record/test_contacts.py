@@ -13,24 +13,12 @@ from skin.calibration import bench, bench_protocol
 from skin.core.files import CONF
 from skin.core.safe_loading import load_yaml
 from skin.device.files import read_recording
-from skin.device.resampling import Frame, Window
 from skin.device.simulated import Simulated
 from skin.mechanics.simulator.naive import Naive
 from skin.record.comparison import compare_session
 from skin.record.serial import Serial, convert_session, record_session
 from skin.record.session import read_session
-from skin.touch.labels import TOUCH
-from skin.wire.contact_lines import (
-    contact_lines,
-    encode_contact_line,
-    join_contact_lines,
-    parse_contact_line,
-)
-from skin.wire.decoder import Decoder
 from skin.wire.emulator import emulated_gestures
-from skin.wire.protocol import Announcement, encode_announcement, encode_line
-from skin.wire.segmentation import AnnouncedSegmenter, AnnouncementListener
-from tests.wire.memory import Sent
 
 SHEET = Sheet((0.16, 0.16), (32, 32), [{"material": "EcoFlex 00-30", "thickness": 0.005}])
 COUNT = 3
@@ -49,48 +37,6 @@ def played(device):
 
 def same(one, other):
     return np.array_equal(np.asarray(one, np.float32), np.asarray(other, np.float32), equal_nan=True)
-
-
-def test_lines_bring_the_contacts_back_to_single_precision(played):
-    for number, gesture in enumerate(played):
-        lines = contact_lines(number, gesture.contacts, 10.0)
-        back = [parse_contact_line(encode_contact_line(line).rstrip(b"\n")) for line in lines]
-        assert same(join_contact_lines(back, 10, 10.0), gesture.contacts)
-        assert join_contact_lines(back[1:], 10, 10.0) is None
-        assert join_contact_lines(back, 20, 10.0) is None
-        assert join_contact_lines(back, 10, 20.0) is None
-    assert join_contact_lines([], 10, 10.0) is None
-
-
-def test_a_changed_byte_is_noticed(played):
-    line = encode_contact_line(contact_lines(0, played[0].contacts, 10.0)[0]).rstrip(b"\n")
-    assert line.startswith(b"# contacts {")
-    for position in range(len(line)):
-        changed = bytearray(line)
-        changed[position] ^= 1
-        assert parse_contact_line(bytes(changed)) is None
-
-
-def test_a_reader_takes_them_for_comments(played):
-    lines = [encode_contact_line(line) for line in contact_lines(0, played[0].contacts, 10.0)]
-    frames = [encode_line([1, number], number, 10_000 * number) for number in range(6)]
-    decoder = Decoder(2)
-    assert len(decoder.feed(b"".join([*frames[:3], *lines, *frames[3:]]))) == 6
-    assert not decoder.stats.bad
-
-
-def test_contacts_of_the_next_gesture_wait_for_it(played):
-    """A reader that is late has the lines of several gestures at once."""
-    data = b""
-    for number, gesture in enumerate(played):
-        data += encode_announcement(Announcement(number, 10 * number, 10, gesture.labels))
-        data += b"".join(map(encode_contact_line, contact_lines(number, gesture.contacts, 10.0)))
-    listener = AnnouncementListener(lambda: Sent(data))()
-    listener.read()
-    segmenter = AnnouncedSegmenter(Window(10, 10.0, 2), listener, TOUCH)
-    frames = [Frame(n, n / 10, n / 10, np.zeros(2), np.ones(2, dtype=bool)) for n in range(10 * COUNT + 1)]
-    gestures = [gesture for frame in frames if (gesture := segmenter.add(frame))]
-    assert [same(gesture.contacts, played[gesture.number].contacts) for gesture in gestures] == [True] * COUNT
 
 
 def test_a_recorded_session_has_them(emulate, device, played, tmp_path):

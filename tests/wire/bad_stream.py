@@ -1,209 +1,116 @@
-"""A stream of valid, damaged and invalid frames and noise, and what a decoder recovers of it.
+"""A stream of valid, damaged and invalid frames and noise, and what a decoder recovers of it."""
 
-Frames are encoded independently of the package. The check uses only which frames were sent intact.
-"""
-
-from collections import deque
-from dataclasses import dataclass
-from itertools import islice
 from random import Random
 
-from skin.device.resampling import Frame
 from skin.wire.decoder import Decoder
-from tests.wire.independent_frames import (
-    FORMATS,
-    WireFormat,
-    binary_frame,
-    damage,
-    invalid_frame,
-    text_line,
-)
+from skin.wire.protocol import crc16, encode_frame, encode_line, stuff, unstuff, xor8
 
-_HEAD = 10  # good frames at the beginning, so that the format shows
-_LENGTHS = (0, 1, 3, 20, 130, 500, 3000)  # bytes, at most, of a chunk; drawn alike
-_PERIOD = 2000  # microseconds
 _SOUP = b"0123456789,.;-+eE* #\t\r\nnaif_x"
 _NO_NUMBERS = (b"nan", b"-inf", b"1e400", b"1_0", b"0x1F", b"--1", b"1.2.3", b"\xd9\xa3", b"1 2", b"")
-_AHEAD = 50  # frames that are looked for after one that did not come
-_LONG = 70_000  # bytes: longer than any line may be
+_INSERTED = (b"\n", b"\0", b"\r\n", b"*", b"#", b",")
+_KINDS = ("u16", "i16", "f32")
 
 
-def fuzz(count: int, spoken: WireFormat, sensors: int, seed: int) -> dict[str, int]:
-    """Feed a decoder with ``count`` chunks of a stream of valid, damaged and invalid frames, and noise.
+def values(number, sensors):
+    """Return the values of a frame by its number: unsigned or signed integers, or fractions."""
+    kind = number % 3
+    whole = [(number * (7 + channel) + 31 * channel) % 1024 - 100 * (kind == 1) for channel in range(sensors)]
+    return [value / 8 for value in whole] if kind == 2 else whole
 
-    Args:
-        count: of chunks, of 0 to 3000 bytes each.
-        spoken: the checksum of the lines, or ``binary``.
-        sensors: S.
-        seed: of the random generator.
+
+def frame(number, spoken, sensors):
+    """Return a frame: a line with one of three checksums, or a ``binary`` one."""
+    if spoken == "binary":
+        return encode_frame(values(number, sensors), number, 2000 * number, _KINDS[number % 3])
+    return encode_line(values(number, sensors), number, 2000 * number, spoken)
+
+
+def invalid(number, spoken, sensors, rng):
+    """Return a frame whose checksum is right and whose content is not: none of it may be read as a value."""
+    trouble = rng.randrange(5)
+    if spoken == "binary":
+        body = bytearray(unstuff(frame(number, spoken, sensors)[:-1])[:-2])
+        if trouble < 3:
+            body[(0, 1, 8)[trouble]] ^= rng.choice((0x41, 0x82, 0xF0))  # mark, type, number of values
+        else:
+            body = body[: -(2 if trouble == 3 else len(body))]
+        return stuff(bytes(body) + crc16(body).to_bytes(2, "little")) + b"\0"
+    fields = frame(number, "none", sensors).rstrip().split(b",")
+    if trouble == 0:
+        fields[rng.randrange(len(fields) - 1)] = rng.choice(_NO_NUMBERS)
+    elif trouble == 1:
+        fields.append(b"5")
+    elif trouble == 2:
+        fields.pop()
+    elif trouble == 3:
+        fields[0] = rng.choice((b"-1", b"0.5"))
+    body = b",".join(fields)
+    tails = {"crc16": b"*%04X" % crc16(body), "xor": b"*%02X" % xor8(body), "none": b""}
+    others = [tail for check, tail in tails.items() if check != spoken]
+    return body + (rng.choice(others) if trouble == 4 else tails[spoken]) + b"\n"
+
+
+def noise(rng, sensors, end):
+    """Return bytes at random, text at random, a header or, now and then, a line that never ends."""
+    kind, length = rng.random(), rng.choice((1, 10, 100, 400))
+    if kind < 0.001:
+        data = b"7" * 70_000
+    elif kind < 0.5:
+        data = rng.randbytes(length)
+    elif kind < 0.6:
+        data = b"# skin proto=1 n=%d rate=50 unit=adc bits=99\n" % sensors
+    else:
+        data = bytes(rng.choices(_SOUP, k=length))
+    return data + (end if rng.random() < 0.7 else b"")
+
+
+def damage(piece, rng):
+    """Return a frame with up to five random errors of up to eight bytes."""
+    data = bytearray(piece)
+    for _ in range(rng.choice((1, 1, 2, 5))):
+        first, run = rng.randrange(len(data)), rng.randint(1, 8)
+        kind, last = rng.randrange(7), min(first + run, len(data))
+        if kind <= 1:
+            data[first] ^= 1 << rng.randrange(8)
+        elif kind == 6:
+            del data[first:]
+        else:
+            begin = last if kind == 3 else first
+            changed = (b"", data[first:last], rng.randbytes(last - first), rng.choice(_INSERTED))[kind - 2]
+            data[begin : last if kind != 5 else first] = changed
+        data = data or bytearray(b"*")
+    return bytes(data)
+
+
+def fuzz(count, spoken, sensors, seed, make=Decoder):
+    """Feed a decoder with ``count`` frames, damaged and invalid ones, and noise, in chunks of any size.
 
     Returns:
-        ``chunks`` and ``bytes``; ``pieces``: frames and fragments in them; ``good``: those sent intact behind
-        a delimiter, ``recovered`` or ``missed``; ``wrong``: frames decoded with wrong values.
-
-    Raises:
-        Exception: any error of the decoder, which should raise none.
+        ``good``: numbers of the frames sent intact behind a delimiter; ``missed``: those not recovered;
+        ``wrong``: number of frames decoded with wrong values.
     """
-    rng, decoder = (
-        Random(f"{spoken} {sensors} {seed}"),
-        Decoder(sensors, "binary" if spoken == "binary" else "text"),
-    )
-    stream = _Stream(rng, spoken, sensors)
-    oracle = _Oracle(stream)
-    for _ in range(count):
-        chunk = stream.chunk(rng.randint(0, rng.choice(_LENGTHS)))
-        for frame in decoder.feed(chunk, stream.time):
-            oracle.take(frame)
-    for frame in decoder.feed(stream.rest(), stream.time):
-        oracle.take(frame)
-    missed = oracle.missed + len(stream.expected)
-    return {
-        "chunks": count,
-        "bytes": stream.sent,
-        "pieces": stream.pieces,
-        "good": oracle.recovered + missed,
-        "recovered": oracle.recovered,
-        "missed": missed,
-        "wrong": oracle.wrong,
-    }
-
-
-class _Stream:
-    """An endless stream of bytes, and the frames in it that a decoder must find.
-
-    Attributes:
-        expected: numbers of the frames that are intact, stand behind a delimiter and have not been seen.
-        pieces, sent: frames and fragments, and bytes, that were made so far.
-    """
-
-    def __init__(self, rng: Random, spoken: WireFormat, sensors: int) -> None:
-        self._rng, self._spoken, self._sensors = rng, spoken, sensors
-        self._end = b"\0" if spoken == "binary" else b"\n"
-        self.expected: deque[int] = deque()
-        self.pieces = self.sent = self._count = 0
-        self._bytes, self._behind = bytearray(), True
-        for _ in range(_HEAD):
-            self._good()
-        if spoken in ("xor", "none"):
-            self.expected.popleft()  # without a CRC the first line may be half a line, and is left out
-
-    @property
-    def time(self) -> float:
-        """Of the latest frame by the device's clock, s."""
-        return self._count * _PERIOD * 1e-6
-
-    def chunk(self, length: int) -> bytes:
-        """Return the next bytes."""
-        kinds = self._good, self._damaged, self._senseless, self._noise, self._again
-        while len(self._bytes) < length:
-            self._rng.choices(kinds, (60, 20, 10, 9, 1))[0]()
-        taken = bytes(self._bytes[:length])
-        del self._bytes[:length]
-        return taken
-
-    def rest(self) -> bytes:
-        """Return the remaining bytes."""
-        return self.chunk(len(self._bytes))
-
-    def values(self, number: int) -> list[float]:
-        """Return the values of a frame by its number: unsigned or signed integers, or fractions."""
-        kind = number % 3
-        return [
-            ((number * (7 + channel) + 31 * channel) % 1024) / (8 if kind == 2 else 1) - 100 * (kind == 1)
-            for channel in range(self._sensors)
-        ]
-
-    def _put(self, piece: bytes) -> None:
-        self._bytes += piece
-        self.sent += len(piece)
-        self.pieces += 1
-        self._behind = piece.endswith(self._end)
-
-    def _next(self) -> int:
-        self._count += 1
-        return self._count % 2**16
-
-    def _good(self) -> None:
-        number = self._next()
-        if self._behind:
-            self.expected.append(number)
-        self._put(self._frame(number))
-
-    def _again(self) -> None:
-        """An old frame once more, as from a device that starts anew; it may be taken or not."""
-        self._put(self._frame(max(0, self._count - self._rng.randint(0, 3)) % 2**16))
-
-    def _damaged(self) -> None:
-        self._put(damage(self._frame(self._next()), self._rng))
-
-    def _frame(self, number: int) -> bytes:
-        clock, values = self._count * _PERIOD % 2**32, self.values(number)
-        if self._spoken == "binary":
-            return binary_frame(number, clock, values, number % 3 + 1)
-        separator, end = self._rng.choice((b",", b";", b"\t", b" ")), self._rng.choice((b"\n", b"\r\n"))
-        return text_line(_fields(number, clock, values), separator, self._spoken) + end
-
-    def _senseless(self) -> None:
-        """A frame whose checksum is right and whose content is not: no value of it may be taken as wrong."""
-        number, rng = self._next(), self._rng
-        clock, values = self._count * _PERIOD % 2**32, self.values(number)
-        if self._spoken == "binary":
-            self._put(invalid_frame(number, clock, values, number % 3 + 1, rng))
-            return
-        fields, trouble = _fields(number, clock, values), rng.randrange(5)
-        check: WireFormat = self._spoken
-        others: list[WireFormat] = [other for other in FORMATS if other not in (check, "binary")]
-        if trouble == 0:
-            fields[rng.randrange(len(fields) - 1)] = rng.choice(_NO_NUMBERS)
-        elif trouble == 1:
-            fields.append(b"5")
-        elif trouble == 2:
-            fields.pop()
-        elif trouble == 3:
-            fields[0] = rng.choice((b"-1", b"0.5"))
-        else:
-            check = rng.choice(others)
-        self._put(text_line(fields, b",", check) + b"\n")
-
-    def _noise(self) -> None:
-        rng = self._rng
-        kind, length = rng.random(), rng.choice((1, 10, 100, 400))
-        if kind < 0.001:
-            noise = b"7" * rng.randint(_LONG - 5000, _LONG)
-        elif kind < 0.5:
-            noise = rng.randbytes(length)
-        elif kind < 0.6:
-            noise = b"# skin proto=1 n=%d rate=50 unit=adc bits=99\n" % self._sensors
-        else:
-            noise = bytes(rng.choices(_SOUP, k=length))
-        self._put(noise + (self._end if rng.random() < 0.7 else b""))
-
-
-def _fields(number: int, clock: int, values: list[float]) -> list[bytes]:
-    return [b"%d" % number, b"%d" % clock, *(b"%g" % value for value in values)]
-
-
-@dataclass
-class _Oracle:
-    """Compares what comes with what was sent, in order."""
-
-    stream: _Stream
-    recovered: int = 0
-    missed: int = 0
-    wrong: int = 0
-
-    def take(self, frame: Frame) -> None:
-        """Take a frame; those that were to come before it are missed."""
-        number, expected = frame.seq, self.stream.expected
-        # A value that is sent as a word for none may only be invalid.
-        if number is None or (frame.values != self.stream.values(number))[frame.valid].any():
-            self.wrong += 1
-            return
-        position = next(
-            (position for position, one in enumerate(islice(expected, _AHEAD)) if one == number), None
-        )
-        if position is not None:
-            for _ in range(position + 1):
-                expected.popleft()
-            self.missed += position
-            self.recovered += 1
+    rng, end = Random(f"{spoken} {sensors} {seed}"), b"\0" if spoken == "binary" else b"\n"
+    data, good, kinds = bytearray(), set(), ("good", "damaged", "invalid", "noise")
+    for number in range(count):
+        # Ten good frames at the beginning, so that the format shows; of them the first may be half a line.
+        kind = rng.choices(kinds, (60, 20, 10, 10))[0] if number >= 10 else "good"
+        intact = frame(number, spoken, sensors)
+        if kind == "good" and data[-1:] in (b"", end) and (number or spoken in ("crc16", "binary")):
+            good.add(number)
+        if kind == "damaged":
+            intact = damage(intact, rng)
+        elif kind == "invalid":
+            intact = invalid(number, spoken, sensors, rng)
+        elif kind == "noise":
+            intact = noise(rng, sensors, end)
+        data += intact
+    decoder, position, recovered, wrong = make(sensors), 0, set(), 0
+    while position < len(data):
+        following = position + rng.randint(0, rng.choice((0, 1, 3, 20, 130, 500, 3000)))
+        for found in decoder.feed(bytes(data[position:following]), 0.002 * count * position / len(data)):
+            # A value that is sent as a word for none may only be invalid.
+            bad = found.seq is None or (found.values != values(found.seq, sensors))[found.valid].any()
+            wrong += bad
+            recovered |= set() if bad else {found.seq}
+        position = following
+    return {"good": good, "missed": good - recovered, "wrong": wrong}

@@ -56,27 +56,16 @@ class Plug:
             self.unplug()
             thread.join(5)
 
-    @contextmanager
     def sending(self, values: Callable[[int], Sequence[float]], rate: float = 200.0, restart: int = 2**32):
         """Send frames in the background; the device starts anew after each ``restart`` frames."""
-        stop = Event()
+        starts = [monotonic()]
 
-        def run() -> None:
-            number, start = 0, monotonic()
-            with suppress(OSError):
-                while not stop.wait(1 / rate):
-                    if number == restart:
-                        number, start = 0, monotonic()
-                    self.send(encode_line(values(number), number, round((monotonic() - start) * 1e6)))
-                    number += 1
+        def encode(number: int) -> bytes:
+            if number % restart == 0:
+                starts[0] = monotonic()
+            return encode_line(values(number), number % restart, round((monotonic() - starts[0]) * 1e6))
 
-        thread = Thread(target=run, daemon=True)
-        thread.start()
-        try:
-            yield
-        finally:
-            stop.set()
-            thread.join(5)
+        return self.streaming(encode, 1 / rate)
 
 
 @pytest.fixture

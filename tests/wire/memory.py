@@ -2,6 +2,8 @@
 
 from time import sleep
 
+from skin.device.resampling import FrameError
+from skin.wire.adapter import Adapter
 from skin.wire.skin import open_skin
 
 
@@ -40,3 +42,12 @@ class Sent:
 def opened(*pieces, layout=4, end=False, **settings):
     """Return a skin that reads pieces from memory."""
     return open_skin("memory", range(layout), opener=lambda: Sent(*pieces, end=end), **settings)
+
+
+def parse_line(line):
+    """Return the numbers of a line of our protocol; FrameError if it holds anything else."""
+    *_, layout = Adapter().layouts(3 * (line + b"\n"))
+    read = layout.reader(line)
+    if read.strange:
+        raise FrameError("number")
+    return read

@@ -2,8 +2,6 @@
 
 from contextlib import suppress
 from itertools import pairwise
-from threading import Event, Thread
-from time import monotonic, sleep
 
 import numpy as np
 import pytest
@@ -16,8 +14,7 @@ from skin.wire.adapter import Adapter, read_adapter
 from skin.wire.clocks import FrameClock
 from skin.wire.decoder import Decoder
 from skin.wire.proposal import propose
-from skin.wire.reader import Port, SkinTimeout
-from skin.wire.skin import open_skin
+from skin.wire.reader import Port, WireFeed
 
 PATIENT = 60.0  # s: machines are busy at times
 SHIPPED = sorted(path.stem for path in (CONF / "adapter").glob("*.yaml"))
@@ -99,11 +96,11 @@ def test_where_the_unit_contradicts_the_hosts_clock_that_rules(fixed, arrival, r
     clock, stopped = FrameClock(1e-6, fixed), []
     for n in range(400):
         clock.place(n, 10 * n, arrival * n, rate=rate)
-        stopped.append(clock.judge(arrival * n))
+        clock.judge(arrival * n)
+        stopped.append(clock.trusted)
     assert not fixed or clock.unit == 1e-6
-    assert stopped.count(True) == 1
-    assert not stopped[0]
-    assert not clock.trusted
+    assert stopped[0]
+    assert not stopped[-1]
 
 
 @pytest.mark.parametrize("modulus", [16, 37, 100, 256, 1000, 4096])
@@ -217,59 +214,43 @@ def test_a_lost_byte_of_a_frame_without_a_checksum_is_not_two_wrong_frames(name)
 
 
 class Board:
-    """A board at the other end of a cable that answers what it is told."""
+    """A stream that answers what it is told."""
 
-    def __init__(self, plug, behave):
-        self.received, self._plug, self._stop = b"", plug, Event()
-        self._thread = Thread(target=self._run, args=(behave,), daemon=True)
+    def __init__(self, answer):
+        self.received, self._answer, self._sent = b"", answer, b""
 
-    def _run(self, behave):
-        import os
-        import select
+    def write(self, data):
+        self.received += data
+        self._sent += self._answer(data)
 
-        while not self._stop.is_set():
-            ready = select.select([self._plug.master], [], [], 0.01)[0]
-            fresh = os.read(self._plug.master, 100) if ready else b""
-            self.received += fresh
-            for line in behave(fresh, self.received):
-                self._plug.send(line)
+    def read(self):
+        data, self._sent = self._sent, b""
+        return data
 
-    def __enter__(self):
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_):
-        self._stop.set()
-        self._thread.join(5)
+    def close(self):
+        pass
 
 
-def test_a_board_is_started_and_stopped(plug):
-    def behave(fresh, received):
-        return [b"7,8,%d\n" % (500 + monotonic() * 100 % 7)] if b"go\r" in received else []
-
-    adapter = {"kind": "text", "start": "go\r", "stop": "halt\r"}
-    with Board(plug, behave) as board:
-        with open_skin(plug.port, range(3), adapter=adapter, timeout=PATIENT) as skin:
-            assert len(skin.read(20)) == 20
-        deadline = monotonic() + PATIENT
-        while not board.received.endswith(b"halt\r"):
-            assert monotonic() < deadline
-            sleep(0.01)
-    assert board.received.count(b"go\r") >= 1
-
-
-def test_a_board_is_polled_for_each_frame(plug):
-    with (
-        Board(plug, lambda fresh, received: [b"1,2,3\n"] * fresh.count(b"?")) as board,
-        open_skin(plug.port, range(3), adapter={"kind": "text", "poll": "?"}, timeout=PATIENT) as skin,
-    ):
-        skin.read(40)
-    assert board.received.count(b"?") >= 40
-
-
-@pytest.mark.parametrize("name", ["start", "poll"])
-def test_a_string_that_is_never_answered_is_said(plug, name):
-    with open_skin(plug.port, range(3), adapter={"kind": "text", name: "go"}, timeout=1.5) as skin:
-        plug.send(b"type go\n")
-        with pytest.raises(SkinTimeout, match=rf"the {name} string 'go' of the adapter was sent \d+ times"):
-            skin.read(1)
+@pytest.mark.parametrize(
+    ("adapter", "answer", "told"),
+    [
+        (
+            {"start": "go\r", "stop": "halt\r"},
+            lambda data: b"7,8,5\n" * 40 * (data == b"go\r"),
+            b"go\rhalt\r",
+        ),
+        ({"poll": "?"}, lambda data: b"1,2,3\n", b"?" * 60),
+        ({"start": "go"}, lambda data: b"type go\n", b"go" * 6),
+        ({"poll": "go"}, lambda data: b"", b"go" * 20),
+    ],
+)
+def test_a_board_is_told_to_start_for_each_frame_and_to_stop(adapter, answer, told):
+    board = Board(answer)
+    feed = WireFeed(lambda: board, Decoder(3, adapter=Adapter(kind="text", **adapter)))
+    frames = [frame for step in range(60) for frame in feed.poll(lambda step=step: 0.1 * step)]
+    feed.close()
+    assert board.received == told
+    (name, text), *_ = adapter.items()
+    unanswered = f"the {name} string {text!r} of the adapter was sent {len(told) // len(text)} times"
+    assert feed.unanswered.startswith("" if frames else unanswered)
+    assert bool(frames) == (answer(b"go\r")[:1].isdigit())

@@ -351,13 +351,6 @@ def test_what_is_no_stream_is_shown():
         propose([(0.0, noise[:2000]), (1.0, noise[2000:])])
 
 
-def test_no_adapter_holds_text_of_a_stream():
-    for name in ("csv", "arduino_plotter", "json_lines", "matrix_rows"):
-        described = read_adapter(name)
-        assert described.pattern is None
-        assert not described.names
-
-
 def test_the_shipped_adapters_read_what_they_are_named_after():
     rng = np.random.default_rng(3)
     rows = np.round(rng.normal(0, 50, (200, 3, 4)), 2)

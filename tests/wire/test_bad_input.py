@@ -44,15 +44,6 @@ def test_a_port_in_use_ends_a_command_with_code_2(plug, tmp_path, verb):
     assert not list(tmp_path.glob("s*"))
 
 
-def test_time_that_goes_backwards_is_a_new_start(plug):
-    with open_skin(plug.port, range(2)) as skin:
-        moments = [(number, 10_000 * number) for number in range(5)] + [(5, 100), (6, 10_100)]
-        plug.send(*(encode_line([1, number], number, t) for number, t in moments))
-        frames = skin.read(7, timeout=PATIENT)
-        assert skin.stats.resets == 1
-    assert [(frame.segment, frame.after) for frame in frames[4:]] == [(0, ""), (1, "reset"), (1, "")]
-
-
 @pytest.mark.parametrize(
     ("rate", "said"),
     [*((rate, " (short taps read low below 100 Hz)") for rate in (10, 20, 50)), (100, "")],
@@ -63,21 +54,6 @@ def test_a_rate_that_misses_the_peaks_of_taps_stands_in_the_status_line(plug, ra
         plug.send(*(encode_line(row.tolist(), n, 1_000_000 // rate * n) for n, row in enumerate(values)))
         skin.read(60, timeout=PATIENT)
         assert LiveLoop(skin, Tare(None, 0.0, 10.0), engine(), None).line == f"{rate}.0 Hz{said}"
-
-
-def test_channels_that_mean_nothing_stand_in_the_status_line(plug):
-    rng = np.random.default_rng(0)
-    values = rng.integers(400, 600, (800, 6))
-    values[:, 1] = 0  # never a change
-    values[200:, 2] = 444  # none any more
-    values[-1, 3] = 1023  # the largest count
-    with open_skin(plug.port, range(6)) as skin:
-        plug.send(encode_header(Header(n=6, bits=10)))
-        plug.send(*(encode_line(row.tolist(), n, 10_000 * n) for n, row in enumerate(values)))
-        frames = skin.read(800, timeout=PATIENT)
-        line = LiveLoop(skin, Tare(None, 0.0, 10.0), engine(), None).line
-    assert frames[-1].valid.tolist() == [True, False, False, True, True, True]
-    assert "sensor 1 dead, sensor 2 stuck, sensor 3 saturated" in line
 
 
 def engine():

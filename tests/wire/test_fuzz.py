@@ -2,20 +2,24 @@
 
 import os
 from itertools import pairwise
+from random import Random
 
 import numpy as np
+import psutil
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from experiments.benchmarks import measure_decoder
 from skin.wire.decoder import Decoder
-from skin.wire.protocol import encode_frame, encode_line, parse_line
-from tests.wire import bad_stream, independent_frames
+from skin.wire.protocol import encode_frame, encode_line
+from tests.wire import bad_stream
+from tests.wire.memory import parse_line
 
 quickly = settings(
     max_examples=60, deadline=None, derandomize=True, database=None, suppress_health_check=list(HealthCheck)
 )
-CHUNKS = int(os.environ.get("FUZZ_CHUNKS", 5000))  # 0.2 s; a million takes 40
+CHUNKS = int(os.environ.get("FUZZ_CHUNKS", 5000))
 ENCODERS = {"text": (encode_line, b"\n"), "binary": (encode_frame, b"\0")}
 
 
@@ -29,11 +33,10 @@ def cut(data, cuts):
     return [data[first:last] for first, last in pairwise(positions)]
 
 
-@pytest.mark.parametrize("format", ["auto", "text", "binary"])
 @given(pieces=st.lists(st.binary(max_size=300), max_size=12), sensors=st.sampled_from([None, 1, 3]))
 @quickly
-def test_nothing_raises(format, pieces, sensors):
-    decoder = Decoder(sensors, format)
+def test_nothing_raises(pieces, sensors):
+    decoder = Decoder(sensors)
     for now, piece in enumerate(pieces):
         for frame in decoder.feed(piece, float(now)):
             assert np.isfinite(frame.values).all()
@@ -68,75 +71,74 @@ def test_lines_survive_the_way_there_and_back(values, seq):
     assert np.array(fields[2:], "f4").tolist() == [value for value in values if abs(value) < 1e38]
 
 
-def corrupted(line, rng):
-    """Flip two bits, or lose two bytes."""
-    data = bytearray(line[:-1])
-    for _ in range(2):
-        position = int(rng.integers(len(data)))
-        if rng.random() < 0.5:
-            data[position] ^= 1 << int(rng.integers(8))
-        else:
-            del data[position]
-    return bytes(data) + b"\n"
-
-
 @pytest.mark.parametrize(("check", "maximum"), [("crc16", 0.001), ("xor", 0.1), ("none", 0.9)])
 def test_how_many_wrong_values_pass_each_checksum(check, maximum):
-    rng, wrong, count = np.random.default_rng(5), 0, 3000
+    rng, wrong, count = Random(5), 0, 3000
     decoder = Decoder(16)
-    decoder.feed(b"".join(encode_line([500] * 16, number, number, check) for number in range(3)))
+    decoder.feed(b"".join(bad_stream.frame(number, check, 16) for number in range(3)))
     for number in range(3, count):
-        values = rng.integers(0, 1024, 16).tolist()
-        for frame in decoder.feed(corrupted(encode_line(values, number, number * 1000, check), rng)):
-            wrong += frame.values.tolist() != values
+        spoilt = bad_stream.damage(bad_stream.frame(number, check, 16)[:-1], rng) + b"\n"
+        for frame in decoder.feed(spoilt):
+            wrong += frame.values.tolist() != bad_stream.values(frame.seq or 0, 16)
     assert wrong / count <= maximum
     assert wrong > 0 or check == "crc16"  # the test can see them
 
 
-def test_another_hand_writes_the_same_frames():
-    values = [0.0, 512.0, 1023.0, 7.0]
-    for check in ("crc16", "xor", "none"):
-        fields = [b"12", b"34000", *(b"%d" % value for value in values)]
-        written = independent_frames.text_line(fields, b",", check) + b"\n"
-        assert written == encode_line([int(value) for value in values], 12, 34000, check)
-    for kind, name in ((1, "u16"), (2, "i16"), (3, "f32")):
-        assert independent_frames.binary_frame(12, 34000, values * 40, kind) == encode_frame(
-            values * 40, 12, 34000, name
-        )
+@pytest.mark.slow("streams for long")
+def test_every_intact_frame_of_a_faulty_wire_arrives_and_no_wrong_value():
+    """One line of a hundred is spoilt; SOAK_SECONDS=600 takes ten minutes of a stream at 500 Hz."""
+    seconds, check = float(os.environ.get("SOAK_SECONDS", 5)), os.environ.get("SOAK_CHECK", "crc16")
+    rng, decoder, wrong, sent, came, memory = Random(1), Decoder(25), 0, set(), set(), []
+    for number in range(round(500 * seconds)):
+        line, spoilt = bad_stream.frame(number, check, 25), number > 10 and rng.random() < 0.01
+        sent |= set() if spoilt or number == 0 else {number}
+        line = bad_stream.damage(line[:-1], rng) + b"\n" if spoilt else line
+        for frame in decoder.feed(line, number / 500):
+            right = frame.values.tolist() == bad_stream.values(frame.seq or 0, 25)
+            wrong += not right
+            came |= {frame.seq} if right else set()
+        if number in (round(50 * seconds), round(500 * seconds) - 1):
+            memory.append(psutil.Process().memory_info().rss)
+    print(len(sent), "intact,", len(sent - came), "missed,", wrong, "wrong,", decoder.stats)
+    assert decoder.stats.bad_frames > 5
+    assert memory[1] - memory[0] < 5e6 + 200 * len(sent)  # the numbers kept here
+    if check == "crc16":  # a weaker checksum passes wrong values, some of them as numbers of frames
+        assert (sent - came, wrong, decoder.stats.resets) == (set(), 0, 0)
+
+
+@pytest.mark.slow("measures the processor time of the decoder")
+def test_decoding_takes_less_than_a_twentieth_of_a_core():
+    assert measure_decoder()["decode_core_share"] < 0.05
 
 
 @pytest.mark.parametrize("spoken", ["crc16", "xor", "none", "binary"])
 def test_every_good_frame_of_a_long_bad_stream_is_recovered(spoken):
-    found = bad_stream.fuzz(CHUNKS, spoken, 25, 7)
-    assert found["missed"] == 0
-    assert found["good"] == found["recovered"] > 0.6 * CHUNKS
-    assert found["pieces"] > 1.5 * found["good"]
-    if spoken in ("crc16", "binary"):
-        assert found["wrong"] <= CHUNKS // 100_000  # 16 bits fit by chance once in 65,536
+    count = min(CHUNKS, 50_000)  # below the modulus of binary frames
+    for seed in range(-(-CHUNKS // count)):
+        found = bad_stream.fuzz(count, spoken, 25, seed)
+        assert not found["missed"]
+        assert len(found["good"]) > 0.4 * count
+        if spoken in ("crc16", "binary"):
+            assert found["wrong"] <= count // 10_000  # 16 bits fit by chance once in 65,536
 
 
 @pytest.mark.parametrize("spoken", ["crc16", "xor", "none", "binary"])
 @given(seed=st.integers(0, 2**32), sensors=st.integers(1, 70))
 @settings(quickly, max_examples=15)
 def test_every_good_frame_of_any_bad_stream_is_recovered(spoken, seed, sensors):
-    assert bad_stream.fuzz(60, spoken, sensors, seed)["missed"] == 0
+    assert not bad_stream.fuzz(60, spoken, sensors, seed)["missed"]
 
 
 @pytest.mark.parametrize("fault", ["drops", "alters"])
-def test_the_oracle_sees_a_decoder_that_fails(fault, monkeypatch):
-    class Failing:
-        def __init__(self, *given):
-            self._decoder, self._count = Decoder(*given), 0
-
+def test_the_oracle_sees_a_decoder_that_fails(fault):
+    class Failing(Decoder):
         def feed(self, data, now):
-            for frame in self._decoder.feed(data, now):
-                self._count += 1
-                if self._count % 50:
+            for frame in super().feed(data, now):
+                if frame.seq % 50:
                     yield frame
                 elif fault == "alters":
                     yield frame._replace(values=frame.values + 1)
 
-    monkeypatch.setattr(bad_stream, "Decoder", Failing)
-    found = bad_stream.fuzz(1000, "crc16", 5, 0)
-    assert found["missed"] > 20
-    assert (found["wrong"] > 20) == (fault == "alters")
+    found = bad_stream.fuzz(1000, "crc16", 5, 0, Failing)
+    assert len(found["missed"]) > 8
+    assert (found["wrong"] > 8) == (fault == "alters")

@@ -1,15 +1,16 @@
 """Fields that say that a channel could not be read invalidate that channel alone."""
 
 import math
+import re
 
 import numpy as np
 import pytest
 
 from skin.device.resampling import FrameError
 from skin.wire.decoder import Decoder
-from skin.wire.monitor import PortMonitor
-from skin.wire.protocol import crc16, encode_frame, parse_line
-from skin.wire.skin import open_skin
+from skin.wire.protocol import crc16, encode_frame
+from skin.wire.skin import PortMonitor
+from tests.wire.memory import opened, parse_line
 
 WORDS = [
     *(b"nan", b"NaN", b"-nan", b"inf", b"-INF", b"1e400", b"-1e999", b"ovf", b"OVF", b"err", b"ERROR"),
@@ -111,26 +112,11 @@ def test_a_binary_value_that_is_no_number_invalidates_its_channel():
     assert frames[1].valid.tolist() == [False, True, False]
 
 
-class Sent:
-    """A stream of bytes that were sent before it was opened."""
-
-    def __init__(self, data):
-        self._data = [data]
-
-    def read(self):
-        if not self._data:
-            raise OSError("end")
-        return self._data.pop()
-
-    def close(self):
-        pass
-
-
 def test_frames_of_an_open_skin_have_the_channel_marked():
     data = b"".join(
         line([n, 1000 * n, 500 + n % 3, b"ovf" if n % 10 == 0 else 7 + (n % 4 == 1)]) for n in range(100)
     )
-    with open_skin("", range(2), opener=lambda: Sent(data)) as skin:
+    with opened(data, layout=2) as skin:
         frames = skin.read(99, timeout=20)
         monitor = PortMonitor(skin)
         monitor._frames.extend(frames)
@@ -144,9 +130,30 @@ def test_frames_of_an_open_skin_have_the_channel_marked():
 
 def test_a_channel_that_never_sends_a_number_is_not_ok():
     data = b"".join(line([n, 1000 * n, 500 + n % 3, b"nan"]) for n in range(100))
-    with open_skin("", range(2), opener=lambda: Sent(data)) as skin:
+    with opened(data, layout=2) as skin:
         monitor = PortMonitor(skin)
         monitor._frames.extend(skin.read(99, timeout=20))
         rows = monitor.summary().splitlines()[-2:]
     assert rows[0].endswith("  ok")
     assert rows[1].endswith("  no value")
+
+
+def test_channels_and_frames_that_fail_under_a_press_are_named():
+    """A word in place of a value costs that value; letters in a line that has no other field, the line."""
+    data = b""
+    for number in range(1200):
+        force = max(0, min(40, number % 500 - 440)) * 10
+        first, second = 100 + number % 3 + force, 200 + number % 2 + force // 4
+        word = b"OL" if first > 300 else b"%d" % first
+        fields = [number, 5000 * number, word, second, 300 + number % 2]
+        data += b"?\n" if first > 400 and number % 2 else line(fields)
+    with opened(data, layout=3) as skin:
+        frames = skin.read(data.count(b",300\n") + data.count(b",301\n") - 1, timeout=20)
+        monitor = PortMonitor(skin)
+        monitor._frames.extend(frames)
+        summary = monitor.summary()
+    assert re.search(
+        r"\n +0 .*invalid in \d+%, more often in contact than at rest: beyond its range", summary
+    )
+    assert "frames are unreadable or lost in contact" in summary
+    assert summary.count("in contact than at rest") == 2

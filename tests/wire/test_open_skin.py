@@ -1,5 +1,6 @@
 """A skin on a real pseudo-terminal or socket, and everything that goes wrong with one."""
 
+import errno
 import logging
 import os
 import signal
@@ -12,13 +13,18 @@ from time import monotonic, sleep
 
 import numpy as np
 import pytest
+import serial
 
 from skin.errors import InputError
+from skin.live.engine import Detection, Engine
+from skin.live.loop import LiveLoop
+from skin.touch.labels import TOUCH
 from skin.wire.channels import Reason
 from skin.wire.decoder import Decoder
 from skin.wire.protocol import Header, encode_frame, encode_header, encode_line
 from skin.wire.reader import SkinDisconnected, SkinTimeout, WireFeed
 from skin.wire.skin import open_skin
+from skin.wire.tare import Tare
 from tests.wire.memory import Sent, opened
 
 LAYOUT = range(4)
@@ -60,67 +66,42 @@ def test_frames_of_a_serial_port(plug, kind):
     assert stats.rate_hz == pytest.approx(100)
 
 
-def test_frames_of_a_socket_and_its_end():
+def test_a_peer_at_a_socket_that_stops_sending_is_left_and_found_again_and_its_end(caplog):
+    """A connection stays open after a power cut in the middle of a frame."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        server.settimeout(PATIENT)
+        address = f"socket://127.0.0.1:{server.getsockname()[1]}"
+        with (
+            open_skin(address, LAYOUT, reconnect=True, silence=0.3, backoff=(0.01, 0.04)) as skin,
+            server.accept()[0] as first,
+        ):
+            first.sendall(lines(*range(5)) + b"5,50000,500,5")
+            with server.accept()[0] as second:
+                second.sendall(lines(*range(3)))
+                frames = skin.read(8, timeout=PATIENT)
+                assert (skin.stats.reconnects, skin.stats.bad_frames) == (1, 0)
+            assert first.recv(1) == b""
+    assert numbers(frames) == [0, 1, 2, 3, 4, 0, 1, 2]
+    assert [frame.after for frame in frames] == [""] * 5 + ["reconnect", "", ""]
+    assert [frame.segment for frame in frames] == [0] * 5 + [1] * 3
+    assert "unplugged (nothing received for 0.3 s)" in caplog.text
+
+
+def test_the_end_of_a_socket_is_an_error_after_what_came_before():
     with socket.create_server(("127.0.0.1", 0)) as server:
         skin = open_skin(f"socket://127.0.0.1:{server.getsockname()[1]}", LAYOUT)
         device, _ = server.accept()
     with skin:
-        device.sendall(lines(*range(50)))
-        assert numbers(skin.read(50, timeout=PATIENT)) == list(range(50))
-        device.sendall(lines(50, 51))
+        device.sendall(lines(50, 51, 52))
         device.close()
         with pytest.raises(SkinDisconnected, match="closed the connection") as caught:
-            skin.read(3, timeout=PATIENT)
-        assert numbers(caught.value.frames) == [50, 51]
+            skin.read(4, timeout=PATIENT)
+        assert numbers(caught.value.frames) == [50, 51, 52]
 
 
 def test_iterating():
     with opened(encode_header(Header(n=4, id="arm-L")), lines(*range(5))) as skin:
         assert (numbers(islice(skin, 5)), skin.header.id) == ([0, 1, 2, 3, 4], "arm-L")
-
-
-BAUD = b"\x00\xff503,50", b"4*1F\nets Jun  8 2016\r\nrst:0x1 (POWERON)\r\n\xff\xfe\x00\n"
-
-
-@pytest.mark.parametrize(
-    ("pieces", "found", "counts"),
-    [
-        ((*BAUD, lines(*range(5))), [(n, 0, "", 0) for n in range(5)], {"skipped": 4, "bad_frames": 0}),
-        ((lines(0, 1, 2, 3, 7, 8),), [(3, 0, "", 0), (7, 3, "gap", 0), (8, 0, "", 0)], {"lost": 3}),
-        (
-            (lines(700, 701, 702), b"booted\n", lines(0, 1)),
-            [(702, 0, "", 0), (0, 0, "reset", 1), (1, 0, "", 1)],
-            {"resets": 1},
-        ),
-    ],
-)
-def test_frames_are_placed_and_counted(pieces, found, counts):
-    """What comes when a port is opened is skipped; a gap is flagged, not filled; a restart is a segment."""
-    with opened(*pieces) as skin:
-        frames = skin.read(sum(piece.count(b"*") for piece in pieces) - (BAUD[1] in pieces), timeout=PATIENT)
-        stats = skin.stats
-    said = [(frame.seq, frame.lost, frame.after, frame.segment) for frame in frames]
-    assert said[-len(found) :] == found
-    assert {name: getattr(stats, name) for name in counts} == counts
-
-
-@pytest.mark.parametrize(
-    ("damaged", "reason"),
-    [
-        (b"5,50000,1,2,3\n", "fields"),
-        (b"5,50000,one,two,three,4\n", "number"),
-        (b"5,nan,1,2,3,4\n", "number"),
-        (line(5).replace(b"501", b"511"), "checksum"),
-        (b"9" * 70_000 + b"\n", "long"),
-    ],
-)
-def test_a_bad_line_costs_itself_only(damaged, reason):
-    # Where every line has a checksum, one without is bad for that.
-    check = "crc16" if reason == "checksum" else "none"
-    with opened(lines(*range(5), check=check), damaged, lines(6, 7, check=check)) as skin:
-        frames = skin.read(7 if check == "crc16" else 6, timeout=PATIENT)
-        assert (numbers(frames[-3:]), frames[-2].lost) == ([4, 6, 7], 1)
-        assert (skin.stats.bad, skin.stats.resyncs) == ({reason: 1}, 1)
 
 
 def test_bad_lines_are_logged_once_a_second_with_their_reason(caplog):
@@ -142,27 +123,11 @@ def test_what_protects_the_frames_is_said_once(caplog, check, said):
     assert [said in entry.message for entry in caplog.records] == [True] * bool(said)
 
 
-NOISE = np.random.default_rng(0).bytes(6000)
-SIXTEEN = b"".join(line(number, [1] * 16) for number in range(200))
-
-
-@pytest.mark.parametrize(
-    ("sent", "reason"),
-    [
-        (SIXTEEN, "16 values per frame, the layout has 4"),
-        (NOISE, r"begin with ([0-9a-f]{2} ){63}[0-9a-f]{2}: is the baud rate"),
-    ],
-)
-def test_what_cannot_be_read_is_refused(sent, reason):
-    with opened(sent) as skin, pytest.raises(InputError, match=reason):
-        skin.read(1, timeout=PATIENT)
-
-
 @pytest.mark.parametrize(
     ("pieces", "reason", "arrived"),
     [
         ([], "port open, nothing received", []),
-        ([b"hello\n"], "6 bytes but no frame", []),
+        ([b"hello\n"], "no frame in 6 bytes", []),
         ([lines(0, 1, 2)], r"3 of 100 frames arrived within 0.3 s: .* stopped sending", [0, 1, 2]),
     ],
 )
@@ -173,14 +138,6 @@ def test_silence_is_told_apart_from_nonsense_and_carries_what_came(pieces, reaso
         assert numbers(caught.value.frames) == arrived
         with pytest.raises(SkinTimeout):
             next(iter(skin))
-
-
-def test_more_than_half_bad_asks_for_baud_rate_and_format():
-    decoder = Decoder(4)
-    decoder.feed(lines(*range(5)), 0.0)
-    for number in range(1, 50):
-        decoder.feed(b"\xfa\x92\x00\n\x81\x82\n", 0.05 * number)
-    assert "wrong baud rate or format" in decoder.stats.trouble
 
 
 def test_unplugging_is_an_error_after_what_came_before(plug):
@@ -242,8 +199,6 @@ def test_who_is_late_loses_the_oldest_frames_and_is_informed():
         ("socket://127.0.0.1:1", "does anything listen there"),
         ("socket://nowhere", "is not an address"),
         ("socket://127.0.0.1:many", "is not an address"),
-        ("simulated", "simulated needs a device"),
-        ("/nowhere/x.parquet", "no recording"),
     ],
 )
 def test_a_port_that_is_none_is_refused(port, reason):
@@ -256,24 +211,18 @@ def test_a_port_in_use_is_refused(plug):
         open_skin(plug.port)
 
 
-def test_a_forbidden_port_is_refused(plug):
-    os.chmod(plug.port, 0)
-    # As root nothing is forbidden, so another user tries; by then everything is imported.
-    code = (
-        "import os, sys, serial; from skin.wire.skin import open_skin\n"
-        "os.geteuid() or os.seteuid(65534)\n"
-        "try: open_skin(sys.argv[1])\n"
-        "except ValueError as error: print(error)\n"
-    )
-    command = [sys.executable, "-c", code, plug.port]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENT, check=False)
-    assert "may not be opened: add your user to dialout" in done.stdout, done.stderr
+def test_a_forbidden_port_is_refused(monkeypatch):
+    def refuse(*_, **__):
+        raise serial.SerialException(errno.EACCES, "Permission denied")
+
+    monkeypatch.setattr(serial, "Serial", refuse)
+    with pytest.raises(InputError, match="may not be opened: add your user to dialout"):
+        open_skin("/dev/ttyACM0")
 
 
 @pytest.mark.parametrize(
     ("setting", "named"),
     [
-        ({"format": "xml"}, "format"),
         ({"baudrate": 0}, "baudrate"),
         ({"backoff": (2, 1)}, "backoff"),
     ],
@@ -293,6 +242,9 @@ def test_channels_that_mean_nothing_are_masked_and_named():
     with opened(encode_header(Header(n=6, bits=10)), data, layout=6) as skin:
         frames = skin.read(800, timeout=PATIENT)
         assert skin.channels == ("ok", "dead", "stuck", "saturated", "ok", "ok")
+        engine = Engine(lambda readings, valid: [0.0] * 4, TOUCH, 6, 30, 10.0, Detection(0.3))
+        status = LiveLoop(skin, Tare(None, 0.0, 10.0), engine, None).line
+        assert "sensor 1 dead, sensor 2 stuck, sensor 3 saturated" in status
     assert frames[100].valid.all()
     assert frames[-1].valid.tolist() == [True, False, False, True, True, True]
     assert frames[-1].saturated.tolist() == [False, False, False, True, False, False]
@@ -310,7 +262,7 @@ def test_tare_and_a_touch(plug):
         assert baseline == pytest.approx([500] * 4, abs=1.01)
         pressed.append(True)
         sleep(0.3)
-        with pytest.raises(InputError, match="channel 2 differs from its old baseline by 300"):
+        with pytest.raises(InputError, match=r"channel 2 differs from its old baseline by (299|30[01])"):
             skin.tare(0.5)
         assert skin.baseline is baseline
         assert skin.tare(0.5, force=True)[2] == pytest.approx(800, abs=1.01)

@@ -1,8 +1,8 @@
 """Which frames are a gesture."""
 
-from collections import Counter
+import json
+from collections import Counter, deque
 from time import sleep
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,10 +10,10 @@ import pytest
 from skin.device.resampling import Frame, Window
 from skin.errors import InputError
 from skin.touch.labels import TOUCH, TOUCH_OR_NOT
-from skin.wire.protocol import Announcement, encode_announcement
+from skin.wire.decoder import Decoder
+from skin.wire.protocol import Announcement, crc16, encode_announcement, encode_line, parse_announcement
 from skin.wire.segmentation import (
     AnnouncedSegmenter,
-    AnnouncementListener,
     ContinuousSegmenter,
     PromptedSegmenter,
     label_plan,
@@ -30,22 +30,13 @@ def window(seconds):
     return Window(round(10 * seconds), 10.0, 1)
 
 
-def announcements(*said):
-    """Return a tap that has heard announcements among other bytes, cut anywhere."""
-    data = b"1,2*00\n" + b"".join(map(encode_announcement, said)) + b"half a li"
-    pieces = [data[:20], data[20:]]
-    listener = AnnouncementListener(lambda: SimpleNamespace(read=lambda: pieces.pop(0), close=lambda: None))()
-    assert listener.read() + listener.read() == data
-    return listener
-
-
 def shown(segmenter, sequence):
     return [gesture for frame in sequence if (gesture := segmenter.add(frame))]
 
 
 def announced(sequence, *said, seconds=0.3, task=TOUCH):
     """Return the gestures of a stream with announcements."""
-    return shown(AnnouncedSegmenter(window(seconds), announcements(*said), task), sequence)
+    return shown(AnnouncedSegmenter(window(seconds), deque(said), task), sequence)
 
 
 def test_an_announced_gesture_is_its_frames():
@@ -125,3 +116,45 @@ def test_windows_that_wait_for_a_touch():
         ContinuousSegmenter(window(0.1), begins=lambda values: values[0] % 50 > 40), frames(range(120))
     )
     assert [gesture.frames[0].seq for gesture in gestures] == [41, 91]
+
+
+def test_an_announcement_comes_back_among_frames_and_not_damaged():
+    contacts = np.full((3, 2, 5), np.nan)
+    contacts[1:, 1] = np.arange(10).reshape(2, 5) / 7
+    said = Announcement(3, 650, 300, LABELS, 10.0, contacts)
+    decoder = Decoder(2)
+    lines = [encode_line([1, number], number, 10_000 * number) for number in range(6)]
+    assert len(decoder.feed(b"".join([*lines[:3], encode_announcement(said), *lines[3:]]))) == 6
+    assert not decoder.stats.bad
+    (heard,) = decoder.announcements
+    np.testing.assert_array_equal(heard.contacts, contacts)
+    assert (heard.number, heard.seq, heard.frames, heard.labels, heard.rate) == (3, 650, 300, LABELS, 10.0)
+    text = encode_announcement(said).rstrip(b"\n")
+    for position in range(len(text)):
+        line = bytearray(text)
+        line[position] ^= 1
+        assert parse_announcement(bytes(line)) is None
+
+
+@pytest.mark.parametrize(
+    "contacts",
+    [
+        {"shape": [3, 101], "rows": []},
+        {"shape": [10**6, 1], "rows": []},
+        {"shape": [3, 2], "rows": [[3, 0, 0, 0, 0, 0, 0]]},
+        {"shape": [3, 2], "rows": [[-1, 0, 0, 0, 0, 0, 0]]},
+        {"shape": [3, 2], "rows": [[0, 0, 0]]},
+        {"shape": [3, 2], "rows": [[0, 0, 0, 0, 0, 0, 1e999]]},
+        [1, 2],
+    ],
+)
+def test_contacts_that_cannot_be_are_no_announcement(contacts):
+    body = b"# " + json.dumps({"number": 0, "seq": 0, "frames": 3, "contacts": contacts}).encode()
+    assert parse_announcement(b"%s*%04X" % (body, crc16(body))) is None
+
+
+@pytest.mark.parametrize(("count", "rate"), [(20, 10.0), (10, 20.0)])
+def test_contacts_of_another_window_or_rate_are_left_out(count, rate):
+    said = Announcement(0, 10, 100, LABELS, rate, np.zeros((count, 1, 5)))
+    (gesture,) = announced(frames(range(120)), said, seconds=1.0)
+    assert gesture.contacts is None

@@ -8,7 +8,8 @@ from skin.device.resampling import Frame
 from skin.errors import InputError
 from skin.wire.channels import unit_conversion
 from skin.wire.protocol import Header
-from skin.wire.skin import warm_up
+from skin.wire.reader import Port
+from skin.wire.skin import SerialSource
 from skin.wire.tare import SkinTouched, Tare
 
 REST = np.array([512.0, 300.0, 40.0])
@@ -26,51 +27,37 @@ def noisy(count, seed=0):
     return REST + np.random.default_rng(seed).integers(-1, 2, (count, 3))
 
 
-class Watch:
-    """Shows frames to a tare and returns them in N, as the live view does; None before the tare."""
-
-    def __init__(self, tare):
-        self.tare = tare
-
-    @property
-    def status(self):
-        return self.tare.status
-
-    def __call__(self, frame):
-        return self.tare.add(frame)
-
-
 def watched(scale=None, tare=1.0, known=None, header=None):
-    """Return what turns the frames of three sensors into N."""
+    """Return the tare of three sensors."""
     conversion = lambda baseline, told: unit_conversion(3, baseline, scale, known, told)  # noqa: E731
-    return Watch(Tare(conversion, tare, RATE, lambda: header))
+    return Tare(conversion, tare, RATE, lambda: header)
 
 
 def test_force_is_counted_from_the_first_quiet_second():
     watch = watched(scale=0.01)
     touched = noisy(150)
     touched[:, 1] += np.linspace(0, 400, 150)
-    assert all(watch(one) is None for one in frames(touched))
+    assert all(watch.add(one) is None for one in frames(touched))
     assert "touched: channel 1" in watch.status
-    quiet = [watch(one) for one in frames(noisy(300), start=1.5)]
+    quiet = [watch.add(one) for one in frames(noisy(300), start=1.5)]
     first = next(number for number, one in enumerate(quiet) if one is not None)
     assert 90 <= first <= 180
     assert watch.status == ""
-    pressed = watch(frames([REST + 200])[0])
+    pressed = watch.add(frames([REST + 200])[0])
     np.testing.assert_allclose(pressed.newtons, 2.0, atol=0.021)
 
 
 def test_the_baseline_is_that_of_maxima_over_the_intervals_of_the_model():
     """The window shows maxima, of which an untouched skin's must be 0."""
     watch, rows = watched(scale=1.0), noisy(400)
-    shown = [one.newtons for row in frames(rows) if (one := watch(row)) is not None]
+    shown = [one.newtons for row in frames(rows) if (one := watch.add(row)) is not None]
     highest = np.stack(shown)[: len(shown) // 10 * 10].reshape(-1, 10, 3).max(axis=1)
     assert np.median(highest, axis=0).tolist() == [0, 0, 0]
 
 
 def test_a_device_that_sends_newtons_says_so():
     watch = watched(tare=0, header=Header(unit="N"))
-    np.testing.assert_allclose(watch(frames(np.array([[1.0, 2.0, 3.0]]))[0]).newtons, [1, 2, 3])
+    np.testing.assert_allclose(watch.add(frames(np.array([[1.0, 2.0, 3.0]]))[0]).newtons, [1, 2, 3])
 
 
 @pytest.mark.parametrize("late", [0.5, 5.0])
@@ -78,25 +65,19 @@ def test_a_device_may_declare_its_unit_a_little_late(late):
     """Many send their header every five seconds."""
     headers = []
     convert = lambda baseline, header: unit_conversion(3, baseline, None, None, header)  # noqa: E731
-    watch = Watch(Tare(convert, 0.0, RATE, lambda: headers[0] if headers else None))
-    assert all(watch(frame) is None for frame in frames(noisy(round(100 * late))))
+    watch = Tare(convert, 0.0, RATE, lambda: headers[0] if headers else None)
+    assert all(watch.add(frame) is None for frame in frames(noisy(round(100 * late))))
     assert watch.status == "waiting for the header of the device"
     headers.append(Header(unit="N"))
-    assert watch(frames(noisy(1), start=late)[0]) is not None
+    assert watch.add(frames(noisy(1), start=late)[0]) is not None
 
 
 def test_counts_without_a_scale_are_refused():
     with pytest.raises(InputError, match=r"sends adc, .* device\.scale="):
-        watched(header=Header(unit="adc", bits=10))(frames(noisy(1))[0])
+        watched(header=Header(unit="adc", bits=10)).add(frames(noisy(1))[0])
     watch = watched()
     with pytest.raises(InputError, match=r"values of no unit, .* device\.scale="):
-        list(map(watch, frames(noisy(700))))
-
-
-def test_a_tare_too_short_for_a_baseline_is_refused():
-    watch = watched(scale=1.0, tare=0.5)
-    with pytest.raises(InputError, match="10 frames, got 5: give more seconds"):
-        list(map(watch, frames(noisy(200))))
+        list(map(watch.add, frames(noisy(700))))
 
 
 def test_a_calibration_gives_scale_gains_and_broken_sensors():
@@ -104,7 +85,7 @@ def test_a_calibration_gives_scale_gains_and_broken_sensors():
         {"gain": [0.5, 1.0, 1.0], "offset": [0.1, 0.2, 0.0]}, {"dead": [2]}, scale=0.02, zero=512
     )
     raw = np.array([612.0, 612.0, 0.0])
-    one = watched(tare=0, known=known)(frames([raw])[0])
+    one = watched(tare=0, known=known).add(frames([raw])[0])
     np.testing.assert_allclose(one.newtons[:2], known.corrected(raw)[:2])
     assert one.usable.tolist() == [True, True, False]
 
@@ -123,7 +104,7 @@ class Played:
             Frame(n, n / rate, n / rate, row, np.ones(2, dtype=bool), segment=int(segment))
             for n, (row, segment) in enumerate(zip(values, segments, strict=True))
         ]
-        self.taken = 0
+        self.taken, self.header = 0, Header()
 
     def read(self, count):
         self.taken += count
@@ -132,9 +113,9 @@ class Played:
 
 def settled(played, seconds, said=None):
     """Return the frames that settling took, and the baseline."""
-    tare = Tare(lambda baseline, header: unit_conversion(2, baseline, 1.0, None, header), seconds, RATE)
+    source = SerialSource(Port(scale=1.0, tare=seconds), 2, RATE)
     tell = (lambda _: None) if said is None else said.append
-    frames, conversion = warm_up(played, tare, RATE, seconds, tell)
+    frames, conversion = source.warm_up(played, tell)
     return frames, conversion.zero
 
 
@@ -204,46 +185,46 @@ def limited(values, channels, limit=1023.0):
 
 def test_a_channel_at_its_limit_has_no_baseline_and_keeps_an_old_one():
     watch = watched(scale=0.01)
-    list(map(watch, limited(noisy(150), [1])))
-    assert watch.tare.conversion.broken.tolist() == [False, True, False]
-    assert watch.tare.warning == "channel 1 at the limit or without a value: no baseline"
+    list(map(watch.add, limited(noisy(150), [1])))
+    assert watch.conversion.broken.tolist() == [False, True, False]
+    assert watch.warning == "channel 1 at the limit or without a value: no baseline"
     watch = watched(scale=0.01)
-    list(map(watch, frames(noisy(150))))
-    assert watch.tare.warning == ""
-    before = watch.tare.conversion.zero
-    watch.tare.restart()
-    list(map(watch, later(limited(noisy(150, 1), [1]))))
-    after = watch.tare.conversion
-    assert (watch.tare.count, after.broken.any(), after.zero[1]) == (2, False, before[1])
+    list(map(watch.add, frames(noisy(150))))
+    assert watch.warning == ""
+    before = watch.conversion.zero
+    watch.restart()
+    list(map(watch.add, later(limited(noisy(150, 1), [1]))))
+    after = watch.conversion
+    assert (watch.count, after.broken.any(), after.zero[1]) == (2, False, before[1])
     watch = watched(scale=0.01)
-    list(map(watch, limited(noisy(400), [0, 1, 2])))
-    assert watch.tare.conversion is None
+    list(map(watch.add, limited(noisy(400), [0, 1, 2])))
+    assert watch.conversion is None
     assert watch.status == "no baseline: all channels at the limit or without a value"
 
 
 def test_a_device_without_noise_is_told():
     watch = watched(scale=0.01)
-    list(map(watch, frames(np.tile(REST, (150, 1)))))
-    assert "this device shows no noise" in watch.tare.warning
+    list(map(watch.add, frames(np.tile(REST, (150, 1)))))
+    assert "this device shows no noise" in watch.warning
 
 
 def test_the_noise_of_the_untouched_skin_is_known():
     watch = watched(scale=0.01)
-    list(map(watch, frames(REST + np.random.default_rng(0).normal(scale=5.0, size=(400, 3)))))
-    np.testing.assert_allclose(watch.tare.conversion.noise, 0.05, rtol=0.3)
-    assert (watch.tare.conversion.changing > 0.9).all()
+    list(map(watch.add, frames(REST + np.random.default_rng(0).normal(scale=5.0, size=(400, 3)))))
+    np.testing.assert_allclose(watch.conversion.noise, 0.05, rtol=0.3)
+    assert (watch.conversion.changing > 0.9).all()
 
 
 def test_a_device_that_restarts_often_gets_a_baseline():
     """Its clock begins again every 0.6 s; the baseline needs a second."""
     watch = watched(scale=0.01)
     for number, one in enumerate(frames(noisy(300))):
-        watch(one._replace(t=number % 60 / 100, segment=number // 60))
-    assert watch.tare.conversion is not None
+        watch.add(one._replace(t=number % 60 / 100, segment=number // 60))
+    assert watch.conversion is not None
 
 
 def test_a_new_baseline_waits_for_the_end_of_a_touch_unless_it_is_forced():
-    tare, touched = watched(scale=0.01).tare, frames(noisy(150) + 100)
+    tare, touched = watched(scale=0.01), frames(noisy(150) + 100)
     list(map(tare.add, frames(noisy(150))))
     tare.restart()
     for one in later(touched):
@@ -261,5 +242,5 @@ def test_few_frames_are_waited_for():
     watch = watched(scale=1.0, tare=2.0)
     for burst in range(6):
         for one in frames(noisy(25)):
-            watch(one._replace(t=0.5 * burst + 0.5, t_host=0.5 * burst + 0.5))
+            watch.add(one._replace(t=0.5 * burst + 0.5, t_host=0.5 * burst + 0.5))
     assert watch.status == "taking the baseline: waiting for more frames"

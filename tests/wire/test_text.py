@@ -9,9 +9,9 @@ from skin.wire.protocol import (
     encode_header,
     encode_line,
     parse_header,
-    parse_line,
     xor8,
 )
+from tests.wire.memory import parse_line
 
 
 def test_the_crc_has_the_published_check_value():

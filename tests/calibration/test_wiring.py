@@ -16,7 +16,6 @@ from skin.calibration.wiring import (
     Confirmed,
     check_usable,
     compose_turns,
-    lies_on_sheet,
     turn_gauge,
     wired_bench,
 )
@@ -103,7 +102,7 @@ def test_turns_come_back_and_compose(turn):
     assert compose_turns(BACK.get(turn, turn), turn) == compose_turns("as_given", "as_given") == "as_given"
     assert compose_turns("as_given", turn) == compose_turns(turn, "as_given") == turn
     assert compose_turns("mirror_x", "mirror_y") == "rotate_180"
-    assert lies_on_sheet(gauge, size)
+    assert gauge.lies_on(size)
 
 
 @pytest.mark.parametrize("name", SKINS)

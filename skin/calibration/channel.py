@@ -17,11 +17,10 @@ from scipy.interpolate import CubicSpline
 from scipy.optimize import OptimizeResult, least_squares
 
 from skin.calibration.bench import BenchData
-from skin.calibration.wiring import list_numbers
+from skin.calibration.wiring import MAD, list_numbers
 from skin.device.curves import Table
 from skin.mechanics.relaxation import first_order_lag
 
-MAD = 1.4826  # standard deviation over the median absolute deviation, of normal noise
 _LAGS = 24  # time constants for which the lagged force is tabulated
 _SLOWEST = 1.0  # s, the longest of them: what the tail of a press can show
 _SUDDEN = (

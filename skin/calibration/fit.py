@@ -11,16 +11,17 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
-from skin.calibration.bench import BenchData
-from skin.calibration.channel import MAD, Channel, Loads, describe_channels, fit_channel
+from skin.calibration.bench import BenchData, BenchSession
+from skin.calibration.channel import Channel, Loads, describe_channels, fit_channel
 from skin.calibration.gauge_drift import check_gauge
 from skin.calibration.wiring import (
-    Idle,
+    MAD,
+    QUIET,
+    Rest,
     check_usable,
     collect_responses,
     find_polarity,
-    find_quantum,
-    measure_idle,
+    measure_rests,
 )
 from skin.device.calibration import BROKEN, QUANTITIES, Calibration
 from skin.device.curves import Curves
@@ -39,15 +40,6 @@ _GAUGES, _LIKE = {"kg": 9.80665, "g": 0.00980665}, 1.5  # N; factor within which
 _UNITS = {"gain": "", "hysteresis": "of peak", "time_constant": "s", "drift": "N/s"}
 
 
-@dataclass(frozen=True)
-class _Rest:
-    """An untouched channel, in the session's unit; why it is broken, or None."""
-
-    idle: Idle
-    quantum: float = 0.0
-    broken: str | None = None
-
-
 def fit_calibration(bench: BenchData, presses: Collection[int] | None = None) -> Calibration:
     """Fit every channel to the simulated true readings of presses, never to the gauge's force.
 
@@ -63,57 +55,47 @@ def fit_calibration(bench: BenchData, presses: Collection[int] | None = None) ->
         InputError: no channel responds to a press.
     """
     used = range(len(bench.gauge)) if presses is None else presses
-    rests = [_measure_rest(bench, number) for number in range(bench.each.shape[1])]
-    responses = collect_responses(bench)
+    raw, responses = bench.session.raw, collect_responses(bench)
+    counts = (np.isfinite(raw) & bench.idle[:, None]).sum(axis=0)
+    broken = _find_broken(bench.session, bench.true.max(axis=0), responses.responding)
+    usable = ~np.isin(np.arange(raw.shape[1]), np.concatenate([*broken.values()]))
+    if few := np.flatnonzero(usable & (counts < QUIET)).tolist():
+        raise InputError(
+            f"channel {few[0]} has {counts[few[0]]} idle frames: do not touch the skin for some seconds"
+        )
+    rests = measure_rests(bench.session, bench.idle)
     polarity = find_polarity(responses, bench.each)
-    largest = bench.true.max(axis=0)
-    silent = (largest >= _PRESSED * largest.max()) & ~responses.responding
-    rests = [
-        replace(rest, broken=rest.broken or "dead") if dead else rest
-        for rest, dead in zip(rests, silent, strict=True)
-    ]
+    offset, drift = (np.array([getattr(rest, name) for rest in rests]) for name in ("offset", "drift"))
+    changes = polarity * (raw - offset - drift * bench.session.time[:, None])
     driven = bench.true[bench.frames_of(used)].max(axis=0, initial=0.0)
     loads, channels = Loads(bench, used), dict[int, Channel]()
-    for number in np.flatnonzero(driven >= _PRESSED * driven.max()).tolist():
-        rest, change = rests[number], _subtract_rest(bench, number, rests[number], polarity[number])
-        if rest.broken is None:
-            noise = math.hypot(rest.idle.noise, rest.quantum / math.sqrt(12))
-            channel = fit_channel(loads, bench.each[:, number], change, noise)
-            channels |= {} if channel is None else {number: channel}
+    for number in np.flatnonzero(usable & (driven >= _PRESSED * driven.max())).tolist():
+        noise = math.hypot(rests[number].noise, rests[number].step / math.sqrt(12))
+        channel = fit_channel(loads, bench.each[:, number], changes[:, number], noise)
+        channels |= {} if channel is None else {number: channel}
     if not any(channel.known for channel in channels.values()):
         raise InputError(
             "no channel responds to a press below its limit: check layout, indenter, the forces and the "
             "session's clock"
         )
-    return _convert_to_newton(bench, rests, polarity, channels)
+    return _describe(bench, rests, polarity, channels, changes, broken)
 
 
-def _measure_rest(bench: BenchData, number: int) -> _Rest:
-    """Return the idle statistics of a channel; one that never changes is broken."""
-    raw = bench.session.raw
-    measured = raw[:, number]
-    present = np.isfinite(measured)
-    if not present.any():
-        return _Rest(Idle(0.0, 0.0, 0.0), broken="dead")
-    if np.ptp(measured[present]) == 0:
-        level = float(measured[present][0])
-        full = 2**bench.session.bits - 1 if bench.session.bits else np.inf
-        limit = level >= min(full, _LIMIT * float(np.nanmax(raw))) > 0
-        return _Rest(
-            Idle(level, 0.0, 0.0), broken="dead" if level == 0 else "saturated" if limit else "stuck"
-        )
-    quiet = present & bench.idle
-    if quiet.sum() < 10:
-        raise InputError(
-            f"channel {number} has {quiet.sum()} idle frames: do not touch the skin for some seconds"
-        )
-    step = find_quantum(measured[present])
-    return _Rest(measure_idle(bench.session.time[quiet], measured[quiet], step), step)
-
-
-def _subtract_rest(bench: BenchData, number: int, rest: _Rest, polarity: float) -> np.ndarray:
-    """Return the change of a channel against its rest, (T,), in the session's unit, above 0 under force."""
-    return polarity * (bench.session.raw[:, number] - rest.idle.offset - rest.idle.drift * bench.session.time)
+def _find_broken(session: BenchSession, pressed: np.ndarray, responding: np.ndarray) -> dict[str, list[int]]:
+    """Return the broken channels by kind: those that never change, or are silent though ``pressed``, N."""
+    broken: dict[str, list[int]] = {kind: [] for kind in BROKEN}
+    largest = float(np.nanmax(session.raw, initial=-np.inf))
+    limit = min(2**session.bits - 1 if session.bits else np.inf, _LIMIT * largest)
+    silent = (pressed >= _PRESSED * pressed.max()) & ~responding
+    for number, values in enumerate(session.raw.T):
+        present = values[np.isfinite(values)]
+        still = not len(present) or np.ptp(present) == 0
+        level = float(present[0]) if still and len(present) else 0.0
+        if level != 0:
+            broken["saturated" if level >= limit > 0 else "stuck"].append(number)
+        elif still or silent[number]:
+            broken["dead"].append(number)
+    return broken
 
 
 def _curved_noise(bench: BenchData, curves: Curves, number: int, change: np.ndarray) -> float:
@@ -140,61 +122,78 @@ def _curves(channels: Mapping[int, Channel], sensors: int) -> Curves | None:
     return Curves(exponent, np.full(sensors, at), tables)
 
 
-def _convert_to_newton(
-    bench: BenchData, rests: Sequence[_Rest], polarity: np.ndarray, channels: Mapping[int, Channel]
+def _describe(
+    bench: BenchData,
+    rests: Sequence[Rest],
+    polarity: np.ndarray,
+    channels: Mapping[int, Channel],
+    changes: np.ndarray,
+    broken: Mapping[str, list[int]],
 ) -> Calibration:
-    """Convert channels to N, and compute ranges over the working ones."""
-    curves = _curves(channels, len(rests))
+    """Return the calibration that follows from the rest and the response of every channel."""
+    curves, known = _curves(channels, len(rests)), {n: one for n, one in channels.items() if one.known}
     at = 1.0 if curves is None else float(curves.at[0])
-    known = {n: channel for n, channel in channels.items() if channel.known}
-    gains = {n: channel.gain(at) for n, channel in known.items()}
-    scale = 1.0 if bench.session.unit == "N" else 1 / float(np.median(list(gains.values())))
-    # Counts have an unknown zero, common to all channels; readings in N do not.
-    counts = [rest.idle.offset for rest in rests if rest.broken is None]
-    zero = 0.0 if bench.session.unit == "N" else float(np.median(counts))
-    noise = [rest.idle.noise for rest in rests]
+    values = {
+        name: np.array([getattr(rest, name) for rest in rests]) for name in ("offset", "noise", "drift")
+    }
+    values |= {"drift": polarity * values["drift"], "quantum": np.array([rest.step for rest in rests])}
+    names = ("clip", "gain", "hysteresis", "time_constant", *(() if curves is None else ("exponent",)))
+    values |= {name: np.full(len(rests), np.nan) for name in names}
+    for number, channel in channels.items():
+        values["clip"][number] = np.nan if channel.clip is None else channel.clip
     for number, channel in known.items():
-        if curves is not None and channel.kind != "linear":
-            change = _subtract_rest(bench, number, rests[number], polarity[number])
-            noise[number] = _curved_noise(bench, curves, number, change)
-    numbers = range(len(rests))
-    offset = [sign * (rest.idle.offset - zero) for sign, rest in zip(polarity, rests, strict=True)]
-    in_unit: dict[str, list[Any]] = {
-        "offset": offset,
-        "noise": noise,
-        "drift": [sign * rest.idle.drift for sign, rest in zip(polarity, rests, strict=True)],
-        "quantum": [rest.quantum for rest in rests],
-        "clip": [channels[n].clip if n in channels else None for n in numbers],
-        "gain": [gains.get(n) for n in numbers],
-    }
-    sensors = {name: [_round(value, scale) for value in values] for name, values in in_unit.items()}
-    sensors["hysteresis"] = [_round(known[n].hysteresis) if n in known else None for n in numbers]
-    sensors["time_constant"] = [_round(known[n].time_constant) if n in known else None for n in numbers]
-    if curves is not None:
-        sensors["exponent"] = [_round(float(curves.exponent[n])) if n in known else None for n in numbers]
-    broken = {kind: [n for n in numbers if rests[n].broken == kind] for kind in BROKEN}
-    ranges: dict[str, list[float]] = {"dead": [0, sum(map(len, broken.values()))]}
-    for name, values in sensors.items():
-        working = [value for n, value in enumerate(values) if rests[n].broken is None and value is not None]
-        ranges |= {name: [min(working), max(working)]} if working else {}
-    error = 2 * scale * float(np.median([channel.error * gains[n] for n, channel in known.items()]))
-    ranges["gain"] = [max(ranges["gain"][0] - error, 0.0), ranges["gain"][1] + error]
-    about: dict[str, Any] = {
-        "unit": bench.session.unit,
-        "presses": len(bench.gauge),
-        "frames": len(bench.session.time),
-    }
-    signs = polarity.astype(int).tolist() if polarity.min() < 0 else ()
-    calibration = Calibration(sensors, broken, ranges, scale, zero, about, polarity=signs)
+        values["gain"][number], values["time_constant"][number] = channel.gain(at), channel.time_constant
+        values["hysteresis"][number] = np.nan if channel.hysteresis is None else channel.hysteresis
+        if curves is not None:
+            values["exponent"][number] = curves.exponent[number]
+            if channel.kind != "linear":
+                values["noise"][number] = _curved_noise(bench, curves, number, changes[:, number])
+    metadata = {"presses": len(bench.gauge), "frames": len(bench.session.time)}
+    calibration = convert_to_newton(bench.session, values, polarity, broken, metadata)
+    scale, (low, high) = calibration.scale, calibration.ranges["gain"]
+    error = 2 * scale * float(np.median([channel.error * channel.gain(at) for channel in known.values()]))
+    ranges = {**calibration.ranges, "gain": [max(low - error, 0.0), high + error]}
     if curves is None:
-        return calibration
-    about["responses"] = describe_channels(known)
+        return replace(calibration, ranges=ranges)
+    about = {**calibration.about, "responses": describe_channels(known)}
     tables = {n: (scale * np.array(table)).tolist() for n, table in curves.tables.items()}
-    return replace(calibration, about=about, exponent_at=at * scale, tables=tables)
+    return replace(calibration, ranges=ranges, about=about, exponent_at=at * scale, tables=tables)
 
 
-def _round(value: float | None, scale: float = 1.0) -> float | None:
-    return None if value is None else float(f"{value * scale:.6g}") + 0.0  # no negative 0
+def convert_to_newton(
+    session: BenchSession,
+    values: Mapping[str, np.ndarray],
+    polarity: np.ndarray,
+    broken: Mapping[str, Sequence[int]],
+    metadata: Mapping[str, Any],
+) -> Calibration:
+    """Return the calibration of a session, with ranges over the working channels.
+
+    Args:
+        session: of the channels.
+        values: quantity -> (S,), in the session's unit, gain per N, offset of the raw values; NaN if unknown.
+        polarity: (S,), 1 or -1.
+        broken: kind -> numbers of channels.
+        metadata: origin of the calibration.
+    """
+    alive = ~np.isin(np.arange(len(polarity)), np.concatenate([*broken.values()]))
+    # Counts have an unknown zero, common to all channels; readings in N do not.
+    scale, zero = 1.0, 0.0
+    if session.unit != "N":
+        scale, zero = 1 / float(np.nanmedian(values["gain"])), float(np.median(values["offset"][alive]))
+    sensors, ranges = dict[str, list[float | None]](), {"dead": [0.0, float((~alive).sum())]}
+    for name, column in {**values, "offset": polarity * (values["offset"] - zero)}.items():
+        converted = column * (1.0 if name in ("hysteresis", "time_constant", "exponent") else scale)
+        # No negative 0.
+        sensors[name] = [float(f"{value:.6g}") + 0.0 if np.isfinite(value) else None for value in converted]
+        working = [
+            value for value, live in zip(sensors[name], alive, strict=True) if live and value is not None
+        ]
+        ranges |= {name: [min(working), max(working)]} if working else {}
+    signs = tuple(polarity.astype(int).tolist()) if polarity.min() < 0 else ()
+    kinds = {kind: list(map(int, numbers)) for kind, numbers in broken.items()}
+    about = {"unit": session.unit, **metadata}
+    return Calibration(sensors, kinds, ranges, scale, zero, about, polarity=signs)
 
 
 @dataclass(frozen=True)

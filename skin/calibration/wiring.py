@@ -20,11 +20,11 @@ from skin.device.calibration import Calibration
 from skin.errors import InputError
 
 _BLOCKS = 200  # of the frames: Theil's line of a drift takes all pairs of their medians
-_MAD = 1.4826  # standard deviation over the median absolute deviation, of normal noise
+MAD = 1.4826  # standard deviation over the median absolute deviation, of normal noise
 _MEDIAN = math.sqrt(math.pi / 2)  # standard error of a median over that of a mean
 _STEPS = 8  # means over the loading of a press
 _BEFORE = 20  # idle frames before a press, from which its rest is taken
-_FEW = 5
+QUIET = 10  # idle frames of a channel that show its noise
 _SURE, _VISIBLE, _STEP = 5.0, 1.0, 1.5  # standard errors, noise and steps above which a channel responds
 _LIMITS = np.geomspace(0.9, 30.0, 40)  # largest prediction over the limit; at 300 any shape fits a step
 _TINY = 1e-6  # of the largest prediction: less is 0
@@ -33,7 +33,7 @@ _STRONGER = 20.0  # response over its prediction, relative to the strongest: abo
 
 
 @dataclass(frozen=True)
-class Idle:
+class Rest:
     """Statistics of an untouched channel, in the session's unit.
 
     Attributes:
@@ -41,11 +41,29 @@ class Idle:
         drift: per s; 0 if its 95 % confidence interval contains 0.
         noise: 1.4826 times the median absolute deviation; with steps of similar size, the standard
             deviation without outliers.
+        step: of the converter; 0: continuous.
     """
 
-    offset: float
-    drift: float
-    noise: float
+    offset: float = 0.0
+    drift: float = 0.0
+    noise: float = 0.0
+    step: float = 0.0
+
+
+def measure_rests(session: BenchSession, idle: np.ndarray) -> list[Rest]:
+    """Return the rest of every channel in idle frames, (T,) bool; one that never changes has no noise."""
+    rests = []
+    for values in session.raw.T:
+        present = np.isfinite(values)
+        quiet = values[present & idle]
+        if len(quiet) < QUIET or np.ptp(quiet) == 0:
+            spare = quiet if len(quiet) else values[present]
+            rests.append(
+                Rest(float(np.median(spare)) if len(spare) else 0.0, step=find_quantum(values[present]))
+            )
+            continue
+        rests.append(measure_rest(session.time[present & idle], quiet, find_quantum(values[present])))
+    return rests
 
 
 def find_quantum(values: np.ndarray) -> float:
@@ -62,7 +80,7 @@ def find_quantum(values: np.ndarray) -> float:
     return float(steps.min(initial=np.inf)) if len(steps) else 0.0
 
 
-def measure_idle(time: np.ndarray, values: np.ndarray, step: float) -> Idle:
+def measure_rest(time: np.ndarray, values: np.ndarray, step: float) -> Rest:
     """Return the statistics of idle frames.
 
     Args:
@@ -77,12 +95,12 @@ def measure_idle(time: np.ndarray, values: np.ndarray, step: float) -> Idle:
     drift = 0.0 if low <= 0 <= high else float(slope)
     steady = values - drift * time
     offset = float(np.median(steady))
-    spread = _MAD * float(np.median(np.abs(steady - offset)))
+    spread = MAD * float(np.median(np.abs(steady - offset)))
     if step > 0.8 * spread:
         # The steps are too coarse for a median.
         spread = float(np.std(steady[np.abs(steady - offset) <= 3 * max(spread, step)]))
     # Rounding and spreading each add the variance of a step (Sheppard's correction).
-    return Idle(offset, drift, math.sqrt(max(spread**2 - step**2 / 6, 0.0)))
+    return Rest(offset, drift, math.sqrt(max(spread**2 - step**2 / 6, 0.0)), step)
 
 
 def _spread(values: np.ndarray, step: float) -> np.ndarray:
@@ -144,7 +162,7 @@ def collect_responses(bench: BenchData) -> Responses:
         if not len(frames):
             continue
         before = idle[idle < frames[0]][-_BEFORE:]
-        level = find_medians(raw[before]) if len(before) >= _FEW else resting
+        level = find_medians(raw[before]) if len(before) >= _BEFORE / 4 else resting
         level = np.where(np.isfinite(level), level, resting)
         rests.append(level)
         for step in np.array_split(frames, min(_STEPS, len(frames))):
@@ -153,10 +171,10 @@ def collect_responses(bench: BenchData) -> Responses:
             numbers.append(number)
             counts.append(len(step))
     measured = np.nan_to_num(np.array(rows))
-    noise, step = _noise(bench, idle)
+    noise, step = np.array([(rest.noise, rest.step) for rest in measure_rests(bench.session, bench.idle)]).T
     error = noise * _MEDIAN * math.sqrt(1 / float(np.median(counts)) + 1 / _BEFORE)
     if len(rests) > 2:  # slow noise, which no mean reduces
-        error = np.maximum(error, _MAD * np.nan_to_num(find_medians(np.abs(np.diff(rests, axis=0)))))
+        error = np.maximum(error, MAD * np.nan_to_num(find_medians(np.abs(np.diff(rests, axis=0)))))
     floor = np.maximum(np.maximum(_SURE * error, _VISIBLE * noise), _STEP * step)
     responding = np.abs(measured).max(axis=0) > floor
     return Responses(measured, np.array(forces), np.array(numbers), error, responding)
@@ -215,19 +233,6 @@ def find_medians(values: np.ndarray) -> np.ndarray:
     if measured.any():
         middle[measured] = np.nanmedian(values[:, measured], axis=0)
     return middle
-
-
-def _noise(bench: BenchData, idle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the noise of a frame and the step of the converter, (S,) each; 0 where there is no number."""
-    noise, step = np.zeros(bench.session.raw.shape[1]), np.zeros(bench.session.raw.shape[1])
-    for channel, values in enumerate(bench.session.raw.T):
-        quiet = idle[np.isfinite(values[idle])]
-        if np.isfinite(values).any():
-            step[channel] = find_quantum(values[np.isfinite(values)])
-        if len(quiet) < 10 or np.ptp(values[quiet]) == 0:
-            continue
-        noise[channel] = measure_idle(bench.session.time[quiet], values[quiet], step[channel]).noise
-    return noise, step
 
 
 Turn = Literal[

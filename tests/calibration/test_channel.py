@@ -9,7 +9,7 @@ from skin.calibration.bench import BenchData, BenchSession
 from skin.calibration.bench_protocol import Protocol
 from skin.calibration.channel import Channel, Loads, fit_channel
 from skin.calibration.fit import evaluate_held_out, fit_calibration, print_calibration
-from skin.calibration.wiring import find_quantum, measure_idle
+from skin.calibration.wiring import find_quantum, measure_rest
 from skin.device.calibration import Calibration, read_calibration, write_calibration
 from skin.device.curves import Curves, check_table
 from skin.errors import InputError
@@ -86,7 +86,7 @@ def noise(seed: int, spread: float, count: int = len(TIME)) -> np.ndarray:
 def test_noise_is_found_under_steps_of_its_own_size(step):
     values = 3.21 + noise(0, 0.05)
     values = np.round(values / step) * step if step else values
-    found = measure_idle(TIME, values, step)
+    found = measure_rest(TIME, values, step)
     assert found.noise == pytest.approx(0.05, rel=0.06)
     assert found.offset == pytest.approx(3.21, abs=0.004)
     assert found.drift == 0
@@ -95,16 +95,16 @@ def test_noise_is_found_under_steps_of_its_own_size(step):
 def test_one_outlier_in_ten_changes_little():
     values = noise(1, 0.05)
     values[::10] += 5
-    found = measure_idle(TIME, values, 0.0)
+    found = measure_rest(TIME, values, 0.0)
     assert found.noise == pytest.approx(0.05, rel=0.2)
     assert abs(found.offset) < 0.01
 
 
 def test_a_drift_is_told_from_none():
-    found = measure_idle(TIME, 1.0 - 0.004 * TIME + noise(2, 0.05), 0.0)
+    found = measure_rest(TIME, 1.0 - 0.004 * TIME + noise(2, 0.05), 0.0)
     expected = [pytest.approx(1.0, abs=0.01), pytest.approx(-0.004, rel=0.05), pytest.approx(0.05, rel=0.05)]
     assert [found.offset, found.drift, found.noise] == expected
-    assert sum(measure_idle(TIME, noise(seed, 0.05), 0.0).drift != 0 for seed in range(40)) <= 6
+    assert sum(measure_rest(TIME, noise(seed, 0.05), 0.0).drift != 0 for seed in range(40)) <= 6
 
 
 def test_the_smallest_step_is_found_in_single_precision():

@@ -279,7 +279,8 @@ def _prepare(
     scale = np.sqrt(noise**2 + (_MODEL * value) ** 2)
     spread = _FACTOR * each[used].max() / each[used]
     model = _Model(felt, np.log(each[used][press]) - middle, press, value, scale, spread, loading, noise)
-    start = np.r_[ratio + middle, np.log(1.04 * value.max()), 1.0, 0.01, np.zeros(len(used))]
+    # The limit begins below the largest values, where frames move it either way.
+    start = np.r_[ratio + middle, np.log(0.95 * value.max()), 1.0, 0.01, np.zeros(len(used))]
     return model, start, middle
 
 

@@ -30,7 +30,8 @@ _SUDDEN = (
 _REACHED = 0.05  # of the strongest press of a sensor: a weaker one says nothing that can be relied on
 _MODEL = 0.01  # of a value: error of the simulated shape of a press, added to the noise
 _FACTOR = 0.05  # of the factors of the nearest presses: what sensors misplaced by 1 mm cause
-_FEWEST = 10  # frames below the limit, above it, or while the force falls, that determine anything
+_FEWEST, _BELOW = 10, 3  # frames that determine anything; frames of a rising force below the limit
+_LINE = 0.03  # an exponent this near to 1 is a line
 _KNOTS, _APART = 8, 0.06  # of a table; least distance of their logarithms
 _MOST = 40  # evaluations of a solution: a curve that wavers between two knots needs no more
 _STORED = 33  # columns of a table
@@ -240,7 +241,10 @@ def fit_channel(loads: Loads, each: np.ndarray, change: np.ndarray, noise: float
     edges = whole
     if model.loss(best) > _GOOD:
         power = model.fit(np.append(line.x, 1.0), whole)
-        best = power if model.loss(power) < _BETTER * model.loss(line) else line
+        if abs(power.x[count] - 1) < _LINE:  # the line may have ended beside its solution
+            line = best = model.fit(power.x[:count], whole)
+        elif model.loss(power) < _BETTER * model.loss(line):
+            best = power
         knots = _choose_knots(model, best)
         if model.loss(best) > _GOOD and len(knots):
             inner = np.r_[-np.inf, knots, np.inf]
@@ -318,7 +322,7 @@ def _describe(
         edges + middle,
         (middle, float(solution[0])),
         (float(seen.min(initial=0.0)) + middle, float(seen.max(initial=0.0)) + middle),
-        float(errors[0]) if below.sum() >= _FEWEST else np.inf,
+        float(errors[0]) if below.sum() >= _BELOW else np.inf,
         limit if above.sum() >= _FEWEST else None,
         float(np.interp(solution[2], np.arange(_LAGS), loads.lags)) * (solution[2] >= 1),
         float(bend) if falling.sum() >= _FEWEST else None,

@@ -190,7 +190,7 @@ def convert_to_newton(
             value for value, live in zip(sensors[name], alive, strict=True) if live and value is not None
         ]
         ranges |= {name: [min(working), max(working)]} if working else {}
-    signs = tuple(polarity.astype(int).tolist()) if polarity.min() < 0 else ()
+    signs: Sequence[int] = polarity.astype(int).tolist() if polarity.min() < 0 else ()
     kinds = {kind: list(map(int, numbers)) for kind, numbers in broken.items()}
     about = {"unit": session.unit, **metadata}
     return Calibration(sensors, kinds, ranges, scale, zero, about, polarity=signs)

@@ -134,6 +134,10 @@ class Gauge:
         """The first row of every press, (P,)."""
         return np.searchsorted(self.press, np.arange(len(self)))
 
+    def lies_on(self, size: Sequence[float]) -> bool:
+        """Return whether all positions are on a sheet of this size, x and y, m."""
+        return bool((self.position >= 0).all() and (self.position <= np.array(size)).all())
+
     def at(self, time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return force, (T,), N, and number of the press, (T,), -1 outside of presses, at times (T,), s."""
         row = np.clip(np.searchsorted(self.time, time, side="right") - 1, 0, len(self.time) - 1)
@@ -466,7 +470,7 @@ class BenchData:
         return np.isin(self.applied[1], list(presses))
 
     @cached_property
-    def _peaks(self) -> np.ndarray:
+    def peaks(self) -> np.ndarray:
         """The largest force of the press so far, (T,), N."""
         force, press = self.applied
         highest = np.zeros(len(force))
@@ -478,12 +482,12 @@ class BenchData:
     @property
     def loading(self) -> np.ndarray:
         """Frames at the largest force of their press so far, (T,), bool."""
-        return (self.applied[0] > 0) & (self.applied[0] >= 0.995 * self._peaks)
+        return (self.applied[0] > 0) & (self.applied[0] >= 0.995 * self.peaks)
 
     @property
     def unloading(self) -> np.ndarray:
         """Frames below the largest force of their press so far, (T,), bool."""
-        return (self.applied[0] > 0) & (self.applied[0] < 0.98 * self._peaks)
+        return (self.applied[0] > 0) & (self.applied[0] < 0.98 * self.peaks)
 
     @cached_property
     def releases(self) -> list[slice]:

@@ -6,7 +6,7 @@ below it.
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 from typing import Any
 
@@ -15,8 +15,9 @@ import numpy as np
 from skin.body.base import AbstractBody, Sensors
 from skin.calibration.bench import BenchSession, Gauge, per_newton, write_bench_session
 from skin.calibration.bench_protocol import Protocol, sent_session
+from skin.calibration.fit import convert_to_newton
 from skin.calibration.placements import Placements, find_placements
-from skin.calibration.wiring import find_quantum, list_numbers, measure_idle
+from skin.calibration.wiring import list_numbers, measure_rests
 from skin.core.settings import configured
 from skin.device.base import AbstractSimulated
 from skin.device.calibration import Calibration
@@ -194,57 +195,23 @@ def _build(
             f"sensors {list_numbers(sorted(dead + never))} were never loaded, or do not respond: put the "
             "load on every sensor and record again, or check the wiring"
         )
-    idle = placements.idle
-    rests = []
-    for channel in session.raw.T:
-        quiet = idle & np.isfinite(channel)
-        rest = channel[np.isfinite(channel)]
-        step = find_quantum(rest) if len(rest) else 0.0
-        # Slow drift is left to the tare: placements move the rest a little, too.
-        rests.append((*_rest(session.time[quiet], channel[quiet], step), step))
-    offset, noise, step_sizes = np.array(rests).T
+    # Slow drift is left to the tare: placements move the rest a little, too.
+    rests = measure_rests(
+        replace(session, time=session.time - session.time[placements.idle].mean()), placements.idle
+    )
+    offset, noise, steps = np.array([(rest.offset, rest.noise, rest.step) for rest in rests]).T
     absolute = np.where(np.isfinite(gains), gains * signs, np.nan)
     typical = float(np.nanmedian(absolute))
-    quiet = float(np.median(np.maximum(noise, step_sizes / math.sqrt(12)))) / typical
+    quiet = float(np.median(np.maximum(noise, steps / math.sqrt(12)))) / typical
     if quiet < usual / _QUIETER:
         raise InputError(
             f"weight={load.weight:g} (kg) would mean a noise of {quiet:.2g} N, device.noise is {usual:g}: "
             "give the load in this unit, or device.noise= if the sensors are so quiet"
         )
-    in_newton = session.unit == "N"
-    scale = 1.0 if in_newton else 1 / typical
-    zero = 0.0 if in_newton else float(np.median(offset[placements.reached]))
-    sensors: dict[str, list[float | None]] = {
-        "offset": _rounded(signs * (offset - zero) * scale),
-        "noise": _rounded(noise * scale),
-        "quantum": _rounded(step_sizes * scale),
-        "gain": _rounded(absolute * scale),
-    }
-    ranges: dict[str, list[float]] = {"dead": [0, len(dead)]}
-    for name, values in sensors.items():
-        working = [value for n, value in enumerate(values) if value is not None and n not in dead]
-        ranges[name] = [min(working), max(working)]
-    about: dict[str, Any] = {
-        "unit": session.unit,
-        "placements": len(placements.change),
-        "weight": load.weight,
-        "base": load.base,
-    }
-    polarity = tuple(int(sign) for sign in signs) if signs.min() < 0 else ()
-    calibration = Calibration(sensors, {"dead": dead}, ranges, scale, zero, about, polarity)
+    metadata = {"placements": len(placements.change), "weight": load.weight, "base": load.base}
+    values = {"offset": offset, "noise": noise, "quantum": steps, "gain": absolute}
+    calibration = convert_to_newton(session, values, signs, {"dead": dead}, metadata)
     return LoadResult(calibration, counts, differ, never)
-
-
-def _rest(time: np.ndarray, values: np.ndarray, step: float) -> tuple[float, float]:
-    """Return the level at rest and the noise of a channel, in the session's unit; 0 without frames."""
-    if len(values) < 2 * 10 or np.ptp(values) == 0:
-        return (float(np.median(values)) if len(values) else 0.0), 0.0
-    idle = measure_idle(time - time.mean(), values, step)
-    return idle.offset, idle.noise
-
-
-def _rounded(values: np.ndarray) -> list[float | None]:
-    return [float(f"{value:.6g}") + 0.0 if np.isfinite(value) else None for value in values]
 
 
 def print_known_load(result: LoadResult) -> None:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from skin.calibration.bench import BenchSession
-from skin.calibration.wiring import find_medians, find_quantum
+from skin.calibration.wiring import MAD, find_medians, find_quantum
 
 _BLOCK = 0.2  # s, whose median is one value
 _REST = 5  # blocks without a load before the first one
@@ -17,7 +17,6 @@ _AFTER = 4  # blocks after it for the rest; fewer before the next load
 _SHORTEST = 1.0  # s of a load: less is a touch
 _STEADY = 0.4, 0.9  # part of a load that is used: a hand no longer guides it, and has not come back
 _UNSTEADY = 0.2  # of the largest change: a load that changes more was touched or slid
-_MAD = 1.4826
 
 
 @dataclass(frozen=True)
@@ -54,7 +53,7 @@ def find_placements(session: BenchSession) -> Placements:
     parts = np.split(np.arange(len(time)), first[1:])
     values = _fill(np.array([find_medians(raw[part]) for part in parts]))
     steps = np.array([find_quantum(column[np.isfinite(column)]) for column in raw.T])
-    noise = _MAD / np.sqrt(2) * np.median(np.abs(np.diff(values, axis=0)), axis=0)
+    noise = MAD / np.sqrt(2) * np.median(np.abs(np.diff(values, axis=0)), axis=0)
     noise = np.maximum(noise, steps / np.sqrt(12))
     spans, rests = _find_loads(values, np.maximum(_LOADED * noise, _STEPS * steps))
     starts = time[first]

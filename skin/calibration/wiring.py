@@ -5,9 +5,9 @@ it would be if the positions of the presses were mirrored or turned, or the chan
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -20,11 +20,11 @@ from skin.device.calibration import Calibration
 from skin.errors import InputError
 
 _BLOCKS = 200  # of the frames: Theil's line of a drift takes all pairs of their medians
-_MAD = 1.4826  # standard deviation over the median absolute deviation, of normal noise
+MAD = 1.4826  # standard deviation over the median absolute deviation, of normal noise
 _MEDIAN = math.sqrt(math.pi / 2)  # standard error of a median over that of a mean
 _STEPS = 8  # means over the loading of a press
 _BEFORE = 20  # idle frames before a press, from which its rest is taken
-_FEW = 5
+QUIET = 10  # idle frames of a channel that show its noise
 _SURE, _VISIBLE, _STEP = 5.0, 1.0, 1.5  # standard errors, noise and steps above which a channel responds
 _LIMITS = np.geomspace(0.9, 30.0, 40)  # largest prediction over the limit; at 300 any shape fits a step
 _TINY = 1e-6  # of the largest prediction: less is 0
@@ -33,7 +33,7 @@ _STRONGER = 20.0  # response over its prediction, relative to the strongest: abo
 
 
 @dataclass(frozen=True)
-class Idle:
+class Rest:
     """Statistics of an untouched channel, in the session's unit.
 
     Attributes:
@@ -41,11 +41,29 @@ class Idle:
         drift: per s; 0 if its 95 % confidence interval contains 0.
         noise: 1.4826 times the median absolute deviation; with steps of similar size, the standard
             deviation without outliers.
+        step: of the converter; 0: continuous.
     """
 
-    offset: float
-    drift: float
-    noise: float
+    offset: float = 0.0
+    drift: float = 0.0
+    noise: float = 0.0
+    step: float = 0.0
+
+
+def measure_rests(session: BenchSession, idle: np.ndarray) -> list[Rest]:
+    """Return the rest of every channel in idle frames, (T,) bool; one that never changes has no noise."""
+    rests = []
+    for values in session.raw.T:
+        present = np.isfinite(values)
+        quiet = values[present & idle]
+        if len(quiet) < QUIET or np.ptp(quiet) == 0:
+            spare = quiet if len(quiet) else values[present]
+            rests.append(
+                Rest(float(np.median(spare)) if len(spare) else 0.0, step=find_quantum(values[present]))
+            )
+            continue
+        rests.append(measure_rest(session.time[present & idle], quiet, find_quantum(values[present])))
+    return rests
 
 
 def find_quantum(values: np.ndarray) -> float:
@@ -62,7 +80,7 @@ def find_quantum(values: np.ndarray) -> float:
     return float(steps.min(initial=np.inf)) if len(steps) else 0.0
 
 
-def measure_idle(time: np.ndarray, values: np.ndarray, step: float) -> Idle:
+def measure_rest(time: np.ndarray, values: np.ndarray, step: float) -> Rest:
     """Return the statistics of idle frames.
 
     Args:
@@ -77,12 +95,12 @@ def measure_idle(time: np.ndarray, values: np.ndarray, step: float) -> Idle:
     drift = 0.0 if low <= 0 <= high else float(slope)
     steady = values - drift * time
     offset = float(np.median(steady))
-    spread = _MAD * float(np.median(np.abs(steady - offset)))
+    spread = MAD * float(np.median(np.abs(steady - offset)))
     if step > 0.8 * spread:
         # The steps are too coarse for a median.
         spread = float(np.std(steady[np.abs(steady - offset) <= 3 * max(spread, step)]))
     # Rounding and spreading each add the variance of a step (Sheppard's correction).
-    return Idle(offset, drift, math.sqrt(max(spread**2 - step**2 / 6, 0.0)))
+    return Rest(offset, drift, math.sqrt(max(spread**2 - step**2 / 6, 0.0)), step)
 
 
 def _spread(values: np.ndarray, step: float) -> np.ndarray:
@@ -144,7 +162,7 @@ def collect_responses(bench: BenchData) -> Responses:
         if not len(frames):
             continue
         before = idle[idle < frames[0]][-_BEFORE:]
-        level = find_medians(raw[before]) if len(before) >= _FEW else resting
+        level = find_medians(raw[before]) if len(before) >= _BEFORE / 4 else resting
         level = np.where(np.isfinite(level), level, resting)
         rests.append(level)
         for step in np.array_split(frames, min(_STEPS, len(frames))):
@@ -153,10 +171,10 @@ def collect_responses(bench: BenchData) -> Responses:
             numbers.append(number)
             counts.append(len(step))
     measured = np.nan_to_num(np.array(rows))
-    noise, step = _noise(bench, idle)
+    noise, step = np.array([(rest.noise, rest.step) for rest in measure_rests(bench.session, bench.idle)]).T
     error = noise * _MEDIAN * math.sqrt(1 / float(np.median(counts)) + 1 / _BEFORE)
     if len(rests) > 2:  # slow noise, which no mean reduces
-        error = np.maximum(error, _MAD * np.nan_to_num(find_medians(np.abs(np.diff(rests, axis=0)))))
+        error = np.maximum(error, MAD * np.nan_to_num(find_medians(np.abs(np.diff(rests, axis=0)))))
     floor = np.maximum(np.maximum(_SURE * error, _VISIBLE * noise), _STEP * step)
     responding = np.abs(measured).max(axis=0) > floor
     return Responses(measured, np.array(forces), np.array(numbers), error, responding)
@@ -217,19 +235,6 @@ def find_medians(values: np.ndarray) -> np.ndarray:
     return middle
 
 
-def _noise(bench: BenchData, idle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the noise of a frame and the step of the converter, (S,) each; 0 where there is no number."""
-    noise, step = np.zeros(bench.session.raw.shape[1]), np.zeros(bench.session.raw.shape[1])
-    for channel, values in enumerate(bench.session.raw.T):
-        quiet = idle[np.isfinite(values[idle])]
-        if np.isfinite(values).any():
-            step[channel] = find_quantum(values[np.isfinite(values)])
-        if len(quiet) < 10 or np.ptp(values[quiet]) == 0:
-            continue
-        noise[channel] = measure_idle(bench.session.time[quiet], values[quiet], step[channel]).noise
-    return noise, step
-
-
 Turn = Literal[
     "as_given",
     "mirror_x",
@@ -240,30 +245,21 @@ Turn = Literal[
     "rotate_270",
     "transpose_other",
 ]
-TURNS: tuple[Turn, ...] = get_args(Turn)
-"""What ``calibrate.places`` takes, the simplest first."""
-WORDS: dict[Turn, str] = {
-    "as_given": "as given",
-    "mirror_x": "mirrored in x (the x axis counts to the left)",
-    "mirror_y": "mirrored in y (the y axis counts upwards)",
-    "rotate_180": "turned by 180 degrees (both axes count backwards)",
-    "transpose": "transposed (x and y are exchanged)",
-    "rotate_90": "turned by 90 degrees",
-    "rotate_270": "turned by 270 degrees",
-    "transpose_other": "mirrored at the other diagonal (x and y are exchanged, and both count backwards)",
+TURNS: dict[Turn, tuple[np.ndarray, str]] = {
+    "as_given": (np.array([[1, 0], [0, 1]]), "as given"),
+    "mirror_x": (np.array([[-1, 0], [0, 1]]), "mirrored in x (the x axis counts to the left)"),
+    "mirror_y": (np.array([[1, 0], [0, -1]]), "mirrored in y (the y axis counts upwards)"),
+    "rotate_180": (np.array([[-1, 0], [0, -1]]), "turned by 180 degrees (both axes count backwards)"),
+    "transpose": (np.array([[0, 1], [1, 0]]), "transposed (x and y are exchanged)"),
+    "rotate_90": (np.array([[0, -1], [1, 0]]), "turned by 90 degrees"),
+    "rotate_270": (np.array([[0, 1], [-1, 0]]), "turned by 270 degrees"),
+    "transpose_other": (
+        np.array([[0, -1], [-1, 0]]),
+        "mirrored at the other diagonal (x and y are exchanged, and both count backwards)",
+    ),
 }
-_MATRICES: dict[Turn, tuple[tuple[int, int], tuple[int, int]]] = {
-    "as_given": ((1, 0), (0, 1)),
-    "mirror_x": ((-1, 0), (0, 1)),
-    "mirror_y": ((1, 0), (0, -1)),
-    "rotate_180": ((-1, 0), (0, -1)),
-    "transpose": ((0, 1), (1, 0)),
-    "rotate_90": ((0, -1), (1, 0)),
-    "rotate_270": ((0, 1), (-1, 0)),
-    "transpose_other": ((0, -1), (-1, 0)),
-}
-"""From the direction in the gauge's frame to that on the sheet, x right and y down."""
-_PLAIN = 0.05  # residual: channels that are explained at least as well need no turn to be tried
+"""What ``calibrate.places`` takes, the simplest first: from the direction in the gauge's frame to that on the
+sheet, x right and y down; and its words."""
 _FITS = 0.45  # residual: sensors misplaced by 5 mm leave 0.25, another sensor 0.6 and more
 _WELL = 0.15  # residual: a channel that is called exchanged has to fit its new place at least as well
 _CLEARER = 2.0, 0.1  # another explanation leaves less than half of the residual, less 0.1 of a channel's
@@ -281,23 +277,17 @@ def turn_gauge(gauge: Gauge, turn: Turn, size: Sequence[float]) -> Gauge:
         turn: from this frame to that of the sheet.
         size: of the sheet, x and y, m.
     """
-    matrix = np.array(_MATRICES[turn], dtype=float)
-    middle = np.array(size) / 2
+    matrix, middle = TURNS[turn][0], np.array(size) / 2
     centred = gauge.position - np.abs(matrix).T @ middle
     direction = matrix @ np.stack([np.cos(gauge.angle), np.sin(gauge.angle)])
     angle = gauge.angle if turn == "as_given" else np.arctan2(direction[1], direction[0])
     return replace(gauge, position=centred @ matrix.T + middle, angle=angle)
 
 
-def lies_on_sheet(gauge: Gauge, size: Sequence[float]) -> bool:
-    """Return whether all positions of a gauge are on a sheet of this size, x and y, m."""
-    return bool((gauge.position >= 0).all() and (gauge.position <= np.array(size)).all())
-
-
 def compose_turns(first: Turn, then: Turn) -> Turn:
     """Return the turn that is the same as one turn after another."""
-    product = np.array(_MATRICES[then]) @ np.array(_MATRICES[first])
-    return next(turn for turn in TURNS if (np.array(_MATRICES[turn]) == product).all())
+    product = TURNS[then][0] @ TURNS[first][0]
+    return next(turn for turn, (matrix, _) in TURNS.items() if (matrix == product).all())
 
 
 @checked("calibrate")
@@ -347,7 +337,7 @@ class _Explanation:
         turn: of the positions.
         sensors: (S,), sensor of every channel.
         residual: (S,), of every channel at its sensor, 0 to 1; 0 where it does not respond.
-        sure: whether no other sensor explains a channel that is not at its own sensor about as well.
+        sure: whether every channel away from its own sensor fits well, and nowhere else about as well.
     """
 
     turn: Turn
@@ -370,18 +360,43 @@ class _Explanation:
         """How much the explanation supposes."""
         return (self.turn != "as_given") + len(self.moved)
 
-    def clearly_worse(self, rival: "_Explanation") -> bool:
+    def leaves_more(self, rival: "_Explanation") -> bool:
         """Return whether another explanation leaves clearly less."""
-        differs = (self.sensors != rival.sensors) | (self.turn != rival.turn)
         factor, minimum = _CLEARER
-        leaves_more = len(self.unexplained) > len(rival.unexplained)
-        return leaves_more or self.residual[differs].sum() > factor * rival.residual[differs].sum() + minimum
+        differs = (self.sensors != rival.sensors) | (self.turn != rival.turn)
+        clearly = self.residual[differs].sum() > factor * rival.residual[differs].sum() + minimum
+        return bool(len(self.unexplained) > len(rival.unexplained) or clearly)
+
+    def improves(self, straight: "_Explanation | None", responding: np.ndarray) -> bool:
+        """Return whether it may be named in place of the layout as it is, where that is possible."""
+        if not (self.parts and self.sure and len(self.unexplained) <= _MOST * responding.sum()):
+            return False
+        if straight is None:
+            return True
+        better = straight.residual > _CLEARER[0] * self.residual + _CLEARER[1]
+        kept = not len(np.setdiff1d(self.unexplained, straight.unexplained))
+        return kept and (self.turn == "as_given" or int(better.sum()) >= _FEWEST)
+
+    def words(self, confirmed: Confirmed) -> str:
+        """Return the explanation in words, with the settings that confirm it."""
+        order, words, settings = np.array(confirmed.order(len(self.sensors))), list[str](), list[str]()
+        if self.turn != "as_given":
+            words.append(f"the places of the presses are {TURNS[self.turn][1]}")
+            settings.append(f"calibrate.places={compose_turns(confirmed.places, self.turn)}")
+        if len(self.moved):
+            verb = "exchanged" if len(self.moved) == 2 else "in another order"
+            words.append(f"channels {list_numbers(np.sort(order[self.moved]))} are {verb}")
+            settings.append(f"'calibrate.channels=[{','.join(map(str, order[np.argsort(self.sensors)]))}]'")
+        return f"{' and '.join(words)}; to confirm that, add {' '.join(settings)}"
 
 
 def wired_bench(
     device: AbstractSimulated, session: BenchSession, rows: Gauge | None, confirmed: Confirmed
 ) -> BenchData:
     """Return the bench data of a session whose channels and places fit the layout.
+
+    Every channel is compared with the prediction for every sensor, for eight turns of the places. The
+    explanation that leaves the least is named, with those that leave about as little.
 
     Args:
         device: with the skin as designed.
@@ -400,40 +415,23 @@ def wired_bench(
         return build_bench_data(device, session, rows)
     gauge = turn_gauge(rows, confirmed.places, device.size)
     turned = {turn: turn_gauge(gauge, turn, device.size) for turn in TURNS}
-    allowed = {turn: places for turn, places in turned.items() if lies_on_sheet(places, device.size)}
+    allowed = {turn: places for turn, places in turned.items() if places.lies_on(device.size)}
     # Where no turn brings all positions onto the sheet, they are refused here.
     bench = build_bench_data(device, session, next(iter(allowed.values()), gauge))
-    responses = collect_responses(bench)
-    straight, best = _compare_turns(device, bench, responses, allowed)
-    clear = [entry for entry in best if _is_conclusive(entry, straight, responses.responding)]
-    explained = straight is not None and not len(straight.unexplained)
-    if explained and (not clear or any(entry is straight for entry in best)):
+    responses, found = collect_responses(bench), list[_Explanation]()
+    for turn, places in allowed.items():
+        each = bench.each if places is bench.gauge else per_newton(device.model, device.body, places)
+        found += _explain(match_channels(responses, each), responses.responding, turn)
+    straight = found[0] if "as_given" in allowed else None
+    least = min(found, key=lambda entry: (len(entry.unexplained), entry.residual.sum()))
+    best = sorted((one for one in found if not one.leaves_more(least)), key=lambda entry: entry.parts)
+    clear = [entry for entry in best if entry.improves(straight, responses.responding)]
+    if straight and not len(straight.unexplained) and (straight in best or not clear):
         return bench
-    raise InputError(_phrase_refusal(straight, best[0], clear, confirmed, responses.responding))
+    raise InputError(_refusal(straight, best[0], clear, confirmed, responses.responding))
 
 
-def _compare_turns(
-    device: AbstractSimulated, bench: BenchData, responses: Responses, allowed: Mapping[Turn, Gauge]
-) -> tuple[_Explanation | None, list[_Explanation]]:
-    """Return the explanation by the layout as it is, and those about as good as the best, simplest first.
-
-    The first is None where the positions as given are not on the sheet.
-    """
-    explanations = list[_Explanation]()
-    for turn, gauge in allowed.items():
-        rows = bench.each if gauge is bench.gauge else per_newton(device.model, device.body, gauge)
-        straight, permuted = _explain(match_channels(responses, rows), responses.responding, turn)
-        plain = straight.residual.max(initial=0.0) < _PLAIN and not straight.clearly_worse(permuted)
-        if turn == "as_given" and plain:
-            return straight, [straight]
-        explanations += [straight, permuted] if len(permuted.moved) else [straight]
-    best = min(explanations, key=lambda entry: (len(entry.unexplained), entry.residual.sum()))
-    good = [entry for entry in explanations if not entry.clearly_worse(best)]
-    designed = explanations[0] if "as_given" in allowed else None
-    return designed, sorted(good, key=lambda entry: entry.parts)
-
-
-def _explain(match: Match, responding: np.ndarray, turn: Turn) -> tuple[_Explanation, _Explanation]:
+def _explain(match: Match, responding: np.ndarray, turn: Turn) -> list[_Explanation]:
     """Return the explanation that leaves channels at their sensors, and the one that permutes them best."""
     channels = np.arange(len(responding))
     cost = np.where(responding[:, None], match.residual, 0.5)
@@ -441,26 +439,25 @@ def _explain(match: Match, responding: np.ndarray, turn: Turn) -> tuple[_Explana
     _, sensors = linear_sum_assignment(cost - 1e-6 * np.eye(len(cost)))
     settled = responding & (cost[channels, sensors] <= _FITS)
     # Unsettled channels stay at their own sensors, where these are free.
-    sensors = np.where(settled, sensors, -1)
-    for channel in np.flatnonzero(~settled):
-        sensors[channel] = -1 if channel in sensors else channel
-    sensors[sensors < 0] = np.setdiff1d(channels, sensors)
+    free = np.setdiff1d(channels, sensors[settled])
+    stay = np.intersect1d(free, channels[~settled])
+    sensors[stay] = stay
+    sensors[~settled & ~np.isin(channels, stay)] = np.setdiff1d(free, stay)
     straight, permuted = (
         np.where(responding, cost[channels, position], 0.0) for position in (channels, sensors)
     )
     factor, minimum = _CLEARER
-    moved = np.flatnonzero(settled & (sensors != channels))
-    seconds = [
-        np.delete(cost[channel], sensors[channel]).min(initial=1.0) > factor * permuted[channel] + minimum
-        for channel in moved
-    ]
-    seconds += list((match.expected[sensors[moved]] >= _PRESSED) & (permuted[moved] <= _WELL))
+    moved = settled & (sensors != channels)
+    cost[channels, sensors] = 1.0
+    sure = (cost.min(axis=1) > factor * permuted + minimum) & (permuted <= _WELL)
+    sure &= match.expected[sensors] >= _PRESSED
     # Of two silent channels, nothing says which is where.
-    seconds.append(int((~settled & (sensors != channels)).sum()) <= 1)
-    return _Explanation(turn, channels, straight), _Explanation(turn, sensors, permuted, all(seconds))
+    known = bool(sure[moved].all()) and int((~settled & (sensors != channels)).sum()) <= 1
+    found = [_Explanation(turn, channels, straight), _Explanation(turn, sensors, permuted, known)]
+    return found if len(found[1].moved) else found[:1]
 
 
-def _phrase_refusal(
+def _refusal(
     straight: _Explanation | None,
     best: _Explanation,
     clear: Sequence[_Explanation],
@@ -468,67 +465,33 @@ def _phrase_refusal(
     responding: np.ndarray,
 ) -> str:
     """Return the sentence that refuses a session, with the settings that confirm its explanations."""
-    order = np.array(confirmed.order(len(responding)))
-    if straight is None:
-        wrong = np.flatnonzero(responding)
-        trouble = "the places of some presses are outside the sheet"
-    else:
-        wrong = np.flatnonzero(straight.residual > _CLEARER[0] * best.residual + _CLEARER[1])
-        wrong = np.union1d(wrong, straight.unexplained).astype(int)
-        noun, verb, position = ("channels", "respond", "their sensors") if len(wrong) > 1 else (
-            "channel", "responds", "its sensor"
-        )  # fmt: skip
-        trouble = (
-            f"{noun} {list_numbers(sorted(order[wrong]))} {verb}, but not to the presses near {position}"
+    order, wrong = np.array(confirmed.order(len(responding))), np.flatnonzero(responding)
+    trouble = "the places of some presses are outside the sheet"
+    if straight is not None:
+        wrong = np.flatnonzero(
+            (straight.residual > _CLEARER[0] * best.residual + _CLEARER[1]) | (straight.residual > _FITS)
         )
-    if not clear and 2 * len(wrong) > responding.sum():
+        listed = list_numbers(np.sort(order[wrong]))
+        trouble = f"channel {listed} responds, but not to the presses near its sensor"
+        if len(wrong) > 1:
+            trouble = f"channels {listed} respond, but not to the presses near their sensors"
+    if clear:
+        # A turn that is made up for by another order says nothing new.
+        others = [entry for entry in clear[1:] if entry.turn == "as_given" or not len(entry.moved)]
+        sentences = [f"{trouble}: the session fits if {clear[0].words(confirmed)}"]
+        sentences += [f"It fits as well if {entry.words(confirmed)}" for entry in others[:2]]
+        if len(left := clear[0].unexplained):
+            sentences.append(f"Channel {list_numbers(np.sort(order[left]))} fits nowhere: check the wiring")
+        return ". ".join(sentences)
+    if 2 * len(wrong) > responding.sum():
         return (
             f"{trouble}: neither another order of the channels nor other axes explain the session; check the "
             "wiring, the layout, the places of the presses and the clock (calibrate.delay)"
         )
-    if not clear:
-        return (
-            f"{trouble}: check the wiring, and the position of the sensor in the layout; "
-            f"to leave it out, add 'calibrate.broken=[{','.join(map(str, wrong))}]'"
-        )
-    sentences = [f"{trouble}: the session fits if {_phrase_explanation(clear[0], confirmed, order)}"]
-    # A turn that is made up for by another order says nothing new.
-    others = [entry for entry in clear[1:] if entry.turn == "as_given" or not len(entry.moved)]
-    sentences += [
-        f"it fits as well if {_phrase_explanation(entry, confirmed, order)}" for entry in others[:2]
-    ]
-    if len(left := clear[0].unexplained):
-        sentences.append(f"channel {list_numbers(sorted(order[left]))} fits nowhere: check the wiring")
-    return ". ".join(text[0].upper() * bool(n) + text[bool(n) :] for n, text in enumerate(sentences))
-
-
-def _is_conclusive(explanation: _Explanation, straight: _Explanation | None, responding: np.ndarray) -> bool:
-    """Return whether an explanation is sure and explains enough to be named."""
-    few = len(explanation.unexplained) <= _MOST * responding.sum()
-    if not (explanation.parts and explanation.sure and few):
-        return False
-    if straight is None:
-        return True
-    if len(np.setdiff1d(explanation.unexplained, straight.unexplained)):
-        return False
-    if explanation.turn == "as_given":
-        return True
-    return int((straight.residual > _CLEARER[0] * explanation.residual + _CLEARER[1]).sum()) >= _FEWEST
-
-
-def _phrase_explanation(explanation: _Explanation, confirmed: Confirmed, order: np.ndarray) -> str:
-    """Return an explanation in words, with its settings."""
-    words, settings = list[str](), list[str]()
-    if explanation.turn != "as_given":
-        words.append(f"the places of the presses are {WORDS[explanation.turn]}")
-        settings.append(f"calibrate.places={compose_turns(confirmed.places, explanation.turn)}")
-    if len(explanation.moved):
-        moved = sorted(order[explanation.moved])
-        verb = "exchanged" if len(moved) == 2 else "in another order"
-        words.append(f"channels {list_numbers(moved)} are {verb}")
-        channels = ",".join(str(channel) for channel in order[np.argsort(explanation.sensors)])
-        settings.append(f"'calibrate.channels=[{channels}]'")
-    return f"{' and '.join(words)}; to confirm that, add {' '.join(settings)}"
+    return (
+        f"{trouble}: check the wiring, and the position of the sensor in the layout; "
+        f"to leave it out, add 'calibrate.broken=[{','.join(map(str, wrong))}]'"
+    )
 
 
 def device_channels(session: BenchSession, confirmed: Confirmed) -> list[int]:

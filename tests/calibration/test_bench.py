@@ -24,26 +24,16 @@ def rows(**changes) -> pa.Table:
     return pa.table(columns | changes)
 
 
-def test_a_pause_or_another_place_begins_a_press():
-    assert bench.gauge_from_table(rows(), "x", "disc", 0.01).press.tolist() == [
-        0,
-        0,
-        0,
-        0,
-        1,
-        1,
-    ]
-    moved = rows(x_m=[0.05, 0.05, 0.06, 0.06, 0.06, 0.06])
-    assert bench.gauge_from_table(moved, "x", "disc", 0.01).press.tolist() == [
-        0,
-        0,
-        1,
-        1,
-        2,
-        2,
-    ]
-    named = rows(indenter=["disc"] * 3 + ["square"] * 3)
-    assert len(bench.gauge_from_table(named, "x", "disc", 0.01)) == 3
+@pytest.mark.parametrize(
+    ("changes", "press"),
+    [
+        ({}, [0, 0, 0, 0, 1, 1]),
+        ({"x_m": [0.05, 0.05, 0.06, 0.06, 0.06, 0.06]}, [0, 0, 1, 1, 2, 2]),
+        ({"indenter": ["disc"] * 3 + ["square"] * 3}, [0, 0, 0, 1, 2, 2]),
+    ],
+)
+def test_a_pause_or_another_place_or_indenter_begins_a_press(changes, press):
+    assert bench.gauge_from_table(rows(**changes), "x", "disc", 0.01).press.tolist() == press
 
 
 def test_forces_are_interpolated_within_a_press_only():

@@ -16,7 +16,6 @@ from skin.calibration.wiring import (
     Confirmed,
     check_usable,
     compose_turns,
-    lies_on_sheet,
     turn_gauge,
     wired_bench,
 )
@@ -103,7 +102,7 @@ def test_turns_come_back_and_compose(turn):
     assert compose_turns(BACK.get(turn, turn), turn) == compose_turns("as_given", "as_given") == "as_given"
     assert compose_turns("as_given", turn) == compose_turns(turn, "as_given") == turn
     assert compose_turns("mirror_x", "mirror_y") == "rotate_180"
-    assert lies_on_sheet(gauge, size)
+    assert gauge.lies_on(size)
 
 
 @pytest.mark.parametrize("name", SKINS)
@@ -114,35 +113,18 @@ def test_a_session_that_fits_passes(skins, name):
     )
 
 
-@pytest.mark.parametrize(
-    ("name", "turn", "dead"),
-    [
-        *((name, turn, ()) for name in SKINS for turn in ("mirror_x", "mirror_y", "rotate_180")),
-        *((name, "mirror_y", (0,)) for name in SKINS),
-    ],
-)
-def test_mirrored_places_are_named_and_right_once_confirmed(skins, name, turn, dead):
+@pytest.mark.parametrize("dead", [(), (0,)])
+@pytest.mark.parametrize(("name", "turn"), list(zip(SKINS * 2, list(TURNS)[1:7], strict=True)))
+def test_turned_places_are_named_and_right_once_confirmed(skins, name, turn, dead):
     skin, session = skins(name)
     session = changed(replace(session, gauge=in_frame(session.gauge, turn, skin.size)), dead=dead)
     said = refused(skin, session)
-    words = {"mirror_x": "the x axis", "mirror_y": "the y axis counts upwards", "rotate_180": "180 degrees"}
-    assert "respond, but not to the presses near their sensors: the session fits if the places" in said
-    assert words[turn] in said
+    assert f"the session fits if the places of the presses are {TURNS[turn][1]}; to confirm" in said
     assert f"add calibrate.places={turn}" in said.split(". ")[0]
     calibration = fit_calibration(wired_bench(skin, session, None, Confirmed(places=turn)))
     assert calibration.broken["dead"] == list(dead)
     alive = np.setdiff1d(np.arange(len(calibration)), dead)
     np.testing.assert_allclose(calibration.values()["gain"][alive], skin.constants.gain[alive], rtol=0.02)
-
-
-@pytest.mark.parametrize("name", SKINS)
-@pytest.mark.parametrize("turn", ["transpose", "rotate_90", "rotate_270"])
-def test_turned_places_are_named_even_where_they_are_outside_the_sheet(skins, name, turn):
-    skin, session = skins(name)
-    session = replace(session, gauge=in_frame(session.gauge, turn, skin.size))
-    assert f"add calibrate.places={turn}" in refused(skin, session).split(". ")[0]
-    found = gains(wired_bench(skin, session, None, Confirmed(places=turn)))
-    np.testing.assert_allclose(found, skin.constants.gain, rtol=0.02)
 
 
 def test_places_that_no_turn_brings_onto_the_sheet_are_refused_with_one(skins):

@@ -1,13 +1,15 @@
-"""Responses that are no lines: is the hidden curve found, named, and undone on held-out presses?"""
+"""One channel: statistics of its rest, gain and limit from few steps, and hidden curves found and undone."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from skin.calibration.bench import BenchData
+from skin.calibration.bench import BenchData, BenchSession
+from skin.calibration.bench_protocol import Protocol
+from skin.calibration.channel import Channel, Loads, fit_channel
 from skin.calibration.fit import evaluate_held_out, fit_calibration, print_calibration
-from skin.calibration.response_fit import fit_shape
+from skin.calibration.wiring import find_quantum, measure_rest
 from skin.device.calibration import Calibration, Curves, read_calibration, write_calibration
 from skin.errors import InputError
 from skin.wire.channels import unit_conversion
@@ -72,10 +74,82 @@ def test_a_line_stays_a_line(hidden):
     assert "exponent" not in calibration.sensors
 
 
-def test_a_response_of_noise_alone_has_no_shape():
-    random = np.random.default_rng(0)
-    true, press = np.tile(np.linspace(0.01, 2, 200), 2), np.repeat([0, 1], 200)
-    assert fit_shape(true, random.normal(0, 0.1, 400), press, 0.1, 0.0).kind == "linear"
+TIME = np.arange(6000) / 100
+
+
+def noise(seed: int, spread: float, count: int = len(TIME)) -> np.ndarray:
+    return spread * np.random.default_rng(seed).standard_normal(count)
+
+
+@pytest.mark.parametrize("step", [0.0, 0.01, 0.05, 0.08, 0.1])
+def test_noise_is_found_under_steps_of_its_own_size(step):
+    values = 3.21 + noise(0, 0.05)
+    values = np.round(values / step) * step if step else values
+    found = measure_rest(TIME, values, step)
+    assert found.noise == pytest.approx(0.05, rel=0.06)
+    assert found.offset == pytest.approx(3.21, abs=0.004)
+    assert found.drift == 0
+
+
+def test_one_outlier_in_ten_changes_little():
+    values = noise(1, 0.05)
+    values[::10] += 5
+    found = measure_rest(TIME, values, 0.0)
+    assert found.noise == pytest.approx(0.05, rel=0.2)
+    assert abs(found.offset) < 0.01
+
+
+def test_a_drift_is_told_from_none():
+    found = measure_rest(TIME, 1.0 - 0.004 * TIME + noise(2, 0.05), 0.0)
+    expected = [pytest.approx(1.0, abs=0.01), pytest.approx(-0.004, rel=0.05), pytest.approx(0.05, rel=0.05)]
+    assert [found.offset, found.drift, found.noise] == expected
+    assert sum(measure_rest(TIME, noise(seed, 0.05), 0.0).drift != 0 for seed in range(40)) <= 6
+
+
+def test_the_smallest_step_is_found_in_single_precision():
+    values = np.round(noise(3, 1.0) / 0.07) * 0.07
+    assert find_quantum(values.astype(np.float32)) == pytest.approx(0.07, rel=1e-3)
+    assert find_quantum(noise(3, 1.0)) == 0
+    last = np.where(np.arange(100) % 2, 512.0, np.nextafter(np.float32(512), np.float32(600)))
+    assert find_quantum(last) == 0
+
+
+def channel(each, steps, shown) -> Channel | None:
+    """Return the fit to presses of 50 N with a true reading ``each`` per N, N; ``shown(true, press)``."""
+    protocol = Protocol(peak=50.0, steps=steps, idle=5.0)
+    gauge = protocol.gauge(np.zeros((len(each), 2)))
+    time = np.arange(round((gauge.time[-1] + 2) * 100)) / 100
+    bench = BenchData(BenchSession(time, np.zeros((len(time), 1)), "N"), gauge, np.array(each)[:, None])
+    values = shown(bench.true[:, 0], bench.applied[1]) + noise(5, 0.05, len(time))
+    values[::20] = np.nan
+    return fit_channel(Loads(bench, range(len(each))), bench.each[:, 0], values, 0.05)
+
+
+@pytest.mark.parametrize("limit", [np.inf, 15.8, 6.0, 3.0])
+def test_gain_and_limit(limit):
+    """At 3 N, only the first step is below it; 15.8 N is hardly reached."""
+    found = channel([0.2, 0.19], (0.1, 0.2, 0.5, 1.0), lambda true, _: np.minimum(1.6 * true, limit))
+    assert found.kind == "linear"
+    assert found.gain(1.0) == pytest.approx(1.6, rel=0.01)
+    assert found.error < 0.02
+    assert found.clip == (None if limit > 15 else pytest.approx(limit, rel=0.01))
+
+
+def test_the_gain_is_between_those_of_presses_that_disagree():
+    """Off the layout by a millimetre, the stronger press may be the weaker one in the simulation."""
+    factors = np.array([0.98, 1.07, 1.0])
+    found = channel(
+        [0.96, 0.92], (0.1, 0.2, 1.0), lambda true, press: np.minimum(true * factors[press], 10.0)
+    )
+    assert 0.98 <= found.gain(1.0) <= 1.07
+    assert found.clip == pytest.approx(10, rel=0.01)
+
+
+def test_a_channel_at_its_limit_or_of_noise_alone_has_no_gain():
+    found = channel([1.0], (0.4, 0.7, 1.0), lambda true, _: np.minimum(100 * true, 10.0))
+    assert not found.known
+    assert found.clip == pytest.approx(10, rel=0.01)
+    assert channel([0.2, 0.2], (0.2, 1.0), lambda true, _: 0 * true) is None
 
 
 def test_curves_are_undone_exactly_and_below_zero_too():

@@ -319,7 +319,7 @@ class Engine:
         """
         void, beyond, lost = self.detector.void, self.detector.beyond, self.detector.lost
         # A tap may come and go; but a device of the rate of a slow model may lose two frames, too.
-        paused = self._pause > max(_GAP / 2, 2.5 / self.rate)
+        paused = bool(self._pause > max(_GAP / 2, 2.5 / self.rate))
         blind = ~self._responds[:, valid & ~void].any(axis=1) | paused
         masked = blind & ~(void | below | beyond | lost | paused)
         sensors = {"below": below, "void": void, "over_range": beyond, "lost_wire": lost, "masked": masked}

@@ -65,6 +65,7 @@ def test_contacts_and_limits_come_along(old, tmp_path):
     assert gesture.resampled.saturated.tolist() == [[True, False]] * 5
 
 
+@pytest.mark.slow("converts 160 damaged sessions, each written as files")
 def test_damage_costs_gestures_and_changes_none(old, tmp_path):
     """A line costs a gesture at most, that of a baseline three."""
     convert_old_session(old, tmp_path / "whole")

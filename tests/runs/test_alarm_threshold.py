@@ -1,5 +1,6 @@
 """The device on which the alarm's threshold is chosen, for a skin and for the imperfections of a device."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -13,7 +14,7 @@ from skin.errors import InputError
 from skin.evaluation import alarm
 from skin.evaluation.alarm import choose_alarm_threshold, profile_settings
 from skin.evaluation.decisions import LiveConditions
-from skin.evaluation.operating_point import OperatingPoint
+from skin.evaluation.operating_point import DangerScore, OperatingPoint
 from skin.runs.build import alarm_source
 from skin.runs.configuration import validate_config
 from skin.runs.run import TAG, FinishedRun
@@ -133,7 +134,7 @@ def device_of(tmp_path, monkeypatch):
 
     def choose(device, learner, live, target, count):
         devices.append(device)
-        return STORED
+        return replace(STORED, score=DangerScore(1.0, 0.0, 0.0))
 
     def device_of(stored, config):
         alarm_point(stored, config, LiveConditions(100.0, 0.1, 2.0, 0.1, 3), say=print)

@@ -27,6 +27,7 @@ from skin.core.rng import Stream, generator
 from skin.device.calibration import read_calibration
 from skin.errors import InputError
 from skin.evaluation.decisions import LiveConditions
+from skin.evaluation.guarantee import threshold_above
 from skin.evaluation.operating_point import (
     LABEL,
     DangerScore,
@@ -316,20 +317,14 @@ def _lowest_threshold(safe: "Tensor", target: float) -> float:
     At most k = floor(target (n + 1)) - 1 of n safe gestures raise the alarm. A new safe gesture then raises
     it with a probability of at most (k + 1) / (n + 1) <= target (split conformal prediction; Vovk, Gammerman
     and Shafer 2005). If n < 1 / target - 1, the threshold is above all scores, and the target is not met.
-    Scores that differ by less than 2e-6 count as equal: either all of them raise the alarm or none.
 
     Args:
         safe: (n,), n > 0, probabilities of ``dangerous`` of safe gestures.
         target: largest rate.
     """
-    scores = np.sort(safe.detach().cpu().double().numpy())[::-1]
     # 1e-9 keeps a product such as 0.29 * 100 from rounding below its whole number.
-    allowed = max(math.floor(target * (len(scores) + 1) + 1e-9) - 1, 0)
-    apart = 1e-6  # scores closer than this may have another order on another processor
-    gaps = scores[:-1] - scores[1:] > 2 * apart  # [i]: between the first i + 1 scores and the others
-    cuts = np.flatnonzero(gaps[:allowed])
-    above = int(cuts[-1]) + 1 if len(cuts) else 0
-    return float(np.float32(scores[above] + apart))
+    allowed = max(math.floor(target * (len(safe) + 1) + 1e-9) - 1, 0)
+    return threshold_above(safe.detach().cpu().double().numpy(), allowed)
 
 
 # The choice on touches, as the live view judges them.

@@ -21,15 +21,14 @@ CONFIDENCE = 0.95
 _APART = 1e-6  # scores closer than this may have another order on another processor
 
 
-def counts(pressure: np.ndarray, sensed: np.ndarray, limit: float) -> np.ndarray:
+def counts(peak: np.ndarray, sensed: np.ndarray) -> np.ndarray:
     """Return which touches a guarantee is about, (B,), bool.
 
     Args:
-        pressure: (B,), largest mean pressure over the area of a footprint, Pa.
-        sensed: (B,), the largest over the footprint of a valid sensor, Pa.
-        limit: Pa.
+        peak, sensed: (B,), largest pressure, and largest at a valid sensor, in multiples of the limit, as in
+            :class:`skin.evaluation.touch_scores.TouchDecisions`.
     """
-    return (pressure > MARGIN * limit) & (sensed > limit)
+    return (peak > MARGIN) & (sensed > 1)
 
 
 # Touches that are all there before the bound is taken.

@@ -16,7 +16,7 @@ from skin.device.base import AbstractSimulated
 from skin.device.sampling import between_frames, draw_constants
 from skin.device.touches import Touches
 from skin.evaluation.decisions import DECISIONS, LiveConditions, held_frames, longest_shown, present_as_press
-from skin.evaluation.operating_point import DangerScore, Predictor
+from skin.evaluation.operating_point import LABEL, DangerScore, Predictor
 from skin.touch import splines
 from skin.touch.labels import RELEASE
 from skin.touch.movie import Movie
@@ -30,15 +30,15 @@ class TouchDecisions(NamedTuple):
         probability: of ``dangerous``, of the model, (B, J).
         reading: largest of the window, N, (B, J).
         contact: whether something touches the skin, (B, J), bool.
-        pressure: largest surface pressure that decides the label ``dangerous``, (B,), Pa.
-        sensed: largest mean pressure over the footprint of a valid sensor, (B,), Pa.
+        peak: what decides the label ``dangerous``, in multiples of its threshold, (B,).
+        sensed: the same at the valid sensor under the largest mean pressure over its footprint, (B,).
     """
 
     row: int
     probability: Tensor
     reading: Tensor
     contact: Tensor
-    pressure: Tensor
+    peak: Tensor
     sensed: Tensor
 
     def highest(self, values: Tensor) -> Tensor:
@@ -92,6 +92,7 @@ def decide_touches(
     parts = list[tuple[Tensor, ...]]()
     weigh = splines.footprints if device.model.smooth else AbstractBody.footprints
     footprints = torch.from_numpy(weigh(device.body, device.sensors)).float()
+    danger = device.sampler.labels[LABEL]
     for first in range(0, len(labels), 50):
         batch, draw = labels[first : first + 50], generator(Stream.ALARM, seed, 2, first)
         movie = device.sampler.sample(len(batch), draw, batch)
@@ -100,8 +101,9 @@ def decide_touches(
         probabilities[contact] = _classify_windows(
             learner, device, live, readings[contact], valid[contact.nonzero()[:, 0]]
         )
-        truth = movie.parameters["pressure"], _sensed_pressure(movie, footprints, valid)
-        parts.append((probabilities, readings.amax(dim=(2, 3)), contact, *truth))
+        peak = danger.measure(movie, device.body) / danger.above
+        sensed = peak * _sensed_pressure(movie, footprints, valid) / movie.parameters["pressure"].clamp(1.0)
+        parts.append((probabilities, readings.amax(dim=(2, 3)), contact, peak, sensed))
         if report is not None:
             report(first + len(batch))
     joined = [torch.cat(part) for part in zip(*parts, strict=True)]

@@ -21,7 +21,7 @@ CONFIDENCE = 0.95
 _APART = 1e-6  # scores closer than this may have another order on another processor
 
 
-def counts(peak: np.ndarray, sensed: np.ndarray) -> np.ndarray:
+def counted(peak: np.ndarray, sensed: np.ndarray) -> np.ndarray:
     """Return which touches a guarantee is about, (B,), bool.
 
     Args:
@@ -48,6 +48,15 @@ def allowed_misses(touches: int, rate: float, confidence: float = CONFIDENCE) ->
 def touches_needed(rate: float, confidence: float = CONFIDENCE) -> int:
     """Return the least number of touches, none of them missed, whose bound is at most ``rate``."""
     return math.ceil(math.log(1 - confidence) / math.log1p(-rate))
+
+
+def touches_drawn(rate: float) -> int:
+    """Return how many dangerous touches to draw for a threshold with a bound of ``rate``.
+
+    Half of them or more count. With three times as many as are needed, some may be missed, so that the
+    threshold does not hang on a single touch.
+    """
+    return 4 * touches_needed(rate)
 
 
 def threshold_above(scores: np.ndarray, allowed: int) -> float:

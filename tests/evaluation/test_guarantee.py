@@ -105,7 +105,7 @@ def test_too_few_touches_or_presses_are_told_how_many_are_needed():
 
 def test_a_touch_counts_above_the_margin_and_on_a_valid_sensor():
     peak, sensed = np.array([1.2, 1.2, 1.05, 1.2]), np.array([1.2, 0.0, 1.05, 1.01])
-    assert guarantee.counts(peak, sensed).tolist() == [True, False, False, True]
+    assert guarantee.counted(peak, sensed).tolist() == [True, False, False, True]
 
 
 def test_the_pressure_of_a_touch_is_that_over_footprints_of_valid_sensors(configured):

@@ -93,8 +93,8 @@ def threshold_for_misses(scores: np.ndarray, rate: float, confidence: float = CO
     threshold = -threshold_above(-scores, allowed)
     if threshold <= 0:
         raise InputError(
-            f"no threshold has {promise}: {int((scores <= 0).sum())} of {len(scores)} dangerous touches on a "
-            "sensor are not felt; lower live.touch, or use a device with less noise"
+            f"no threshold has {promise}: {(scores < 2 * _APART).sum()} of {len(scores)} dangerous touches "
+            "on a sensor are not felt, or look safe; lower live.touch, or use a device with less noise"
         )
     return threshold
 

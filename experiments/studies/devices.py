@@ -13,6 +13,7 @@ from hydra.utils import instantiate
 from matplotlib.figure import Figure
 from rich.progress import track
 from scipy.ndimage import gaussian_filter
+from scipy.stats import binomtest
 
 from experiments.studies.measures import Subject
 from experiments.studies.pages import Page
@@ -23,15 +24,16 @@ from skin.core.rng import Stream, generator
 from skin.device.base import AbstractSimulated
 from skin.device.resampling import Frame
 from skin.device.simulated import Simulated
-from skin.evaluation.alarm import SAFE_TOUCHES, AlarmSource, choose_alarm_threshold
+from skin.evaluation.alarm import AlarmSource, choose_alarm_threshold
+from skin.evaluation.guarantee import MARGIN, counted
 from skin.evaluation.metrics import compute_metrics
-from skin.evaluation.operating_point import LABEL, Reached
-from skin.evaluation.settings import check_evaluation
+from skin.evaluation.operating_point import LABEL
 from skin.evaluation.touch_scores import decide_touches
 from skin.live.engine import DebounceSettings, Engine
 from skin.live.engine_builder import engine_settings
 from skin.plot.figures import COLOURS
-from skin.runs.build import load_model
+from skin.runs.build import build_device, load_model
+from skin.runs.configuration import recompose
 from skin.touch.labels import TOUCH
 from skin.touch.shapes import Shapes
 from skin.wire.channels import UnitConversion
@@ -40,55 +42,60 @@ from skin.wire.emulator import gestures_with_labels, upsample
 
 @dataclass(frozen=True)
 class TouchAlarms:
-    """False alarms and recall per touch, as the live view raises alarms, beside those of single windows.
+    """Alarms per touch, as the live view raises them, and dangerous touches without one.
 
-    Thresholds are chosen on other touches of the same device than those that are counted.
+    The threshold is chosen on other touches than those that are counted, as ``evaluation`` says. Rates are
+    given with exact 95 % intervals: of false alarms, of all safe touches and of those below 0.9 times the
+    limit (``clear_false_alarm``); of safe touches whose danger is unknown; of missed touches above 1.1 times
+    the limit, and of those of them that are on a sensor (``failure``).
 
     Args:
-        safe, dangerous: number of touches that are counted.
+        safe: number of safe touches that are counted.
+        dangerous: largest number of touches above 1.1 times the limit and on a sensor.
         seed: of the touches that are counted; it must differ from those of training and thresholds.
+        actual: overrides of the device that is counted; the threshold does not know them.
     """
 
     safe: Annotated[int, Ge(1)] = 10000
     dangerous: Annotated[int, Ge(1)] = 2000
     seed: Annotated[int, Ge(0)] = 1_000_003
+    actual: Sequence[str] = ()
 
     def __call__(self, subject: Subject) -> pd.DataFrame:
-        trained, settings = subject.trained, check_evaluation(subject.config.evaluation)
-        device = subject.device.simulated("touches are simulated")
+        run = subject.trained.run
+        assert run is not None
+        model, purpose = load_model(run, subject.config), "touches are simulated"
+        device = subject.device.simulated(purpose)
+        counts = build_device(recompose(subject.config, self.actual)).simulated(purpose)
         rate = float(np.ravel(device.rate)[0])
-        live = trained.live_conditions(rate, DebounceSettings().alarm, rate <= device.model_rate)
-        source = AlarmSource("this run", settings, subject.learner, device=device)
-        touch = choose_alarm_threshold(source, live, anew=True)
-        window = choose_alarm_threshold(source, anew=True)
-        assert touch is not None
-        assert window is not None  # it has the label
-        labels = device.sampler.balanced(2 * max(self.safe, self.dangerous), generator(Stream.TEST, 7))
+        live = model.live_conditions(rate, DebounceSettings().alarm, rate <= device.model_rate)
+        source = AlarmSource("this run", subject.config.evaluation, model.learner, device=device)
+        point = choose_alarm_threshold(source, live, anew=True)
+        assert point is not None  # it has the label
+        # A few more, because not all of them are on a sensor and far above the limit.
+        drawn = max(self.safe, self.dangerous * 5 // 4)
+        labels = counts.sampler.balanced(2 * drawn, generator(Stream.TEST, 7))
         danger = labels[:, TOUCH.names.index(LABEL)]
-        counted = np.concatenate([labels[~danger][: self.safe], labels[danger][: self.dangerous]])
-        few = min(self.safe, SAFE_TOUCHES)
-        alarms = touch.alarm(
-            decide_touches(subject.learner, device, live, counted, self.seed).scores(touch.score)
-        )
-        at_once = replace(live, patience=0.0)
-        single = window.alarm(
-            decide_touches(subject.learner, device, at_once, counted[:few], self.seed).scores(None)
-        )
-        tests = device.touches("test")
-        probabilities = subject.learner.probabilities(tests)
-        raised, false = int(alarms[self.safe :].sum()), int(alarms[: self.safe].sum())
-        reached = {
-            "touch": Reached(self.dangerous, raised, self.safe, false),
-            "window": window.reached(probabilities, tests.known_labels, trained.device.task),
-            "touch_at_window_threshold": Reached(0, 0, few, int(single.sum())),
+        kinds = np.flatnonzero(~danger)[: self.safe], np.flatnonzero(danger)[: self.dangerous * 5 // 4]
+        labels, safe = labels[np.concatenate(kinds)], ~danger[np.concatenate(kinds)]
+        touches = decide_touches(model.learner, counts, live, labels, self.seed)
+        alarms, peak = point.alarm(touches.scores(point.score)).numpy(), touches.peak.numpy()
+        likely = (touches._replace(row=1).scores(point.score) > 0.5).numpy()
+        groups = {
+            "failure": ~alarms[counted(peak, touches.sensed.numpy())][: self.dangerous],
+            "missed": ~alarms[peak > MARGIN],
+            "unknown": (likely & ~alarms)[safe],
+            "false_alarm": alarms[safe],
+            "clear_false_alarm": alarms[peak < 2 - MARGIN],
         }
-        metrics = {"touch/threshold": touch.threshold, "window/threshold": window.threshold}
-        for name, alarm in reached.items():
-            rates = zip(("rate", "low", "high"), (alarm.false_alarm_rate, *alarm.range), strict=True)
-            metrics |= {f"{name}/false_alarm_{kind}": value for kind, value in rates}
-            metrics |= {f"{name}/recall": alarm.recall} if alarm.dangerous else {}
+        metrics = {"touch/threshold": point.threshold, "touch/recall": alarms[~safe].mean()}
+        for name, those in groups.items():
+            rates = those.mean(), *binomtest(int(those.sum()), len(those)).proportion_ci()
+            ends = zip(("rate", "low", "high"), rates, strict=True)
+            metrics |= {f"touch/{name}_{kind}": value for kind, value in ends}
         frame = pd.DataFrame([metrics])
-        frame.attrs["about"] = "\n".join(f"{name}: {alarm.sentence()}" for name, alarm in reached.items())
+        found = ", ".join(f"{name} {those.sum()} of {len(those)}" for name, those in groups.items())
+        frame.attrs["about"] = f"{subject.condition}: {point.sentence()}\n{found}"
         return frame
 
 

@@ -27,6 +27,13 @@ from skin.core.rng import Stream, generator
 from skin.device.calibration import read_calibration
 from skin.errors import InputError
 from skin.evaluation.decisions import LiveConditions
+from skin.evaluation.guarantee import (
+    Guarantee,
+    counted,
+    threshold_above,
+    threshold_for_misses,
+    touches_drawn,
+)
 from skin.evaluation.operating_point import (
     LABEL,
     DangerScore,
@@ -316,20 +323,14 @@ def _lowest_threshold(safe: "Tensor", target: float) -> float:
     At most k = floor(target (n + 1)) - 1 of n safe gestures raise the alarm. A new safe gesture then raises
     it with a probability of at most (k + 1) / (n + 1) <= target (split conformal prediction; Vovk, Gammerman
     and Shafer 2005). If n < 1 / target - 1, the threshold is above all scores, and the target is not met.
-    Scores that differ by less than 2e-6 count as equal: either all of them raise the alarm or none.
 
     Args:
         safe: (n,), n > 0, probabilities of ``dangerous`` of safe gestures.
         target: largest rate.
     """
-    scores = np.sort(safe.detach().cpu().double().numpy())[::-1]
     # 1e-9 keeps a product such as 0.29 * 100 from rounding below its whole number.
-    allowed = max(math.floor(target * (len(scores) + 1) + 1e-9) - 1, 0)
-    apart = 1e-6  # scores closer than this may have another order on another processor
-    gaps = scores[:-1] - scores[1:] > 2 * apart  # [i]: between the first i + 1 scores and the others
-    cuts = np.flatnonzero(gaps[:allowed])
-    above = int(cuts[-1]) + 1 if len(cuts) else 0
-    return float(np.float32(scores[above] + apart))
+    allowed = max(math.floor(target * (len(safe) + 1) + 1e-9) - 1, 0)
+    return threshold_above(safe.detach().cpu().double().numpy(), allowed)
 
 
 # The choice on touches, as the live view judges them.
@@ -346,7 +347,8 @@ def _on_touches(
     target, count = settings.false_alarm_rate, min(settings.safe_gestures, SAFE_TOUCHES)
     if source.device is not None:
         device = source.device.simulated("touches are simulated")
-        return _on_touches_of(device, source.learner, _snapped(live, device), target, count)
+        point = _on_touches_of(device, source.learner, _snapped(live, device), settings, count)
+        return _guaranteed(point, settings)
     path = source.used.get("calibration") if source.used.get("port") else None
     if settings.profile is None and path is None and "skins" in source.trained:
         # Such trainings have devices so different that a threshold for all of them hides dangerous touches.
@@ -363,14 +365,16 @@ def _on_touches(
         "imperfections": {name: str(value) for name, value in vars(device.imperfection).items()},
         "live": asdict(live),
         "target": target,
+        "missed": settings.miss_rate,
         "count": count,
     }
     key = array_cache.hashed(content, _sources())
 
     def choose() -> dict[str, np.ndarray]:
         devices = "" if settings.profile is None else f" and devices of the profile {settings.profile}"
-        say(f"choosing the alarm's threshold on {count} safe touches at {live.rate:.3g} Hz{devices}")
-        point = _on_touches_of(device, source.learner, live, target, count)
+        others = "" if settings.miss_rate is None else f" and {touches_drawn(settings.miss_rate)} dangerous"
+        say(f"choosing the alarm's threshold on {count} safe{others} touches at {live.rate:.3g} Hz{devices}")
+        point = _on_touches_of(device, source.learner, live, settings, count)
         assert point.score is not None
         counts = point.threshold, point.raised, point.dangerous, point.found
         return {"point": np.array(counts), "score": np.array(astuple(point.score))}
@@ -380,9 +384,19 @@ def _on_touches(
     threshold, *counts = kept["point"].tolist()
     raised, dangerous, found = (int(number) for number in counts)
     score = DangerScore(*kept["score"].tolist())
-    return OperatingPoint(
+    point = OperatingPoint(
         threshold, target, count, raised, device.data_seed, dangerous, found, live.rate, score
     )
+    return _guaranteed(point, settings)
+
+
+def _guaranteed(point: OperatingPoint, settings: Evaluation) -> OperatingPoint:
+    """Return a point with the guarantee that it was chosen for, if any."""
+    if settings.miss_rate is None:
+        return point
+    conditions = f"{settings.profile or 'this device'}, {point.rate:.3g} Hz"
+    misses = point.dangerous - point.found
+    return replace(point, guarantee=Guarantee(settings.miss_rate, point.dangerous, misses, conditions))
 
 
 def _snapped(live: LiveConditions, device: "AbstractSimulated") -> LiveConditions:
@@ -398,39 +412,50 @@ def _snapped(live: LiveConditions, device: "AbstractSimulated") -> LiveCondition
 def _sources() -> list[Path]:
     """Return the files that the thresholds kept on disk depend on."""
     from skin.device import imperfection, sampling
-    from skin.evaluation import decisions, operating_point, touch_scores
+    from skin.evaluation import decisions, guarantee, operating_point, touch_scores
 
-    modules = (imperfection, sampling, decisions, operating_point, touch_scores)
+    modules = (imperfection, sampling, decisions, guarantee, operating_point, touch_scores)
     return [Path(__file__), *(Path(str(module.__file__)) for module in modules)]
 
 
 def _on_touches_of(
-    device: "AbstractSimulated", learner: Predictor | None, live: LiveConditions, target: float, count: int
+    device: "AbstractSimulated",
+    learner: Predictor | None,
+    live: LiveConditions,
+    settings: Evaluation,
+    count: int,
 ) -> OperatingPoint:
-    """Return the threshold that ``target`` of ``count`` safe touches pass, checked on dangerous ones.
+    """Return the threshold that few of ``count`` safe touches pass, checked on dangerous ones.
 
-    ``device`` measures each touch; with ``randomise``, by another device.
+    With ``settings.miss_rate`` it is the highest that finds most dangerous ones that count, and checked on
+    safe ones. ``device`` measures each touch; with ``randomise``, by another device.
     """
     from skin.evaluation.touch_scores import decide_touches
 
     assert learner is not None
     seed, fitted = device.data_seed, min(count, FITTED_TOUCHES)
-    enough = fitted + max(count, DANGEROUS_TOUCHES) + 16  # of the 16 combinations some have one touch fewer
+    target, missed = settings.false_alarm_rate, settings.miss_rate
+    tests = DANGEROUS_TOUCHES if missed is None else touches_drawn(missed)
+    enough = fitted + max(count, tests) + 16  # of the 16 combinations some have one touch fewer
     labels = device.sampler.balanced(2 * enough, generator(Stream.ALARM, seed, 1))
     danger = labels[:, TOUCH.names.index(LABEL)]
     safe, others = labels[~danger], labels[danger]
-    chosen = np.concatenate(
-        [safe[:count], others[:DANGEROUS_TOUCHES], safe[count:][:fitted], others[DANGEROUS_TOUCHES:][:fitted]]
-    )
+    chosen = np.concatenate([safe[:count], others[:tests], safe[count:][:fitted], others[tests:][:fitted]])
     with Steps({"choosing the threshold of the alarm": 20.0}) as steps:
         # More threads than free cores take many times as long.
         decisions = decide_touches(
             learner, device, live, chosen, seed, lambda done: steps.report(done / len(chosen))
         )
-    tested = count + DANGEROUS_TOUCHES
+    tested = count + tests
     score = decisions.fit(np.arange(tested, len(chosen)), np.arange(2 * fitted) >= fitted)
     scores = decisions.scores(score)[:tested]
-    threshold = _lowest_threshold(scores[:count], target)
-    point = OperatingPoint(threshold, target, count, 0, seed, DANGEROUS_TOUCHES, 0, live.rate, score)
-    alarms = point.alarm(scores)
-    return replace(point, raised=int(alarms[:count].sum()), found=int(alarms[count:].sum()))
+    safe_scores, others_scores = scores[:count], scores[count:]
+    if missed is None:
+        threshold = _lowest_threshold(safe_scores, target)
+    else:
+        which = counted(decisions.peak.numpy(), decisions.sensed.numpy())
+        others_scores = others_scores[which[count:tested]]
+        threshold = threshold_for_misses(others_scores.numpy(), missed)
+    point = OperatingPoint(threshold, target, count, 0, seed, len(others_scores), 0, live.rate, score)
+    raised, found = (int(point.alarm(part).sum()) for part in (safe_scores, others_scores))
+    return replace(point, raised=raised, found=found)

@@ -13,6 +13,7 @@ import numpy as np
 from scipy.special import expit, logit
 
 from skin.errors import InputError
+from skin.evaluation.guarantee import Guarantee
 from skin.evaluation.settings import ENOUGH
 from skin.touch.labels import ALARM, Task
 
@@ -148,6 +149,8 @@ class OperatingPoint:
         rate: of the device, Hz, where the threshold was chosen for the alarm of the live view, which judges
             many windows of a touch; None: it was chosen for one window of each gesture.
         score: gives the probability that is compared; None: it is the model's.
+        guarantee: that few dangerous touches are missed, for which the threshold was chosen in place of
+            ``target``; ``dangerous`` are those that count.
     """
 
     threshold: float
@@ -159,6 +162,7 @@ class OperatingPoint:
     found: int = 0
     rate: float | None = None
     score: DangerScore | None = None
+    guarantee: Guarantee | None = None
 
     @classmethod
     def default(cls, target: float) -> "OperatingPoint":
@@ -192,6 +196,9 @@ class OperatingPoint:
         rule = f"alarm above {self.threshold:.4f}"
         if not self.safe:
             return f"{rule}: not chosen on any gestures, its false-alarm rate is unknown"
+        if self.guarantee is not None:
+            rate = f"{100 * self.raised / self.safe:.1f} % of {self.safe} safe touches raise it"
+            return f"{rule}: {self.guarantee.sentence()}; {rate}"
         kind = "safe validation" if self.seed is None else "fresh safe"
         what = "gestures" if self.rate is None else f"touches at {self.rate:.3g} Hz"
         text = f"{rule}, chosen on {self.safe} {kind} {what} for {100 * self.target:g} % false alarms"

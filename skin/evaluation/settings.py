@@ -22,6 +22,7 @@ class Evaluation:
     false_alarm_rate: float
     safe_gestures: int = 5000
     profile: str | None = None
+    miss_rate: float | None = None
 
 
 def check_evaluation(settings: Evaluation | None) -> Evaluation:
@@ -34,6 +35,11 @@ def check_evaluation(settings: Evaluation | None) -> Evaluation:
         raise InputError(
             f"a false-alarm rate is between 0 and 1, got {settings.false_alarm_rate:g}: "
             "use evaluation.false_alarm_rate=0.02"
+        )
+    if settings.miss_rate is not None and not 0 < settings.miss_rate < 0.5:
+        raise InputError(
+            "a miss rate is a fraction of dangerous touches between 0 and 0.5, got "
+            f"{settings.miss_rate:g}: use evaluation.miss_rate=0.001"
         )
     if settings.safe_gestures < 1:
         raise InputError(

@@ -10,12 +10,14 @@ import torch
 from torch import Tensor
 from torch.nn.functional import max_pool1d, pad
 
+from skin.body.base import AbstractBody
 from skin.core.rng import Stream, generator
 from skin.device.base import AbstractSimulated
 from skin.device.sampling import between_frames, draw_constants
 from skin.device.touches import Touches
 from skin.evaluation.decisions import DECISIONS, LiveConditions, held_frames, longest_shown, present_as_press
-from skin.evaluation.operating_point import DangerScore, Predictor
+from skin.evaluation.operating_point import LABEL, DangerScore, Predictor
+from skin.touch import splines
 from skin.touch.labels import RELEASE
 from skin.touch.movie import Movie
 
@@ -24,16 +26,20 @@ class TouchDecisions(NamedTuple):
     """The J decisions about each of B touches.
 
     Attributes:
+        row: decisions in a row that the patience needs.
         probability: of ``dangerous``, of the model, (B, J).
         reading: largest of the window, N, (B, J).
         contact: whether something touches the skin, (B, J), bool.
-        row: decisions in a row that the patience needs.
+        peak: what decides the label ``dangerous``, in multiples of its threshold, (B,).
+        sensed: the same at the valid sensor under the largest mean pressure over its footprint, (B,).
     """
 
+    row: int
     probability: Tensor
     reading: Tensor
     contact: Tensor
-    row: int
+    peak: Tensor
+    sensed: Tensor
 
     def highest(self, values: Tensor) -> Tensor:
         """Return the largest over the decisions of the smallest value (B, J) among ``row`` ones, (B,).
@@ -83,7 +89,10 @@ def decide_touches(
         report: called with the number of touches that are done.
     """
     device = device.replace(padded=False, stream=False)
-    parts = list[tuple[Tensor, Tensor, Tensor]]()
+    parts = list[tuple[Tensor, ...]]()
+    weigh = splines.footprints if device.model.smooth else AbstractBody.footprints
+    footprints = torch.from_numpy(weigh(device.body, device.sensors)).float()
+    danger = device.sampler.labels[LABEL]
     for first in range(0, len(labels), 50):
         batch, draw = labels[first : first + 50], generator(Stream.ALARM, seed, 2, first)
         movie = device.sampler.sample(len(batch), draw, batch)
@@ -92,11 +101,19 @@ def decide_touches(
         probabilities[contact] = _classify_windows(
             learner, device, live, readings[contact], valid[contact.nonzero()[:, 0]]
         )
-        parts.append((probabilities, readings.amax(dim=(2, 3)), contact))
+        peak = danger.measure(movie, device.body) / danger.above
+        sensed = peak * _sensed_pressure(movie, footprints, valid) / movie.parameters["pressure"].clamp(1.0)
+        parts.append((probabilities, readings.amax(dim=(2, 3)), contact, peak, sensed))
         if report is not None:
             report(first + len(batch))
-    probability, reading, contact = (torch.cat(part) for part in zip(*parts, strict=True))
-    return TouchDecisions(probability, reading, contact, live.decisions(_round_rate(device, live)))
+    joined = [torch.cat(part) for part in zip(*parts, strict=True)]
+    return TouchDecisions(live.decisions(_round_rate(device, live)), *joined)
+
+
+def _sensed_pressure(movie: Movie, footprints: Tensor, valid: Tensor) -> Tensor:
+    """Return the largest mean pressure over the footprint (S, H * W) of a valid sensor (B, S), (B,), Pa."""
+    means = (movie.frames.flatten(1) @ footprints.T)[movie.index] * movie.scale[:, :, None]
+    return means.amax(dim=1).where(valid, 0.0).amax(dim=1)
 
 
 def _round_rate(device: AbstractSimulated, live: LiveConditions) -> float:

@@ -53,6 +53,7 @@ ADDED: dict[str, Any] = {
     "task": None,
     "targets": None,
     "second": 0.0,
+    "miss_rate": None,
     "training_touch": {},
     "start": None,
 }

@@ -17,6 +17,7 @@ from skin.errors import InputError
 from skin.evaluation import alarm, touch_scores
 from skin.evaluation.alarm import AlarmSource, choose_alarm_threshold, threshold_gestures
 from skin.evaluation.decisions import LiveConditions
+from skin.evaluation.guarantee import allowed_misses, counted
 from skin.evaluation.metrics import compute_metrics
 from skin.evaluation.operating_point import DangerScore, OperatingPoint, Reached, parse_operating_point
 from skin.evaluation.report import evaluate
@@ -220,7 +221,13 @@ def test_a_damaged_one_is_refused(text):
 
 @pytest.mark.parametrize(
     ("name", "value", "better"),
-    [("false_alarm_rate", 0.0, 0.02), ("false_alarm_rate", 1.0, 0.02), ("safe_gestures", 0, 2000)],
+    [
+        ("false_alarm_rate", 0.0, 0.02),
+        ("false_alarm_rate", 1.0, 0.02),
+        ("safe_gestures", 0, 2000),
+        ("miss_rate", 0.0, 0.001),
+        ("miss_rate", 0.5, 0.001),
+    ],
 )
 def test_what_cannot_be_chosen_is_refused(name, value, better):
     with pytest.raises(InputError, match=f"{name}={better}"):
@@ -303,6 +310,24 @@ def test_the_share_of_new_safe_touches_is_the_one_that_was_asked_for(drawn, rate
     fraction = float(point.alarm(decisions.scores(point.score)).float().mean())
     # Both are counted: three standard deviations of 400 and 800 touches.
     assert fraction == pytest.approx(0.1, abs=3 * (0.09 / 400 + 0.09 / 800) ** 0.5)
+
+
+def test_the_misses_of_touches_that_count_are_those_that_were_asked_for(drawn):
+    """The true rate of a threshold on the n-th lowest of N scores is a beta variable."""
+    point = choose(Largest(), drawn, replace(SETTINGS, miss_rate=0.05), watching(20.0))
+    promise = point.guarantee
+    assert (promise.touches, promise.misses) == (point.dangerous, point.dangerous - point.found)
+    assert promise.misses == allowed_misses(promise.touches, 0.05) > 0
+    assert f"on a sensor: at most 5 % missed, 95 %, {promise.touches} touches, this device, 20 Hz" in (
+        point.sentence()
+    )
+    assert f"{100 * point.raised / 64:.1f} % of 64 safe touches raise it" in point.sentence()
+    labels = balanced(1600, generator(Stream.TEST, 8))
+    others = touch_scores.decide_touches(Largest(), drawn, watching(20.0), labels[labels[:, 3]], 99)
+    missed = ~point.alarm(others.scores(point.score))[counted(others.peak, others.sensed)]
+    true = beta(promise.misses + 1, promise.touches - promise.misses)
+    spread = (true.var() + true.mean() / len(missed)) ** 0.5
+    assert float(missed.float().mean()) == pytest.approx(true.mean(), abs=3 * spread)
 
 
 class Blurred(Largest):

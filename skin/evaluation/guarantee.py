@@ -1,0 +1,170 @@
+"""What an alarm promises: bounds on the fraction of missed touches, and thresholds that keep them.
+
+A touch counts if its pressure is above 1.1 times the limit and it is on a sensor: the area above the limit
+contains the centre of a valid sensor. All bounds are exact for the finite number of touches, and suppose that
+the touches to come are drawn as these were. torch is not imported.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import brentq
+from scipy.special import betainc, betaln
+from scipy.stats import beta, binom
+
+from skin.errors import InputError
+
+MARGIN = 1.1
+"""Times the limit, above which a touch counts: nearer to it, gains known to 5 % decide what is dangerous."""
+CONFIDENCE = 0.95
+_APART = 1e-6  # scores closer than this may have another order on another processor
+
+
+def counted(peak: np.ndarray, sensed: np.ndarray) -> np.ndarray:
+    """Return which touches a guarantee is about, (B,), bool.
+
+    Args:
+        peak, sensed: (B,), largest pressure, and largest at a valid sensor, in multiples of the limit, as in
+            :class:`skin.evaluation.touch_scores.TouchDecisions`.
+    """
+    return (peak > MARGIN) & (sensed > 1)
+
+
+# Touches that are all there before the bound is taken.
+
+
+def miss_bound(misses: int, touches: int, confidence: float = CONFIDENCE) -> float:
+    """Return the upper bound of the fraction of missed touches (Clopper and Pearson, 1934)."""
+    return 1.0 if misses >= touches else float(beta.ppf(confidence, misses + 1, touches - misses))
+
+
+def allowed_misses(touches: int, rate: float, confidence: float = CONFIDENCE) -> int:
+    """Return the largest number of misses whose bound is at most ``rate``; -1: there are too few touches."""
+    most = int(binom.ppf(1 - confidence, touches, rate))
+    return most if binom.cdf(most, touches, rate) <= 1 - confidence else most - 1
+
+
+def touches_needed(rate: float, confidence: float = CONFIDENCE) -> int:
+    """Return the least number of touches, none of them missed, whose bound is at most ``rate``."""
+    return math.ceil(math.log(1 - confidence) / math.log1p(-rate))
+
+
+def touches_drawn(rate: float) -> int:
+    """Return how many dangerous touches to draw for a threshold with a bound of ``rate``.
+
+    Half of them or more count. With three times as many as are needed, some may be missed, so that the
+    threshold does not hang on a single touch.
+    """
+    return 4 * touches_needed(rate)
+
+
+def threshold_above(scores: np.ndarray, allowed: int) -> float:
+    """Return the lowest threshold, a float32 number, that at most ``allowed`` of the scores (n,) exceed.
+
+    Scores that differ by less than 2e-6 count as equal: either all of them exceed it or none.
+    """
+    scores = np.sort(scores)[::-1]
+    gaps = scores[:-1] - scores[1:] > 2 * _APART  # [i]: between the first i + 1 scores and the others
+    cuts = np.flatnonzero(gaps[:allowed])
+    above = int(cuts[-1]) + 1 if len(cuts) else 0
+    return float(np.float32(scores[above] + _APART))
+
+
+def threshold_for_misses(scores: np.ndarray, rate: float, confidence: float = CONFIDENCE) -> float:
+    """Return the highest threshold that misses at most ``rate`` of the touches, with a confidence.
+
+    The thresholds below each score are tested from the lowest on, with the exact binomial p-value of "more
+    than ``rate`` are missed", until one is not rejected: Learn then Test with a fixed sequence (Angelopoulos
+    et al., 2021). As misses only grow with the threshold, the last that is rejected is an order statistic.
+
+    Args:
+        scores: (n,), of touches that count, drawn independently of all that the scores were fitted to.
+        rate: largest wanted fraction of missed touches.
+        confidence: that it is kept.
+
+    Raises:
+        InputError: too few touches, or too many of them without contact.
+    """
+    allowed, needed = allowed_misses(len(scores), rate, confidence), touches_needed(rate, confidence)
+    promise = f"at most {100 * rate:g} % missed, with {100 * confidence:g} %"
+    if allowed < 0:
+        raise InputError(f"{len(scores)} touches cannot show {promise}: {needed} are needed for this")
+    threshold = -threshold_above(-scores, allowed)
+    if threshold <= 0:
+        raise InputError(
+            f"no threshold has {promise}: {(scores < 2 * _APART).sum()} of {len(scores)} dangerous touches "
+            "on a sensor are not felt, or look safe; lower live.touch, or use a device with less noise"
+        )
+    return threshold
+
+
+# Presses recorded one by one on a real skin.
+
+
+def anytime_bound(misses: int, presses: int, confidence: float = CONFIDENCE) -> float:
+    """Return an upper bound of the fraction of missed presses that holds at all times at once.
+
+    Presses may be added one by one, and one may stop when the bound is low enough: the probability that it is
+    ever below the true fraction is at most 1 - ``confidence``. The likelihood of the misses, averaged over
+    fractions from 0 to p, over that at p is a martingale if p is true, and a supermartingale if more are
+    missed (Ville, 1939; Robbins, 1970). The bound is the p at which it reaches 1 / (1 - ``confidence``).
+    """
+    if misses >= presses:
+        return 1.0
+    ends = misses + 1.0, presses - misses + 1.0
+
+    def excess(p: float) -> float:
+        average = math.log(betainc(*ends, p)) + betaln(*ends) - math.log(p)
+        likelihood = misses * math.log(p) + (presses - misses) * math.log1p(-p)
+        return float(average - likelihood + math.log(1 - confidence))
+
+    return float(brentq(excess, max(misses / presses, 1e-12), 1 - 1e-12))
+
+
+def presses_needed(rate: float, misses: int = 0, confidence: float = CONFIDENCE) -> int:
+    """Return the least number of presses, with some missed, whose anytime-valid bound is at most ``rate``."""
+    low, high = misses, misses + 2
+    while anytime_bound(misses, high, confidence) > rate:
+        low, high = high, 2 * high
+    while high - low > 1:
+        middle = (low + high) // 2
+        enough = anytime_bound(misses, middle, confidence) <= rate
+        low, high = (low, middle) if enough else (middle, high)
+    return high
+
+
+def check_presses(misses: int, presses: int, rate: float, confidence: float = CONFIDENCE) -> None:
+    """Raise InputError, with the number that is needed, unless presses show at most ``rate`` missed."""
+    if anytime_bound(misses, presses, confidence) > rate:
+        needed = presses_needed(rate, misses, confidence)
+        raise InputError(
+            f"{misses} misses of {presses} presses do not show at most {100 * rate:g} % missed, with "
+            f"{100 * confidence:g} %: {needed} presses are needed for this, if no more are missed"
+        )
+
+
+@dataclass(frozen=True)
+class Guarantee:
+    """That an alarm misses few of the touches that count, in simulation.
+
+    Attributes:
+        rate: largest fraction of missed touches.
+        touches: n that count, on which it was shown.
+        misses: k of them.
+        conditions: profile of the devices and their rate, in words.
+        confidence: of the bound.
+    """
+
+    rate: float
+    touches: int
+    misses: int
+    conditions: str
+    confidence: float = CONFIDENCE
+
+    def sentence(self) -> str:
+        """Return the promise in words, with its conditions."""
+        return (
+            f"in simulation, above {MARGIN:g} x the limit and on a sensor: at most {100 * self.rate:g} % "
+            f"missed, {100 * self.confidence:g} %, {self.touches:,} touches, {self.conditions}"
+        )

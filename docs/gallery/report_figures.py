@@ -19,9 +19,10 @@ from skin.plot import figures
 from skin.plot.animation import still
 from skin.plot.plot3d import Scene, deflection, surface
 from skin.runs.build import build_device
+from skin.runs.configuration import validate_config
 
 with initialize_config_dir(str(CONF), version_base="1.3"):
-    config = compose("train", ["simulator=fem", "device.test_gestures=160"])
+    config = validate_config(compose("train", ["simulator=fem", "device.test_gestures=160"]))
 device = build_device(config).simulated("the figures of the report are of a simulated skin")
 folder, size = Path(mkdtemp()), device.size
 

@@ -115,7 +115,7 @@ class Kernel:
         vectors: (V, D), scaled touches.
         weights: (V, K).
         intercept: (K,).
-        scale: of the Laplacian kernel exp(-scale mean |z - z'|); 0: the linear kernel mean(z z').
+        scale: of the Laplacian kernel ``exp(-scale mean(abs(z - z')))``; 0: the linear kernel ``mean(z z')``.
         link: (2,), slope and offset of the logits of a label, or slope for classes; NaN: outputs are targets.
     """
 

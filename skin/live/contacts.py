@@ -205,7 +205,7 @@ class MeanReadings(NamedTuple):
         frames: number of frames.
         step: of the converter, N; 0: none.
         time, host: s, the clocks of the device and of the host at the latest frame.
-        tares: number of tares and calibrations so far.
+        tare: identity of the tare or calibration that they follow.
     """
 
     values: np.ndarray
@@ -216,7 +216,7 @@ class MeanReadings(NamedTuple):
     step: float
     time: float
     host: float
-    tares: int = 0
+    tare: int = 0
 
 
 def average_readings(
@@ -290,12 +290,12 @@ def serve(mechanics: Mechanics, pipe: Connection) -> None:
         os.nice(5)  # below what shows verdicts
     os.dup2(2, 1)  # what a library prints is no JSON line
     torch.set_num_threads(1)
-    posterior, tares = mechanics.posterior(), -1
+    posterior, tare = mechanics.posterior(), -1
     with threadpool_limits(1), suppress(EOFError, OSError):  # the command has ended
         while True:
             readings = pipe.recv()
-            if readings.tares != tares:
-                watch, tares = Watch(posterior.candidates, posterior.prior, mechanics.noise), readings.tares
+            if readings.tare != tare:
+                watch, tare = Watch(posterior.candidates, posterior.prior, mechanics.noise), readings.tare
             try:
                 message = estimate_contacts(posterior, mechanics.noise, readings)
                 watch.look(readings.values, readings.valid & ~readings.saturated, posterior.noise)
@@ -323,8 +323,6 @@ class LiveContacts:
         self._recent: deque[NewtonFrame] = deque(maxlen=1000)
         self._pipe: Connection | None = None
         self.changed: tuple[int, ...] = ()
-        self._conversion: UnitConversion | None = None
-        self._tares = 0
         self._asked_at: float | None = None  # the host's time, s, of readings that are not answered yet
         self.explain(reason)
 
@@ -376,8 +374,7 @@ class LiveContacts:
         """
         if self._pipe is None or not stream:
             return
-        if conversion is not self._conversion:
-            self._conversion, self._tares, self.changed = conversion, self._tares + 1, ()
+        self._conversion = conversion  # kept, so that the next one has another identity
         self._recent.extend(stream)
         last = stream[-1].frame
         while (first := self._recent[0].frame).segment != last.segment or not (
@@ -391,7 +388,7 @@ class LiveContacts:
             if verdicts and self._asked_at is None:
                 masked, whole = verdicts[-1].masked, self._whole()
                 readings = average_readings(self._recent, conversion, masked, baseline, whole)
-                self._pipe.send(readings._replace(tares=self._tares))
+                self._pipe.send(readings._replace(tare=id(conversion)))
                 self._asked_at = last.t_host
         except (OSError, EOFError):
             self.explain("the process that estimates them has ended")

@@ -325,8 +325,14 @@ class Engine:
         changed = np.isin(np.arange(self.sensors), self.changed)
         blind = ~self._responds[:, valid & ~void].any(axis=1) | paused | changed
         masked = blind & ~(void | below | beyond | lost | paused | changed)
-        sensors = {"below": below, "void": void, "over_range": beyond, "lost_wire": lost, "masked": masked}
-        sensors["changed"] = changed
+        sensors = {
+            "below": below,
+            "void": void,
+            "over_range": beyond,
+            "lost_wire": lost,
+            "changed": changed,
+            "masked": masked,
+        }
         notes = [Note(code, _numbers(which)) for code, which in sensors.items() if which.any()]
         notes += [Note("unreadable")] * self._losses.excessive + [Note("pause", seconds=self._pause)] * paused
         return _numbers(blind), tuple(notes)

@@ -39,7 +39,7 @@ QUIET = 1e-3
 def unknown_contacts(reason: str) -> dict[str, Any]:
     """Return the message that nothing is known of contacts, with the reason."""
     empty = dict.fromkeys(("device_time", "number", "probability", "probabilities", "fit", "large"))
-    return {"state": "unknown", "reason": reason, **empty, "contacts": []}
+    return {"state": "unknown", "reason": reason, **empty, "contacts": [], "changed": []}
 
 
 def contact_message(estimate: "FrameEstimate", time: float, noise_fit: float = 1e-4) -> dict[str, Any]:
@@ -56,6 +56,7 @@ def contact_message(estimate: "FrameEstimate", time: float, noise_fit: float = 1
         "device_time": time,
         "fit": round(estimate.fit, 6),
         "large": round(estimate.large, 6),
+        "changed": [],
     }
     if not (estimate.fingertip or none):
         # The strongest of the fingertips that fit best: a reader must find where a hard touch is.
@@ -204,6 +205,7 @@ class MeanReadings(NamedTuple):
         frames: number of frames.
         step: of the converter, N; 0: none.
         time, host: s, the clocks of the device and of the host at the latest frame.
+        tare: identity of the tare or calibration that they follow.
     """
 
     values: np.ndarray
@@ -214,6 +216,7 @@ class MeanReadings(NamedTuple):
     step: float
     time: float
     host: float
+    tare: int = 0
 
 
 def average_readings(
@@ -281,19 +284,24 @@ def serve(mechanics: Mechanics, pipe: Connection) -> None:
     """Prepare the mechanics, then answer readings with messages until the pipe is closed."""
     import torch
 
+    from skin.inference.watch import Watch
+
     if hasattr(os, "nice"):
         os.nice(5)  # below what shows verdicts
     os.dup2(2, 1)  # what a library prints is no JSON line
     torch.set_num_threads(1)
-    posterior = mechanics.posterior()
+    posterior, tare = mechanics.posterior(), -1
     with threadpool_limits(1), suppress(EOFError, OSError):  # the command has ended
         while True:
             readings = pipe.recv()
+            if readings.tare != tare:
+                watch, tare = Watch(posterior.candidates, posterior.prior, mechanics.noise), readings.tare
             try:
                 message = estimate_contacts(posterior, mechanics.noise, readings)
+                watch.look(readings.values, readings.valid & ~readings.saturated, posterior.noise)
             except (ArithmeticError, ValueError, AssertionError, InputError) as error:
                 message = unknown_contacts(f"the estimate failed: {error}")
-            pipe.send(message)
+            pipe.send(message | {"changed": [*watch.changed]})
 
 
 class LiveContacts:
@@ -303,6 +311,9 @@ class LiveContacts:
         reason: why nothing is known before :meth:`start`.
         stale: s after its readings from which an estimate is unknown.
         span: s of which the readings are averaged.
+
+    Attributes:
+        changed: sensors that have changed since the latest tare.
     """
 
     def __init__(
@@ -311,6 +322,7 @@ class LiveContacts:
         self.stale, self._span = stale, span
         self._recent: deque[NewtonFrame] = deque(maxlen=1000)
         self._pipe: Connection | None = None
+        self.changed: tuple[int, ...] = ()
         self._asked_at: float | None = None  # the host's time, s, of readings that are not answered yet
         self.explain(reason)
 
@@ -362,6 +374,7 @@ class LiveContacts:
         """
         if self._pipe is None or not stream:
             return
+        self._conversion = conversion  # kept, so that the next one has another identity
         self._recent.extend(stream)
         last = stream[-1].frame
         while (first := self._recent[0].frame).segment != last.segment or not (
@@ -371,9 +384,11 @@ class LiveContacts:
         try:
             if self._asked_at is not None and self._pipe.poll():
                 self._latest, self._asked_at = (self._pipe.recv(), self._asked_at), None
+                self.changed = tuple(self._latest[0]["changed"])
             if verdicts and self._asked_at is None:
                 masked, whole = verdicts[-1].masked, self._whole()
-                self._pipe.send(average_readings(self._recent, conversion, masked, baseline, whole))
+                readings = average_readings(self._recent, conversion, masked, baseline, whole)
+                self._pipe.send(readings._replace(tare=id(conversion)))
                 self._asked_at = last.t_host
         except (OSError, EOFError):
             self.explain("the process that estimates them has ended")

@@ -152,6 +152,7 @@ class Engine:
         detector: of contact, with what the untouched skin reads by now.
         above: probability above which a touch is dangerous.
         alarm: the latest verdict was dangerous, and the contact has not ended.
+        changed: sensors that a watch reports, whose positions are unknown.
     """
 
     classify: Classify
@@ -163,6 +164,7 @@ class Engine:
     patience: DebounceSettings = field(default_factory=DebounceSettings)
     presses: np.ndarray | None = None
     danger: DangerScore | None = None
+    changed: tuple[int, ...] = field(default=(), init=False)
 
     def __post_init__(self) -> None:
         self.window = Window(self.frames, self.rate, self.sensors)
@@ -320,9 +322,17 @@ class Engine:
         void, beyond, lost = self.detector.void, self.detector.beyond, self.detector.lost
         # A tap may come and go; but a device of the rate of a slow model may lose two frames, too.
         paused = bool(self._pause > max(_GAP / 2, 2.5 / self.rate))
-        blind = ~self._responds[:, valid & ~void].any(axis=1) | paused
-        masked = blind & ~(void | below | beyond | lost | paused)
-        sensors = {"below": below, "void": void, "over_range": beyond, "lost_wire": lost, "masked": masked}
+        changed = np.isin(np.arange(self.sensors), self.changed)
+        blind = ~self._responds[:, valid & ~void].any(axis=1) | paused | changed
+        masked = blind & ~(void | below | beyond | lost | paused | changed)
+        sensors = {
+            "below": below,
+            "void": void,
+            "over_range": beyond,
+            "lost_wire": lost,
+            "changed": changed,
+            "masked": masked,
+        }
         notes = [Note(code, _numbers(which)) for code, which in sensors.items() if which.any()]
         notes += [Note("unreadable")] * self._losses.excessive + [Note("pause", seconds=self._pause)] * paused
         return _numbers(blind), tuple(notes)

@@ -401,6 +401,7 @@ class LiveLoop:
         self._count_dead(now)
         for readings in stream:
             self._display.add(readings)
+        self._engine.changed = self._display.contacts.changed
         verdicts = self._engine.push(stream)
         if frozen := self._tare.freshness.frozen:
             self._display.set_verdict(None, now, FROZEN_READINGS[frozen], self._engine.alarm)

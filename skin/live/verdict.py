@@ -17,6 +17,7 @@ NOTES = {
     "over_range": "no value of {sensors} since the force rose: beyond the range, or a broken wire",
     "unreadable": "more frames are unreadable in this contact than at rest: values beyond the range?",
     "lost_wire": "{sensors} fell to rest while neighbours stay pressed: a broken wire",
+    "changed": "{sensors} have changed, by what the others read: check, calibrate or tare the skin",
     "masked": "a touch near {sensors} would stay undetected: no valid reading",
     "pause": "no frame for {seconds:.2f} s, in which a touch may have come and gone",
     "near_threshold": "probably dangerous, but below the threshold of the alarm",

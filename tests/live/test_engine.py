@@ -384,3 +384,11 @@ def test_labels_that_exclude_each_other_have_one_winner():
 def test_patience_that_would_be_too_late_is_refused(wrong):
     with pytest.raises(InputError, match="patience"):
         DebounceSettings(**wrong)
+
+
+def test_where_a_sensor_has_changed_no_touch_is_safe():
+    subject = rested()
+    subject.changed = (2,)
+    verdict = play(subject, np.ones((30, 4)), start=0.6)[-1]
+    assert (verdict.unknown, verdict.danger) == ((2,), None)
+    assert [note.message["sensors"] for note in verdict.notes if note.code == "changed"] == [[2]]

@@ -207,7 +207,7 @@ class Engine:
         self.window.clear()
         shape = self.frames, self.sensors
         self._idle = np.zeros(shape, dtype=np.float32), np.ones(shape, dtype=bool)
-        self.alarm, self._peak_probability = False, 0.0
+        self.alarm, self._peak_probability, self._ended = False, 0.0, -inf
         label, patience = self.patience.label, self.patience
         self._touch, self._danger = Debounce(label, label), Debounce(patience.alarm, patience.calm)
         self._labels = {name: Debounce(label, label) for name in self.task.gated if name != "dangerous"}
@@ -346,7 +346,11 @@ class Engine:
         touching = decision.draft.contact is not None or decision.risen or learned
         # An alarm does not wait for the touch.
         touched = self._touch(touching, decision.time, period) or self.alarm
-        labels = self._debounce_labels(decision.time, probabilities, period)
+        if decision.draft.contact is not None or learned:
+            self._ended = decision.time
+        # A touch that leaves the window looks shorter than it was, so a press would become a tap.
+        finished = touched and decision.time - self._ended > 2 * self.patience.label
+        labels = self._debounce_labels({} if finished else probabilities, decision.time, period)
         notes = self._collect_notes(decision.draft.notes, probabilities, touched)
         if "dangerous" in probabilities:
             labels |= {"dangerous": self.alarm}
@@ -388,18 +392,20 @@ class Engine:
         return order_notes(notes.values())
 
     def _debounce_labels(
-        self, time: float, probabilities: dict[str, float], period: float
+        self, probabilities: dict[str, float], time: float, period: float
     ) -> dict[str, bool]:
-        """Return the predicted labels but ``dangerous``: the likeliest one if they exclude each other."""
-        best = max(probabilities, key=probabilities.__getitem__)
-        labels = {}
-        for name, debounce in self._labels.items():
+        """Return the labels but ``dangerous``: the likeliest one if they exclude each other.
+
+        Without probabilities, they stay as they are.
+        """
+        best = max(probabilities, key=probabilities.__getitem__, default="")
+        for name in self._labels.keys() & probabilities:
+            debounce = self._labels[name]
             predicted = name == best if self.task.kind == "exclusive" else probabilities[name] > 0.5
-            labels[name] = debounce(predicted, time, period)
             # A word must not stand beside the probability of its opposite.
-            if labels[name] == predicted:
+            if debounce(predicted, time, period) == predicted:
                 self._agreeing[name] = probabilities[name]
-        return labels
+        return {name: debounce.state for name, debounce in self._labels.items()}
 
 
 def _numbers(which: np.ndarray | np.bool) -> tuple[int, ...]:

@@ -392,3 +392,11 @@ def test_where_a_sensor_has_changed_no_touch_is_safe():
     verdict = play(subject, np.ones((30, 4)), start=0.6)[-1]
     assert (verdict.unknown, verdict.danger) == ((2,), None)
     assert [note.message["sensors"] for note in verdict.notes if note.code == "changed"] == [[2]]
+
+
+def test_a_finished_touch_keeps_its_last_labels_while_it_leaves_the_window():
+    subject = rested(window=30)
+    play(subject, np.full((100, 4), 3.0), start=0.6)
+    said = [verdict for verdict in play(subject, np.zeros((400, 4)), start=1.6) if verdict.touched]
+    assert said[-1].t > 3.5
+    assert all(verdict.labels["press"] for verdict in said)

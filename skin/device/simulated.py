@@ -28,7 +28,7 @@ from skin.mechanics.geometry import sensor_geometry
 from skin.mechanics.relaxation import Relaxing, relaxes
 from skin.mechanics.simulator.base import AbstractSimulator
 from skin.touch.fingertips import read_touch
-from skin.touch.labels import TOUCH, TOUCH_OR_NOT, TOUCH_SLIDING
+from skin.touch.labels import TOUCH, TOUCH_OR_NOT, TOUCH_SLIDING, Limits
 from skin.touch.movie import Movie
 from skin.touch.paths import TouchSettings
 from skin.touch.sampler import AbstractContact, AbstractSampler
@@ -248,7 +248,8 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
         positions = np.stack([x * width / columns, y * height / rows])
         away = self.true_sensors.positions[:, :2, None, None] - positions
         discs = torch.from_numpy(np.hypot(*away.swapaxes(0, 1)) <= radius).float()
-        return self.model(self.sampler.settings.thresholds.pressure * discs).readings
+        limits = self.sampler.settings.limits or Limits(self.sampler.settings.thresholds.pressure)
+        return self.model(min(limits.pressure, limits.force / (np.pi * radius**2)) * discs).readings
 
     def draw(self, stream: Stream, count: int, *key: int) -> Touches:
         """Return touches of a stream of randomness at a key."""

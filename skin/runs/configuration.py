@@ -54,6 +54,7 @@ ADDED: dict[str, Any] = {
     "targets": None,
     "second": 0.0,
     "miss_rate": None,
+    "limits": {},
     "training_touch": {},
     "start": None,
 }
@@ -173,6 +174,7 @@ class Config:
     seed: int = 0
     task: str | None = None
     epochs: dict[str, int] = field(default_factory=dict)
+    limits: dict[str, Any] = field(default_factory=dict)
     touch: dict[str, Any] = field(default_factory=dict)
     body: dict[str, Any] = field(default_factory=dict)
     layout: dict[str, Any] = field(default_factory=dict)
@@ -443,7 +445,7 @@ _FIXED = (
     "seed",
 )
 # Groups of the skin and its touches, in the order of conf/skin.yaml; the others of a run come after them.
-_SKIN = ("touch", "layout", "simulator", "contact", "device", "profile", "data", "body")
+_SKIN = ("limits", "touch", "layout", "simulator", "contact", "device", "profile", "data", "body")
 
 
 def recompose(stored: Config, overrides: Sequence[str]) -> Config:
@@ -508,6 +510,8 @@ def _restored(stored: Config, device: Mapping[str, Any]) -> DictConfig:
         refers = isinstance(value, str) and value.startswith("${") and name in run.device
         if refers and OmegaConf.select(run, value[2:-1]) == run.device[name]:
             run.device[name] = value
+    if run.touch:
+        run.touch.limits = "${limits}"
     return run
 
 

@@ -30,7 +30,7 @@ from skin.touch.paths import (
     draw_until_fit,
     sample_paths,
 )
-from skin.touch.sampler import AbstractContact, AbstractSampler, ContactProblem, ContactResult, balanced
+from skin.touch.sampler import AbstractContact, AbstractSampler, ContactProblem, ContactResult
 from skin.touch.shapes import Shapes
 
 
@@ -326,6 +326,8 @@ class TouchSampler(AbstractSampler):
                 "the pressures of two gestures at a time add up only with contact=prescribed: set that, or "
                 "touch.second=0"
             )
+        if self.settings.limits and self.settings.limits.human_force < np.inf:
+            self.kinds = self._human_kinds()
 
     @cached_property
     def fit(self) -> Fit | None:
@@ -335,7 +337,7 @@ class TouchSampler(AbstractSampler):
     @torch.no_grad()
     def sample(self, count: int, generator: np.random.Generator, labels: np.ndarray | None = None) -> Movie:
         """Return the movies of ``count`` gestures; see :meth:`AbstractSampler.sample`."""
-        wanted = balanced(count, generator) if labels is None else labels
+        wanted = self.balanced(count, generator) if labels is None else labels
         settings, pending = self.settings, np.arange(count)
         draws, misfits, unconverged = np.zeros((3, count))
         fitted = self.fit and self.fit.draw(wanted[:, 0], generator)
@@ -408,6 +410,33 @@ class TouchSampler(AbstractSampler):
             movie.parameters["unconverged"] = torch.from_numpy(unconverged[rows]).float()
         given_up = pressed.hopeless.reshape(-1, ahead).any(axis=1) & ~chosen
         return chosen, given_up, movie[torch.from_numpy(first[chosen])]
+
+    def _human_kinds(self, bodies: int = 16, paths: int = 8, rare: float = 0.1) -> np.ndarray:
+        """Return the 16 combinations of labels, small in place of big where that takes more than a person.
+
+        Args:
+            bodies: big bodies drawn for each combination that is dangerous, too.
+            paths: drawn for each of them.
+            rare: fraction of them that must be dangerous within ``human_force``.
+        """
+        kinds, generator = np.arange(2 ** len(TOUCH)), np.random.default_rng(0)
+        heavy = kinds[kinds & 0b1001 == 0b1001]  # big and dangerous
+        wanted = np.repeat(heavy, bodies)[:, None] >> np.arange(len(TOUCH)) & 1 == 1
+        rows, fitted = np.arange(len(wanted)), self.fit and self.fit.draw(wanted[:, 0], generator)
+        drawn = draw_bodies(wanted[:, 0], self.settings, self.shapes, generator, self.fit, fitted)
+        drawn |= draw_times(wanted, self.settings, self.padded, generator)
+        random = generator.random((paths, len(wanted), 5))
+        able = self._round(rows, wanted, drawn, random, *np.zeros((2, len(wanted))))[0]
+        left_out = heavy[able.reshape(-1, bodies).mean(axis=1) < rare]
+        if len(left_out):
+            which = {("tap", "press")[kind >> 2 & 1] for kind in left_out}
+            warnings.warn(
+                f"a big dangerous {' or '.join(sorted(which))} takes more than limits.human_force here: "
+                "it is left out, and small ones are drawn in its place",
+                UserWarning,
+                stacklevel=3,
+            )
+        return np.where(np.isin(kinds, left_out), kinds - 1, kinds)
 
     def _press(self, gestures: Draws, wanted: np.ndarray) -> tuple[Movie, ContactResult]:
         """Return the movie of gestures (B,) with its labels."""

@@ -130,7 +130,8 @@ class Movie:
             peak (highest cell pressure, Pa), force (N, all cells at full force), draws (how many paths were
             drawn until one had the wanted labels), net_x and net_y (m, from the first position of the path
             to its last), x and y (m, that first position); area, travel, frames and pressure
-            (``skin.touch.movie.Measures``), of which the labels are made; and where pressure is solved for,
+            (``skin.touch.movie.Measures``), of which the labels are made; excess where there are limits
+            (:meth:`skin.touch.labels.Limits.excess`, of one gesture); and where pressure is solved for,
             unconverged (frames of all its draws that were not found).
         shear: (U, 2), tangential traction along x and y of each frame divided by its pressure: the
             coefficient of friction times the direction of motion, 0 for static touches; None: no friction.
@@ -243,7 +244,7 @@ def add_second(movie: Movie, fraction: float, contact: float, generator: np.rand
 
     parameters = {name: values.clone() for name, values in movie.parameters.items()}
     parameters["contacts"] = torch.ones(len(movie)).index_fill_(0, first, 2)
-    for name in ("peak", *Measures._fields):
+    for name in parameters.keys() & {"peak", "excess", *Measures._fields}:
         parameters[name][first] = torch.maximum(parameters[name][first], movie.parameters[name][second])
     onset = torch.minimum(movie.parameters["onset"][first], begin.float())
     parameters["onset"][first], parameters["duration"][first] = onset, counts.float()

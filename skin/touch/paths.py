@@ -16,7 +16,7 @@ from torch import Tensor
 from skin.body.base import AbstractBody
 from skin.core.settings import RISING, check_settings, configured
 from skin.errors import InputError
-from skin.touch.labels import RELEASE, TOUCH_OR_NOT, TOUCH_SLIDING, Label, Thresholds
+from skin.touch.labels import RELEASE, TOUCH_OR_NOT, TOUCH_SLIDING, Label, Limits, Thresholds
 from skin.touch.shapes import Pose
 
 if TYPE_CHECKING:
@@ -67,6 +67,8 @@ class TouchSettings(ABC):
         ongoing: fraction of touches whose window ends at some moment from their begin to 0.3 s after their
             end, as the windows of a live view do. Labels are those of what the window shows. It has no effect
             on touches that begin at the first frame.
+        limits: that decide what is dangerous (:class:`skin.touch.labels.Limits`); None: the pressure of
+            ``thresholds``. Ranges of peaks are then relative to the limits.
         labels: labels of one's own by name, behind those of the report. Touches are not drawn for them: each
             has those that its movie gives.
 
@@ -90,6 +92,7 @@ class TouchSettings(ABC):
     gap: Above0 = (1.0, 6.0)
     stride: Above0 = (1.5, 4.5)
     thresholds: Thresholds = field(default_factory=Thresholds)
+    limits: Limits | None = None
     labels: Mapping[str, Label] = field(default_factory=dict)
 
     @cached_property
@@ -154,6 +157,7 @@ class TouchSettings(ABC):
         }
         if not isinstance(limits := values.get("thresholds", {}), Thresholds):
             values["thresholds"] = configured(Thresholds, limits, "touch.thresholds")
+        values["limits"] = Limits.of(values.get("limits"))
         if not isinstance(labels := values.get("labels", {}), Mapping):
             raise InputError(f"touch.labels must be labels by name, got {labels!r}")
         if taken := sorted(set(labels) & {*TOUCH_OR_NOT.names, *TOUCH_SLIDING.names}):

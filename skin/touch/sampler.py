@@ -75,13 +75,24 @@ class AbstractContact(ABC):
         """Return the pressure of gestures at a force that gives the wanted labels, if there is one."""
 
 
-def balanced(count: int, generator: np.random.Generator, chosen: Sequence[str] = TOUCH.names) -> np.ndarray:
+def balanced(
+    count: int,
+    generator: np.random.Generator,
+    chosen: Sequence[str] = TOUCH.names,
+    kinds: np.ndarray | None = None,
+) -> np.ndarray:
     """Return label combinations (count, 4), bool: those of the chosen labels, balanced; others are false.
 
     They are equally frequent, to within one, in random order.
+
+    Args:
+        count: B.
+        generator: source of randomness.
+        chosen: labels, those of the bits of a combination.
+        kinds: (K,), the combinations; None: all.
     """
-    kinds = 2 ** len(chosen)
-    codes = generator.permutation(generator.permutation(kinds)[np.arange(count) % kinds])
+    kinds = np.arange(2 ** len(chosen)) if kinds is None else kinds
+    codes = generator.permutation(generator.permutation(kinds)[np.arange(count) % len(kinds)])
     labels = np.zeros((count, len(TOUCH)), dtype=bool)
     labels[:, [TOUCH.names.index(name) for name in chosen]] = codes[:, None] >> np.arange(len(chosen)) & 1
     return labels
@@ -102,6 +113,7 @@ class AbstractSampler(ABC):
 
     Attributes:
         chosen: the labels that touches can be drawn for, names of ``TOUCH``; the others follow.
+        kinds: combinations of the chosen labels that are drawn (:func:`balanced`); None: all.
         labels: all labels by name: those of ``TOUCH``, then labels of one's own.
         leak: see :func:`skin.device.balance.check_label_leakage`.
 
@@ -110,6 +122,7 @@ class AbstractSampler(ABC):
     """
 
     chosen: tuple[str, ...] = TOUCH.names
+    kinds: np.ndarray | None = None
 
     def __init__(
         self,
@@ -122,14 +135,15 @@ class AbstractSampler(ABC):
     ) -> None:
         self.body, self.contact, self.padded = body, contact, padded
         self.settings, self.leak = settings, float(getattr(settings, "leak", 1.0))
-        self.labels = report_labels(settings.thresholds, settings.rate) | dict(settings.labels)
+        self.labels = report_labels(settings.thresholds, settings.rate, settings.limits)
+        self.labels |= settings.labels
         self.footprints = torch.as_tensor(footprints, dtype=torch.float32)
         self.moments = None if moments is None else torch.as_tensor(moments, dtype=torch.float32)
         self.shapes = Shapes(settings.shapes, body, settings.thresholds.contact, moments is not None)
 
     def balanced(self, count: int, generator: np.random.Generator) -> np.ndarray:
         """Return label combinations (count, 4), bool, that can be drawn, balanced, in random order."""
-        return balanced(count, generator, self.chosen)
+        return balanced(count, generator, self.chosen, self.kinds)
 
     @abstractmethod
     def sample(self, count: int, generator: np.random.Generator, labels: np.ndarray | None = None) -> Movie:
@@ -166,6 +180,11 @@ class AbstractSampler(ABC):
         floats = {name: torch.from_numpy(drawn[name]).float() for name in _PARAMETERS}
         floats |= {name: value.float() for name, value in measures._asdict().items()}
         trajectories, friction = paths.trajectories, self.settings.shear
+        if limits := self.settings.limits:
+            force = floats["force"] * trajectories.profile.amax(1)
+            press = measures.frames > self.settings.frames.duration
+            excess = limits.excess(floats["pressure"].numpy(), force.numpy(), press.numpy())
+            floats["excess"] = torch.from_numpy(excess).float()
         drag = torch.from_numpy(friction * heading(paths.position, paths.first)).float()
         movie = Movie(
             frames,

@@ -1,0 +1,139 @@
+"""Limits of pressure and force: what is dangerous under them, and tables that are refused."""
+
+import numpy as np
+import pytest
+
+from skin.body.layout import Grid
+from skin.body.sheet import Sheet
+from skin.device.simulated import Simulated
+from skin.errors import InputError
+from skin.mechanics.contact.prescribed import Prescribed
+from skin.mechanics.simulator.naive import Naive
+from skin.runs.configuration import fingerprint, recompose
+from skin.touch.gestures import TouchSampler
+from skin.touch.labels import Limits
+
+BODY = Sheet((0.16, 0.16), (16, 16), [{"material": "EcoFlex 00-30", "thickness": 0.005}])
+FORCE = {"limit": 65, "unit": "N", "source": "a table"}
+PRESSURE = {"limit": 1.4, "unit": "MPa", "source": "a table"}
+
+
+def drawn(count: int = 64, **limits):
+    """Return the sampler of a sheet with these limits, and a movie of it."""
+    settings = {"limits": limits} if limits else {}
+    footprints = BODY.footprints(Grid(5, 5).sensors(BODY))
+    sampler = TouchSampler(BODY, footprints, Prescribed(), settings)
+    return sampler, sampler.sample(count, np.random.default_rng(3))
+
+
+def test_the_report_is_the_default(configured):
+    plain, report = configured(), configured("limits=report")
+    assert plain.touch["limits"] == {}
+    old = configured()
+    del old.touch["limits"], old.device["touch"]["limits"]
+    assert fingerprint(old) == fingerprint(plain) != fingerprint(report)
+    limits = Limits.of(report.touch["limits"])
+    assert limits.pressure == limits.tap_pressure == plain.touch["thresholds"]["pressure"]
+    (_, movie), (_, under) = drawn(), drawn(**report.limits)
+    assert "excess" not in movie.parameters
+    assert movie.labels.equal(under.labels)
+    assert movie.parameters["pressure"].numpy() == pytest.approx(
+        under.parameters["pressure"].numpy(), rel=1e-5
+    )
+
+
+def test_a_force_alone_makes_a_light_wide_press_dangerous():
+    _, movie = drawn(force=FORCE)
+    pressure, force = (movie.parameters[name] for name in ("pressure", "force"))
+    big, _, _, dangerous = (movie.labels > 0.5).T
+    assert movie.labels.mean(dim=0).tolist() == [0.5] * 4  # all 16 combinations
+    assert pressure[big & dangerous].max() < 90.5e3
+    assert force[dangerous].min() > 65 * 0.99
+    assert force[~dangerous].max() <= 65 * 1.01
+    assert ((movie.parameters["excess"] > 1) == dangerous).all()
+
+
+def test_a_tap_has_limits_of_its_own():
+    _, movie = drawn(force=FORCE, tap_force=FORCE | {"limit": 130})
+    force, press, dangerous = movie.parameters["force"], movie.labels[:, 2] > 0.5, movie.labels[:, 3] > 0.5
+    assert force[~press & ~dangerous].max() > 65
+    assert force[~press & dangerous].min() > 130 * 0.99
+    assert force[press & ~dangerous].max() <= 65 * 1.01
+
+
+def test_the_first_limit_that_is_exceeded_decides():
+    limits = Limits.of({"pressure": PRESSURE, "force": FORCE})
+    excess = limits.excess(
+        np.array([1.4e6, 2.8e6, 0]), np.array([130.0, 6.5, 65.0]), np.array([True, False, True])
+    )
+    assert excess == pytest.approx([2, 2, 1])
+
+
+def test_what_no_person_can_press_is_left_out_and_named():
+    human = {"limit": 1000, "unit": "N", "source": "a table"}
+    with pytest.warns(UserWarning, match="a big dangerous press or tap takes more than limits.human_force"):
+        _, movie = drawn(pressure=PRESSURE, human_force=human)
+    big, _, _, dangerous = (movie.labels > 0.5).T
+    assert dangerous.float().mean() == 0.5
+    assert not (big & dangerous).any()
+    assert (big & ~dangerous).any()
+    assert movie.parameters["force"].max() <= 1000
+
+
+def test_presses_at_the_limit_follow_it():
+    limited, plain = (
+        Simulated(body=BODY, layout=Grid(5, 5), simulator=Naive, touch=touch, gestures=10)
+        for touch in ({"limits": {"force": FORCE}}, {})
+    )
+    area = 0.03 * 0.16**2  # of a press
+    ratio = limited.press_readings() / plain.press_readings()
+    assert ratio.diagonal().numpy() == pytest.approx(65 / area / 90.5e3, rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("table", "reason"),
+    [
+        ({"force": {"limit": 65, "unit": "N"}}, r"limits.force needs source"),
+        ({"force": {"limit": 65, "source": "x"}}, r"limits.force needs unit"),
+        ({"force": FORCE | {"source": ""}}, r"limits.force.source"),
+        ({"force": FORCE | {"unit": "kg"}}, r"limits.force.unit=kg must be 'N'"),
+        ({"pressure": PRESSURE | {"unit": "N"}}, r"limits.pressure.unit=N must be 'Pa', 'kPa'"),
+        ({"pressure": PRESSURE | {"limit": 0}}, r"limits.pressure.limit=0 must be greater than 0"),
+        ({"pressure": 90.5e3}, r"limits.pressure must be settings by name"),
+        ({"force": FORCE, "press_force": FORCE}, r"limits has no setting press_force"),
+        ({"tap_force": FORCE}, r"limits must give pressure, force or both"),
+    ],
+)
+def test_a_table_without_unit_or_source_is_refused(table, reason):
+    with pytest.raises(InputError, match=reason):
+        Limits.of(table)
+
+
+def test_a_stored_run_takes_other_limits(configured):
+    for stored in (configured(), configured("limits=report")):
+        other = recompose(stored, ["limits=cuff"])
+        assert other.device["touch"]["limits"] == other.touch["limits"] == other.limits
+        assert other.limits["pressure"]["limit"] == 22.8
+        assert recompose(stored, []).touch["limits"] == stored.limits
+
+
+def test_a_table_of_ones_own_trains_and_evaluates(run, tmp_path):
+    (tmp_path / "conf" / "limits").mkdir(parents=True)
+    table = tmp_path / "conf" / "limits" / "mine.yaml"
+    table.write_text("force: {limit: 65, unit: N, source: a table}\n")
+    words = "--config-dir", "conf", "limits=mine", "experiment=rules", "simulator=naive", "data.gestures=96"
+    small = (
+        "device.test_gestures=32",
+        "evaluation.safe_gestures=32",
+        "evaluation.devices=0",
+        "evaluation.layouts=0",
+    )
+    done = run(tmp_path, "train", *words, *small)
+    assert done.returncode == 0, done.stderr
+    done = run(tmp_path, "evaluate", "run=latest", *small)
+    assert done.returncode == 0, done.stderr
+    assert "overall/accuracy" in done.stdout
+    table.write_text("force: {limit: 65, unit: N}\n")
+    done = run(tmp_path, "train", *words)
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1), done.stderr
+    assert "limits.force needs source" in done.stderr

@@ -111,7 +111,7 @@ def _names(name: str) -> list[str]:
 # Checks of a configuration that need no run, made before anything is loaded.
 
 
-_GROUPS = ("body", "layout", "limits", "touch", "device", "contact")
+_GROUPS = ("body", "layout", "touch", "device", "contact")
 
 
 def check_quickly(config: Config, run: str | None, overrides: Sequence[str]) -> None:
@@ -140,7 +140,7 @@ def check_quickly(config: Config, run: str | None, overrides: Sequence[str]) -> 
     if run is not None and not run.endswith(".onnx"):
         named = groups.keys() & {override.split("=")[0].split(".")[0] for override in overrides}
         check_groups({name: groups[name] for name in {"device", "contact"} & named})
-        if {"limits", "touch"} & named:
+        if "touch" in named:
             from skin.touch.fingertips import read_touch
 
             read_touch(groups["touch"])

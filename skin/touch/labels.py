@@ -127,16 +127,14 @@ class Thresholds:
     travel: float = 1e-3
 
 
-_Source = Annotated[str, MinLen(1)]
-_PASCAL = {"Pa": 1.0, "kPa": 1e3, "MPa": 1e6, "N/cm2": 1e4}
-
-
-def _pressure(limit: PositiveFloat, unit: Literal["Pa", "kPa", "MPa", "N/cm2"], source: _Source) -> float:
+def _pressure(
+    limit: PositiveFloat, unit: Literal["Pa", "kPa", "MPa", "N/cm2"], source: Annotated[str, MinLen(1)]
+) -> float:
     """Return an entry of a table of limits in Pa."""
-    return limit * _PASCAL[unit]
+    return limit * {"Pa": 1.0, "kPa": 1e3, "MPa": 1e6, "N/cm2": 1e4}[unit]
 
 
-def _force(limit: PositiveFloat, unit: Literal["N"], source: _Source) -> float:
+def _force(limit: PositiveFloat, unit: Literal["N"], source: Annotated[str, MinLen(1)]) -> float:
     """Return an entry of a table of limits in N."""
     return float(limit)
 
@@ -168,7 +166,8 @@ class Limits:
                 press.
 
         Raises:
-            InputError: an entry without unit or source, an unknown one, or neither pressure nor force.
+            InputError: an entry without unit or source, an unknown one, neither pressure nor force, or forces
+                alone that no person exerts.
         """
         if isinstance(table, Limits) or not table:
             return table if isinstance(table, Limits) else None
@@ -182,18 +181,21 @@ class Limits:
             for name, entry in table.items()
         }
         taps = {f"tap_{name}": values[name] for name in ("pressure", "force") if name in values}
-        return configured(cls, taps | values, "limits")
+        limits = configured(cls, taps | values, "limits")
+        if "pressure" not in values and limits.human_force <= max(limits.force, limits.tap_force):
+            raise InputError(
+                f"limits.human_force={limits.human_force:g} N must be above the limits of force, or no touch "
+                "is dangerous: leave it out, or give limits.pressure, too"
+            )
+        return limits
 
     def of_contact(self, press: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the limits of pressure, Pa, and force, N, of presses and taps (B,), bool."""
-        pairs = (self.pressure, self.tap_pressure), (self.force, self.tap_force)
-        pressure, force = (np.where(press, lasting, transient) for lasting, transient in pairs)
-        return pressure, force
+        return np.where(press, self.pressure, self.tap_pressure), np.where(press, self.force, self.tap_force)
 
     def excess(self, pressure: np.ndarray, force: np.ndarray, press: np.ndarray) -> np.ndarray:
         """Return the largest ratio of pressure (B,), Pa, and force (B,), N, to their limits, (B,)."""
-        pressures, forces = self.of_contact(press)
-        return np.maximum(pressure / pressures, force / forces)
+        return np.maximum(*map(np.divide, (pressure, force), self.of_contact(press)))
 
 
 @dataclass(frozen=True)

@@ -234,11 +234,10 @@ def add_second(movie: Movie, fraction: float, contact: float, generator: np.rand
     force = total.amax(dim=1)
     scale = total / force[:, None]
     touched = scale > 0
-    parts = (
+    one, other = (
         part[touched][:, None, None] * movie.frames[rows[touched]]
         for part, rows in zip(fractions, index, strict=True)
     )
-    frames = sum(parts) / scale[touched][:, None, None]
     counts = touched.sum(dim=1)
     column = (touched.cumsum(dim=1) - 1).clamp(min=0) + (counts.cumsum(0) - counts)[:, None]
 
@@ -251,7 +250,13 @@ def add_second(movie: Movie, fraction: float, contact: float, generator: np.rand
     parameters["force"][first] = force
     indices, scales = movie.index.clone(), movie.scale.clone()
     indices[first], scales[first] = column + len(movie.frames), scale
-    sums = Movie(torch.cat([movie.frames, frames]), indices, scales, movie.labels, parameters)
+    sums = Movie(
+        torch.cat([movie.frames, (one + other) / scale[touched][:, None, None]]),
+        indices,
+        scales,
+        movie.labels,
+        parameters,
+    )
     return sums[torch.arange(len(movie))]  # without the frames of first gestures alone
 
 

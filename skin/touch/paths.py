@@ -96,6 +96,11 @@ class TouchSettings(ABC):
     labels: Mapping[str, Label] = field(default_factory=dict)
 
     @cached_property
+    def danger(self) -> Limits:
+        """The limits that decide what is dangerous."""
+        return self.limits or Limits(self.thresholds.pressure, tap_pressure=self.thresholds.pressure)
+
+    @cached_property
     def frames(self) -> GestureFrames:
         """The durations in frames of the model, ``round(seconds * rate)``, and the speeds per frame."""
 
@@ -325,6 +330,10 @@ class Trajectories:
         profile: (B, T), its fraction of full force; 0 without contact.
         peak: (B,), the wanted highest cell pressure, Pa.
         wanted: (B, 4), bool, the wanted labels in the order of ``skin.touch.labels.TOUCH``.
+        position: (U, 2), position of each frame within the gesture's span, m.
+        first: (B,), the first frame of each gesture.
+        net: (B, 2), from its first position to its last, m.
+        travel: (B,), largest distance from its first position, m.
     """
 
     owner: np.ndarray
@@ -334,20 +343,6 @@ class Trajectories:
     profile: Tensor
     peak: np.ndarray
     wanted: np.ndarray
-
-
-class SampledPaths(NamedTuple):
-    """Sampled trajectories of gestures.
-
-    Attributes:
-        trajectories: the frames (U,) of gestures (B,).
-        position: (U, 2), position of each frame within the gesture's span, m.
-        first: (B,), the first frame of each gesture.
-        net: (B, 2), from its first position to its last, m.
-        travel: (B,), largest distance from its first position, m.
-    """
-
-    trajectories: Trajectories
     position: np.ndarray
     first: np.ndarray
     net: np.ndarray
@@ -356,7 +351,7 @@ class SampledPaths(NamedTuple):
 
 def sample_paths(
     gestures: Draws, wanted: np.ndarray, settings: TouchSettings, proportional: bool
-) -> SampledPaths:
+) -> Trajectories:
     """Return the distinct frames of gestures.
 
     A sliding touch has one per step. A static touch has one, or one per force level where pressure is not
@@ -388,7 +383,9 @@ def sample_paths(
     poses = Pose(shape, angle, scales, position - gestures["low"][owner], stretch)
     fraction = np.zeros(len(owner))
     np.maximum.at(fraction, index, scale)
-    trajectories = Trajectories(
+    from_first = position - position[first[owner]]
+    travel = np.maximum.reduceat(np.hypot(*from_first.T), first)
+    return Trajectories(
         owner,
         poses,
         fraction,
@@ -396,7 +393,8 @@ def sample_paths(
         torch.from_numpy(scale).float(),
         gestures["peak"],
         wanted,
+        position,
+        first,
+        from_first[first + counts - 1],
+        travel,
     )
-    from_first = position - position[first[owner]]
-    travel = np.maximum.reduceat(np.hypot(*from_first.T), first)
-    return SampledPaths(trajectories, position, first, from_first[first + counts - 1], travel)

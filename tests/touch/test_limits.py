@@ -8,9 +8,11 @@ from skin.body.sheet import Sheet
 from skin.device.simulated import Simulated
 from skin.errors import InputError
 from skin.mechanics.contact.prescribed import Prescribed
+from skin.mechanics.contact.rigid import Rigid
 from skin.mechanics.simulator.naive import Naive
+from skin.mechanics.simulator.solid import Solid
 from skin.runs.configuration import fingerprint, recompose
-from skin.touch.gestures import TouchSampler
+from skin.touch.gestures import GestureSettings, TouchSampler
 from skin.touch.labels import Limits
 
 BODY = Sheet((0.16, 0.16), (16, 16), [{"material": "EcoFlex 00-30", "thickness": 0.005}])
@@ -20,26 +22,23 @@ PRESSURE = {"limit": 1.4, "unit": "MPa", "source": "a table"}
 
 def drawn(count: int = 64, **limits):
     """Return the sampler of a sheet with these limits, and a movie of it."""
-    settings = {"limits": limits} if limits else {}
     footprints = BODY.footprints(Grid(5, 5).sensors(BODY))
-    sampler = TouchSampler(BODY, footprints, Prescribed(), settings)
+    sampler = TouchSampler(BODY, footprints, Prescribed(), GestureSettings.of({"limits": limits}))
     return sampler, sampler.sample(count, np.random.default_rng(3))
 
 
-def test_the_report_is_the_default(configured):
-    plain, report = configured(), configured("limits=report")
+def test_a_table_of_the_threshold_is_the_default(configured):
+    plain = configured()
     assert plain.touch["limits"] == {}
     old = configured()
     del old.touch["limits"], old.device["touch"]["limits"]
-    assert fingerprint(old) == fingerprint(plain) != fingerprint(report)
-    limits = Limits.of(report.touch["limits"])
-    assert limits.pressure == limits.tap_pressure == plain.touch["thresholds"]["pressure"]
-    (_, movie), (_, under) = drawn(), drawn(**report.limits)
+    assert fingerprint(old) == fingerprint(plain) != fingerprint(configured("limits=cuff"))
+    (_, movie), (_, under) = drawn(), drawn(pressure=PRESSURE | {"limit": 90.5, "unit": "kPa"})
     assert "excess" not in movie.parameters
     assert movie.labels.equal(under.labels)
-    assert movie.parameters["pressure"].numpy() == pytest.approx(
-        under.parameters["pressure"].numpy(), rel=1e-5
-    )
+    pressure = movie.parameters["pressure"].numpy()
+    assert under.parameters["pressure"].numpy() == pytest.approx(pressure, rel=1e-5)
+    assert under.parameters["excess"].numpy() == pytest.approx(pressure / 90.5e3, rel=1e-5)
 
 
 def test_a_force_alone_makes_a_light_wide_press_dangerous():
@@ -80,6 +79,22 @@ def test_what_no_person_can_press_is_left_out_and_named():
     assert movie.parameters["force"].max() <= 1000
 
 
+def test_a_rigid_object_is_as_dangerous_as_its_limits_say():
+    device = Simulated(
+        body=Sheet((0.08, 0.08), (8, 8), BODY.layers),
+        layout=Grid(2, 2),
+        simulator=Solid,
+        contact=Rigid,
+        touch={"shapes": ["disc"], "limits": {"pressure": PRESSURE | {"limit": 22.8, "unit": "kPa"}}},
+        gestures=10,
+    )
+    movie = device.sampler.sample(16, np.random.default_rng(0))
+    pressure, dangerous = movie.parameters["pressure"] / 22.8e3, movie.labels[:, 3] > 0.5
+    assert (pressure > 1).equal(dangerous)
+    assert pressure.max() < 180 / 90.5
+    assert movie.parameters["peak"][~dangerous].median() < 0.7 * 22.8e3  # spread over its range
+
+
 def test_presses_at_the_limit_follow_it():
     limited, plain = (
         Simulated(body=BODY, layout=Grid(5, 5), simulator=Naive, touch=touch, gestures=10)
@@ -102,6 +117,10 @@ def test_presses_at_the_limit_follow_it():
         ({"pressure": 90.5e3}, r"limits.pressure must be settings by name"),
         ({"force": FORCE, "press_force": FORCE}, r"limits has no setting press_force"),
         ({"tap_force": FORCE}, r"limits must give pressure, force or both"),
+        (
+            {"force": FORCE, "human_force": FORCE},
+            r"limits.human_force=65 N must be above the limits of force",
+        ),
     ],
 )
 def test_a_table_without_unit_or_source_is_refused(table, reason):
@@ -109,12 +128,25 @@ def test_a_table_without_unit_or_source_is_refused(table, reason):
         Limits.of(table)
 
 
-def test_a_stored_run_takes_other_limits(configured):
-    for stored in (configured(), configured("limits=report")):
-        other = recompose(stored, ["limits=cuff"])
-        assert other.device["touch"]["limits"] == other.touch["limits"] == other.limits
-        assert other.limits["pressure"]["limit"] == 22.8
-        assert recompose(stored, []).touch["limits"] == stored.limits
+def test_a_run_keeps_the_limits_that_it_learned(configured):
+    stored = configured("limits=cuff")
+    other = recompose(stored, ["touch=fingertips", "device.noise=0.2"])
+    assert other.touch["limits"] == other.device["touch"]["limits"] == stored.limits
+
+
+@pytest.mark.parametrize(
+    ("trained", "word"),
+    [
+        ([], "limits=cuff"),
+        (["limits=cuff"], "touch.limits={}"),
+        ([], "+device.touch.limits={pressure:{limit:1,unit:MPa,source:a}}"),
+        ([], "touch.thresholds.pressure=50e3"),
+    ],
+)
+def test_a_run_takes_no_other_limits(configured, trained, word):
+    """Its alarm would be late, or say of other limits what it learned of its own."""
+    with pytest.raises(InputError, match=r"was fixed when the run was trained"):
+        recompose(configured(*trained), [word])
 
 
 def test_a_table_of_ones_own_trains_and_evaluates(run, tmp_path):

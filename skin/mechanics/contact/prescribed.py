@@ -7,7 +7,6 @@ import torch
 
 from skin.body.base import AbstractBody
 from skin.mechanics.simulator.base import AbstractSimulator
-from skin.touch.labels import Limits
 from skin.touch.paths import Trajectories
 from skin.touch.sampler import AbstractContact, ContactProblem, ContactResult
 
@@ -38,18 +37,18 @@ class Prescribed(AbstractContact):
         else:
             frames, area = shapes.render(*trajectories.poses), None
             peak = _peak(frames.flatten(1).amax(1), trajectories)
-        highest_cell = trajectories.peak
-        if limits := problem.settings.limits:
-            # The drawn multiple of the report's pressure is one of the limit that the gesture reaches first.
-            pressure, force = limits.of_contact(trajectories.wanted[:, 2])
-            force = np.where(trajectories.wanted[:, 3], force, np.minimum(force, limits.human_force))
-            reached = np.minimum(pressure, force * peak / (width * height))
-            highest_cell = highest_cell * reached / problem.settings.thresholds.pressure
+        # The drawn multiple of the threshold of pressure is one of the limit that the gesture reaches first.
+        human = problem.settings.danger.human_force
+        limit, most = problem.settings.danger.of_contact(trajectories.wanted[:, 2])
+        most = np.where(trajectories.wanted[:, 3], most, np.minimum(most, human))
+        reached = np.minimum(limit, most * (peak / (width * height)))
+        highest_cell = trajectories.peak * (reached / problem.settings.thresholds.pressure)
         force = highest_cell * (width * height) / peak
         owner = torch.from_numpy(trajectories.owner)
         frames *= torch.from_numpy(force / (width * height)).float()[owner, None, None]
-        refused = force > (limits or Limits()).human_force
-        return ContactResult(frames, force, highest_cell, refused, np.zeros(len(force), bool), area=area)
+        return ContactResult(
+            frames, force, highest_cell, force > human, np.zeros(len(force), bool), area=area
+        )
 
 
 def _peak(highest: torch.Tensor, trajectories: Trajectories) -> np.ndarray:

@@ -495,10 +495,11 @@ def recompose(stored: Config, overrides: Sequence[str]) -> Config:
     changed = [name for path, value in leaves if OmegaConf.select(run, name := ".".join(path)) != value]
     # An alarm at other limits than those that the run learned would be late.
     changed += [
-        name
+        f"{touch}.{name}"
         for touch in ("touch", "device.touch")
-        for name in (f"{touch}.limits", f"{touch}.thresholds.pressure")
-        if (OmegaConf.select(whole, name) or {}) != (OmegaConf.select(run, name) or {})
+        for name in ("limits", "thresholds.pressure")
+        if (settings := OmegaConf.select(whole, touch))
+        and (OmegaConf.select(settings, name) or {}) != (OmegaConf.select(run.touch, name) or {})
     ]
     if changed:
         raise InputError(

@@ -132,13 +132,16 @@ def test_a_run_keeps_the_limits_that_it_learned(configured):
     stored = configured("limits=cuff")
     other = recompose(stored, ["touch=fingertips", "device.noise=0.2"])
     assert other.touch["limits"] == other.device["touch"]["limits"] == stored.limits
+    assert recompose(stored, ["device=recording", "device.path=x"]).touch["limits"] == stored.limits
+    recorded = configured("limits=cuff", "device=recording", "device.path=x")
+    assert recompose(recorded, ["device=simulated"]).device["touch"]["limits"] == stored.limits
 
 
 @pytest.mark.parametrize(
     ("trained", "word"),
     [
         ([], "limits=cuff"),
-        (["limits=cuff"], "touch.limits={}"),
+        (["limits=cuff"], "touch.limits=null"),
         ([], "+device.touch.limits={pressure:{limit:1,unit:MPa,source:a}}"),
         ([], "touch.thresholds.pressure=50e3"),
     ],
@@ -149,23 +152,35 @@ def test_a_run_takes_no_other_limits(configured, trained, word):
         recompose(configured(*trained), [word])
 
 
-def test_a_table_of_ones_own_trains_and_evaluates(run, tmp_path):
-    (tmp_path / "conf" / "limits").mkdir(parents=True)
+@pytest.fixture
+def own(tmp_path):
+    """The path of a table of one's own, and words that train under it in seconds."""
     table = tmp_path / "conf" / "limits" / "mine.yaml"
+    table.parent.mkdir(parents=True)
     table.write_text("force: {limit: 65, unit: N, source: a table}\n")
     words = "--config-dir", "conf", "limits=mine", "experiment=rules", "simulator=naive", "data.gestures=96"
-    small = (
-        "device.test_gestures=32",
-        "evaluation.safe_gestures=32",
-        "evaluation.devices=0",
-        "evaluation.layouts=0",
-    )
-    done = run(tmp_path, "train", *words, *small)
+    return table, words
+
+
+SMALL = (
+    *("device.test_gestures=32", "evaluation.safe_gestures=32"),
+    *("evaluation.devices=0", "evaluation.layouts=0"),
+)
+
+
+@pytest.mark.slow("trains a run, evaluates it, and imports what both need")
+def test_a_table_of_ones_own_trains_and_evaluates(run, tmp_path, own):
+    done = run(tmp_path, "train", *own[1], *SMALL)
     assert done.returncode == 0, done.stderr
-    done = run(tmp_path, "evaluate", "run=latest", *small)
+    done = run(tmp_path, "evaluate", "run=latest", *SMALL)
     assert done.returncode == 0, done.stderr
     assert "overall/accuracy" in done.stdout
-    table.write_text("force: {limit: 65, unit: N}\n")
-    done = run(tmp_path, "train", *words)
+    done = run(tmp_path, "evaluate", "run=latest", "limits=cuff", *SMALL)
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1), done.stderr
+
+
+def test_a_command_refuses_a_table_without_source(run, tmp_path, own):
+    own[0].write_text("force: {limit: 65, unit: N}\n")
+    done = run(tmp_path, "train", *own[1])
     assert (done.returncode, done.stderr.count("\n")) == (2, 1), done.stderr
     assert "limits.force needs source" in done.stderr

@@ -5,7 +5,7 @@
     skin study -m study=models study.part=norm,ensemble simulator=naive
     skin study study=robustness study.part=dead study.rows=[features,gru]
     skin study study=margins study.run=latest
-    skin study study=known_loads
+    skin study study=robustness study.part=[known_loads,known_loads_alarm]
 
 A study is a file of conf/study; study.part=NAME chooses a comparison of a file with several. It trains the
 runs that are missing, with the budget in that file; rerun to resume. Writes study_<name>.md, .csv and .png

@@ -24,7 +24,7 @@ from skin.device.sampling import draw_constants, idle_excess, measure
 from skin.device.touches import Part, Recording, Touches, TouchStream, draw_timeline, only_touches
 from skin.errors import InputError
 from skin.mechanics.contact.prescribed import Prescribed
-from skin.mechanics.geometry import sensor_geometry
+from skin.mechanics.geometry import footprints, sensor_geometry
 from skin.mechanics.relaxation import Relaxing, relaxes
 from skin.mechanics.simulator.base import AbstractSimulator
 from skin.touch.fingertips import read_touch
@@ -32,7 +32,6 @@ from skin.touch.labels import TOUCH, TOUCH_OR_NOT, TOUCH_SLIDING
 from skin.touch.movie import Movie
 from skin.touch.paths import TouchSettings
 from skin.touch.sampler import AbstractContact, AbstractSampler
-from skin.touch.splines import footprints
 
 # The true sensors of a simulated device and its model of them.
 
@@ -248,7 +247,8 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
         positions = np.stack([x * width / columns, y * height / rows])
         away = self.true_sensors.positions[:, :2, None, None] - positions
         discs = torch.from_numpy(np.hypot(*away.swapaxes(0, 1)) <= radius).float()
-        return self.model(self.sampler.settings.thresholds.pressure * discs).readings
+        danger = self.sampler.settings.danger
+        return self.model(min(danger.pressure, danger.force / (np.pi * radius**2)) * discs).readings
 
     def draw(self, stream: Stream, count: int, *key: int) -> Touches:
         """Return touches of a stream of randomness at a key."""

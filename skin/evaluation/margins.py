@@ -115,6 +115,7 @@ def measure_margins(
     measures = Measures(*(parameters[name] for name in Measures._fields))
     settings = simulation.sampler.settings
     fractions = _fractions(measures, settings.thresholds, settings.frames.duration)
+    fractions[:, TOUCH.names.index(LABEL)] = parameters.get("excess", fractions[:, TOUCH.names.index(LABEL)])
     spans = {name: find_spans(predicted[:, n], fractions[:, n]) for n, name in enumerate(TOUCH.names)}
     danger = TOUCH.names.index(LABEL)
     spans[ALARM_NAME] = find_spans(point.alarm(probabilities[:, danger]), fractions[:, danger])

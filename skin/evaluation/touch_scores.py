@@ -17,7 +17,7 @@ from skin.device.sampling import between_frames, draw_constants
 from skin.device.touches import Touches
 from skin.evaluation.decisions import DECISIONS, LiveConditions, held_frames, longest_shown, present_as_press
 from skin.evaluation.operating_point import LABEL, DangerScore, Predictor
-from skin.touch import splines
+from skin.mechanics import geometry
 from skin.touch.labels import RELEASE
 from skin.touch.movie import Movie
 
@@ -90,7 +90,7 @@ def decide_touches(
     """
     device = device.replace(padded=False, stream=False)
     parts = list[tuple[Tensor, ...]]()
-    weigh = splines.footprints if device.model.smooth else AbstractBody.footprints
+    weigh = geometry.footprints if device.model.smooth else AbstractBody.footprints
     footprints = torch.from_numpy(weigh(device.body, device.sensors)).float()
     danger = device.sampler.labels[LABEL]
     for first in range(0, len(labels), 50):

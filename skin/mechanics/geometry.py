@@ -1,14 +1,53 @@
 """Where the sensors of a skin are, and what they respond to, as numbers for a network."""
 
 import math
+from functools import lru_cache
 
 import numpy as np
 import torch
+from scipy.interpolate import make_interp_spline
 from torch import Tensor
 
 from skin.body.base import GEOMETRY, REACHES, AbstractBody, Sensors
 from skin.mechanics.simulator.base import AbstractSimulator
 from skin.touch import splines
+
+# What the moments of a pressure (skin/touch/splines.py) say of footprints, and of values at nodes.
+
+
+@lru_cache
+def _gram(count: int) -> np.ndarray:
+    points, weights = splines.gauss_points(0, count)
+    values = splines.spline_values(points, count)
+    return values.T @ (weights[:, None] * values)
+
+
+@lru_cache
+def fit_nodes(count: int, nodes: int) -> np.ndarray:
+    """Return the coefficients (count, nodes) of the least-squares fit of nodal values along one axis.
+
+    Evenly spaced nodes, ends included, are joined by a cubic spline, which the splines of the cells fit.
+    """
+    points, weights = splines.gauss_points(0, count)
+    joined = make_interp_spline(np.linspace(0, count, nodes), np.eye(nodes), k=min(3, nodes - 1))(points)
+    return np.linalg.solve(_gram(count), splines.spline_values(points, count).T @ (weights[:, None] * joined))
+
+
+def footprints(body: AbstractBody, sensors: Sensors) -> np.ndarray:
+    """Return weights (S, H * W) of moments whose sum is the mean pressure over each footprint, Pa.
+
+    The weights fit the footprint by least squares; a footprint beyond the edge of the body is clipped.
+    """
+    weights = []
+    for axis, (count, cell) in enumerate(zip(body.cells, body.cell, strict=True)):
+        middle, half = sensors.positions[:, axis] / cell, sensors.footprint[axis] / cell / 2
+        rows = []
+        for low, high in zip(np.maximum(middle - half, 0), np.minimum(middle + half, count), strict=True):
+            points, fractions = splines.gauss_points(low, high)
+            rows.append(fractions @ splines.spline_values(points, count) / (high - low))
+        weights.append(np.linalg.solve(_gram(count), np.array(rows).T).T)
+    return np.einsum("sh,sw->shw", weights[1], weights[0]).reshape(len(sensors), -1)
+
 
 # The pressure of a fingertip, differentiable in its position, radius and force.
 

@@ -54,6 +54,7 @@ ADDED: dict[str, Any] = {
     "targets": None,
     "second": 0.0,
     "miss_rate": None,
+    "limits": {},
     "training_touch": {},
     "start": None,
 }
@@ -107,8 +108,9 @@ def _git(*arguments: str) -> str | None:
     if BUNDLED != ROOT:  # a wheel, which may be installed inside another repository
         return None
     try:
-        command = ["git", "-C", str(ROOT), *arguments]
-        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+        return subprocess.run(
+            ["git", "-C", str(ROOT), *arguments], capture_output=True, text=True, check=True
+        ).stdout.strip()
     except (OSError, subprocess.CalledProcessError):
         return None
 
@@ -173,6 +175,7 @@ class Config:
     seed: int = 0
     task: str | None = None
     epochs: dict[str, int] = field(default_factory=dict)
+    limits: dict[str, Any] = field(default_factory=dict)
     touch: dict[str, Any] = field(default_factory=dict)
     body: dict[str, Any] = field(default_factory=dict)
     layout: dict[str, Any] = field(default_factory=dict)
@@ -436,6 +439,7 @@ _FIXED = (
     "model",
     "fusion",
     "learner",
+    "limits",
     "optimizer",
     "trainer",
     "experiment",
@@ -468,14 +472,16 @@ def recompose(stored: Config, overrides: Sequence[str]) -> Config:
     if fixed := [key for key, group in groups.items() if group in _FIXED]:
         raise InputError(f"{fixed[0]} was fixed when the run was trained: leave it out, or train another run")
     keys = [key for key, group in groups.items() if group in (*_SKIN, "task", "evaluation")]
-    general = [lines[key] for key, group in groups.items() if group in ("hydra", "tracking")]
-    fresh = compose("train", [*general, *(lines[key] for key in keys)])
+    general = [key for key, group in groups.items() if group in ("hydra", "tracking")]
+    fresh = compose("train", [lines[key] for key in (*general, *keys)])
     run = _restored(stored, _raw(fresh.device))
-    options = [lines[key] for key, group in groups.items() if key in _SKIN or group == "hydra"]
-    whole = _compose_options(run, options)
+    whole = _compose_options(
+        run, [lines[key] for key, group in groups.items() if key in _SKIN or group == "hydra"]
+    )
     for group in _SKIN:
-        changed = (whole.get(group) or {}) != (run.get(group) or {})
-        other = changed and (fresh.get(group) or {}).get("_target_") != (run[group] or {}).get("_target_")
+        other = (whole.get(group) or {}) != (run.get(group) or {}) and (
+            (fresh.get(group) or {}).get("_target_") != (run[group] or {}).get("_target_")
+        )
         if group in fresh and (group in keys or other):
             whole[group] = _raw(fresh)[group]
     for key in keys:
@@ -485,12 +491,21 @@ def recompose(stored: Config, overrides: Sequence[str]) -> Config:
             source = OmegaConf.select(fresh, parent) if parent else fresh
             OmegaConf.update(whole, key, _raw(source)[name], merge=False)
     whole.tracking = fresh.tracking
-    for path, value in iterate_leaves({group: _raw(whole)[group] for group in _FIXED if group in whole}):
-        if OmegaConf.select(run, ".".join(path)) != value:
-            raise InputError(
-                f"{'.'.join(path)} was fixed when the run was trained: leave it out of the option that sets "
-                "it, or train another run"
-            )
+    leaves = iterate_leaves({group: _raw(whole)[group] for group in _FIXED if group in whole})
+    changed = [name for path, value in leaves if OmegaConf.select(run, name := ".".join(path)) != value]
+    # An alarm at other limits than those that the run learned would be late.
+    changed += [
+        f"{touch}.{name}"
+        for touch in ("touch", "device.touch")
+        for name in ("limits", "thresholds.pressure")
+        if (settings := OmegaConf.select(whole, touch))
+        and (OmegaConf.select(settings, name) or {}) != (OmegaConf.select(run.touch, name) or {})
+    ]
+    if changed:
+        raise InputError(
+            f"{changed[0]} was fixed when the run was trained: leave it out, also of the option that sets "
+            "it, or train another run"
+        )
     return validate_config(whole)
 
 

@@ -1,6 +1,6 @@
 """Fingertips: one to three discs that press a skin at known positions, still or sliding together."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import cache
 from typing import Annotated, Any, final
@@ -20,8 +20,8 @@ from skin.touch.labels import CONTACT, TOUCH
 from skin.touch.movie import Movie, join_movies, measure_gestures
 from skin.touch.paths import (
     Draws,
-    SampledPaths,
     TouchSettings,
+    Trajectories,
     draw_motion,
     draw_times,
     draw_until_fit,
@@ -207,8 +207,12 @@ class FingertipSampler(AbstractSampler):
         InputError: settings or pictures that cannot be used.
     """
 
-    chosen = ("dynamic", "press")
     settings: FingertipSettings
+
+    @property
+    def kinds(self) -> Sequence[int]:
+        """Neither dynamic nor press, one of them, or both."""
+        return 0b000, 0b010, 0b100, 0b110
 
     @torch.no_grad()
     def sample(self, count: int, generator: np.random.Generator, labels: np.ndarray | None = None) -> Movie:
@@ -269,7 +273,7 @@ class FingertipSampler(AbstractSampler):
         """Return the movie of drawn touches (B,) with its labels."""
         settings = self.settings
         paths = sample_paths(drawn, wanted, settings, proportional=True)
-        index, profile = paths.trajectories.index, paths.trajectories.profile
+        index, profile = paths.index, paths.profile
         frames, highest, area = self._pressure(paths, drawn)
         weights = self.footprints if self.moments is None else self.moments
         measures = measure_gestures(
@@ -286,14 +290,14 @@ class FingertipSampler(AbstractSampler):
         movie.parameters["contacts"] = torch.from_numpy(drawn["number"]).float()
         return movie
 
-    def _pressure(self, paths: SampledPaths, drawn: Draws) -> tuple[Tensor, Tensor, Tensor | None]:
+    def _pressure(self, paths: Trajectories, drawn: Draws) -> tuple[Tensor, Tensor, Tensor | None]:
         """Return what all fingertips press at full force.
 
         Returns:
             The sum of their pressures, (U, H, W), Pa, the highest one, (U,), Pa, and the fraction of the
             sheet in contact, (U,), or None where cells are counted.
         """
-        owner, position = paths.trajectories.owner, paths.trajectories.poses.position
+        owner, position = paths.owner, paths.poses.position
         shape, scale = drawn["tips"], drawn["radius"] / half_extents(self.shapes)[drawn["tips"]]
         frames = torch.zeros(len(owner), *self.body.shape)
         highest, areas = torch.zeros(2, len(owner))
@@ -317,7 +321,7 @@ class FingertipSampler(AbstractSampler):
         return frames, frames.flatten(1).amax(1), None
 
 
-def _contacts(paths: SampledPaths, drawn: Draws, highest: np.ndarray, present: np.ndarray) -> Tensor:
+def _contacts(paths: Trajectories, drawn: Draws, highest: np.ndarray, present: np.ndarray) -> Tensor:
     """Return the contacts at each time, (B, T, K, 5), float32, columns :data:`CONTACT`; NaN without contact.
 
     Args:
@@ -326,8 +330,8 @@ def _contacts(paths: SampledPaths, drawn: Draws, highest: np.ndarray, present: n
         highest: (B, K), highest pressure at full force, Pa.
         present: (B, K), bool.
     """
-    profile = paths.trajectories.profile.double().numpy()[..., None]
-    positions = paths.trajectories.poses.position[paths.trajectories.index.numpy()]
+    profile = paths.profile.double().numpy()[..., None]
+    positions = paths.poses.position[paths.index.numpy()]
     centre = positions[:, :, None] + drawn["offset"][:, None]
     values = np.empty((*centre.shape[:3], len(CONTACT)))
     values[..., :2], values[..., 2] = centre, drawn["radius"][:, None]

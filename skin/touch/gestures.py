@@ -5,10 +5,10 @@ sampler, which redraws gestures until they have the wanted labels.
 """
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Annotated, Any, NamedTuple, final
+from typing import Annotated, NamedTuple, final
 
 import numpy as np
 import torch
@@ -30,7 +30,7 @@ from skin.touch.paths import (
     draw_until_fit,
     sample_paths,
 )
-from skin.touch.sampler import AbstractContact, AbstractSampler, ContactProblem, ContactResult, balanced
+from skin.touch.sampler import AbstractContact, AbstractSampler, ContactProblem, ContactResult
 from skin.touch.shapes import Shapes
 
 
@@ -70,6 +70,11 @@ class GestureSettings(TouchSettings):
                 "two gestures at a time have no common direction of friction: set touch.second=0 or "
                 "touch.shear=0"
             )
+        if self.second and np.isfinite([self.danger.force, self.danger.tap_force]).any():
+            raise InputError(
+                "two gestures at a time may exceed a limit of force together, which their labels ignore: set "
+                "touch.second=0 (of device.training_touch, too), or leave the forces out of limits"
+            )
         # A range beyond its threshold would be redrawn forever: (lowest, highest allowed).
         allowed = {
             "small_area": (0, self.thresholds.area),
@@ -94,7 +99,16 @@ class GestureSettings(TouchSettings):
         padded: bool,
         moments: np.ndarray | None,
     ) -> "TouchSampler":
-        """Return what draws gestures."""
+        """Return what draws gestures.
+
+        Raises:
+            InputError: two gestures at a time with a contact that solves for the pressure.
+        """
+        if self.second and not contact.proportional:
+            raise InputError(
+                "the pressures of two gestures at a time add up only with contact=prescribed: set that, or "
+                "touch.second=0"
+            )
         return TouchSampler(body, footprints, contact, self, padded, moments)
 
 
@@ -130,18 +144,14 @@ class Fit(NamedTuple):
         Raises:
             InputError: no shape fits.
         """
-        random = np.random.default_rng(0).random((2, probes, 4))
+        count = len(shapes.names)
+        random = np.random.default_rng(0).random((2, probes, 4)).repeat(count, axis=0)
+        big, shape = np.repeat([False, True], count * probes), np.tile(np.repeat(np.arange(count), probes), 2)
 
         def fitting(fitted: bool) -> np.ndarray:
             """Return the fraction of small and big bodies of each shape that fit, (2, N)."""
-
-            def fits(big: int, shape: int) -> float:
-                same = np.full(probes, bool(big))
-                arguments = same, settings, shapes, random[big], np.full(probes, shape)
-                drawn = _draw_fitted(*arguments, same) if fitted else _draw_unfitted(*arguments)
-                return float(drawn["fits"].mean())
-
-            return np.array([[fits(big, shape) for shape in range(len(shapes.names))] for big in (0, 1)])
+            drawn = _draw_whole(big, settings, shapes, random.reshape(-1, 4), shape, big if fitted else None)
+            return drawn["fits"].reshape(2, count, probes).mean(axis=2)
 
         redrawn = fitting(False)
         totals = redrawn.sum(axis=1, keepdims=True)
@@ -195,50 +205,42 @@ def draw_bodies(
 
     def draw(todo: np.ndarray) -> Draws:
         random = generator.random((len(big), 3 if fit is None else 4))[todo]
-        if fit is None or kept is None:
-            shape = (random[:, 0] * len(shapes.names)).astype(int)
-            return _draw_unfitted(big[todo], settings, shapes, random, shape)
-        shape = kept[todo]
-        return _draw_fitted(big[todo], settings, shapes, random, shape, fit.big[shape])
+        drawn = (random[:, 0] * len(shapes.names)).astype(int) if kept is None else kept[todo]
+        asked = None if fit is None or kept is None else fit.big[drawn]
+        return _draw_whole(big[todo], settings, shapes, random, drawn, asked)
 
     return draw_until_fit(len(big), draw, lambda: _explain_no_room(settings, shapes.body.size))
 
 
-def _draw_unfitted(
-    big: np.ndarray, settings: GestureSettings, shapes: Shapes, random: np.ndarray, shape: np.ndarray
-) -> Draws:
-    angle = 2 * np.pi * random[:, 1]
-    scale = shapes.scale(shape, _between(big, settings.big_area, settings.small_area, random[:, 2]))
-    low, high = shapes.extent(shape, angle, scale)
-    fits = (high - low + settings.spare <= shapes.body.size).all(axis=1)
-    return {
-        "shape": shape, "angle": angle, "stretch": np.ones(len(big)), "scale": scale,
-        "low": low, "high": high, "fits": fits,
-    }  # fmt: skip
-
-
-def _draw_fitted(
+def _draw_whole(
     big: np.ndarray,
     settings: GestureSettings,
     shapes: Shapes,
     random: np.ndarray,
     shape: np.ndarray,
-    asked_big: np.ndarray,
+    asked_big: np.ndarray | None,
     rounding: float = 1e-9,
 ) -> Draws:
-    angle = 2 * np.pi * random[:, 1]
-    scale_asked = shapes.whole_scale(
-        shape, _between(asked_big, settings.big_area, settings.small_area, random[:, 2])
-    )
-    low, high = shapes.extent(shape, angle, scale_asked)
-    room = np.array(shapes.body.size) - settings.spare
-    x, y = ((high - low) / np.maximum(room, rounding)).T
-    # The stretch nearest to 1 at which both sides have room.
-    stretch = np.clip(1, y**2, np.maximum(x**-2, y**2))
-    fits = (x * y <= 1 + rounding) & (np.maximum(stretch, 1 / stretch) <= settings.stretch)
-    scale_own = shapes.whole_scale(shape, _between(big, settings.big_area, settings.small_area, random[:, 3]))
-    scale = np.where(big == asked_big, scale_asked, scale_own)
-    low, high = shapes.extent(shape, angle, scale, stretch)
+    """Draw angle and size of shapes (B,), from numbers (B, 4), and whether they fit.
+
+    They are stretched to fit with the size of ``asked_big``; None: they are not stretched.
+    """
+    angle, stretch = 2 * np.pi * random[:, 1], np.ones(len(big))
+    if asked_big is None:
+        scale = shapes.scale(shape, _between(big, settings.big_area, settings.small_area, random[:, 2]))
+        low, high = shapes.extent(shape, angle, scale)
+        fits = (high - low + settings.spare <= shapes.body.size).all(axis=1)
+    else:
+        sizes = settings.big_area, settings.small_area
+        asked = shapes.whole_scale(shape, _between(asked_big, *sizes, random[:, 2]))
+        low, high = shapes.extent(shape, angle, asked)
+        x, y = ((high - low) / np.maximum(np.array(shapes.body.size) - settings.spare, rounding)).T
+        # The stretch nearest to 1 at which both sides have room.
+        stretch = np.clip(1, y**2, np.maximum(x**-2, y**2))
+        fits = (x * y <= 1 + rounding) & (np.maximum(stretch, 1 / stretch) <= settings.stretch)
+        own = shapes.whole_scale(shape, _between(big, *sizes, random[:, 3]))
+        scale = np.where(big == asked_big, asked, own)
+        low, high = shapes.extent(shape, angle, scale, stretch)
     return {
         "shape": shape, "angle": angle, "stretch": stretch, "scale": scale,
         "low": low, "high": high, "fits": fits,
@@ -311,31 +313,42 @@ class TouchSampler(AbstractSampler):
     settings: GestureSettings
     attempts, attempts_with_same_shape, paths_at_once = 50, 25, 64
 
-    def __init__(
-        self,
-        body: AbstractBody,
-        footprints: np.ndarray,
-        contact: AbstractContact,
-        settings: Mapping[str, Any] | GestureSettings | None = None,
-        padded: bool = True,
-        moments: np.ndarray | None = None,
-    ) -> None:
-        super().__init__(body, footprints, contact, GestureSettings.of(settings), padded, moments)
-        if self.settings.second and not contact.proportional:
-            raise InputError(
-                "the pressures of two gestures at a time add up only with contact=prescribed: set that, or "
-                "touch.second=0"
-            )
-
     @cached_property
     def fit(self) -> Fit | None:
         """The fit of shapes to the sheet; None where shapes are redrawn until they fit."""
         return Fit.of(self.settings, self.shapes)
 
+    @cached_property
+    def kinds(self) -> Sequence[int]:
+        """All combinations of labels; small in place of big where dangerous takes more than a person.
+
+        Of 64 big bodies with 8 paths each, a tenth must be dangerous within ``limits.human_force``.
+        """
+        kinds, generator = np.arange(2 ** len(TOUCH)), np.random.default_rng(0)
+        if self.settings.danger.human_force == np.inf:
+            return kinds.tolist()
+        heavy = kinds[kinds & 0b1001 == 0b1001]  # big and dangerous
+        wanted = np.repeat(heavy, 16)[:, None] >> np.arange(len(TOUCH)) & 1 > 0
+        fitted = self.fit and self.fit.draw(wanted[:, 0], generator)
+        drawn = draw_bodies(wanted[:, 0], self.settings, self.shapes, generator, self.fit, fitted)
+        drawn |= draw_times(wanted, self.settings, self.padded, generator)
+        random, counts = generator.random((8, len(wanted), 5)), np.zeros((2, len(wanted)))
+        able = self._round(np.arange(len(wanted)), wanted, drawn, random, *counts)[0]
+        left_out = heavy[able.reshape(len(heavy), -1).mean(axis=1) < 0.1]
+        if len(left_out):
+            names = sorted({("tap", "press")[kind >> 2 & 1] for kind in left_out})
+            warnings.warn(
+                f"a big dangerous {' or '.join(names)} takes more than limits.human_force here: it is left "
+                "out, and small ones are drawn in its place",
+                UserWarning,
+                stacklevel=3,
+            )
+        return np.where(np.isin(kinds, left_out), kinds - 1, kinds).tolist()
+
     @torch.no_grad()
     def sample(self, count: int, generator: np.random.Generator, labels: np.ndarray | None = None) -> Movie:
         """Return the movies of ``count`` gestures; see :meth:`AbstractSampler.sample`."""
-        wanted = balanced(count, generator) if labels is None else labels
+        wanted = self.balanced(count, generator) if labels is None else labels
         settings, pending = self.settings, np.arange(count)
         draws, misfits, unconverged = np.zeros((3, count))
         fitted = self.fit and self.fit.draw(wanted[:, 0], generator)
@@ -412,10 +425,8 @@ class TouchSampler(AbstractSampler):
     def _press(self, gestures: Draws, wanted: np.ndarray) -> tuple[Movie, ContactResult]:
         """Return the movie of gestures (B,) with its labels."""
         paths = sample_paths(gestures, wanted, self.settings, self.contact.proportional)
-        pressed = self.contact.press(
-            paths.trajectories, ContactProblem(self.shapes, self.footprints, self.settings)
-        )
-        index, profile, frames = paths.trajectories.index, paths.trajectories.profile, pressed.frames
+        pressed = self.contact.press(paths, ContactProblem(self.shapes, self.footprints, self.settings))
+        index, profile, frames = paths.index, paths.profile, pressed.frames
         area = None if pressed.area is None else torch.from_numpy(pressed.area).float()
         weights = self.footprints if area is None or self.moments is None else self.moments
         measures = measure_gestures(
@@ -431,11 +442,11 @@ class TouchSampler(AbstractSampler):
         return self._movie(frames, drawn, paths, measures), pressed
 
     def _explain_impossible(self, labels: np.ndarray) -> InputError:
-        names = (name if on else f"not {name}" for name, on in zip(TOUCH.names, labels, strict=True))
         return InputError(
-            f"no gesture in {self.attempts * self.settings.redraws} draws was {', '.join(names)}: on this "
-            "sheet, with these sensors, the ranges under touch rule it out; sensors far apart have small "
-            "readings under a small dangerous touch: raise touch.small_area or touch.dangerous_peak, or add "
-            "sensors"
+            f"no gesture in {self.attempts * self.settings.redraws} draws was "
+            + ", ".join(name if on else f"not {name}" for name, on in zip(TOUCH.names, labels, strict=True))
+            + ": on this sheet, with these sensors, touch or limits rule it out; sensors far apart have "
+            "small readings under a small dangerous touch: raise touch.small_area or touch.dangerous_peak, "
+            "or add sensors"
             f"{self.contact.advice}"
         )

@@ -42,8 +42,7 @@ def load_image(name: str) -> np.ndarray:
             f"cannot read the shape {name} ({path}): {error}; touch.shapes takes grey-scale pictures, "
             "such as a PNG, white = full pressure"
         ) from error
-    usable = pixels.ndim == 2 and np.isfinite(pixels).all() and pixels.min(initial=0) >= 0 and pixels.any()
-    if not usable:
+    if pixels.ndim != 2 or not np.isfinite(pixels).all() or pixels.min(initial=0) < 0 or not pixels.any():
         span = f" from {pixels.min():g} to {pixels.max():g}" if pixels.size else ""
         raise InputError(
             f"the shape {name} must be a grey-scale picture (h, w) of finite values from 0 up, not all "

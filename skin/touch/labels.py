@@ -5,13 +5,18 @@ movie that decides, and the threshold. A label of one's own has the same four in
 (CONTRIBUTING.md). torch is not imported here: an exported model needs no torch.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
+from math import inf
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
+import numpy as np
 from annotated_types import Ge, Gt, Lt, MinLen
+from pydantic import PositiveFloat
 
-from skin.core.settings import ONCE, checked
+from skin.core.settings import ONCE, checked, configured
+from skin.errors import InputError
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -109,8 +114,8 @@ class Thresholds:
     Attributes:
         area: a touch is big if it covers more than this fraction of the sheet.
         duration: a touch is a press if it lasts longer than this without interruption, s.
-        pressure: a touch is dangerous if some sensor's surface pressure exceeds this in some frame, Pa
-            (cuff algometry, Jespersen et al.).
+        pressure: without ``touch.limits`` a touch is dangerous if some sensor's surface pressure exceeds this
+            in some frame, Pa (cuff algometry, Jespersen et al.).
         contact: cells above this fraction of the gesture's peak cell are in contact.
         travel: a touch is dynamic if its centre of pressure moves further than this from where it began, m.
     """
@@ -120,6 +125,77 @@ class Thresholds:
     pressure: float = 90.5e3
     contact: Annotated[float, Gt(0), Lt(1)] = 0.02
     travel: float = 1e-3
+
+
+def _pressure(
+    limit: PositiveFloat, unit: Literal["Pa", "kPa", "MPa", "N/cm2"], source: Annotated[str, MinLen(1)]
+) -> float:
+    """Return an entry of a table of limits in Pa."""
+    return limit * {"Pa": 1.0, "kPa": 1e3, "MPa": 1e6, "N/cm2": 1e4}[unit]
+
+
+def _force(limit: PositiveFloat, unit: Literal["N"], source: Annotated[str, MinLen(1)]) -> float:
+    """Return an entry of a table of limits in N."""
+    return float(limit)
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Limits above which a touch is dangerous, in place of ``Thresholds.pressure``; infinite: no limit.
+
+    Attributes:
+        pressure: of lasting contact, of a press: mean over a sensor's footprint, Pa.
+        force: of lasting contact, all that touches at a time, N.
+        tap_pressure: of transient contact, of a tap, Pa.
+        tap_force: of transient contact, N.
+        human_force: the largest force that a person exerts, N. Touches of larger force are not drawn.
+    """
+
+    pressure: float = inf
+    force: float = inf
+    tap_pressure: float = inf
+    tap_force: float = inf
+    human_force: float = inf
+
+    @classmethod
+    def of(cls, table: "Mapping[str, Any] | Limits | None") -> "Limits | None":
+        """Return the limits of a table (``conf/limits``); None if it is empty.
+
+        Args:
+            table: name of a limit -> limit, unit and source. Without limits of its own, a tap has those of a
+                press.
+
+        Raises:
+            InputError: an entry without unit or source, an unknown one, neither pressure nor force, or forces
+                alone that no person exerts.
+        """
+        if isinstance(table, Limits) or not table:
+            return table if isinstance(table, Limits) else None
+        if not isinstance(table, Mapping) or {"pressure", "force"}.isdisjoint(table):
+            raise InputError(
+                f"limits must give pressure, force or both, got {table}: "
+                "as in pressure: {limit: 22.8, unit: kPa, source: title or address}"
+            )
+        values = {
+            name: configured(_force if str(name).endswith("force") else _pressure, entry, f"limits.{name}")
+            for name, entry in table.items()
+        }
+        taps = {f"tap_{name}": values[name] for name in ("pressure", "force") if name in values}
+        limits = configured(cls, taps | values, "limits")
+        if "pressure" not in values and limits.human_force <= max(limits.force, limits.tap_force):
+            raise InputError(
+                f"limits.human_force={limits.human_force:g} N must be above the limits of force, or no touch "
+                "is dangerous: leave it out, or give limits.pressure, too"
+            )
+        return limits
+
+    def of_contact(self, press: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the limits of pressure, Pa, and force, N, of presses and taps (B,), bool."""
+        return np.where(press, self.pressure, self.tap_pressure), np.where(press, self.force, self.tap_force)
+
+    def excess(self, pressure: np.ndarray, force: np.ndarray, press: np.ndarray) -> np.ndarray:
+        """Return the largest ratio of pressure (B,), Pa, and force (B,), N, to their limits, (B,)."""
+        return np.maximum(*map(np.divide, (pressure, force), self.of_contact(press)))
 
 
 @dataclass(frozen=True)
@@ -147,18 +223,20 @@ ALARM = "dangerous"
 """The label that raises the alarm."""
 
 
-def report_labels(thresholds: Thresholds, rate: float) -> dict[str, Label]:
+def report_labels(thresholds: Thresholds, rate: float, limits: Limits | None = None) -> dict[str, Label]:
     """Return the four labels of the report (section 2.1.1) by name, in the order of ``TOUCH``.
 
     Args:
         thresholds: of the labels.
         rate: frames per second of the movie, Hz: the duration of a touch is counted in frames.
+        limits: that decide what is dangerous; None: the pressure of the thresholds.
     """
+    name, above = ("excess", 1.0) if limits else ("pressure", thresholds.pressure)
     return {
         "big": Label("small", partial(_parameter, name="area"), thresholds.area),
         "dynamic": Label("static", partial(_parameter, name="travel"), thresholds.travel),
         "press": Label("tap", partial(_parameter, name="frames"), round(thresholds.duration * rate)),
-        ALARM: Label("safe", partial(_parameter, name="pressure"), thresholds.pressure),
+        ALARM: Label("safe", partial(_parameter, name=name), above),
     }
 
 

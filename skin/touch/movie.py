@@ -130,7 +130,8 @@ class Movie:
             peak (highest cell pressure, Pa), force (N, all cells at full force), draws (how many paths were
             drawn until one had the wanted labels), net_x and net_y (m, from the first position of the path
             to its last), x and y (m, that first position); area, travel, frames and pressure
-            (``skin.touch.movie.Measures``), of which the labels are made; and where pressure is solved for,
+            (``skin.touch.movie.Measures``), of which the labels are made; excess where there are limits
+            (:meth:`skin.touch.labels.Limits.excess`, of one gesture); and where pressure is solved for,
             unconverged (frames of all its draws that were not found).
         shear: (U, 2), tangential traction along x and y of each frame divided by its pressure: the
             coefficient of friction times the direction of motion, 0 for static touches; None: no friction.
@@ -233,24 +234,29 @@ def add_second(movie: Movie, fraction: float, contact: float, generator: np.rand
     force = total.amax(dim=1)
     scale = total / force[:, None]
     touched = scale > 0
-    parts = (
+    one, other = (
         part[touched][:, None, None] * movie.frames[rows[touched]]
         for part, rows in zip(fractions, index, strict=True)
     )
-    frames = sum(parts) / scale[touched][:, None, None]
     counts = touched.sum(dim=1)
     column = (touched.cumsum(dim=1) - 1).clamp(min=0) + (counts.cumsum(0) - counts)[:, None]
 
     parameters = {name: values.clone() for name, values in movie.parameters.items()}
     parameters["contacts"] = torch.ones(len(movie)).index_fill_(0, first, 2)
-    for name in ("peak", *Measures._fields):
+    for name in parameters.keys() & {"peak", "excess", *Measures._fields}:
         parameters[name][first] = torch.maximum(parameters[name][first], movie.parameters[name][second])
     onset = torch.minimum(movie.parameters["onset"][first], begin.float())
     parameters["onset"][first], parameters["duration"][first] = onset, counts.float()
     parameters["force"][first] = force
     indices, scales = movie.index.clone(), movie.scale.clone()
     indices[first], scales[first] = column + len(movie.frames), scale
-    sums = Movie(torch.cat([movie.frames, frames]), indices, scales, movie.labels, parameters)
+    sums = Movie(
+        torch.cat([movie.frames, (one + other) / scale[touched][:, None, None]]),
+        indices,
+        scales,
+        movie.labels,
+        parameters,
+    )
     return sums[torch.arange(len(movie))]  # without the frames of first gestures alone
 
 

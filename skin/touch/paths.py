@@ -16,7 +16,7 @@ from torch import Tensor
 from skin.body.base import AbstractBody
 from skin.core.settings import RISING, check_settings, configured
 from skin.errors import InputError
-from skin.touch.labels import RELEASE, TOUCH_OR_NOT, TOUCH_SLIDING, Label, Thresholds
+from skin.touch.labels import RELEASE, TOUCH_OR_NOT, TOUCH_SLIDING, Label, Limits, Thresholds
 from skin.touch.shapes import Pose
 
 if TYPE_CHECKING:
@@ -67,6 +67,8 @@ class TouchSettings(ABC):
         ongoing: fraction of touches whose window ends at some moment from their begin to 0.3 s after their
             end, as the windows of a live view do. Labels are those of what the window shows. It has no effect
             on touches that begin at the first frame.
+        limits: that decide what is dangerous (:class:`skin.touch.labels.Limits`); None: the pressure of
+            ``thresholds``. Ranges of peaks are then relative to the limits.
         labels: labels of one's own by name, behind those of the report. Touches are not drawn for them: each
             has those that its movie gives.
 
@@ -90,7 +92,13 @@ class TouchSettings(ABC):
     gap: Above0 = (1.0, 6.0)
     stride: Above0 = (1.5, 4.5)
     thresholds: Thresholds = field(default_factory=Thresholds)
+    limits: Limits | None = None
     labels: Mapping[str, Label] = field(default_factory=dict)
+
+    @cached_property
+    def danger(self) -> Limits:
+        """The limits that decide what is dangerous."""
+        return self.limits or Limits(self.thresholds.pressure, tap_pressure=self.thresholds.pressure)
 
     @cached_property
     def frames(self) -> GestureFrames:
@@ -154,6 +162,7 @@ class TouchSettings(ABC):
         }
         if not isinstance(limits := values.get("thresholds", {}), Thresholds):
             values["thresholds"] = configured(Thresholds, limits, "touch.thresholds")
+        values["limits"] = Limits.of(values.get("limits"))
         if not isinstance(labels := values.get("labels", {}), Mapping):
             raise InputError(f"touch.labels must be labels by name, got {labels!r}")
         if taken := sorted(set(labels) & {*TOUCH_OR_NOT.names, *TOUCH_SLIDING.names}):
@@ -321,6 +330,10 @@ class Trajectories:
         profile: (B, T), its fraction of full force; 0 without contact.
         peak: (B,), the wanted highest cell pressure, Pa.
         wanted: (B, 4), bool, the wanted labels in the order of ``skin.touch.labels.TOUCH``.
+        position: (U, 2), position of each frame within the gesture's span, m.
+        first: (B,), the first frame of each gesture.
+        net: (B, 2), from its first position to its last, m.
+        travel: (B,), largest distance from its first position, m.
     """
 
     owner: np.ndarray
@@ -330,20 +343,6 @@ class Trajectories:
     profile: Tensor
     peak: np.ndarray
     wanted: np.ndarray
-
-
-class SampledPaths(NamedTuple):
-    """Sampled trajectories of gestures.
-
-    Attributes:
-        trajectories: the frames (U,) of gestures (B,).
-        position: (U, 2), position of each frame within the gesture's span, m.
-        first: (B,), the first frame of each gesture.
-        net: (B, 2), from its first position to its last, m.
-        travel: (B,), largest distance from its first position, m.
-    """
-
-    trajectories: Trajectories
     position: np.ndarray
     first: np.ndarray
     net: np.ndarray
@@ -352,7 +351,7 @@ class SampledPaths(NamedTuple):
 
 def sample_paths(
     gestures: Draws, wanted: np.ndarray, settings: TouchSettings, proportional: bool
-) -> SampledPaths:
+) -> Trajectories:
     """Return the distinct frames of gestures.
 
     A sliding touch has one per step. A static touch has one, or one per force level where pressure is not
@@ -384,7 +383,9 @@ def sample_paths(
     poses = Pose(shape, angle, scales, position - gestures["low"][owner], stretch)
     fraction = np.zeros(len(owner))
     np.maximum.at(fraction, index, scale)
-    trajectories = Trajectories(
+    from_first = position - position[first[owner]]
+    travel = np.maximum.reduceat(np.hypot(*from_first.T), first)
+    return Trajectories(
         owner,
         poses,
         fraction,
@@ -392,7 +393,8 @@ def sample_paths(
         torch.from_numpy(scale).float(),
         gestures["peak"],
         wanted,
+        position,
+        first,
+        from_first[first + counts - 1],
+        travel,
     )
-    from_first = position - position[first[owner]]
-    travel = np.maximum.reduceat(np.hypot(*from_first.T), first)
-    return SampledPaths(trajectories, position, first, from_first[first + counts - 1], travel)

@@ -12,7 +12,7 @@ from torch import Tensor
 from skin.body.base import AbstractBody
 from skin.touch.labels import TOUCH, report_labels
 from skin.touch.movie import Measures, Movie
-from skin.touch.paths import Draws, SampledPaths, TouchSettings, Trajectories, heading
+from skin.touch.paths import Draws, TouchSettings, Trajectories, heading
 from skin.touch.shapes import Shapes
 
 if TYPE_CHECKING:
@@ -75,16 +75,18 @@ class AbstractContact(ABC):
         """Return the pressure of gestures at a force that gives the wanted labels, if there is one."""
 
 
-def balanced(count: int, generator: np.random.Generator, chosen: Sequence[str] = TOUCH.names) -> np.ndarray:
-    """Return label combinations (count, 4), bool: those of the chosen labels, balanced; others are false.
+def balanced(
+    count: int, generator: np.random.Generator, kinds: Sequence[int] = range(2 ** len(TOUCH))
+) -> np.ndarray:
+    """Return label combinations (count, 4), bool, equally frequent, to within one, in random order.
 
-    They are equally frequent, to within one, in random order.
+    Args:
+        count: B.
+        generator: source of randomness.
+        kinds: the combinations; bit n tells whether label n of ``TOUCH`` holds.
     """
-    kinds = 2 ** len(chosen)
-    codes = generator.permutation(generator.permutation(kinds)[np.arange(count) % kinds])
-    labels = np.zeros((count, len(TOUCH)), dtype=bool)
-    labels[:, [TOUCH.names.index(name) for name in chosen]] = codes[:, None] >> np.arange(len(chosen)) & 1
-    return labels
+    codes = generator.permutation(generator.permutation(kinds)[np.arange(count) % len(kinds)])
+    return codes[:, None] >> np.arange(len(TOUCH)) & 1 > 0
 
 
 class AbstractSampler(ABC):
@@ -97,19 +99,16 @@ class AbstractSampler(ABC):
         settings: of the touches.
         padded: whether touches begin at a random frame of the window instead of its first.
         moments: (S, H * W), weights of moments of the pressure in place of ``footprints``
-            (:func:`skin.touch.splines.footprints`). The frames of movies are then moments. None: they are
-            mean pressures of cells.
+            (:func:`skin.mechanics.geometry.footprints`). The frames of movies are then moments. None: they
+            are mean pressures of cells.
 
     Attributes:
-        chosen: the labels that touches can be drawn for, names of ``TOUCH``; the others follow.
         labels: all labels by name: those of ``TOUCH``, then labels of one's own.
         leak: see :func:`skin.device.balance.check_label_leakage`.
 
     Raises:
         InputError: settings or pictures that cannot be used.
     """
-
-    chosen: tuple[str, ...] = TOUCH.names
 
     def __init__(
         self,
@@ -122,14 +121,25 @@ class AbstractSampler(ABC):
     ) -> None:
         self.body, self.contact, self.padded = body, contact, padded
         self.settings, self.leak = settings, float(getattr(settings, "leak", 1.0))
-        self.labels = report_labels(settings.thresholds, settings.rate) | dict(settings.labels)
+        self.labels = report_labels(settings.thresholds, settings.rate, settings.limits)
+        self.labels |= settings.labels
         self.footprints = torch.as_tensor(footprints, dtype=torch.float32)
         self.moments = None if moments is None else torch.as_tensor(moments, dtype=torch.float32)
         self.shapes = Shapes(settings.shapes, body, settings.thresholds.contact, moments is not None)
 
+    @property
+    def kinds(self) -> Sequence[int]:
+        """The combinations of labels that touches are drawn for, as of :func:`balanced`."""
+        return range(2 ** len(TOUCH))
+
+    @property
+    def chosen(self) -> list[str]:
+        """The labels that touches can be drawn for; the others follow."""
+        return [name for bit, name in enumerate(TOUCH.names) if any(kind >> bit & 1 for kind in self.kinds)]
+
     def balanced(self, count: int, generator: np.random.Generator) -> np.ndarray:
         """Return label combinations (count, 4), bool, that can be drawn, balanced, in random order."""
-        return balanced(count, generator, self.chosen)
+        return balanced(count, generator, self.kinds)
 
     @abstractmethod
     def sample(self, count: int, generator: np.random.Generator, labels: np.ndarray | None = None) -> Movie:
@@ -148,7 +158,7 @@ class AbstractSampler(ABC):
         self,
         frames: Tensor,
         drawn: Draws,
-        paths: SampledPaths,
+        paths: Trajectories,
         measures: Measures,
         contacts: Tensor | None = None,
     ) -> Movie:
@@ -162,15 +172,20 @@ class AbstractSampler(ABC):
             contacts: of fingertips; see :class:`skin.touch.movie.Movie`.
         """
         drawn = drawn | dict(zip(("net_x", "net_y"), paths.net.T, strict=True))
-        drawn |= dict(zip("xy", paths.trajectories.poses.position[paths.first].T, strict=True))
+        drawn |= dict(zip("xy", paths.poses.position[paths.first].T, strict=True))
         floats = {name: torch.from_numpy(drawn[name]).float() for name in _PARAMETERS}
         floats |= {name: value.float() for name, value in measures._asdict().items()}
-        trajectories, friction = paths.trajectories, self.settings.shear
+        friction = self.settings.shear
+        if limits := self.settings.limits:
+            force = floats["force"] * paths.profile.amax(1)
+            press = measures.frames > self.settings.frames.duration
+            excess = limits.excess(floats["pressure"].numpy(), force.numpy(), press.numpy())
+            floats["excess"] = torch.from_numpy(excess).float()
         drag = torch.from_numpy(friction * heading(paths.position, paths.first)).float()
         movie = Movie(
             frames,
-            trajectories.index,
-            trajectories.profile,
+            paths.index,
+            paths.profile,
             torch.empty(0),
             floats,
             drag if friction else None,

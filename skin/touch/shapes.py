@@ -22,22 +22,6 @@ from skin.touch.images import halve, hulls, load_image, pyramid
 
 # Cells rendered at once: their sampling grid, 8 bytes for each of 4 points, stays in the cache (4 MiB).
 _CELLS_AT_ONCE = 128 * 1024
-_POINTS = 4  # samples of a cell, 2 x 2
-
-
-class Solids(NamedTuple):
-    """Shapes as objects with an outline, sampled on the cells.
-
-    Attributes:
-        inside: (F, H, W), bool, cells that the object covers by at least half; if there are none, those with
-            the largest cover.
-        grey: (F, H, W), mean grey of the covered part, 1 = white; 0 outside.
-        rim: (F, H, W), its mean distance from the outline, m; 0 outside.
-    """
-
-    inside: Tensor
-    grey: Tensor
-    rim: Tensor
 
 
 class Pose(NamedTuple):
@@ -57,7 +41,7 @@ class Pose(NamedTuple):
     position: np.ndarray
     stretch: np.ndarray
 
-    def rows(self, rows: np.ndarray) -> Pose:
+    def rows(self, rows: np.ndarray | slice) -> Pose:
         """Return some of the shapes."""
         return Pose(*(values[rows] for values in self))
 
@@ -92,7 +76,7 @@ class Shapes:
         self.names = tuple(names)
         self.body: AbstractBody = body
         self.contact, self.fine = contact, fine
-        # Cells are sampled at _POINTS = 2 x 2 points, a spacing apart.
+        # Cells are sampled at 2 x 2 points, a spacing apart.
         self.spacing = float(np.sqrt(np.prod(body.cell))) / 2
         finest = max(64, max(body.size) / self.spacing) * (2 if fine else 1)
         self.levels = pyramid([load_image(name) for name in names], 2 ** int(np.ceil(np.log2(finest))))
@@ -140,12 +124,13 @@ class Shapes:
     def _large(self) -> Shapes:
         """The same shapes on a square of the same cells, of four times the area, which holds a long shape."""
         count = int(np.ceil(2 * np.sqrt(np.prod(self.body.cells))))
-        size = (count * self.body.cell[0], count * self.body.cell[1])
         # The same images, because scales refer to them, but without values computed for this sheet.
         large = copy(self)
         for name in ("_calibration", "_points"):
             vars(large).pop(name, None)
-        large.body = Sheet(size, (count, count), self.body.layers)
+        large.body = Sheet(
+            (count * self.body.cell[0], count * self.body.cell[1]), (count, count), self.body.layers
+        )
         return large
 
     @cached_property
@@ -246,7 +231,7 @@ class Shapes:
             rows (f,); upper left corner of each picture from its position, in cells, (f, 2); samples along a
             cell; (f, y, x), float32.
         """
-        scale = self._visible(drawn.scale, drawn.stretch)
+        scale = self.visible(drawn)
         bounds = self.extent(drawn.shape, drawn.angle, scale, drawn.stretch, self._outlines)
         corner, end = (side / self.body.cell for side in bounds)
         extent = np.maximum(np.ceil(end - corner), 1).astype(int)
@@ -271,20 +256,31 @@ class Shapes:
         self, texture: Tensor, drawn: Pose, corner: np.ndarray, box: np.ndarray, count: int
     ) -> Tensor:
         """Return samples (f, y, x) of textures (f, 1, p, p), ``count`` along each side of a box's cells."""
-        wide = np.sqrt(drawn.stretch)
-        turn = np.exp(-1j * drawn.angle) / self._visible(drawn.scale, drawn.stretch)
-        begin = (corner * self.body.cell).T
-        shift = turn * (begin[0] / wide + 1j * (begin[1] * wide))
-        x, y = (
+        points = (
             torch.from_numpy((np.arange(cells * count) + 0.5) * (size / count))
             for cells, size in zip(box, self.body.cell, strict=True)
         )
+        return self._seen(texture, drawn, corner * self.body.cell, *points)[:, 0]
+
+    def _seen(self, texture: Tensor, drawn: Pose, begin: np.ndarray, x: Tensor, y: Tensor) -> Tensor:
+        """Return samples (f, C, Y, X) of textures (f, C, p, p) at points (X,), (Y,), m, behind ``begin``.
+
+        Args:
+            texture: of each shape.
+            drawn: the shapes.
+            begin: (f, 2), position of the origin of the points from that of each shape, m.
+            x, y: along the axes of the sheet.
+        """
+        wide = np.sqrt(drawn.stretch)
+        # A rotation is a product of complex numbers; grid_sample takes real and imaginary parts.
+        turn = np.exp(-1j * drawn.angle) / self.visible(drawn)
+        shift = turn * (begin[:, 0] / wide + 1j * (begin[:, 1] * wide))
         turn_x, turn_y, shifts = (
             torch.from_numpy(part)[:, None, None] for part in (turn / wide, 1j * turn * wide, shift)
         )
         across, down = (turn_x * x + shifts).to(torch.complex64), (turn_y * y[:, None]).to(torch.complex64)
         grid = torch.view_as_real(across + down)
-        return grid_sample(texture, grid, padding_mode="zeros", align_corners=False)[:, 0]
+        return grid_sample(texture, grid, mode="bilinear", padding_mode="zeros", align_corners=False)
 
     def _moments(self, pictures: Tensor, corner: np.ndarray, count: int) -> Tensor:
         """Return the moments (f, H, W) of pictures (f, y, x) with corners at positions (f, 2), in cells."""
@@ -325,34 +321,14 @@ class Shapes:
             position: (F, 2), m.
             stretch: (F,), along x after the rotation.
         """
+        drawn = Pose(shape, angle, scale, position, np.ones(len(shape)) if stretch is None else stretch)
         frames = torch.empty(len(shape), *self.body.shape)
-        for part, cells in self._render_parts(self.levels, shape, angle, scale, position, stretch):
+        for part, cells in self.cells(self.levels, drawn):
             frames[part] = cells[:, 0].div_(cells.sum((2, 3)).unsqueeze(2))
         return frames
 
-    def solids(
-        self,
-        shape: np.ndarray,
-        angle: np.ndarray,
-        scale: np.ndarray,
-        position: np.ndarray,
-        stretch: np.ndarray | None = None,
-    ) -> Solids:
-        """Return shapes as objects on the cells; the arguments are those of :meth:`render`.
-
-        The object is where the image is brighter than ``contact``. Stretching does not change ``rim``.
-        """
-        cells = torch.empty(len(shape), 3, *self.body.shape)
-        for part, values in self._render_parts(self._objects, shape, angle, scale, position, stretch):
-            cells[part] = values
-        cover, grey, rim = cells.unbind(1)
-        maximum = cover.amax((1, 2), keepdim=True)
-        inside = cover >= torch.minimum(maximum, torch.tensor(_POINTS / 2))
-        size = torch.from_numpy(self._visible(scale, stretch)).float()[:, None, None]
-        return Solids(inside, *((value / cover).where(inside, 0) for value in (grey, rim * size)))
-
     @cached_property
-    def _objects(self) -> list[Tensor]:
+    def objects(self) -> list[Tensor]:
         """Levels (N, 3, p, p): inside or not, and inside, grey and distance from the rim in scales."""
         finest = self.levels[0][:, 0]
         inside = finest > self.contact
@@ -361,59 +337,35 @@ class Shapes:
         scales = torch.from_numpy(rim).float() * (2 / finest.shape[-1])
         return halve(torch.stack([inside.float(), finest * inside, scales * inside], dim=1))
 
-    def _visible(self, scale: np.ndarray, stretch: np.ndarray | None) -> np.ndarray:
-        """Return scales (F,), m, of at least the spacing of the samples."""
-        narrow = 1.0 if stretch is None else np.sqrt(np.maximum(stretch, 1 / stretch))
-        return np.maximum(scale, max(self.body.cell) / 4 * narrow)
+    def visible(self, drawn: Pose) -> np.ndarray:
+        """Return the scales (F,), m, of shapes, at least the spacing of the samples."""
+        narrow = np.sqrt(np.maximum(drawn.stretch, 1 / drawn.stretch))
+        return np.maximum(drawn.scale, max(self.body.cell) / 4 * narrow)
 
-    def _render_parts(
-        self,
-        levels: list[Tensor],
-        shape: np.ndarray,
-        angle: np.ndarray,
-        scale: np.ndarray,
-        position: np.ndarray,
-        stretch: np.ndarray | None,
-    ) -> Iterator[tuple[slice, Tensor]]:
-        """Yield parts of the frames and sums (f, C, H, W) of their cells' samples of levels (N, C, p, p)."""
-        scale = self._visible(scale, stretch)
-        wide = np.sqrt(np.ones(len(scale)) if stretch is None else stretch)
-        texel = 2 * scale / levels[0].shape[-1]
+    def cells(self, levels: list[Tensor], drawn: Pose) -> Iterator[tuple[slice, Tensor]]:
+        """Yield parts of shapes and the sums (f, C, H, W) of 2 x 2 samples a cell of levels (N, C, p, p)."""
+        texel = 2 * self.visible(drawn) / levels[0].shape[-1]
         level = np.clip(np.floor(np.log2(self.spacing / texel)), 0, len(levels) - 1).astype(int)
-        turn = np.exp(-1j * angle) / scale
-        turns = np.stack([turn / wide, turn * wide])
-        shift = turn * (position[:, 0] / wide + 1j * (position[:, 1] * wide))
         step = max(1, _CELLS_AT_ONCE // int(np.prod(self.body.shape)))
-        runs = np.split(np.arange(len(level)), np.flatnonzero(np.diff(level)) + 1)
-        for run in runs:
+        for run in np.split(np.arange(len(level)), np.flatnonzero(np.diff(level)) + 1):
             for start in range(0, len(run), step):
                 part = slice(run[start], run[min(start + step, len(run)) - 1] + 1)
-                texture = levels[level[run[0]]][torch.from_numpy(shape[part])]
-                yield part, self._sample(texture, turns[:, part], shift[part])
+                one = drawn.rows(part)
+                texture = levels[level[run[0]]][torch.from_numpy(one.shape)]
+                upper, lower = self._seen(texture, one, -one.position, *self._points).chunk(2, dim=2)
+                left, right = (upper + lower).chunk(2, dim=3)
+                yield part, left + right
 
     @cached_property
-    def _points(self) -> tuple[Tensor, Tensor]:
-        """Sample points along x (2 W,) and, times i, along y (2 H, 1), m.
+    def _points(self) -> list[Tensor]:
+        """Sample points along x (2 W,) and along y (2 H,), m.
 
         The first halves of all cells, then the second ones, so that a mean over cells reads whole rows.
         """
-        x, y = (
+        return [
             torch.cat([torch.arange(count) + 0.25, torch.arange(count) + 0.75]).double() * size
             for count, size in zip(self.body.cells, self.body.cell, strict=True)
-        )
-        return x, 1j * y[:, None]
-
-    def _sample(self, texture: Tensor, turns: np.ndarray, shift: np.ndarray) -> Tensor:
-        """Return sums (f, C, H, W) of textures (f, C, p, p) seen at turns * (x, i y) - shift, in scales."""
-        x, y = self._points
-        turn_x, turn_y, shifts = (torch.from_numpy(values)[:, None, None] for values in (*turns, shift))
-        # A rotation is a product of complex numbers; grid_sample takes real and imaginary parts.
-        across, down = (turn_x * x - shifts).to(torch.complex64), (turn_y * y).to(torch.complex64)
-        grid = torch.view_as_real(across + down)
-        samples = grid_sample(texture, grid, mode="bilinear", padding_mode="zeros", align_corners=False)
-        upper, lower = samples.chunk(2, dim=2)
-        left, right = (upper + lower).chunk(2, dim=3)
-        return left + right
+        ]
 
 
 def _interpolate(shape: np.ndarray, at: np.ndarray, nodes: np.ndarray, values: np.ndarray) -> np.ndarray:

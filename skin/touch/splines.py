@@ -10,9 +10,7 @@ from functools import lru_cache
 
 import numpy as np
 import torch
-from scipy.interpolate import BSpline, make_interp_spline
-
-from skin.body.base import AbstractBody, Sensors
+from scipy.interpolate import BSpline
 
 REACH = 2
 """How far a spline reaches from the middle of its cell, in cells."""
@@ -62,7 +60,7 @@ def fold_back(wide: torch.Tensor) -> torch.Tensor:
     return inner
 
 
-def _points(low: float, high: float) -> tuple[np.ndarray, np.ndarray]:
+def gauss_points(low: float, high: float) -> tuple[np.ndarray, np.ndarray]:
     """Return Gauss points and weights between two points, in cells, by pieces of a quarter of a cell."""
     cuts = np.unique([low, *(np.arange(np.ceil(low * _PIECES), high * _PIECES) / _PIECES), high])
     middle, half = (cuts[1:] + cuts[:-1]) / 2, np.diff(cuts) / 2
@@ -72,39 +70,5 @@ def _points(low: float, high: float) -> tuple[np.ndarray, np.ndarray]:
 @lru_cache
 def of_cells(count: int) -> np.ndarray:
     """Return the moments (count, count) of 1 Pa on each cell (columns) along one axis."""
-    points, weights = _points(0, count)
+    points, weights = gauss_points(0, count)
     return (weights[:, None] * spline_values(points, count)).reshape(count, -1, count).sum(1).T
-
-
-@lru_cache
-def _gram(count: int) -> np.ndarray:
-    points, weights = _points(0, count)
-    splines = spline_values(points, count)
-    return splines.T @ (weights[:, None] * splines)
-
-
-@lru_cache
-def fit_nodes(count: int, nodes: int) -> np.ndarray:
-    """Return the coefficients (count, nodes) of the least-squares fit of nodal values along one axis.
-
-    Evenly spaced nodes, ends included, are joined by a cubic spline, which the splines of the cells fit.
-    """
-    points, weights = _points(0, count)
-    joined = make_interp_spline(np.linspace(0, count, nodes), np.eye(nodes), k=min(3, nodes - 1))(points)
-    return np.linalg.solve(_gram(count), spline_values(points, count).T @ (weights[:, None] * joined))
-
-
-def footprints(body: AbstractBody, sensors: Sensors) -> np.ndarray:
-    """Return weights (S, H * W) of moments whose sum is the mean pressure over each footprint, Pa.
-
-    The weights fit the footprint by least squares; a footprint beyond the edge of the body is clipped.
-    """
-    weights = []
-    for axis, (count, cell) in enumerate(zip(body.cells, body.cell, strict=True)):
-        middle, half = sensors.positions[:, axis] / cell, sensors.footprint[axis] / cell / 2
-        rows = []
-        for low, high in zip(np.maximum(middle - half, 0), np.minimum(middle + half, count), strict=True):
-            points, fractions = _points(low, high)
-            rows.append(fractions @ spline_values(points, count) / (high - low))
-        weights.append(np.linalg.solve(_gram(count), np.array(rows).T).T)
-    return np.einsum("sh,sw->shw", weights[1], weights[0]).reshape(len(sensors), -1)

@@ -91,7 +91,7 @@ def test_stretched_frames_have_the_area_of_unstretched_ones():
 def test_a_sheet_of_nine_sensors_and_three_to_one_has_all_gestures():
     """Of the 250 big touches of such a sheet 249 were bars, and 4038 gestures could not be drawn at all."""
     body = OBLONG["240 x 80 mm"]
-    source = TouchSampler(body, body.footprints(Grid(3, 3).sensors(body)), Prescribed())
+    source = TouchSampler(body, body.footprints(Grid(3, 3).sensors(body)), Prescribed(), GestureSettings())
     movie = source.sample(512, np.random.default_rng(0))
     assert source.fit
     shape, big = movie.parameters["shape"].numpy().astype(int), movie.labels[:, 0].numpy() > 0.5
@@ -104,13 +104,15 @@ def test_a_sheet_of_nine_sensors_and_three_to_one_has_all_gestures():
 def test_the_least_leak_fits_any_sheet(size):
     body = Sheet(size, (20, 16), LAYER)
     sensors = body.footprints(Grid(3, 3).sensors(body))
-    assert TouchSampler(body, sensors, Prescribed()).fit is None
-    assert TouchSampler(body, sensors, Prescribed(), {"leak": 0.5}).fit
+    assert TouchSampler(body, sensors, Prescribed(), GestureSettings()).fit is None
+    assert TouchSampler(body, sensors, Prescribed(), GestureSettings(leak=0.5)).fit
 
 
 def test_the_default_gestures_are_what_they_were_at_f889bde():
     """Shapes and times are whole numbers, the same on every machine; published results stand on them."""
-    source = TouchSampler(DEFAULT, DEFAULT.footprints(Grid().sensors(DEFAULT)), Prescribed())
+    source = TouchSampler(
+        DEFAULT, DEFAULT.footprints(Grid().sensors(DEFAULT)), Prescribed(), GestureSettings()
+    )
     assert source.fit is None
     movie = source.sample(400, np.random.default_rng(0))
     whole = np.stack([movie.parameters[name].numpy() for name in ("shape", "duration", "onset", "draws")])
@@ -120,7 +122,7 @@ def test_the_default_gestures_are_what_they_were_at_f889bde():
 
 def test_shapes_without_room_are_named():
     footprints = DEFAULT.footprints(Grid().sensors(DEFAULT))
-    source = TouchSampler(DEFAULT, footprints, Prescribed(), {"shapes": ["bar"], "spare": 0.1})
+    source = TouchSampler(DEFAULT, footprints, Prescribed(), GestureSettings(shapes=("bar",), spare=0.1))
     with pytest.raises(InputError, match=r"none of touch.shapes=\['bar'\] covers 0.3 to 0.7.*touch.stretch"):
         source.sample(16, np.random.default_rng(0))
 

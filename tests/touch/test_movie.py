@@ -11,7 +11,7 @@ from skin.body.sheet import Sheet
 from skin.core.rng import Stream, generator
 from skin.device.touches import draw_timeline
 from skin.mechanics.contact.prescribed import Prescribed
-from skin.touch.gestures import TouchSampler
+from skin.touch.gestures import GestureSettings, TouchSampler
 
 BODY = Sheet([0.16, 0.16], [32, 32], [{"material": "EcoFlex 00-30", "thickness": 0.005}])
 SENSORS = Grid(5, 5).sensors(BODY)
@@ -28,14 +28,14 @@ def content(movie):
 
 @pytest.mark.parametrize(("padded", "expected"), [(True, "1dae3ead7e41041b"), (False, "1a29a25f89bf9452")])
 def test_400_gestures_are_those_of_the_published_numbers(padded, expected):
-    sampler = TouchSampler(BODY, BODY.footprints(SENSORS), Prescribed(), padded=padded)
+    sampler = TouchSampler(BODY, BODY.footprints(SENSORS), Prescribed(), GestureSettings(), padded)
     movie = sampler.sample(400, generator(Stream.BUDGET, 0, 1))
     assert movie.index.shape == (400, 30)
     assert content(movie) == expected
 
 
 def test_a_stream_is_that_of_the_published_numbers():
-    sampler = TouchSampler(BODY, BODY.footprints(SENSORS), Prescribed())
+    sampler = TouchSampler(BODY, BODY.footprints(SENSORS), Prescribed(), GestureSettings())
     timeline = draw_timeline(sampler, 2000, (10, 60), generator(Stream.BUDGET, 0, 2))
     assert len(timeline.begin) > 30
     assert content(timeline.movie) == "0949cc88db13cbcf"

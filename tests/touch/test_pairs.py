@@ -8,7 +8,7 @@ from skin.body.layout import Scattered
 from skin.body.sheet import Sheet
 from skin.errors import InputError
 from skin.mechanics.contact.prescribed import Prescribed
-from skin.touch.gestures import TouchSampler
+from skin.touch.gestures import GestureSettings, TouchSampler
 from skin.touch.movie import add_second
 
 BODY = Sheet([0.16, 0.16], [16, 16], [{"material": "EcoFlex 00-30", "thickness": 0.005}])
@@ -16,7 +16,7 @@ WEIGHTS = BODY.footprints(Scattered(4, 4, seed=0).sensors(BODY))
 
 
 def sample(count=240, **settings):
-    sampler = TouchSampler(BODY, WEIGHTS, Prescribed(), settings)
+    sampler = TouchSampler(BODY, WEIGHTS, Prescribed(), GestureSettings.of(settings))
     return sampler.sample(count, np.random.default_rng(3))
 
 
@@ -90,4 +90,6 @@ def test_what_does_not_add_up_is_refused():
         proportional = False
 
     with pytest.raises(InputError, match="contact=prescribed"):
-        TouchSampler(BODY, WEIGHTS, Rigid(), {"second": 0.5})
+        GestureSettings(second=0.5).sampler(BODY, WEIGHTS, Rigid(), True, None)
+    with pytest.raises(InputError, match="limit of force together"):
+        sample(second=0.5, limits={"force": {"limit": 65, "unit": "N", "source": "a table"}})

@@ -10,7 +10,7 @@ from skin.body.layout import Scattered
 from skin.body.sheet import Sheet
 from skin.errors import InputError
 from skin.mechanics.contact.prescribed import Prescribed
-from skin.touch.gestures import TouchSampler
+from skin.touch.gestures import GestureSettings, TouchSampler
 from skin.touch.movie import join_movies
 from skin.touch.sampler import balanced
 
@@ -24,7 +24,7 @@ SHEETS = {
 def sampler(body: Sheet, **settings) -> TouchSampler:
     padded = settings.pop("padded", True)
     sensors = Scattered(5, 5, seed=0).sensors(body)
-    return TouchSampler(body, body.footprints(sensors), Prescribed(), settings, padded)
+    return TouchSampler(body, body.footprints(sensors), Prescribed(), GestureSettings.of(settings), padded)
 
 
 @pytest.fixture(scope="module", params=SHEETS)
@@ -118,9 +118,8 @@ def test_a_touch_that_stands_still_is_rendered_once(sampled):
 def test_sliding_is_straight_and_as_fast_as_drawn():
     """On a large sheet, where nothing is reflected within a few frames of the middle."""
     body = Sheet([1.0, 1.0], [200, 200], LAYER)
-    source = TouchSampler(
-        body, np.full((1, 40000), 1 / 40000), Prescribed(), {"tap": [0.1, 0.3], "shapes": ["fingertip"]}
-    )
+    settings = GestureSettings(tap=(0.1, 0.3), shapes=("fingertip",))
+    source = TouchSampler(body, np.full((1, 40000), 1 / 40000), Prescribed(), settings)
     wanted = np.tile([False, True, False, False], (40, 1))
     movie = source.sample(40, np.random.default_rng(0), wanted)
     weight = movie.frames / movie.frames.sum((1, 2), keepdim=True)
@@ -201,7 +200,9 @@ def test_a_combination_that_never_occurs_is_refused():
     body = SHEETS["default"]
     blind = np.zeros((1, 1024))
     with pytest.raises(InputError, match=r"no gesture in .* draws was .*dangerous"):
-        TouchSampler(body, blind, Prescribed(), {"redraws": 1}).sample(16, np.random.default_rng(0))
+        TouchSampler(body, blind, Prescribed(), GestureSettings(redraws=1)).sample(
+            16, np.random.default_rng(0)
+        )
 
 
 def test_nothing_but_the_path_gives_dynamic_away():

@@ -37,11 +37,18 @@ class Prescribed(AbstractContact):
         else:
             frames, area = shapes.render(*trajectories.poses), None
             peak = _peak(frames.flatten(1).amax(1), trajectories)
-        force = trajectories.peak * (width * height) / peak
+        # The drawn multiple of the threshold of pressure is one of the limit that the gesture reaches first.
+        human = problem.settings.danger.human_force
+        limit, most = problem.settings.danger.of_contact(trajectories.wanted[:, 2])
+        most = np.where(trajectories.wanted[:, 3], most, np.minimum(most, human))
+        reached = np.minimum(limit, most * (peak / (width * height)))
+        highest_cell = trajectories.peak * (reached / problem.settings.thresholds.pressure)
+        force = highest_cell * (width * height) / peak
         owner = torch.from_numpy(trajectories.owner)
         frames *= torch.from_numpy(force / (width * height)).float()[owner, None, None]
-        none = np.zeros(len(force), bool)
-        return ContactResult(frames, force, trajectories.peak, none, none, area=area)
+        return ContactResult(
+            frames, force, highest_cell, force > human, np.zeros(len(force), bool), area=area
+        )
 
 
 def _peak(highest: torch.Tensor, trajectories: Trajectories) -> np.ndarray:

@@ -13,9 +13,11 @@ from torch import Tensor
 from skin.body.base import AbstractBody
 from skin.core.settings import checked
 from skin.mechanics.simulator.base import AbstractSimulator
+from skin.touch.gestures import GestureSettings
 from skin.touch.movie import measure_gestures
 from skin.touch.paths import Trajectories
 from skin.touch.sampler import AbstractContact, ContactProblem, ContactResult
+from skin.touch.shapes import Pose, Shapes
 
 # Contact of rigid objects with an elastic surface, in batches, by projected conjugate gradients.
 
@@ -264,7 +266,7 @@ def find_force(
             which of them did not converge.
         begin: (B, N), initial pressures.
         peak: (B,), drawn peak pressure, Pa.
-        wanted: (B, 2), bool: big, dangerous.
+        labels: (B, 4), bool, wanted labels in the order of ``TOUCH``.
         problem: the body, ranges and thresholds.
     """
     search = _Search.of(begin, peak, labels, problem)
@@ -273,8 +275,8 @@ def find_force(
         selected = torch.from_numpy(rows)
         equilibrium, lost = solve(rows, search.load[rows], search.pressure[selected])
         search.pressure[selected] = equilibrium.pressure.to(search.pressure)
-        peaks, classes = _classes(equilibrium.pressure, problem)
-        rows = search.move(rows, search.judge(rows, peaks, classes != labels[rows], lost), peaks)
+        peaks, classes = _classes(equilibrium.pressure, problem, labels[rows, 2])
+        rows = search.move(rows, search.judge(rows, peaks, classes != search.wanted[rows], lost), peaks)
         if not len(rows):
             break
     search.result[search.failed] = np.nan
@@ -313,18 +315,18 @@ class _Search:
     def of(
         cls, begin: torch.Tensor, peak: np.ndarray, labels: np.ndarray, problem: ContactProblem
     ) -> "_Search":
-        """Return a search that begins at the drawn peaks (B,), Pa, clipped to their ranges."""
+        """Return a search that begins at the drawn peaks (B,), Pa, scaled and clipped to their ranges."""
         settings, cell = problem.settings, problem.shapes.body.cell
-        ends = np.where(labels[:, 1:], settings.dangerous_peak, settings.safe_peak)
+        ends, scale = _peak_range(labels, settings)
         minimum, maximum = ends[:, 0] * _NEAR, np.maximum(ends[:, 1] / _NEAR, ends[:, 0] * _NEAR)
-        target = np.clip(peak, minimum, maximum)
+        target = np.clip(peak * scale, minimum, maximum)
         fraction = torch.from_numpy(target / begin.amax(1).double().numpy()).to(begin)
         pressure = begin * fraction[:, None]
         load = pressure.sum(1).double().numpy() * (cell[0] * cell[1])
         count = len(peak)
         power, last = np.full(count, 1.5), np.full((2, count), np.nan)
         result = np.full(count, np.nan), np.zeros(count, bool), np.zeros(count, bool)
-        return cls(labels, minimum, maximum, target, load, pressure, power, last, *result)
+        return cls(labels[:, [0, 3]], minimum, maximum, target, load, pressure, power, last, *result)
 
     def judge(self, rows: np.ndarray, peak: np.ndarray, wrong: np.ndarray, lost: np.ndarray) -> np.ndarray:
         """Store finished searches, and move the target where the classes at it are wrong.
@@ -364,14 +366,31 @@ class _Search:
         return rows
 
 
-def _classes(pressure: torch.Tensor, problem: ContactProblem) -> tuple[np.ndarray, np.ndarray]:
+def _peak_range(labels: np.ndarray, settings: GestureSettings) -> tuple[np.ndarray, np.ndarray]:
+    """Return the ranges (B, 2), Pa, of the peak pressure of touches with labels (B, 4), bool, and a scale.
+
+    They are relative to a limit of pressure. A wide touch reaches a limit of force far below that.
+    """
+    ends = np.where(labels[:, 3:], settings.dangerous_peak, settings.safe_peak)
+    pressure, force = settings.danger.of_contact(labels[:, 2])
+    scale = np.where(np.isfinite(pressure), pressure / settings.thresholds.pressure, 1)
+    ends *= scale[:, None]
+    ends[:, 0] *= np.where(np.isfinite(force), 0.01, 1)
+    return ends, scale
+
+
+def _classes(
+    pressure: torch.Tensor, problem: ContactProblem, press: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Return the peak pressure (b,), Pa, and the classes big and dangerous (b, 2) of frames."""
     body, thresholds = problem.shapes.body, problem.settings.thresholds
     frames = pressure.float().view(-1, *body.shape)
     index, once = torch.arange(len(frames))[:, None], torch.ones(len(frames), 1)
     measures = measure_gestures(frames, index, once, problem.footprints, body.cell, thresholds.contact)
-    held = measures.area > thresholds.area, measures.pressure > thresholds.pressure
-    return frames.flatten(1).amax(1).double().numpy(), torch.stack(held, dim=1).numpy()
+    force = frames.sum((1, 2)).numpy() * np.prod(body.cell)
+    excess = problem.settings.danger.excess(measures.pressure.numpy(), force, press)
+    held = measures.area.numpy() > thresholds.area, excess > 1
+    return frames.flatten(1).amax(1).double().numpy(), np.stack(held, axis=1)
 
 
 def _halfway(target: np.ndarray, end: np.ndarray) -> np.ndarray:
@@ -385,6 +404,31 @@ def _power(power: np.ndarray, load: np.ndarray, peak: np.ndarray, last: np.ndarr
     apart = np.abs(run) > 1e-3
     slope = np.divide(rise, run, out=power.copy(), where=apart)
     return np.clip(slope, 0.5, 5.0)
+
+
+class Solids(NamedTuple):
+    """Shapes as objects with an outline, sampled on the cells.
+
+    Attributes:
+        inside: (F, H, W), bool, cells that the object covers by at least half; if there are none, those with
+            the largest cover.
+        grey: (F, H, W), mean grey of the covered part, 1 = white; 0 outside.
+        rim: (F, H, W), its mean distance from the outline, m, which stretching does not change; 0 outside.
+    """
+
+    inside: Tensor
+    grey: Tensor
+    rim: Tensor
+
+
+def solids(shapes: Shapes, drawn: Pose) -> Solids:
+    """Return shapes (F,) as objects, which are where the image is brighter than ``shapes.contact``."""
+    cells = torch.cat([part for _, part in shapes.cells(shapes.objects, drawn)])
+    cover, grey, rim = cells.unbind(1)
+    maximum = cover.amax((1, 2), keepdim=True)
+    inside = cover >= torch.minimum(maximum, torch.tensor(2.0))  # of 2 x 2 samples
+    size = torch.from_numpy(shapes.visible(drawn)).float()[:, None, None]
+    return Solids(inside, *((value / cover).where(inside, 0) for value in (grey, rim * size)))
 
 
 @final
@@ -466,9 +510,8 @@ class Rigid(AbstractContact):
         np.maximum.at(peak, trajectories.owner[solved], states.pressure.amax(1).double().numpy())
         frames = (frames / fractions).view(-1, *body.shape)
         # At other positions of a path, or under a small object, the peak may exceed its range.
-        settings = problem.settings
-        dangerous = trajectories.wanted[:, 3]
-        refused |= peak > np.where(dangerous, settings.dangerous_peak[1], settings.safe_peak[1])
+        refused |= peak > _peak_range(trajectories.wanted, problem.settings)[0][:, 1]
+        refused |= force > problem.settings.danger.human_force
         refused |= lost > 0
         return ContactResult(frames, force, peak, refused, forces.area, lost)
 
@@ -478,12 +521,12 @@ class Rigid(AbstractContact):
         Infinite where there is no object. On an arm the object moves along the normal at its middle, and the
         gap includes the curvature of the skin.
         """
-        solids = problem.shapes.solids(*trajectories.poses)
-        lower = self.relief * (1 - solids.grey)
-        inward = (self.fillet - solids.rim).clamp(min=0, max=self.fillet)
+        inside, grey, rim = solids(problem.shapes, trajectories.poses)
+        lower = self.relief * (1 - grey)
+        inward = (self.fillet - rim).clamp(min=0, max=self.fillet)
         lower += self.fillet - (self.fillet**2 - inward**2).clamp(min=0).sqrt()
-        lower = (lower.flatten(1) + _sag(problem.shapes.body, solids.inside.flatten(1))).where(
-            solids.inside.flatten(1), torch.inf
+        lower = (lower.flatten(1) + _sag(problem.shapes.body, inside.flatten(1))).where(
+            inside.flatten(1), torch.inf
         )
         return lower - lower.amin(1, keepdim=True)
 
@@ -507,7 +550,7 @@ class Rigid(AbstractContact):
             return state, (~(state.residual <= self.tolerance)).numpy()
 
         solution = find_force(
-            solved, own_gap.isfinite().float(), trajectories.peak, trajectories.wanted[:, [0, 3]], problem
+            solved, own_gap.isfinite().float(), trajectories.peak, trajectories.wanted, problem
         )
         return solution, solution.failed.astype(np.int64)
 

@@ -17,6 +17,7 @@ from torch import Tensor
 from skin.body.base import AbstractBody, Sensors, require_memory
 from skin.core import array_cache
 from skin.core.settings import checked
+from skin.mechanics.geometry import fit_nodes
 from skin.mechanics.simulator._cholesky import Cholesky
 from skin.mechanics.simulator._hexahedra import Hexahedra
 from skin.mechanics.simulator._mesh import build_meshes
@@ -48,8 +49,7 @@ class Elastic:
         self.cells = columns // refinement, rows // refinement
         # A moment acts on the nodes as the splines fit what the nodes know of an influence.
         self._fits = [
-            splines.fit_nodes(count, nodes + 1)
-            for count, nodes in zip(self.cells, (columns, rows), strict=True)
+            fit_nodes(count, nodes + 1) for count, nodes in zip(self.cells, (columns, rows), strict=True)
         ]
         self._area = mesh.lines[0][-1] * mesh.lines[1][-1] / (self.cells[0] * self.cells[1])
 
@@ -141,6 +141,7 @@ _HERE = Path(__file__).parent
 _SOURCES = [
     *sorted((_HERE.parents[1] / "body").glob("*.py")),
     *(_HERE / f"{name}.py" for name in ("_cholesky", "_hexahedra", "_mesh", "_reading", "base", "solid")),
+    _HERE.parent / "geometry.py",
     Path(splines.__file__),
 ]
 _INWARDS = 2

@@ -11,7 +11,7 @@ from skin.body.layout import Grid
 from skin.device.base import in_threads
 from skin.errors import InputError
 from skin.mechanics.contact.prescribed import Prescribed
-from skin.mechanics.contact.rigid import Rigid
+from skin.mechanics.contact.rigid import Rigid, solids
 from skin.mechanics.simulator.base import AbstractSimulator, Response
 from skin.mechanics.simulator.naive import Naive
 from skin.touch.gestures import GestureSettings, TouchSampler
@@ -46,7 +46,8 @@ def rigid(**settings) -> Rigid:
 
 
 def sampler(contact=None, **settings) -> TouchSampler:
-    return TouchSampler(BODY, BODY.footprints(SENSORS), contact or Prescribed(), settings, True)
+    given = GestureSettings.of(settings)
+    return TouchSampler(BODY, BODY.footprints(SENSORS), contact or Prescribed(), given)
 
 
 def problem(**settings) -> ContactProblem:
@@ -74,6 +75,7 @@ def still(
         torch.tensor([fractions]),
         np.array([peak]),
         np.array([wanted], bool),
+        *(np.zeros((count, 2)), np.zeros(1, int), np.zeros((1, 2)), np.zeros(1)),
     )
 
 
@@ -150,7 +152,7 @@ def test_white_touches_first_and_the_outline_is_an_arc():
     contact = rigid(relief=0.01, fillet=0.0)
     shapes = problem(shapes=["blurred_disc"])
     gap = contact.gap(still(0.06), shapes)[0]
-    grey = shapes.shapes.solids(*still(0.06).poses[:4])
+    grey = solids(shapes.shapes, still(0.06).poses)
     inside = grey.inside[0].flatten()
     expected = 0.01 * (1 - grey.grey[0].flatten()[inside])
     torch.testing.assert_close(gap[inside], expected - expected.min())

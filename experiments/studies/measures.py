@@ -24,7 +24,8 @@ from torch import Tensor
 
 from experiments.studies.pages import Page, Panel, draw_panels
 from skin.core.rng import Stream, generator
-from skin.device.base import AbstractDevice, AbstractSimulated
+from skin.device.base import AbstractDevice
+from skin.device.simulated import Simulated
 from skin.device.touches import Recording
 from skin.errors import InputError
 from skin.evaluation.alarm import choose_alarm_threshold
@@ -346,9 +347,7 @@ class Frozen:
         start = {"set": subject.condition, "hash": present, "gestures": len(touches)}
         return pd.DataFrame([start | accuracies])
 
-    def _predict(
-        self, subject: Subject, device: AbstractSimulated
-    ) -> Callable[[np.ndarray, np.ndarray], Any] | None:
+    def _predict(self, subject: Subject, device: Simulated) -> Callable[[np.ndarray, np.ndarray], Any] | None:
         """Return the predictor for the skin of a device; None: it was exported for another layout."""
         module, _, function = self.predictor.partition(":")
         if function:

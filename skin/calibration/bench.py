@@ -19,7 +19,7 @@ from skin.body.base import AbstractBody, require_memory
 from skin.core.files import tabular, whole, write
 from skin.core.safe_loading import read_parts
 from skin.core.settings import checked
-from skin.device.base import AbstractSimulated
+from skin.device.simulated import Simulated
 from skin.errors import InputError
 from skin.mechanics.simulator.base import AbstractSimulator
 from skin.touch.fingertips import half_extents, peak_per_newton
@@ -504,7 +504,7 @@ class BenchData:
         return releases
 
 
-def build_bench_data(device: AbstractSimulated, session: BenchSession, gauge: Gauge | None) -> BenchData:
+def build_bench_data(device: Simulated, session: BenchSession, gauge: Gauge | None) -> BenchData:
     """Simulate the presses of a session on the skin as designed.
 
     Raises:

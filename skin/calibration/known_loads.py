@@ -19,9 +19,9 @@ from skin.calibration.fit import convert_to_newton
 from skin.calibration.placements import Placements, find_placements
 from skin.calibration.wiring import list_numbers, measure_rests
 from skin.core.settings import configured
-from skin.device.base import AbstractSimulated
 from skin.device.calibration import Calibration
 from skin.device.resampling import Frame, StreamClock
+from skin.device.simulated import Simulated
 from skin.errors import InputError
 from skin.mechanics.simulator.base import AbstractSimulator
 from skin.wire.channels import UnitConversion
@@ -94,7 +94,7 @@ class LoadResult:
     never: list[int]
 
 
-def fit_known_load(device: AbstractSimulated, session: BenchSession, load: KnownLoad) -> LoadResult:
+def fit_known_load(device: Simulated, session: BenchSession, load: KnownLoad) -> LoadResult:
     """Fit offsets and noise to idle frames, and gains to placements of a load.
 
     Args:
@@ -136,7 +136,7 @@ def base_readings(model: AbstractSimulator, body: AbstractBody, sensors: Sensors
 
 
 def _fit_weight(
-    device: AbstractSimulated, placements: Placements, load: KnownLoad
+    device: Simulated, placements: Placements, load: KnownLoad
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """Return gains (S,), in the session's unit per N, NaN if unknown; placements (S,); their difference."""
     expected = load.force * base_readings(device.model, device.body, device.sensors, load.base)
@@ -295,7 +295,7 @@ def measure_ratios(
 
 
 def emulate_placements(
-    device: AbstractSimulated,
+    device: Simulated,
     readings: np.ndarray,
     protocol: Protocol,
     generator: np.random.Generator,
@@ -320,9 +320,7 @@ def emulate_placements(
     return sent_session(device, true, time, generator, bits)
 
 
-def write_demo_placements(
-    device: AbstractSimulated, load: KnownLoad, settings: Mapping[str, Any], path: str
-) -> str:
+def write_demo_placements(device: Simulated, load: KnownLoad, settings: Mapping[str, Any], path: str) -> str:
     """Write the simulated session of a load on every sensor twice, in any order; return a summary.
 
     Args:

@@ -48,7 +48,8 @@ from skin.touch.labels import TOUCH
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from skin.device.base import AbstractDevice, AbstractSimulated
+    from skin.device.base import AbstractDevice
+    from skin.device.simulated import Simulated as AbstractSimulated
     from skin.device.touches import Touches
 
 SAFE_TOUCHES = ENOUGH

@@ -9,7 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from skin.device.base import AbstractDevice, AbstractSimulated
+from skin.device.base import AbstractDevice
+from skin.device.simulated import Simulated
 from skin.device.touches import Touches
 from skin.errors import InputError
 from skin.evaluation.metrics import compute_metrics, count_confusions
@@ -297,7 +298,7 @@ def bin_by_fraction(
 
 def _listen(
     learner: Predictor,
-    device: AbstractSimulated,
+    device: Simulated,
     task: Task,
     all_gates: dict[str, Gate],
     settings: StreamSettings,
@@ -335,7 +336,7 @@ def _frames(seconds: float, rate: float, name: str) -> int:
     return frames
 
 
-def _measure_length(learner: Predictor, device: AbstractSimulated, window: float) -> float | str:
+def _measure_length(learner: Predictor, device: Simulated, window: float) -> float | str:
     """Return the overall accuracy on test touches in windows of another length, s, or why there is none.
 
     All lengths have the same touches with other onsets; windows that are shorter than the longest press have

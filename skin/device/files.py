@@ -201,11 +201,7 @@ def read_recording(path: str | Path, complete: bool = True) -> Recording:
     """
     path = tabular(path, "a recording")
     if path.suffix == ".csv":
-        raise InputError(
-            f"{path} is a table without layout and rate: give {path.with_suffix('.parquet')}; one of an "
-            f"earlier version, beside {path.name}.json, is converted by skin convert "
-            "reader=skin.device.readers.table"
-        )
+        raise InputError(f"{path} is a table without layout and rate: give {path.with_suffix('.parquet')}")
     with _refused(path):
         check_seal(path)
         about, task = _describe(path)

@@ -106,7 +106,7 @@ docs: $(READY)  ## build the documentation site in site/, offline; run tutorials
 	@echo "site/index.html"
 
 notice: $(READY)  ## write NOTICE, the licences of dependencies, data and weights
-	$(BIN)/python -m experiments.notice
+	$(BIN)/python -m docs.notice
 
 clean:  ## remove environments and caches; keep results and runs
 	rm -rf $(VENV) $(PEERS) $(WHEEL) site docs/generated *.egg-info .pytest_cache .ruff_cache .mypy_cache outputs

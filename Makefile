@@ -19,7 +19,6 @@ TEST := $(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist work
 ROUNDINGS := OMP_NUM_THREADS=1 OMP_NUM_THREADS=2 MKL_CBWR=COMPATIBLE MKL_CBWR=AVX2 \
 	ATEN_CPU_CAPABILITY=default OPENBLAS_CORETYPE=Haswell
 NUMERICAL := $(addprefix tests/,body design evaluation wire/test_segmentation.py wire/test_tare.py calibration record/test_session.py \
-	record/test_old_session.py \
 	learning mechanics studies/test_embeddings.py studies/test_embedding_probe.py touch laws \
 	$(addprefix device/test_,calibration.py imperfection.py resampling.py device_sampling.py)) experiments/laws
 
@@ -107,7 +106,7 @@ docs: $(READY)  ## build the documentation site in site/, offline; run tutorials
 	@echo "site/index.html"
 
 notice: $(READY)  ## write NOTICE, the licences of dependencies, data and weights
-	$(BIN)/python -m experiments.notice
+	$(BIN)/python -m docs.notice
 
 clean:  ## remove environments and caches; keep results and runs
 	rm -rf $(VENV) $(PEERS) $(WHEEL) site docs/generated *.egg-info .pytest_cache .ruff_cache .mypy_cache outputs

@@ -32,8 +32,8 @@ from hydra.utils import instantiate
 
 from skin.core.files import CONF, ROOT, results, write
 from skin.core.messages import quiet
-from skin.device.base import AbstractSimulated
 from skin.device.resampling import Frame
+from skin.device.simulated import Simulated
 from skin.learning.network import Network
 from skin.live.engine import Detection, Engine
 from skin.runs.build import TorchModel, build_data, build_device, build_learner
@@ -193,7 +193,7 @@ def measure_latency(row: str, repeats: int, onnx: bool = False, rate: float = 10
         return _time_verdicts(device, OnnxModel(path), 1000 * repeats, rate)
 
 
-def _time_verdicts(device: AbstractSimulated, model: Model, count: int, rate: float) -> Figures:
+def _time_verdicts(device: Simulated, model: Model, count: int, rate: float) -> Figures:
     """Return the times of :func:`measure_latency` for a model on a stream of a device."""
     sensors, repeats, warm = len(model.positions), round(rate / device.model_rate), 50  # verdicts not counted
     engine = Engine(model.probabilities, model.task, sensors, model.window, model.rate, Detection(0.3))  # N

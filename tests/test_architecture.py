@@ -91,7 +91,8 @@ def test_a_room_imports_only_rooms_below_it(room):
 def test_nothing_outside_of_their_room_imports_a_device():
     """The interface says what a device can do, so that a device of one's own can do it too."""
     devices = {OmegaConf.load(path)["_target_"] for path in (CONF / "device").glob("*.yaml")}
-    assert len(devices) >= 4
+    devices.remove("skin.device.simulated.Simulated")  # what `AbstractDevice.simulation` returns
+    assert len(devices) >= 3
     for name, path in library().items():
         room = ".".join(name.split(".")[:2])
         assert not {target for target in imports(path) & devices if not target.startswith(f"{room}.")}, name

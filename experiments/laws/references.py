@@ -19,7 +19,7 @@ from scipy.interpolate import RectBivariateSpline
 from scipy.special import j0, j1
 
 from skin.body.sheet import Sheet
-from skin.mechanics.simulator._hexahedra import Hexahedra
+from skin.mechanics.simulator._mesh import Hexahedra
 from skin.mechanics.simulator.base import factorised
 
 # F / (E* d side) of a flat rigid square punch without friction, E* = E / (1 - nu^2), is pi times the

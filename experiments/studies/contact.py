@@ -27,7 +27,7 @@ from skin.body.base import AbstractBody, Layer, Sensors
 from skin.body.layout import Listed
 from skin.body.material import Material
 from skin.body.sheet import Sheet
-from skin.device.base import AbstractSimulated
+from skin.device.simulated import Simulated
 from skin.errors import InputError
 from skin.inference.candidates import FingertipPrior, disc_readings
 from skin.inference.noise import Noise
@@ -168,7 +168,7 @@ class ExactSkin:
         return self._discs.forces(fingertips, self._sensors.positions[:, :2], side) / area
 
 
-def press_hands(device: AbstractSimulated, count: int, rng: np.random.Generator) -> np.ndarray:
+def press_hands(device: Simulated, count: int, rng: np.random.Generator) -> np.ndarray:
     """Return the readings (count, S), N, of hands and bars of the default gestures."""
     settings = GestureSettings(shapes=("bar", "hand"))
     shapes = Shapes(settings.shapes, device.body)

@@ -21,7 +21,6 @@ from skin.calibration.bench import BenchSession
 from skin.calibration.bench_protocol import Protocol
 from skin.calibration.known_loads import KnownLoad, emulate_placements, fit_known_load
 from skin.core.rng import Stream, generator
-from skin.device.base import AbstractSimulated
 from skin.device.resampling import Frame
 from skin.device.simulated import Simulated
 from skin.evaluation.alarm import AlarmSource, choose_alarm_threshold
@@ -170,7 +169,7 @@ class AlarmTiming(NamedTuple):
 
 
 def dangerous_touches(
-    device: AbstractSimulated, number: int, tap: bool, load: Sequence[Sequence[float]] | None, seed: int = 0
+    device: Simulated, number: int, tap: bool, load: Sequence[Sequence[float]] | None, seed: int = 0
 ) -> Iterator[np.ndarray]:
     """Yield the true readings (T, S), N, of dangerous static touches at the model's rate.
 
@@ -195,7 +194,7 @@ def dangerous_touches(
 
 def play_touch(
     engine: Engine,
-    device: AbstractSimulated,
+    device: Simulated,
     force: np.ndarray,
     rate: float,
     seed: int = 0,

@@ -29,7 +29,8 @@ from experiments.studies.measures import Subject
 from experiments.studies.pages import Page, figure_text
 from experiments.studies.study import Statement
 from skin.device.balance import report_balance
-from skin.device.base import AbstractDevice, AbstractSimulated
+from skin.device.base import AbstractDevice
+from skin.device.simulated import Simulated
 from skin.device.touches import Touches
 from skin.errors import InputError
 from skin.evaluation.report import scattered_devices
@@ -119,7 +120,7 @@ class Embeddings:
         if device.simulation is None:
             return [device.touches("train")[: self.train], device.touches("test")[: self.test]]
         simulation = device.simulation.replace(data_seed=self.first + seed, gestures=self.train + self.test)
-        drawn, others = simulation.recording().touches, list[AbstractSimulated]()
+        drawn, others = simulation.recording().touches, list[Simulated]()
         if self.layouts > 1:
             with suppress(InputError):  # this number of sensors cannot form a grid
                 others = list(scattered_devices(device.simulation, self.layouts))

@@ -27,7 +27,7 @@ from experiments.studies.comparison import (
 )
 from experiments.studies.study import Study
 from skin.core.files import candidates, whole, write
-from skin.device.base import AbstractSimulated
+from skin.device.simulated import Simulated
 from skin.errors import InputError
 from skin.evaluation.metrics import decode
 from skin.mechanics.simulator.naive import Naive
@@ -450,7 +450,7 @@ def confusion_rows(codes: Mapping[str, np.ndarray]) -> pd.DataFrame:
     return pd.DataFrame(lines, columns=columns)
 
 
-def draw_skin(device: AbstractSimulated, folder: Path, name: str = "fem") -> list[Path]:
+def draw_skin(device: Simulated, folder: Path, name: str = "fem") -> list[Path]:
     """Draw figures 10 and 11 from the gestures of a skin whose simulator has a name."""
     recording = device.recording("test", complete=False)
     touches, drawn = recording.touches, recording.parameters

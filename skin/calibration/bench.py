@@ -19,7 +19,7 @@ from skin.body.base import AbstractBody, require_memory
 from skin.core.files import tabular, whole, write
 from skin.core.safe_loading import read_parts
 from skin.core.settings import checked
-from skin.device.base import AbstractSimulated
+from skin.device.simulated import Simulated
 from skin.errors import InputError
 from skin.mechanics.simulator.base import AbstractSimulator
 from skin.touch.fingertips import half_extents, peak_per_newton
@@ -43,7 +43,7 @@ def load_table(path: str | Path, what: str) -> tuple[pa.Table, dict[str, Any]]:
     table of its frames; damaged files are left out, with a warning.
 
     Raises:
-        InputError: no such file, another ending, unreadable, no rows, or a session of an earlier version.
+        InputError: no such file, another ending, unreadable, or no rows.
     """
     path = Path(path).expanduser()
     if not path.is_dir():
@@ -68,8 +68,6 @@ def load_table(path: str | Path, what: str) -> tuple[pa.Table, dict[str, Any]]:
             about = json.loads(sidecar.read_text(encoding="utf-8")) if sidecar.is_file() else {}
         if not isinstance(about, dict):
             raise ValueError(f"its metadata are {about!r}, and must be an object, as in {{}}")
-        if path.suffix == ".csv" and "started_unix" in about:
-            raise ValueError(f"of an earlier version: skin convert from={path} out=FOLDER converts it")
         if not len(table):
             raise ValueError("it has no rows below its header")
     except InputError:
@@ -504,7 +502,7 @@ class BenchData:
         return releases
 
 
-def build_bench_data(device: AbstractSimulated, session: BenchSession, gauge: Gauge | None) -> BenchData:
+def build_bench_data(device: Simulated, session: BenchSession, gauge: Gauge | None) -> BenchData:
     """Simulate the presses of a session on the skin as designed.
 
     Raises:

@@ -10,7 +10,7 @@ from pydantic import PositiveFloat
 
 from skin.calibration.bench import BenchSession, Gauge, per_newton, true_readings, write_bench_session
 from skin.core.settings import configured
-from skin.device.base import AbstractSimulated
+from skin.device.simulated import Simulated
 from skin.wire.emulator import Converter
 
 
@@ -66,7 +66,7 @@ class Protocol:
             np.repeat(np.arange(len(positions)), len(press)),
         )
 
-    def positions(self, device: AbstractSimulated, generator: np.random.Generator) -> np.ndarray:
+    def positions(self, device: Simulated, generator: np.random.Generator) -> np.ndarray:
         """Return two positions per sensor, on it and up to 3 mm beside it, (2 S, 2), m, inside the sheet."""
         centre = device.sensors.positions[:, :2]
         beside = centre + generator.uniform(-0.003, 0.003, centre.shape)
@@ -74,7 +74,7 @@ class Protocol:
 
 
 def emulate_session(
-    device: AbstractSimulated,
+    device: Simulated,
     gauge: Gauge,
     protocol: Protocol,
     generator: np.random.Generator,
@@ -88,7 +88,7 @@ def emulate_session(
 
 
 def sent_session(
-    device: AbstractSimulated,
+    device: Simulated,
     true: np.ndarray,
     time: np.ndarray,
     generator: np.random.Generator,
@@ -103,7 +103,7 @@ def sent_session(
     return BenchSession(time, sent, "N" if bits is None else "adc", gauge, bits)
 
 
-def write_demo_session(device: AbstractSimulated, settings: Mapping[str, Any], path: str) -> str:
+def write_demo_session(device: Simulated, settings: Mapping[str, Any], path: str) -> str:
     """Write the simulated session of a device under the protocol; return a summary.
 
     Args:

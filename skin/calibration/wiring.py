@@ -15,8 +15,8 @@ from scipy.stats import theilslopes
 
 from skin.calibration.bench import BenchData, BenchSession, Gauge, build_bench_data, per_newton
 from skin.core.settings import checked
-from skin.device.base import AbstractSimulated
 from skin.device.calibration import Calibration
+from skin.device.simulated import Simulated
 from skin.errors import InputError
 
 _BLOCKS = 200  # of the frames: Theil's line of a drift takes all pairs of their medians
@@ -391,7 +391,7 @@ class _Explanation:
 
 
 def wired_bench(
-    device: AbstractSimulated, session: BenchSession, rows: Gauge | None, confirmed: Confirmed
+    device: Simulated, session: BenchSession, rows: Gauge | None, confirmed: Confirmed
 ) -> BenchData:
     """Return the bench data of a session whose channels and places fit the layout.
 

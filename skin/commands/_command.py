@@ -9,6 +9,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from difflib import get_close_matches
 from functools import wraps
+from inspect import signature
 from pathlib import Path
 from textwrap import indent
 from typing import Any
@@ -25,15 +26,17 @@ from yaml import YAMLError
 
 from skin.core.files import CONF
 from skin.core.messages import JobInputError, one_line, to_input_error
-from skin.core.settings import check_groups, walk_settings
+from skin.core.settings import check_groups, check_settings, walk_settings
 from skin.errors import InputError
 from skin.runs.configuration import (
     Config,
+    check_numbers,
     check_server,
     hide_password,
     overrides,
+    plain_settings,
+    refuse_unknown,
     validate_config,
-    verb_settings,
 )
 from skin.runs.sweep import belongs_to_other_shard
 
@@ -181,7 +184,7 @@ def command(name: str = "train") -> Callable[[Callable[..., Any]], Callable[...,
             if HydraConfig.get().mode == RunMode.MULTIRUN and belongs_to_other_shard():
                 return None
             try:
-                own, checked = verb_settings(config, task), validate_config(config)
+                own, checked = _verb_settings(config, task), validate_config(config)
                 check_server(checked.tracking.uri)
                 check_quickly(checked, own.get("run"), overrides())
                 return task(checked, **own)
@@ -220,6 +223,32 @@ def command(name: str = "train") -> Callable[[Callable[..., Any]], Callable[...,
         return main
 
     return decorate
+
+
+def _verb_settings(config: DictConfig, verb: Callable[..., Any]) -> dict[str, Any]:
+    """Return the settings of a verb alone, by the names of its parameters after the first.
+
+    Args:
+        config: as Hydra composes it.
+        verb: its function; ``from_`` is the setting ``from``, which is a keyword of Python.
+
+    Raises:
+        InputError: a value does not fit the annotation of its parameter, a group is null, or a setting is
+            unknown.
+    """
+    hints = {name: str(hint) for name, hint in (Config.__annotations__ | verb.__annotations__).items()}
+    for name in sorted(name for name, hint in hints.items() if "dict" in hint or "skin." in hint):
+        if name in config and config[name] is None:
+            raise InputError(
+                f"{name}=null leaves nothing to use: give settings or an option, or leave it out"
+            )
+    names = [*signature(verb).parameters][1:]
+    refuse_unknown(config, [name.removesuffix("_") for name in names])
+    plain = plain_settings(config)
+    settings = {name: plain[name.removesuffix("_")] for name in names}
+    check_numbers({name.removesuffix("_"): value for name, value in settings.items()})
+    check_settings(verb, settings, "")
+    return settings
 
 
 def notify(text: str) -> None:

@@ -3,12 +3,11 @@
     skin convert from=map.yaml out=x.parquet
     skin convert reader=package.function path=FOLDER out=x.parquet
     skin convert from=session out=x.csv
-    skin convert from=session.csv out=session
 
 A mapping file says what the columns are; a Python function reads everything else (docs/recordings.md).
 device=recording device.path=x.parquet trains on the result. The skin of the configuration matters only for a
-mapping with positions: layout. The third form writes time, number, raw values and gesture of the frames of a
-session (skin record) for a spreadsheet; the last one converts a session of an earlier version.
+mapping with positions: layout. The last form writes time, number, raw values and gesture of the frames of a
+session (skin record) for a spreadsheet.
 """
 
 from collections.abc import Mapping
@@ -45,11 +44,6 @@ def main(
         with whole(target) as partial:
             write_csv(table, partial)
         print(f"{target}: {len(table)} frames")
-        return
-    if session.suffix == ".csv":
-        from skin.record.session import convert_old_session
-
-        print(convert_old_session(session, target))
         return
     file = tabular(out, "a recording")
 

@@ -19,10 +19,7 @@ from skin.runs.configuration import Config
 def main(config: Config, out: str | None, seconds: float | None, record: dict[str, Any]) -> None:
     """Record raw frames to a session, then convert its gestures to a recording."""
     if out is None or Path(out).suffix in (".csv", ".parquet") or not Path(out).name:
-        raise InputError(
-            f"a session is a folder, got out={out}: give out=session, or convert a session of an earlier "
-            "version with skin convert from=session.csv out=session"
-        )
+        raise InputError(f"a session is a folder, got out={out}: give out=session")
     if unknown := sorted(set(record) - {"free", "finish"}):
         raise InputError(f"record has no {unknown[0]}: it takes free, finish")
 

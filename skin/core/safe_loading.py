@@ -192,20 +192,8 @@ def sha256(content: bytes) -> str:
     return hashlib.sha256(content).hexdigest()
 
 
-def file_sha256(path: Path) -> str:
-    """Return the checksum of a regular file, which need not fit into memory.
-
-    Raises:
-        ValueError: not a regular file.
-        OSError: unreadable.
-    """
-    regular(path)
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
-
-
 def write_parquet(table: "pa.Table", path: Path, **settings: Any) -> None:
-    """Write a Parquet file with a checksum for :func:`check_seal`.
+    """Write a Parquet file with a checksum for :func:`check_content`.
 
     Args:
         table: to write.
@@ -266,22 +254,10 @@ def seal(path: Path) -> None:
     path.write_bytes(content[: position.start] + digest + content[position.stop :])
 
 
-def check_seal(path: Path) -> None:
-    """Check the checksum of :func:`seal` before anything else of a file is interpreted.
-
-    Files of older versions and of other programs have none and pass.
-
-    Raises:
-        ChecksumError: the file is not as it was written.
-        ValueError: not a regular file.
-        OSError: unreadable.
-    """
-    regular(path)
-    check_content(path.read_bytes())
-
-
 def check_content(content: bytes) -> None:
-    """Do the same with the content of a file.
+    """Check the checksum of :func:`seal` in the content of a file, before anything else of it is interpreted.
+
+    Files of other programs have none and pass.
 
     Raises:
         ChecksumError: it is not as it was written.

@@ -22,8 +22,8 @@ from skin.core.rng import Stream, generator
 from skin.core.settings import checked
 from skin.design.drawing import placement
 from skin.design.placement import PlacementProblem, Zones, keep_out
-from skin.device.base import AbstractDevice, AbstractSimulated
-from skin.device.simulated import build_model
+from skin.device.base import AbstractDevice
+from skin.device.simulated import Simulated, build_model
 from skin.errors import InputError
 from skin.plot.figures import save_figure
 from skin.runs.build import SkinModel
@@ -37,7 +37,7 @@ _BATCH = 256
 
 @torch.no_grad()
 def reading_covariance(
-    device: AbstractSimulated, sensors: Sensors, touches: int, seed: int, clip: float
+    device: Simulated, sensors: Sensors, touches: int, seed: int, clip: float
 ) -> tuple[np.ndarray, int]:
     """Return the covariance of the readings of sampled touches, and from how many frames it is.
 
@@ -67,7 +67,7 @@ def reading_covariance(
     return squares / frames - np.outer(mean, mean), frames
 
 
-def _reader(device: AbstractSimulated, sensors: Sensors) -> Callable[[Movie], Tensor]:
+def _reader(device: Simulated, sensors: Sensors) -> Callable[[Movie], Tensor]:
     """Return a function that gives the readings (F, C), N, of all frames with contact of a movie."""
     rows = None if device.sampler.settings.shear else device.model.pressure_rows(sensors)
     if rows is None:
@@ -144,7 +144,7 @@ class Place:
         paths = self._write(problem, chosen, content, forbidden, folder)
         print("\n".join(map(str, paths)))
 
-    def _noise(self, device: AbstractSimulated) -> float:
+    def _noise(self, device: Simulated) -> float:
         noise = _median(device.constants.noise) if self.noise is None else self.noise
         if noise == 0:
             raise InputError(

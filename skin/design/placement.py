@@ -19,7 +19,7 @@ from skin.body.base import AbstractBody, Sensors, overlaps
 from skin.body.layout import Grid, place_sensors
 from skin.core.files import candidates
 from skin.core.rng import Stream, generator
-from skin.device.base import AbstractSimulated
+from skin.device.simulated import Simulated
 from skin.errors import InputError
 
 Sites = Sequence[int] | np.ndarray
@@ -286,7 +286,7 @@ class PlacementProblem:
     @classmethod
     def of(
         cls,
-        device: AbstractSimulated,
+        device: Simulated,
         forbidden: np.ndarray | None,
         count: int | None,
         keep: str | Sequence[int],

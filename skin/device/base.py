@@ -11,17 +11,14 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar
 import torch
 from torch import Tensor
 
-from skin.body.base import AbstractBody, Sensors
+from skin.body.base import AbstractBody
 from skin.core.rng import Stream, generator
 from skin.device.touches import Part, Recording, Touches, concatenate
 from skin.errors import InputError
 from skin.touch.labels import Task
 
 if TYPE_CHECKING:
-    from skin.device.imperfection import Constants, Imperfection
-    from skin.device.touches import TouchStream
-    from skin.mechanics.simulator.base import AbstractSimulator
-    from skin.touch.sampler import AbstractSampler
+    from skin.device.simulated import Simulated
 
 
 Split = Literal["train", "validation", "holdout", "test"]
@@ -52,12 +49,12 @@ class AbstractDevice(ABC):
     real: bool = False
 
     @property
-    def simulation(self) -> "AbstractSimulated | None":
+    def simulation(self) -> "Simulated | None":
         """This device, if it simulates its touches; else None."""
         return None
 
     @property
-    def reference(self) -> "AbstractSimulated | None":
+    def reference(self) -> "Simulated | None":
         """The simulated skin of the configuration, on which thresholds of ``skin live`` are tuned."""
         return self.simulation
 
@@ -120,7 +117,7 @@ class AbstractDevice(ABC):
             "device.port=/dev/ttyACM0, device=recording device.path=FILE.parquet, or leave out device="
         )
 
-    def simulated(self, purpose: str) -> "AbstractSimulated":
+    def simulated(self, purpose: str) -> "Simulated":
         """Return this device as a simulated one.
 
         Args:
@@ -132,90 +129,6 @@ class AbstractDevice(ABC):
         if self.simulation is None:
             raise InputError(f"{purpose}: leave out device=, or add device=simulated")
         return self.simulation
-
-
-class AbstractSimulated(AbstractDevice):
-    """Base class of devices that simulate their touches, with all parameters, and can draw others.
-
-    Attributes:
-        body: the sheet.
-        simulator: ``simulator(body, sensors)`` gives the map from pressure to true readings.
-        sensors: S sensors, at the positions that touches report.
-        model: maps pressure to the true readings of the sensors at their true positions.
-        sampler: draws the touches.
-        window: frames per touch.
-        model_rate: frames per second of touches, Hz.
-        rate: frames per second of the sensors, Hz, or [least, most]; touches are resampled to ``model_rate``.
-        stream: whether touches are windows of streams.
-        seed: for the device's constants and noise.
-        data_seed: for the gestures of the training budget.
-        calibration: file with the imperfections; or None.
-        imperfection: distribution of the imperfections of such devices.
-        constants: imperfections of this device.
-        idle: mean readings of the untouched skin, (S,), N.
-    """
-
-    body: AbstractBody
-    simulator: Callable[[AbstractBody, Sensors], "AbstractSimulator"]
-    sensors: Sensors
-    model: "AbstractSimulator"
-    sampler: "AbstractSampler"
-    window: int
-    model_rate: float
-    rate: float | tuple[float, float]
-    stream: bool
-    seed: int
-    data_seed: int
-    calibration: str | None
-    imperfection: "Imperfection"
-    constants: "Constants"
-
-    @property
-    def simulation(self) -> "AbstractSimulated":
-        """This device."""
-        return self
-
-    @property
-    @abstractmethod
-    def idle(self) -> Tensor:
-        """Mean readings of the untouched skin, (S,), N; 0 for dead sensors."""
-
-    @abstractmethod
-    def replace(self, **changes: Any) -> "AbstractSimulated":
-        """Return a device with other settings, such as ``seed=3`` for another device of the same kind."""
-
-    @abstractmethod
-    def fresh_touches(self, count: int) -> Touches:
-        """Return touches that belong to no split."""
-
-    @abstractmethod
-    def press_readings(self) -> Tensor:
-        """Return the true readings (S, S), N, of a press at the limit of ``dangerous`` on each sensor.
-
-        Row i is of a disc of even pressure around sensor i.
-        """
-
-    @abstractmethod
-    def recording(self, split: Split | None = None, epoch: int = 0, complete: bool = True) -> Recording:
-        """Return the touches of a split, or the whole budget, with the applied force and the parameters.
-
-        Args:
-            split: None takes the whole budget.
-            epoch: used by ``train`` with fresh gestures.
-            complete: include the displacements and the largest strains.
-        """
-
-    @abstractmethod
-    def simulate_stream(
-        self, frames: int, gap: Sequence[int] | None = None, number: int = 0
-    ) -> "TouchStream":
-        """Return a test stream in one piece, to be cut as one likes; one device feels all of it.
-
-        Args:
-            frames: its length, frames.
-            gap: [least, most] idle frames between two touches; None: ``touch.gap``.
-            number: of the stream; each number gives other gestures.
-        """
 
 
 # A device that yields placeholder touches of the right shapes.

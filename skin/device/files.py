@@ -32,7 +32,7 @@ from torch import Tensor
 from skin.body.base import require_memory
 from skin.core import files
 from skin.core.files import MANIFEST, tabular, whole
-from skin.core.safe_loading import check_seal, parse_json, read_file, sha256, write_parquet
+from skin.core.safe_loading import check_content, parse_json, read_file, sha256, write_parquet
 from skin.core.settings import ONCE, check_settings
 from skin.device.touches import Recording, Touches
 from skin.errors import InputError
@@ -201,13 +201,9 @@ def read_recording(path: str | Path, complete: bool = True) -> Recording:
     """
     path = tabular(path, "a recording")
     if path.suffix == ".csv":
-        raise InputError(
-            f"{path} is a table without layout and rate: give {path.with_suffix('.parquet')}; one of an "
-            f"earlier version, beside {path.name}.json, is converted by skin convert "
-            "reader=skin.device.readers.table"
-        )
+        raise InputError(f"{path} is a table without layout and rate: give {path.with_suffix('.parquet')}")
     with _refused(path):
-        check_seal(path)
+        check_content(path.read_bytes())
         about, task = _describe(path)
         if not complete:
             about |= {"force": False, "displacement": False, "parameters": []}

@@ -4,24 +4,18 @@ Those of public data sets are examples of a function of one's own: it takes the 
 returns a recording.
 """
 
-import json
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Annotated
 
 import numpy as np
 import pandas as pd
-import pyarrow as pa
-import pyarrow.csv
-import pyarrow.parquet
 from annotated_types import Ge, Le
 from pydantic import PositiveFloat
 
 from skin.body.layout import tile_centres
 from skin.device.conversion import build_recording
-from skin.device.files import read_recording
 from skin.device.formats import FORCES, parse_numbers, require_columns
 from skin.device.touches import Recording
 from skin.errors import InputError
@@ -189,23 +183,3 @@ def eflesh(path: Path) -> Recording:
         per_sensor=3,
         size=None if gauge else (0.03, 0.03),
     )
-
-
-def table(path: Path) -> Recording:
-    """Read a recording of an earlier version: a table in CSV, with its description in ``x.csv.json``.
-
-    Raises:
-        InputError: no such files, or another description or other rows than were written.
-    """
-    try:
-        about = json.loads(path.with_name(f"{path.name}.json").read_text(encoding="utf-8"))
-        about.pop("sha256", None)
-        rows = pa.csv.read_csv(path).replace_schema_metadata({"skin": json.dumps(about)})
-        with TemporaryDirectory() as folder:
-            pa.parquet.write_table(rows, f"{folder}/{path.stem}.parquet")
-            return read_recording(f"{folder}/{path.stem}.parquet")
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
-    except (OSError, ValueError, TypeError, AttributeError) as error:
-        reason = " ".join(str(error).split())
-        raise InputError(f"{path} is no recording of an earlier version: {reason}") from error

@@ -17,7 +17,7 @@ from skin.body.layout import AbstractLayout
 from skin.core.rng import Stream, generator
 from skin.core.settings import checked
 from skin.device.balance import summarise
-from skin.device.base import AbstractSimulated, Split, grouped, joined, split_rows, split_slices
+from skin.device.base import AbstractDevice, Split, grouped, joined, split_rows, split_slices
 from skin.device.imperfection import Imperfection, ImperfectionSettings
 from skin.device.resampling import check_rate
 from skin.device.sampling import draw_constants, idle_excess, measure
@@ -90,9 +90,7 @@ def build_model(
 _VERSIONS = {"skin": __version__, "torch": torch.__version__, "numpy": np.__version__}
 
 
-def describe(
-    device: AbstractSimulated, recording: Recording, split: Split | None, epoch: int
-) -> dict[str, Any]:
+def describe(device: "Simulated", recording: Recording, split: Split | None, epoch: int) -> dict[str, Any]:
     """Return how a recording was made, and a summary of its touches.
 
     Args:
@@ -119,7 +117,7 @@ _BATCH = 1024
 
 @checked("device")
 @dataclass(kw_only=True, eq=False)
-class Simulated(ImperfectionSettings, AbstractSimulated):
+class Simulated(ImperfectionSettings, AbstractDevice):
     """Yields simulated gestures, measured by a device with imperfections.
 
     Training, validation and holdout are 80/10/10 of one budget of gestures; test gestures come from a stream
@@ -147,6 +145,15 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
         footprint_error: standard deviation of the logarithm of the true over the reported side of footprints.
         described: ``described(body, sensors)``, the simulator that :attr:`geometry` reports the responses of;
             None: ``simulator``.
+
+    Attributes:
+        sensors: S sensors, at the positions that touches report.
+        model: maps pressure to the true readings of the sensors at their true positions.
+        sampler: draws the touches.
+        window: frames per touch.
+        model_rate: frames per second of touches, Hz.
+        imperfection: distribution of the imperfections of such devices.
+        constants: imperfections of this device.
 
     Raises:
         InputError: invalid settings.
@@ -211,6 +218,11 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
         return sensor_geometry(self.body, self.sensors, model)
 
     @property
+    def simulation(self) -> "Simulated":
+        """This device."""
+        return self
+
+    @property
     def idle(self) -> Tensor:
         """What the untouched skin reads on average, (S,), N; 0 for dead sensors."""
         excess = idle_excess(self.constants, self.model_rate)
@@ -237,6 +249,8 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
     def press_readings(self, covered: float = 0.03) -> Tensor:
         """Return the true readings (S, S), N, of a press at the limit of ``dangerous`` on each sensor.
 
+        Row i is of a disc of even pressure around sensor i.
+
         Args:
             covered: fraction of the sheet under a press: small, and larger than any footprint.
         """
@@ -255,7 +269,13 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
         return joined(self._batches(False, stream, count, *key)).touches
 
     def recording(self, split: Split | None = None, epoch: int = 0, complete: bool = True) -> Recording:
-        """Return the same touches with the applied force and the gestures' parameters."""
+        """Return the same touches with the applied force and the gestures' parameters.
+
+        Args:
+            split: None takes the whole budget.
+            epoch: used by ``train`` with fresh gestures.
+            complete: include the displacements and the largest strains.
+        """
         recording = self._split(split, epoch, complete)
         return replace(recording, metadata=describe(self, recording, split, epoch))
 
@@ -339,7 +359,13 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
 
     @torch.no_grad()
     def simulate_stream(self, frames: int, gap: Sequence[int] | None = None, number: int = 0) -> TouchStream:
-        """Return a test stream in one piece; without ``gap``, [least, most] frames, as ``touch.gap`` says."""
+        """Return a test stream in one piece, to be cut as one likes; one device feels all of it.
+
+        Args:
+            frames: its length, frames.
+            gap: [least, most] idle frames between two touches; None: ``touch.gap``.
+            number: of the stream; each number gives other gestures.
+        """
         if self.randomise:
             return self.replace(randomise=False).simulate_stream(frames, gap, number)
         key = Stream.TEST, 1, number

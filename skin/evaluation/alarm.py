@@ -20,7 +20,6 @@ from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from omegaconf import OmegaConf
 
-from skin.core import array_cache
 from skin.core.files import CONF
 from skin.core.progress import Steps
 from skin.core.rng import Stream, generator
@@ -43,12 +42,14 @@ from skin.evaluation.operating_point import (
     parse_operating_point,
 )
 from skin.evaluation.settings import ENOUGH, Evaluation, check_evaluation
+from skin.mechanics import array_cache
 from skin.touch.labels import TOUCH
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from skin.device.base import AbstractDevice, AbstractSimulated
+    from skin.device.base import AbstractDevice
+    from skin.device.simulated import Simulated as AbstractSimulated
     from skin.device.touches import Touches
 
 SAFE_TOUCHES = ENOUGH

@@ -17,7 +17,8 @@ from torch import Tensor
 
 from skin.body.layout import Scattered
 from skin.core.files import whole, write
-from skin.device.base import AbstractDevice, AbstractSimulated
+from skin.device.base import AbstractDevice
+from skin.device.simulated import Simulated
 from skin.device.touches import Touches
 from skin.errors import InputError
 from skin.evaluation.metrics import compute_metrics, count_confusions, encode
@@ -129,14 +130,14 @@ def _test(device: AbstractDevice) -> tuple[Touches, dict[str, Tensor]]:
     return recording.touches, recording.parameters
 
 
-def _devices(device: AbstractSimulated, settings: Evaluation) -> Iterator[Touches]:
+def _devices(device: Simulated, settings: Evaluation) -> Iterator[Touches]:
     """Yield the fraction of the test touches that each of some other devices of the same kind measures."""
     for number in range(settings.devices):
         sibling = device.replace(seed=1 + number)  # the default device has 0
         yield sibling.touches("test")[number :: settings.devices]
 
 
-def _layouts(device: AbstractSimulated, settings: Evaluation) -> Iterator[Touches]:
+def _layouts(device: Simulated, settings: Evaluation) -> Iterator[Touches]:
     """Yield the fraction of the test touches for each of some other layouts.
 
     A gesture whose dangerous pressure no sensor of a layout would feel takes another path there.
@@ -145,7 +146,7 @@ def _layouts(device: AbstractSimulated, settings: Evaluation) -> Iterator[Touche
         yield other.touches("test")[number :: settings.layouts]
 
 
-def scattered_devices(device: AbstractSimulated, count: int) -> Iterator[AbstractSimulated]:
+def scattered_devices(device: Simulated, count: int) -> Iterator[Simulated]:
     """Yield a device on each of some scattered layouts with as many sensors, equally deep and tilted.
 
     Raises:

@@ -12,8 +12,8 @@ from torch.nn.functional import max_pool1d, pad
 
 from skin.body.base import AbstractBody
 from skin.core.rng import Stream, generator
-from skin.device.base import AbstractSimulated
 from skin.device.sampling import between_frames, draw_constants
+from skin.device.simulated import Simulated
 from skin.device.touches import Touches
 from skin.evaluation.decisions import DECISIONS, LiveConditions, held_frames, longest_shown, present_as_press
 from skin.evaluation.operating_point import LABEL, DangerScore, Predictor
@@ -72,7 +72,7 @@ class TouchDecisions(NamedTuple):
 @torch.inference_mode()
 def decide_touches(
     learner: Predictor,
-    device: AbstractSimulated,
+    device: Simulated,
     live: LiveConditions,
     labels: np.ndarray,
     seed: int,
@@ -116,13 +116,13 @@ def _sensed_pressure(movie: Movie, footprints: Tensor, valid: Tensor) -> Tensor:
     return means.amax(dim=1).where(valid, 0.0).amax(dim=1)
 
 
-def _round_rate(device: AbstractSimulated, live: LiveConditions) -> float:
+def _round_rate(device: Simulated, live: LiveConditions) -> float:
     """Return the rate of the device, rounded to a multiple of the model's, Hz."""
     return max(1, round(live.rate / device.model_rate)) * device.model_rate
 
 
 def _decision_windows(
-    device: AbstractSimulated, movie: Movie, live: LiveConditions, draw: np.random.Generator
+    device: Simulated, movie: Movie, live: LiveConditions, draw: np.random.Generator
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return the windows (B, J, T, S), N, of J decisions about each touch, as the model sees them.
 
@@ -150,7 +150,7 @@ def _decision_windows(
 
 
 def _measure_touches(
-    device: AbstractSimulated, movie: Movie, live: LiveConditions, draw: np.random.Generator
+    device: Simulated, movie: Movie, live: LiveConditions, draw: np.random.Generator
 ) -> tuple[Tensor, Tensor]:
     """Return what devices read of touches after a window of rest, (B, F, S), N, and their valid sensors."""
     force = device.model.respond(movie, displacement=False).readings
@@ -176,7 +176,7 @@ def _draw_decisions(shape: torch.Size, first: int, step: float, draw: np.random.
 
 
 def _classify_windows(
-    learner: Predictor, device: AbstractSimulated, live: LiveConditions, readings: Tensor, valid: Tensor
+    learner: Predictor, device: Simulated, live: LiveConditions, readings: Tensor, valid: Tensor
 ) -> Tensor:
     """Return the probability of ``dangerous`` of windows (W, T, S) with valid sensors (W, S), (W,)."""
     positions = torch.from_numpy(device.sensors.positions).float()

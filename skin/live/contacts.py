@@ -24,7 +24,7 @@ from skin.wire.channels import NewtonFrame, UnitConversion
 
 if TYPE_CHECKING:
     from skin.body.base import AbstractBody, Sensors
-    from skin.device.base import AbstractSimulated
+    from skin.device.simulated import Simulated as AbstractSimulated
     from skin.inference.noise import Noise
     from skin.inference.posterior import ContactEstimate, FrameEstimate, Posterior
     from skin.mechanics.simulator.base import AbstractSimulator

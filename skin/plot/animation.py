@@ -17,8 +17,8 @@ from PIL.Image import Dither, Image, fromarray, new
 
 from skin.body.base import AbstractBody
 from skin.core.files import whole
-from skin.device.base import AbstractDevice, AbstractSimulated
-from skin.device.touches import Touches
+from skin.device.base import AbstractDevice
+from skin.device.simulated import Simulated
 from skin.errors import InputError
 from skin.learning.representation import centres, weights
 from skin.plot.figures import save_figure
@@ -213,7 +213,7 @@ def _between(scene: Scene) -> np.ndarray:
 
 @torch.no_grad()
 def simulate_scene(
-    device: AbstractSimulated, labels: Sequence[str] | None, shape: str | None, seed: int, field: bool
+    device: Simulated, labels: Sequence[str] | None, shape: str | None, seed: int, field: bool
 ) -> Scene:
     """Draw a touch as a simulated device measures it.
 
@@ -261,7 +261,7 @@ def read_scene(device: AbstractDevice, index: int) -> Scene:
         raise InputError(
             f"there are {len(touches)} touches, got index={index}: give index=0 to {len(touches) - 1}"
         )
-    touch: Touches = touches[index : index + 1]
+    touch = touches[index : index + 1]
     readings = touch.readings.where(touch.valid, 0)[0].numpy()
     positions = np.broadcast_to(touch.positions.numpy(), (1, *readings.shape, 3))[0]
     heading = "" if touch.labels is None else _title("", touch.labels[0].bool().numpy(), device.task.names)

@@ -27,8 +27,9 @@ from skin.calibration.bench import (
 from skin.calibration.wiring import turn_gauge
 from skin.core.files import write
 from skin.core.rng import Stream, generator
-from skin.device.base import AbstractSimulated, Blank
+from skin.device.base import Blank
 from skin.device.resampling import resample
+from skin.device.simulated import Simulated
 from skin.device.touches import Touches
 from skin.errors import InputError
 from skin.plot.figures import COLOURS, save_figure
@@ -113,7 +114,7 @@ class SessionComparison:
 
 
 def compare_session(
-    device: AbstractSimulated, path: str, presses: str | None, settings: Mapping[str, Any]
+    device: Simulated, path: str, presses: str | None, settings: Mapping[str, Any]
 ) -> SessionComparison:
     """Return the touches of a session beside their simulation.
 
@@ -141,7 +142,7 @@ def compare_session(
 
 
 def compare_predictions(
-    name: str, config: Config, comparison: SessionComparison, device: AbstractSimulated
+    name: str, config: Config, comparison: SessionComparison, device: Simulated
 ) -> list[str]:
     """Return what a run predicts of both sides; print a warning if it learned another mechanics.
 
@@ -185,7 +186,7 @@ def describe_agreement(
     return lines
 
 
-def compare_gestures(device: AbstractSimulated, path: str, seed: int) -> SessionComparison:
+def compare_gestures(device: Simulated, path: str, seed: int) -> SessionComparison:
     """Return the gestures of a session beside their simulation.
 
     Announced gestures are those of an emulator: the same ones are simulated, on the device that is given.
@@ -238,7 +239,7 @@ def compare_gestures(device: AbstractSimulated, path: str, seed: int) -> Session
     return SessionComparison("gestures", pairs, _touches(device, pairs))
 
 
-def _simulate_readings(device: AbstractSimulated, gestures: Sequence[Gesture]) -> np.ndarray:
+def _simulate_readings(device: Simulated, gestures: Sequence[Gesture]) -> np.ndarray:
     """Return what a device reads in gestures above what it reads before them, (B, T, S), N."""
     force = np.stack([gesture.force for gesture in gestures])
     true = torch.from_numpy(np.pad(force, ((0, 0), (_IDLE, 0), (0, 0)))).float()
@@ -247,7 +248,7 @@ def _simulate_readings(device: AbstractSimulated, gestures: Sequence[Gesture]) -
     return (readings[:, _IDLE:] - readings[:, :_IDLE].median(dim=1, keepdim=True).values).numpy()
 
 
-def compare_presses(device: AbstractSimulated, bench: BenchData, scale: float | None) -> SessionComparison:
+def compare_presses(device: Simulated, bench: BenchData, scale: float | None) -> SessionComparison:
     """Simulate a session's presses on a device; idle medians are subtracted on both sides.
 
     Args:
@@ -300,7 +301,7 @@ def compare_presses(device: AbstractSimulated, bench: BenchData, scale: float | 
     return SessionComparison("presses", pairs, touches)
 
 
-def _touches(device: AbstractSimulated, pairs: Sequence[Pair]) -> list[Touches]:
+def _touches(device: Simulated, pairs: Sequence[Pair]) -> list[Touches]:
     """Return simulated and measured readings as a model sees them: 0 where not valid."""
     valid, positions = np.stack([pair.valid for pair in pairs]), device.sensors.positions
     return [

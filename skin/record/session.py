@@ -13,13 +13,10 @@ Each file is written whole, with checksums. A damaged one is left out, with the 
 """
 
 import logging
-import zlib
-from collections.abc import Iterable, Mapping
-from contextlib import AbstractContextManager, suppress
+from collections.abc import Mapping
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
-from math import nan
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -27,10 +24,10 @@ import pyarrow as pa
 from filelock import FileLock, Timeout
 
 from skin.core import files
-from skin.core.safe_loading import json_sum, parse_json, read_file, read_parts, write_parquet
+from skin.core.safe_loading import json_sum, parse_json, read_parts, write_parquet
 from skin.device.calibration import Curves
 from skin.device.files import numbered
-from skin.device.resampling import After, Frame, Resampled, Window
+from skin.device.resampling import Frame, Resampled
 from skin.errors import InputError
 from skin.wire.channels import UnitConversion
 from skin.wire.segmentation import RecordedGesture
@@ -41,7 +38,6 @@ BAD = (ValueError, LookupError, TypeError, AttributeError)
 """Errors of content that is damaged."""
 
 FORMAT = 3
-_SUM = ', "sum": "'  # before the checksum of a line of format 2
 _KEY = b"skin_gesture"
 _STEP = 1e-3  # s at least between the clocks of two segments
 _log = logging.getLogger(__name__)
@@ -76,8 +72,7 @@ def read_session(folder: Path) -> StoredSession:
         metadata, parts = read_parts(folder)
     except (OSError, ValueError) as error:
         raise InputError(
-            f"cannot read the session {folder}: {error}: skin record out=FOLDER makes one, skin convert "
-            "from=x.csv out=FOLDER converts one of an earlier version"
+            f"cannot read the session {folder}: {error}: skin record out=FOLDER makes one"
         ) from error
     stored = StoredSession(metadata)
     for path, table in parts.items():
@@ -263,106 +258,3 @@ class SessionLog:
 def _states(valid: np.ndarray, saturated: np.ndarray) -> np.ndarray:
     """Return the states of values, int8."""
     return (INVALID * ~valid + SATURATED * saturated).astype(np.int8)
-
-
-# Sessions of earlier versions: x.csv, whose lines with # are JSON with a checksum, and x.csv.json.
-
-
-def convert_old_session(path: Path, folder: Path) -> str:
-    """Convert a session of an earlier version to a folder; return what became of it.
-
-    Args:
-        path: x.csv, with x.csv.json beside it.
-        folder: to be made.
-
-    Raises:
-        InputError: not such a session, or the folder exists or cannot be written.
-    """
-    if folder.exists():
-        raise InputError(f"{folder} exists: give another out=")
-    try:
-        metadata = parse_json(read_file(path.with_name(path.name + ".json")))
-        lines = read_file(path).decode("ascii", "replace").split("\n")[1:-1]
-        if metadata.pop("sum") != json_sum(metadata) or metadata["format"] != 2:
-            raise ValueError("checksum or format beside it are others")
-        with TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent) as parent:
-            log = SessionLog(Path(parent) / folder.name, metadata | {"format": FORMAT})
-            begun = _copy_lines(lines, log)
-            log.write()
-            (Path(parent) / folder.name).rename(folder)
-    except (OSError, *BAD) as error:
-        raise InputError(f"cannot convert {path}, as of an earlier version: {error}") from error
-    left = ", ".join(map(str, sorted(begun - log.done)))
-    without = f", without {left}, which are incomplete or damaged" if left else ""
-    return f"{folder}: {len(log.done)} gestures{without}"
-
-
-def _copy_lines(lines: Iterable[str], log: SessionLog) -> set[int]:
-    """Copy frames and intact gestures; return the numbers of all gestures, complete or not."""
-    metadata, begun, conversions = log.metadata, set[int](), dict[str, UnitConversion]()
-    window = Window(metadata["window"], metadata["rate"], len(metadata["positions"]))
-    channels, marks = np.arange(window.sensors), {"invalid": [-1], "saturated": [-1]}
-    taken: Taken | None = None  # the gesture that is going on
-    after: After = ""
-    segment, lost, last, sums = 0, 0, 0.0, ""
-    for line in lines:
-        content = _parse_line(line, window.sensors)
-        match content["event"]:
-            case "frame":
-                t, invalid, saturated = content["time"], *(np.isin(channels, marks[name]) for name in marks)
-                segment, last = segment + int(t < last), t  # of which one is damaged
-                frame = Frame(content["number"], t, t, content["values"], ~invalid, segment, lost, after)
-                polarity = None if taken is None else np.where(taken[1].scale < 0, -1.0, 1.0)
-                frame = frame._replace(saturated=saturated, polarity=polarity)
-                lost, after = 0, ""
-                window.add(frame)
-                log.add(frame, t)
-                if taken is not None:
-                    taken[0].frames.append(frame)
-                    sums += _line_sum(line)
-            case "meaning":
-                conversions[content["sum"]] = decode_conversion(content, window.sensors)
-                segment += 1
-            case "begin":
-                marks, sums, number = {name: content[name] for name in marks}, "", content["number"]
-                begun.add(number)
-                gesture = RecordedGesture(number, content["labels"], content["time"], 0)
-                taken = (
-                    (gesture, conversions[content["meaning"]]) if content["meaning"] in conversions else None
-                )
-                if contacts := content.get("contacts"):
-                    gesture.contacts = np.full((window.frames, contacts["most"], 5), nan)
-                    for row, position, *values in contacts["rows"]:
-                        gesture.contacts[row, position] = values
-            case "end":
-                complete = taken and (taken[0].number, sums) == (content["number"], content["frames"])
-                if taken and complete and taken[0].number not in log.done:
-                    taken[0].lost, taken[0].resampled = content["lost"], window.since(taken[0].begin)
-                    log.write(taken)
-                taken = None
-            case "broken" | "damaged":
-                lost, taken = lost + int(content["event"] == "damaged"), None
-            case "gap":
-                after, lost = content["after"], lost + content["lost"]
-                segment += int(after != "gap")
-            case mark:
-                marks[mark] = content["channels"]
-    return begun
-
-
-def _parse_line(line: str, sensors: int) -> dict[str, Any]:
-    """Return an event, or a frame as one; a damaged line is the event ``damaged``."""
-    with suppress(*BAD):
-        if not line.startswith("#"):
-            t, number, *texts = line.split(",")
-            values = np.array(texts, dtype=float)
-            if len(values) == sensors and np.isfinite([float(t), *values]).all():
-                seq = int(number) if number else None
-                return {"event": "frame", "time": float(t), "number": seq, "values": values}
-        elif line[-10:-2] == _line_sum(line[: -len(_SUM) - 10] + "}"):
-            return dict(parse_json(line[1:]))
-    return {"event": "damaged"}
-
-
-def _line_sum(text: str) -> str:
-    return f"{zlib.crc32(text.encode()):08x}"

@@ -10,11 +10,10 @@ import platform
 import re
 import socket
 import subprocess
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from functools import cache
-from inspect import signature
 from math import isnan
 from pathlib import Path
 from typing import Any, cast
@@ -31,7 +30,7 @@ from omegaconf.errors import OmegaConfBaseException
 from skin import __version__
 from skin.core.files import BUNDLED, CONF, MANIFEST, ROOT, candidates
 from skin.core.messages import one_line
-from skin.core.settings import check_settings, import_target, option_name, walk_settings
+from skin.core.settings import import_target, option_name, walk_settings
 from skin.errors import InputError
 from skin.evaluation.settings import Evaluation
 
@@ -168,7 +167,7 @@ class Config:
     """A checked configuration of a skin or a training, in plain containers.
 
     What it does not set is None, a group that it lacks empty. Groups without a type here are checked by their
-    class. What a command adds is an annotated parameter of its function (:func:`verb_settings`).
+    class. What a command adds is an annotated parameter of its function.
     """
 
     row: str | None = None
@@ -269,9 +268,9 @@ def validate_config(config: Any) -> Config:
     """
     try:
         # Before a learner gets the settings of its optimizer, which have names of their own.
-        _check_numbers(OmegaConf.to_container(config) if isinstance(config, DictConfig) else config)
+        check_numbers(OmegaConf.to_container(config) if isinstance(config, DictConfig) else config)
         if isinstance(config, DictConfig):
-            plain = _resolved(config)
+            plain = plain_settings(config)
             config = {name: plain[name] for name in Config.__annotations__ if name in plain}
         return cast(Config, OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(Config), config)))
     except OmegaConfBaseException as error:
@@ -289,13 +288,13 @@ def refuse_unknown(config: DictConfig, own: Sequence[str] = ()) -> None:
         raise InputError(f"there is no setting {', '.join(map(str, unknown))}: --help lists them")
 
 
-def _resolved(config: DictConfig) -> dict[str, Any]:
+def plain_settings(config: DictConfig) -> dict[str, Any]:
     """Return a composed configuration in plain containers, without Hydra's own settings."""
     own = OmegaConf.masked_copy(config, [str(name) for name in config if name != "hydra"])
     return OmegaConf.to_container(own, resolve=True)  # type: ignore[return-value]
 
 
-def _check_numbers(settings: Any) -> None:
+def check_numbers(settings: Any) -> None:
     """Raise InputError for numbers that no setting takes."""
     # NaN would pass most comparisons, and numbers of more than 64 bits overflow in arrays.
     for path, value in walk_settings(settings):
@@ -305,35 +304,6 @@ def _check_numbers(settings: Any) -> None:
         counted = path in (("seconds",), ("gestures",), ("n",))  # settings of commands
         if counted and isinstance(value, int | float) and value < 0:
             raise InputError(f"{path[0]}={value:g} is below 0: give a number above 0")
-
-
-def verb_settings(config: DictConfig, verb: Callable[..., Any]) -> dict[str, Any]:
-    """Return the settings of a verb alone, by the names of its parameters after the first.
-
-    Args:
-        config: as Hydra composes it.
-        verb: its function; ``from_`` is the setting ``from``, which is a keyword of Python.
-
-    Raises:
-        InputError: a value does not fit the annotation of its parameter, a group is null, or a setting is
-            unknown.
-    """
-    hints = {name: str(hint) for name, hint in (Config.__annotations__ | verb.__annotations__).items()}
-    for name in sorted(name for name, hint in hints.items() if "dict" in hint or "skin." in hint):
-        if name in config and config[name] is None:
-            raise InputError(
-                f"{name}=null leaves nothing to use: give settings or an option, or leave it out"
-            )
-    names = [*signature(verb).parameters][1:]
-    refuse_unknown(config, [name.removesuffix("_") for name in names])
-    try:
-        plain = _resolved(config)
-    except OmegaConfBaseException as error:
-        raise InputError(one_line(error)) from error
-    settings = {name: plain[name.removesuffix("_")] for name in names}
-    _check_numbers({name.removesuffix("_"): value for name, value in settings.items()})
-    check_settings(verb, settings, "")
-    return settings
 
 
 def settings_of(config: Config) -> dict[str, Any]:

@@ -29,7 +29,7 @@ from omegaconf.errors import OmegaConfBaseException
 from skin import __version__
 from skin.core.files import candidates, unwritable
 from skin.core.messages import one_line
-from skin.core.safe_loading import TEXT, file_sha256, load_yaml, parse_json, read_file, regular
+from skin.core.safe_loading import TEXT, load_yaml, parse_json, read_file, regular, sha256
 from skin.core.settings import check_targets, configured
 from skin.errors import InputError
 from skin.evaluation.operating_point import LABEL, OperatingPoint, parse_operating_point
@@ -290,7 +290,7 @@ def checksums(folder: Path, learned: str) -> str:
         learned: name of the file of weights.
     """
     return "".join(
-        f"{file_sha256(folder / name)}  {name}\n" for name in sorted((RECORD, CONFIG, CARD, learned))
+        f"{sha256(read_file(folder / name))}  {name}\n" for name in sorted((RECORD, CONFIG, CARD, learned))
     )
 
 

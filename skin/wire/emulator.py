@@ -19,8 +19,8 @@ from annotated_types import Ge, Le
 from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat
 
 from skin.core.rng import Stream, generator
-from skin.device.base import AbstractSimulated
 from skin.device.resampling import Check
+from skin.device.simulated import Simulated
 from skin.errors import InputError
 from skin.wire.protocol import (
     EMULATED,
@@ -79,7 +79,7 @@ class Converter:
         return np.clip(np.round(middle + newtons / self.scale), 0, 2**self.bits - 1).astype(np.float64)
 
 
-def emulated_gestures(device: AbstractSimulated, seed: int = 0) -> Iterator[Gesture]:
+def emulated_gestures(device: Simulated, seed: int = 0) -> Iterator[Gesture]:
     """Yield touches that are not used for training, balanced in batches of 16."""
     with ThreadPoolExecutor(1, "skin-gestures") as ahead:
         # Drawn while the previous ones are sent, so that there is no pause.
@@ -90,18 +90,18 @@ def emulated_gestures(device: AbstractSimulated, seed: int = 0) -> Iterator[Gest
             yield from ready
 
 
-def gestures_with_labels(device: AbstractSimulated, labels: np.ndarray, seed: int = 0) -> list[Gesture]:
+def gestures_with_labels(device: Simulated, labels: np.ndarray, seed: int = 0) -> list[Gesture]:
     """Return one gesture for each row of labels (B, 4), 0 or 1, in the order of ``TOUCH``."""
     return _draw_gestures(device, labels, generator(Stream.TEST, 5, seed))
 
 
-def _batch(device: AbstractSimulated, seed: int, number: int) -> list[Gesture]:
+def _batch(device: Simulated, seed: int, number: int) -> list[Gesture]:
     draw = generator(Stream.TEST, 2, seed, number)
     return _draw_gestures(device, device.sampler.balanced(16, draw), draw)  # every combination of labels
 
 
 @torch.no_grad()
-def _draw_gestures(device: AbstractSimulated, labels: np.ndarray, draw: np.random.Generator) -> list[Gesture]:
+def _draw_gestures(device: Simulated, labels: np.ndarray, draw: np.random.Generator) -> list[Gesture]:
     movie = device.sampler.sample(len(labels), draw, labels)
     readings = device.model.respond(movie, displacement=False).readings.double().numpy()
     names, rows, force = device.task.names, movie.labels.int().tolist(), movie.force.double().numpy()
@@ -396,7 +396,7 @@ class Emulator:
 
     def __init__(
         self,
-        device: AbstractSimulated,
+        device: Simulated,
         port: AbstractPort,
         settings: EmulatorSettings,
         faults: Faults,

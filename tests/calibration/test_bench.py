@@ -97,13 +97,6 @@ def test_a_log_of_a_microcontroller_is_a_session(tmp_path):
     assert found.gauge is None
 
 
-def test_a_session_of_an_earlier_version_is_refused(tmp_path):
-    (tmp_path / "s.csv").write_text("time,seq,raw_00\n0,0,5\n")
-    (tmp_path / "s.csv.json").write_text('{"format": 2, "started_unix": 1}')
-    with pytest.raises(InputError, match=r"of an earlier version: skin convert from=\S+s\.csv out=FOLDER"):
-        bench.read_bench_session(tmp_path / "s.csv", "disc", 0.01)
-
-
 @pytest.mark.parametrize(
     ("text", "reason"),
     [

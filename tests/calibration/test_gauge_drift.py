@@ -7,7 +7,7 @@ import pytest
 
 from skin.calibration.bench import BenchData
 from skin.calibration.bench_protocol import emulate_session
-from skin.calibration.gauge_drift import check_gauge
+from skin.calibration.fit import check_gauge
 from skin.errors import InputError
 from tests.calibration.test_fit import PROTOCOL, SLOW, device, session_of
 

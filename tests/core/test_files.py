@@ -11,7 +11,6 @@ import torch
 
 from skin.calibration.bench import BenchSession
 from skin.calibration.bench import write_bench_session as write_session
-from skin.core import array_cache
 from skin.core.files import json_line, json_text, write
 from skin.core.messages import to_input_error
 from skin.device import calibration
@@ -19,6 +18,7 @@ from skin.device.files import write_recording as write_recording
 from skin.device.touches import Recording
 from skin.errors import InputError
 from skin.evaluation.report import write_probabilities
+from skin.mechanics import array_cache
 from skin.plot import animation, figures
 from skin.plot.animation import simulate_scene
 from skin.runs.configuration import Tracking

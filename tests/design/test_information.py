@@ -7,7 +7,7 @@ from scipy.stats import chi2
 
 from skin.body.base import Sheet
 from skin.body.layout import Grid
-from skin.design.precision import Sensitivity, local_covariance, sensitivity
+from skin.design.expected import Sensitivity, local_covariance, sensitivity
 from skin.inference.noise import Noise
 from skin.mechanics.geometry import Fingertip
 from skin.mechanics.simulator.fem import PlatesAndBeams

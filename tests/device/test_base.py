@@ -12,7 +12,7 @@ from skin.device.files import write_recording
 from skin.device.simulated import Simulated
 from skin.errors import InputError
 from skin.evaluation.alarm import threshold_gestures
-from skin.evaluation.margins import measure_margins
+from skin.evaluation.metrics import measure_margins
 from skin.evaluation.operating_point import OperatingPoint
 from skin.evaluation.report import touch_sets
 from skin.evaluation.settings import Evaluation

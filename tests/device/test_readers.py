@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import torch
 
-from skin.core.files import ROOT, json_line
+from skin.core.files import ROOT
 from skin.device.conversion import build_recording, convert_files, read_by_function
-from skin.device.files import describe_recording, read_recording, write_recording
+from skin.device.files import read_recording, write_recording
 from skin.device.formats import read_format
-from skin.device.readers import GESTURES, VARIANTS, cost, eflesh, epi, table
+from skin.device.readers import GESTURES, VARIANTS, cost, eflesh, epi
 from skin.errors import InputError
 
 REAL = ROOT.parent / "shared" / "real"
@@ -175,24 +175,6 @@ def test_eflesh_places_begin_at_zero(tmp_path):
     next(tmp_path.glob("*/states.csv")).write_text("1,2,3,4\n")
     with pytest.raises(InputError, match=r"states\.csv needs as many rows"):
         eflesh(tmp_path)
-
-
-def test_a_table_of_an_earlier_version_is_converted(tmp_path):
-    recording = build_recording(np.ones((2, 3, 4), np.float32), 10.0, labels={"press": [1, None]})
-    path = write_recording(recording, tmp_path / "x.csv")
-    with pytest.raises(InputError, match=r"give \S+x.parquet; .* reader=skin.device.readers.table"):
-        read_recording(path)
-    with pytest.raises(InputError, match=r"x.csv is no recording of an earlier version: .*No such file"):
-        table(path)
-    about = describe_recording(recording) | {"sha256": {"table": "0", "description": "1"}}
-    path.with_name("x.csv.json").write_text(json_line(about))
-    read = table(path)
-    assert torch.equal(read.touches.readings, recording.touches.readings)
-    assert read.touches.labels.nan_to_num(-1).tolist() == [[1], [-1]]
-    for wrong in ("[]", "3", "{", json_line(about | {"gestures": 3})):
-        path.with_name("x.csv.json").write_text(wrong)
-        with pytest.raises(InputError, match=r"x.csv"):
-            table(path)
 
 
 @pytest.mark.slow("converts recordings that are large")

@@ -2,7 +2,7 @@
 
 import pytest
 
-from experiments.notice import licence, names, notice
+from docs.notice import licence, names, notice
 from skin.core.files import ROOT
 from skin.errors import InputError
 

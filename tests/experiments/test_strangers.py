@@ -201,13 +201,6 @@ def test_a_recording_makes_no_objects(run, recording, tmp_path, marker):
     assert done.returncode == 0, done.stderr
 
 
-def test_a_sidecar_is_json_alone(run, recording, tmp_path, marker):
-    (tmp_path / "x.csv").write_bytes((recording / "x.csv").read_bytes())
-    (tmp_path / "x.csv.json").write_bytes(pickle.dumps(Payload(marker), 0))
-    table = ["reader=skin.device.readers.table", "path=x.csv", "out=y.parquet"]
-    refused(run(tmp_path, "convert", *table, store=False), marker, "x.csv")
-
-
 def test_a_cache_is_built_anew_where_it_holds_objects(run, tmp_path, marker, monkeypatch):
     monkeypatch.setenv("SKIN_CACHE", str(tmp_path / "cache"))
     command = ["generate.py", "simulator=fem", *SKIN[1:], "n=5", "body.cells=[12,12]", "out=x.csv"]

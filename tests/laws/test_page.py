@@ -14,7 +14,7 @@ from experiments.laws.references import Slab
 from skin.body.base import Sensors
 from skin.body.sheet import Sheet
 from skin.core.files import ROOT
-from skin.mechanics.simulator._hexahedra import Hexahedra
+from skin.mechanics.simulator._mesh import Hexahedra
 
 
 def record(law, statement="Things fall.", source="an apple"):

@@ -1,4 +1,4 @@
-"""Readings from the motion of elements: the force across the footprint of a sensor in any direction."""
+"""Rows over the motion of elements: the force across the footprint of a sensor, and the strain of cells."""
 
 import warnings
 
@@ -7,7 +7,7 @@ import scipy.sparse as sp
 from scipy.sparse.linalg import spsolve
 
 from skin.body.base import Sensors
-from skin.mechanics.simulator._hexahedra import Hexahedra, lagrange
+from skin.mechanics.simulator._mesh import Hexahedra, lagrange
 
 _POINTS = 24  # along each side of a tilted footprint: what it loses is known to 4 %, its reading to 0.1 %
 _NOTHING = 1e-13  # of the largest weight of a node; weights fade by 0.27 from node to node
@@ -91,3 +91,35 @@ def warn_of_cut(sensors: Sensors, extent: tuple[float, float, float]) -> None:
             UserWarning,
             stacklevel=3,
         )
+
+
+def strain_rows(mesh: Hexahedra, top: float, refinement: int) -> list[sp.csr_matrix]:
+    """Return rows (6 cells, 3 N) of the mean strain of each cell in the upper and the lower half of a layer.
+
+    Args:
+        mesh: of the body.
+        top: thickness of the uppermost layer, m; a single row of elements has no halves.
+        refinement: elements along each side of a cell.
+    """
+    x, y, z = ((line[1:] + line[:-1]) / 2 for line in mesh.lines)
+    along = [
+        sp.kron(sp.eye_array(len(line) // refinement), np.full((1, refinement), 1 / refinement))
+        for line in (x, y)
+    ]
+    mean, positions = sp.kron(along[1], along[0]).tocsr(), np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    halves = [half for half in np.array_split(z[z < top], 2) if len(half)]
+    return [
+        sp.vstack(
+            [
+                sum(mean @ part for part in parts) / len(half)
+                for parts in zip(
+                    *(
+                        mesh.strain(np.column_stack([positions, np.full(len(positions), depth)]))
+                        for depth in half
+                    ),
+                    strict=True,
+                )
+            ]
+        ).tocsr()
+        for half in halves
+    ]

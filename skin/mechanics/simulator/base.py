@@ -204,3 +204,37 @@ def flatten(pressure: Tensor, shape: tuple[int, int], dtype: torch.dtype) -> Ten
     if not pressure.is_floating_point():
         raise ValueError(f"pressure must be floating point, in Pa, got {pressure.dtype}")
     return pressure.to(dtype).flatten(-2)
+
+
+# The largest strain of the top layer, which shows whether the linear solution is valid.
+
+
+# Components xx, yy, zz, yz, xz, xy, and how often each stands in the tensor.
+_PAIRS = ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))
+_TIMES = torch.tensor([1.0, 1.0, 1.0, 2.0, 2.0, 2.0])
+_NUMBERS_AT_ONCE = 2**24
+
+
+def largest_strain(cells: Tensor, rows: Tensor) -> Tensor:
+    """Return the largest principal strain by size, (F,), under pressures on the cells (F, cells), Pa.
+
+    Where the strain tensor is largest by its norm; a single component is its own principal strain.
+
+    Args:
+        cells: (F, cells), Pa.
+        rows: (C, places, cells), 1/Pa, with C = 1, or 6 for xx, yy, zz, yz, xz, xy.
+    """
+    components, positions, _ = rows.shape
+    strains = []
+    for part in cells.split(max(1, _NUMBERS_AT_ONCE // (components * positions))):
+        strain = (part @ rows.flatten(0, 1).T).unflatten(-1, (components, positions))
+        if components == 1:
+            strains.append(strain.abs().amax((1, 2)))
+            continue
+        at = (strain.square() * _TIMES[:, None]).sum(1).argmax(1)
+        worst = strain[torch.arange(len(part)), :, at]
+        tensor = worst.new_zeros(len(part), 3, 3)
+        for value, (i, j) in zip(worst.T, _PAIRS, strict=True):
+            tensor[:, i, j] = tensor[:, j, i] = value
+        strains.append(torch.linalg.eigvalsh(tensor).abs().amax(1))
+    return torch.cat(strains)

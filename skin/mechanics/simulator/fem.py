@@ -10,12 +10,11 @@ import torch
 from torch import Tensor
 
 from skin.body.base import AbstractBody, Sensors, require_memory
-from skin.core import array_cache
-from skin.core.array_cache import folder
 from skin.core.settings import checked
 from skin.errors import InputError
-from skin.mechanics.simulator._strain import largest, squeeze
-from skin.mechanics.simulator.base import AbstractSimulator, Response, factorised, flatten
+from skin.mechanics import array_cache
+from skin.mechanics.array_cache import folder
+from skin.mechanics.simulator.base import AbstractSimulator, Response, factorised, flatten, largest_strain
 from skin.mechanics.simulator.plates import Constraint, Structure
 
 # Readings as matrices, solved once and kept on disk: the sheet is linear, so a functional s of its motion is
@@ -204,11 +203,17 @@ class PlatesAndBeams(AbstractSimulator):
     def strain(self, loads: Tensor, shear: Tensor | None = None) -> Tensor:
         """Return the largest compressive strain of the top layer, (U,)."""
         cells = flatten(loads, self.shape, self.transfer.dtype)
-        return largest(cells, self._squeeze.to(cells.device))
+        return largest_strain(cells, self._squeeze.to(cells.device))
 
     @cached_property
     def _squeeze(self) -> Tensor:
-        return torch.from_numpy(squeeze(self._structure)[None]).float()
+        """The compressive strain of the top layer, (1, nodes, cells), 1/Pa."""
+        structure = self._structure
+        moved = factorised(structure.stiffness()).solve(structure.load().toarray())
+        layers, rows, columns = structure.grid
+        down = -moved.reshape(layers, rows * columns, len(structure.free), -1)[:, :, structure.free.index(2)]
+        below = down[-2] if layers > 1 else 0.0
+        return torch.from_numpy((down[-1] - below) / structure.body.layers[-1].thickness)[None].float()
 
     def motion(self, pressure: Tensor, shear: Tensor | None = None) -> Tensor:
         """Return the displacement of each sensor along x, along y and into the skin, (..., S, 3), m.

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from skin.body.base import Sensors, Sheet
-from skin.core.array_cache import folder as cache_folder
+from skin.mechanics.array_cache import folder as cache_folder
 from skin.mechanics.simulator import fem as _operator
 from skin.mechanics.simulator.fem import build, cached
 from skin.mechanics.simulator.plates import Structure

@@ -8,11 +8,9 @@ from scipy.sparse.linalg import spsolve
 
 from skin.body.base import Arm, Sensors, Sheet
 from skin.errors import InputError
-from skin.mechanics.simulator._cholesky import Cholesky
-from skin.mechanics.simulator._hexahedra import Hexahedra
-from skin.mechanics.simulator._mesh import build_mesh
+from skin.mechanics.simulator._mesh import Hexahedra, build_mesh
 from skin.mechanics.simulator._reading import reading_rows
-from skin.mechanics.simulator.solid import Elastic, Solid
+from skin.mechanics.simulator.solid import Cholesky, Elastic, Solid
 from skin.touch import splines
 
 LAYERS = [

@@ -21,8 +21,7 @@ from skfem import (
 from skfem.helpers import ddot, div, sym_grad
 
 from skin.body.base import Sheet
-from skin.mechanics.simulator._hexahedra import Hexahedra
-from skin.mechanics.simulator._mesh import build_mesh
+from skin.mechanics.simulator._mesh import Hexahedra, build_mesh
 from skin.mechanics.simulator.solid import Elastic
 
 LAYERS = [

@@ -1,6 +1,6 @@
 """Write NOTICE: the licences of the dependencies, of the data and of the weights.
 
-python -m experiments.notice
+python -m docs.notice
 """
 
 import re
@@ -61,7 +61,7 @@ def licence(name: str) -> str:
     statements = (read.get(name, ""), expression, short, ", ".join(classes), text)
     known = [each.splitlines()[0] for each in statements if each not in ("", "UNKNOWN")]
     if not known:
-        raise InputError(f"{name} states no licence: read it, and add it to experiments/notice.py")
+        raise InputError(f"{name} states no licence: read it, and add it to docs/notice.py")
     return known[0]
 
 

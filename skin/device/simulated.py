@@ -111,6 +111,7 @@ def describe(
         "shapes": list(device.sampler.shapes.names),
         "summary": summarise(only_touches(recording), device.body),
         "versions": _VERSIONS,
+        **({"limits": str(limits)} if (limits := device.sampler.settings.limits) else {}),
     }
 
 

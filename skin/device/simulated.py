@@ -109,6 +109,7 @@ def describe(device: "Simulated", recording: Recording, split: Split | None, epo
         "shapes": list(device.sampler.shapes.names),
         "summary": summarise(only_touches(recording), device.body),
         "versions": _VERSIONS,
+        **({"limits": str(limits)} if (limits := device.sampler.settings.limits) else {}),
     }
 
 

@@ -101,6 +101,8 @@ def test_presses_at_the_limit_follow_it():
         for touch in ({"limits": {"force": FORCE}}, {})
     )
     area = 0.03 * 0.16**2  # of a press
+    assert "force=65.0" in limited.recording(None).metadata["limits"]
+    assert "limits" not in plain.recording(None).metadata
     ratio = limited.press_readings() / plain.press_readings()
     assert ratio.diagonal().numpy() == pytest.approx(65 / area / 90.5e3, rel=1e-4)
 

@@ -4,7 +4,6 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -16,9 +15,6 @@ from skin.evaluation.operating_point import LABEL, OperatingPoint, Predictor, Re
 from skin.learning.features import above_idle
 from skin.touch.labels import PLACE, TOUCH, Task, Thresholds, target_unit
 from skin.touch.movie import Measures
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 OUTCOMES = "outcomes.npy"
 """Name of the file of a run that holds the outcomes of its test gestures."""
@@ -383,42 +379,3 @@ def _split_ranges(edges: Sequence[float], values: Tensor) -> Iterator[tuple[floa
         inside = (values <= high) & ((values > low) | (low == 0))
         if inside.any():
             yield low, high, inside
-
-
-def margins_frame(report: MarginReport) -> "pd.DataFrame":
-    """Return touches by their measure over its threshold, and by the highest reading.
-
-    Columns: label, by, low, high, touches, said, wrong; ``mean`` of the measure, and ``lower`` and ``upper``
-    end of the interval of said over touches. Limits are texts.
-    """
-    import pandas as pd  # not needed by skin live
-
-    rows = [
-        {"label": name, "by": "threshold", "low": str(span.low), "high": str(span.high),
-         "touches": span.count, "said": str(span.said), "wrong": span.wrong, "mean": span.mean,
-         "lower": span.range[0], "upper": span.range[1]}
-        for name, spans in report.spans.items()
-        for span in spans
-    ]  # fmt: skip
-    rows += [
-        {"label": name, "by": "reading", "low": str(group.low), "high": str(group.high),
-         "touches": group.count, "said": "", "wrong": group.wrong[name]}
-        for name in TOUCH.names
-        for group in report.faint
-    ]  # fmt: skip
-    frame = pd.DataFrame(rows)
-    low, high = frame.low.astype(float), frame.high.astype(float)
-    spans = frame.by == "threshold"
-    close = frame[spans & (low >= 0.9) & (high <= 1.1)].groupby("label").wrong.sum()
-    weak = frame[~spans & (high <= 1.0)].groupby("label").wrong.sum()  # N
-    wrong = frame[spans].groupby("label").wrong.sum()
-    clear = frame[spans & (frame.label == ALARM_NAME) & (low >= 1.1)]
-    about = (
-        f"within 10 % of their thresholds lie {close.get('big', 0)} of {wrong.big} errors of big and "
-        f"{close.get('dangerous', 0)} of {wrong.dangerous} of dangerous; no reading passes 1 N in "
-        f"{weak.get('dynamic', 0)} of {wrong.dynamic} errors of dynamic; {clear.wrong.sum()} of "
-        f"{clear.touches.sum()} touches more than 10 % above the threshold of dangerous raise "
-        f"no alarm; {report.point.sentence()}; {report.reached.sentence()}"
-    )
-    frame.attrs |= {"metrics": report.metrics, "about": about}
-    return frame

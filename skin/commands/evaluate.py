@@ -45,9 +45,9 @@ def main(config: Config, run: str, out: str | None) -> None:
         steps.start()
         steps.begin("evaluating them")
         title = f"{finished.title} ({finished.identity})"
-        identity = {"evaluated": finished.identity, "overrides": " ".join(changes)}
+        tags = {"evaluated": finished.identity, "overrides": " ".join(changes)}
         store = Store.open(configured.tracking)
-        with store.run(f"evaluation of {finished.title}", identity, finished.identity) as evaluation:
+        with store.run(f"evaluation of {finished.title}", tags, finished.identity) as evaluation:
             # Evaluations do not overwrite each other's files.
             path = results(out) / f"evaluation_{option_name(device)}_{evaluation.info.run_id[:8]}.md"
             if touches.labels is None:
@@ -58,8 +58,7 @@ def main(config: Config, run: str, out: str | None) -> None:
                 report = evaluate(learner, device, settings, point)
                 log_report(store, evaluation, report, device.task, {})
                 words = f"`{' '.join(changes)}`" if changes else "the settings of the run"
-                count = len(report.predictions)
-                description = f"Run {title}, evaluated with {words}, {count} gestures."
+                description = f"Run {title}, evaluated with {words}, {len(report.predictions)} gestures."
                 written = publish_evaluation(path, report, device.task, finished.title, description)
                 print_report(report, title)
             for file in written:

@@ -25,7 +25,7 @@ from rich.console import Console
 from torch import Tensor
 
 from skin.core.messages import PARENT, quiet
-from skin.device.balance import report_balance
+from skin.device.simulated import report_balance
 from skin.errors import InputError
 from skin.evaluation.alarm import AlarmSource, choose_alarm_threshold, threshold_device
 from skin.evaluation.metrics import OUTCOMES, compute_metrics

@@ -103,7 +103,7 @@ class AbstractSampler(ABC):
     Attributes:
         chosen: the labels that touches can be drawn for, names of ``TOUCH``; the others follow.
         labels: all labels by name: those of ``TOUCH``, then labels of one's own.
-        leak: see :func:`skin.device.balance.check_label_leakage`.
+        leak: see :func:`skin.device.simulated.check_label_leakage`.
 
     Raises:
         InputError: settings or pictures that cannot be used.

@@ -1,8 +1,6 @@
 """Short for `skin evaluate`."""
 
-import sys
-
 from skin.__main__ import main
 
 if __name__ == "__main__":
-    main(["evaluate", *sys.argv[1:]])
+    main(before=["evaluate"])

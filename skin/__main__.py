@@ -24,16 +24,17 @@ def verbs() -> dict[str, str]:
     return {name: f"skin.commands.{name}" for name in names} | dict(sorted(others.items()))
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
+def main(arguments: Sequence[str] | None = None, before: Sequence[str] = ()) -> None:
     """Run a verb.
 
     Args:
         arguments: the verb and what follows it; None: those of the command line.
+        before: what stands before those of the command line, such as the verb of a program.
 
     Raises:
         SystemExit: with code 2 for bad input.
     """
-    verb, *overrides = (sys.argv[1:] if arguments is None else list(arguments)) or ["--help"]
+    verb, *overrides = ([*before, *sys.argv[1:]] if arguments is None else list(arguments)) or ["--help"]
     modules = verbs()
     if verb in ("-sc", "--shell-completion"):
         _complete(" ".join(overrides), modules)

@@ -86,7 +86,7 @@ def test_a_mistyped_verb_is_told_the_right_one(verb, words, capsys):
 
 @pytest.mark.parametrize("name", SCRIPTS)
 def test_a_script_is_short_for_its_verb(run, tmp_path, name):
-    assert f'main(["{name}", *sys.argv[1:]])' in (ROOT / "experiments" / f"{name}.py").read_text()
+    assert f'main(before=["{name}"])' in (ROOT / "experiments" / f"{name}.py").read_text()
     done = run(tmp_path, f"{name}.py", "typo=1", store=False)
     assert done.returncode == 2
     assert "typo" in done.stderr

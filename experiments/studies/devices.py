@@ -18,8 +18,7 @@ from scipy.stats import binomtest
 from experiments.studies.measures import Subject
 from experiments.studies.pages import Page
 from skin.calibration.bench import BenchSession
-from skin.calibration.bench_protocol import Protocol
-from skin.calibration.known_loads import KnownLoad, emulate_placements, fit_known_load
+from skin.calibration.known_loads import KnownLoad, Protocol, emulate_placements, fit_known_load
 from skin.core.rng import Stream, generator
 from skin.device.resampling import Frame
 from skin.device.simulated import Simulated

@@ -28,9 +28,8 @@ from experiments.studies.comparison import combine_verdicts, compare_samples, ju
 from experiments.studies.measures import Subject
 from experiments.studies.pages import Page, figure_text
 from experiments.studies.study import Statement
-from skin.device.balance import report_balance
 from skin.device.base import AbstractDevice
-from skin.device.simulated import Simulated
+from skin.device.simulated import Simulated, report_balance
 from skin.device.touches import Touches
 from skin.errors import InputError
 from skin.evaluation.report import scattered_devices

@@ -29,10 +29,11 @@ from skin.device.simulated import Simulated
 from skin.device.touches import Recording
 from skin.errors import InputError
 from skin.evaluation.alarm import choose_alarm_threshold
-from skin.evaluation.metrics import ALARM_NAME, compute_metrics, encode, margins_frame, measure_margins
+from skin.evaluation.margins import ALARM_NAME, MarginReport, measure_margins
+from skin.evaluation.metrics import compute_metrics, encode
 from skin.evaluation.operating_point import OperatingPoint
 from skin.evaluation.settings import StreamSettings, check_evaluation
-from skin.evaluation.streams import evaluate_windows, streams_frame
+from skin.evaluation.streams import WindowReport, evaluate_windows
 from skin.learning.graph import neighbours
 from skin.learning.learner import AbstractLearner
 from skin.runs.build import TorchModel, alarm_source, build_device, load_run
@@ -158,6 +159,43 @@ class Margins:
         return Page(frame.attrs["about"], tables, data, draw_panels(title, panels))
 
 
+def margins_frame(report: MarginReport) -> pd.DataFrame:
+    """Return touches by their measure over its threshold, and by the highest reading.
+
+    Columns: label, by, low, high, touches, said, wrong; ``mean`` of the measure, and ``lower`` and ``upper``
+    end of the interval of said over touches. Limits are texts.
+    """
+    rows = [
+        {"label": name, "by": "threshold", "low": str(span.low), "high": str(span.high),
+         "touches": span.count, "said": str(span.said), "wrong": span.wrong, "mean": span.mean,
+         "lower": span.range[0], "upper": span.range[1]}
+        for name, spans in report.spans.items()
+        for span in spans
+    ]  # fmt: skip
+    rows += [
+        {"label": name, "by": "reading", "low": str(group.low), "high": str(group.high),
+         "touches": group.count, "said": "", "wrong": group.wrong[name]}
+        for name in TOUCH.names
+        for group in report.faint
+    ]  # fmt: skip
+    frame = pd.DataFrame(rows)
+    low, high = frame.low.astype(float), frame.high.astype(float)
+    spans = frame.by == "threshold"
+    close = frame[spans & (low >= 0.9) & (high <= 1.1)].groupby("label").wrong.sum()
+    weak = frame[~spans & (high <= 1.0)].groupby("label").wrong.sum()  # N
+    wrong = frame[spans].groupby("label").wrong.sum()
+    clear = frame[spans & (frame.label == ALARM_NAME) & (low >= 1.1)]
+    about = (
+        f"within 10 % of their thresholds lie {close.get('big', 0)} of {wrong.big} errors of big and "
+        f"{close.get('dangerous', 0)} of {wrong.dangerous} of dangerous; no reading passes 1 N in "
+        f"{weak.get('dynamic', 0)} of {wrong.dynamic} errors of dynamic; {clear.wrong.sum()} of "
+        f"{clear.touches.sum()} touches more than 10 % above the threshold of dangerous raise "
+        f"no alarm; {report.point.sentence()}; {report.reached.sentence()}"
+    )
+    frame.attrs |= {"metrics": report.metrics, "about": about}
+    return frame
+
+
 class Streams(StreamSettings):
     """False alarms per hour of a stream, and accuracy by the fraction of a touch that a window shows."""
 
@@ -177,6 +215,38 @@ class Streams(StreamSettings):
         across, up = "fraction of the touch in the window", "accuracy, %"
         figure = draw_panels(title, [Panel(across, up, lines, ticks=list(accuracy.columns))])
         return Page(frame.attrs["about"], tables, frame, figure)
+
+
+def streams_frame(report: WindowReport) -> pd.DataFrame:
+    """Return every figure of an evaluation on streams, as texts: measure, name, at, value."""
+    rows: list[Sequence[object]] = []
+    for part in report.bins:
+        rows.append(["windows", "", part.name, part.count])
+        rows += (["accuracy", name, part.name, f"{v:.4f}"] for name, v in part.accuracy.items())
+        rows += (["majority", name, part.name, f"{v:.4f}"] for name, v in part.majority.items())
+    cells = ("idle said idle", "idle said touched", "touched said idle", "touched said touched")
+    for gate, counts in report.gates.items():
+        rows += ([cell, gate, "", int(n)] for cell, n in zip(cells, counts.flatten(), strict=True))
+    bins = (report.bins[0], report.bins[-1]) if report.bins else ()
+    parts = [f"accuracy {100 * part.overall:.1f} % at share {part.name}" for part in bins]
+    for gate, alarms in report.alarms.items():
+        rows += ([f"alarms {name}", gate, "", value] for name, value in vars(alarms).items())
+        low, high = alarms.range
+        parts.append(
+            f"gate {gate}: {alarms.per_hour:.1f} ({low:.1f} to {high:.1f}) false alarms per hour without "
+            f"touch, {alarms.found} of {alarms.dangerous} dangerous touches and {alarms.raised} of "
+            f"{alarms.safe} safe ones raised the alarm"
+        )
+    rows += [
+        ["threshold, N", "threshold", "", f"{report.threshold:.4f}"],
+        ["stream, h", "", "", report.hours],
+    ]
+    rows += (["window, s", "overall", f"{window:g}", value] for window, value in report.lengths.items())
+    trained = "windows of streams" if report.streamed else "whole touches"
+    parts.append(f"trained on {trained}; {report.point.sentence()}")
+    frame = pd.DataFrame(rows, columns=["measure", "name", "at", "value"]).map(str)
+    frame.attrs |= {"metrics": report.metrics(), "about": "; ".join(parts)}
+    return frame
 
 
 @dataclass(frozen=True)

@@ -2,10 +2,11 @@
 
     python -m experiments.studies.reproduce
 
-The statements are in conf/study/, and those without a study in conf/statements.yaml.
+The statements are in conf/study/, and those without a study in statements.yaml beside this file.
 """
 
 from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import Any
 
 import pandas as pd
@@ -20,7 +21,7 @@ from skin.core.settings import configured
 _PAGE = ROOT / "docs" / "reproduce.md"
 _HEAD = """# Reproduction of the report's statements
 
-Written by `python -m experiments.studies.reproduce` from the statements in `conf/` and the published results.
+Written by `python -m experiments.studies.reproduce` from the statements of studies and published results.
 
 - `study=…` is short for `skin study study=…`. An empty cell repeats the command above. Finite elements,
   default settings, three or five seeds. In parentheses: report sections.
@@ -33,7 +34,7 @@ Written by `python -m experiments.studies.reproduce` from the statements in `con
 def reproduce_page() -> str:
     """Return the page of the committed files."""
     studies, parts = dict(every_study()), [_HEAD]
-    sections: Any = OmegaConf.to_container(OmegaConf.load(CONF / "statements.yaml"))
+    sections: Any = OmegaConf.to_container(OmegaConf.load(Path(__file__).with_name("statements.yaml")))
     for section in sections:
         parts.append(f"\n## {section['title']}\n\n| statement | command | outcome |\n|---|---|---|\n")
         for name in section["studies"]:

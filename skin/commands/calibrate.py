@@ -42,8 +42,8 @@ def main(
     from rich.console import Console
 
     from skin.calibration import bench, known_loads
-    from skin.calibration.bench_protocol import write_demo_session
     from skin.calibration.fit import fit_presses, print_calibration
+    from skin.calibration.known_loads import write_demo_session
     from skin.calibration.wiring import Confirmed, device_channels, wired_bench
     from skin.device.calibration import write_calibration
     from skin.runs.build import build_device

@@ -1,12 +1,11 @@
-"""Imperfections of a device: settings, and a list of effects; each draws its constants and changes readings.
+"""Imperfections of a device: their settings, the constants of a device, and what it makes of true readings.
 
 The report (2.1.4) clips the force and then adds noise and offset. Hysteresis, a first-order lag, the gain and
 the curve of the sensor come before the clip; drift and rounding after the noise.
 """
 
-from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, fields
 from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
@@ -19,9 +18,6 @@ from skin.core.settings import RISING, checked
 from skin.device.calibration import Calibration, Curves, Table, read_calibration
 from skin.errors import InputError
 from skin.mechanics.relaxation import apply_hysteresis, first_order_lag, quantize
-
-Numbers = Mapping[str, np.ndarray]
-"""Numbers by name, (S,), or (B, 1, S) where every gesture has a device of its own."""
 
 
 class Constants(NamedTuple):
@@ -63,149 +59,28 @@ class Constants(NamedTuple):
         return Constants(*(value.to(device) for value in self))
 
 
-class AbstractEffect(ABC):
-    """One imperfection of the sensors.
+def convert(readings: Tensor, constants: Constants, time: Tensor, noise: Tensor | None) -> Tensor:
+    """Return clipped readings (B, T, S), N, which are overwritten, behind the converter of a device.
 
-    Attributes:
-        constants: names of the settings that are its constants without a draw.
+    It adds noise, a constant offset less the baseline of a tare, and a drift from the first frame of a window
+    or stream, and rounds: it measures before the device subtracts its baseline.
+
+    Args:
+        readings: (B, T, S), N.
+        constants: of the device.
+        time: of every frame, (T,), s.
+        noise: (B, T, S), standard normal; None: it is in the readings already.
     """
-
-    constants: tuple[str, ...] = ()
-
-    def draw(self, values: Numbers, random: Numbers) -> Numbers:
-        """Return the constants of the effect by name, as in :class:`Constants`.
-
-        Args:
-            values: of the settings by name; for a range, the value of the device.
-            random: standard random numbers (:meth:`Imperfection.constants`).
-        """
-        return {name: values[name] for name in self.constants}
-
-    @abstractmethod
-    def apply(self, readings: Tensor, constants: Constants, time: Tensor, noise: Tensor | None) -> Tensor:
-        """Return readings (B, T, S), N, with the effect; those given may be overwritten after the clip.
-
-        Args:
-            readings: (B, T, S), N.
-            constants: of the device.
-            time: of every frame, (T,), s.
-            noise: (B, T, S), standard normal; None: it is in the readings already.
-        """
+    offset = constants.offset - constants.baseline
+    readings = readings.add_(offset if noise is None else noise.mul_(constants.noise) + offset)
+    if constants.drift.any():
+        readings = readings.add_(constants.drift * time[:, None])
+    if constants.quantum.any():
+        readings = quantize(readings + constants.baseline, constants.quantum) - constants.baseline
+    return readings
 
 
-class Hysteresis(AbstractEffect):
-    """A gap between unloading and loading."""
-
-    constants = ("hysteresis",)
-
-    def apply(self, readings: Tensor, constants: Constants, time: Tensor, noise: Tensor | None) -> Tensor:
-        """Return readings with the gap; see :func:`skin.mechanics.relaxation.apply_hysteresis`."""
-        gap = constants.hysteresis
-        return apply_hysteresis(readings, gap) if gap.any() else readings
-
-
-class Lag(AbstractEffect):
-    """A first-order lag behind the force."""
-
-    def draw(self, values: Numbers, random: Numbers) -> Numbers:
-        """Return the time constant; a fraction ``without_lag`` of devices has none."""
-        return {"time_constant": values["time_constant"] * (random["lag"] >= values["without_lag"])}
-
-    def apply(self, readings: Tensor, constants: Constants, time: Tensor, noise: Tensor | None) -> Tensor:
-        """Return readings that lag."""
-        constant = constants.time_constant
-        return first_order_lag(readings, constant, time) if constant.any() else readings
-
-
-class Gain(AbstractEffect):
-    """A factor of each sensor, and one that all sensors of a device share."""
-
-    def draw(self, values: Numbers, random: Numbers) -> Numbers:
-        """Return the product of both factors."""
-        own, common = (np.exp(values[f"{name}_spread"] * random[name]) for name in ("gain", "scale"))
-        return {"gain": own * common}
-
-    def apply(self, readings: Tensor, constants: Constants, time: Tensor, noise: Tensor | None) -> Tensor:
-        """Return readings times the factor."""
-        return readings * constants.gain
-
-
-@dataclass
-class SensorCurve(AbstractEffect):
-    """The curve of the sensors: a power law, or a table of some of them.
-
-    Attributes:
-        tables: by sensor, from 0.
-        table: of all sensors; None: those of ``tables`` alone.
-    """
-
-    tables: Mapping[int, Table] = field(default_factory=dict)
-    table: Table | None = None
-
-    constants = ("exponent", "exponent_at")
-
-    def curves(self, constants: Constants) -> Curves | None:
-        """Return the curves of a device; None: all are linear."""
-        tables = self.tables
-        if self.table is not None:
-            tables = dict.fromkeys(range(constants.dead.shape[-1]), self.table)
-        linear = not tables and bool((constants.exponent == 1).all())
-        return None if linear else Curves(constants.exponent, constants.exponent_at, tables)
-
-    def apply(self, readings: Tensor, constants: Constants, time: Tensor, noise: Tensor | None) -> Tensor:
-        """Return the values of the curve."""
-        curves = self.curves(constants)
-        return readings if curves is None else curves.bend(readings)
-
-
-class Clip(AbstractEffect):
-    """The largest value of the sensors and of their converter."""
-
-    constants = ("clip",)
-
-    def apply(self, readings: Tensor, constants: Constants, time: Tensor, noise: Tensor | None) -> Tensor:
-        """Return clipped readings, which the further effects may overwrite."""
-        return readings.clamp(-constants.clip, constants.clip)
-
-
-class SensorNoise(AbstractEffect):
-    """Noise in every frame, and a constant offset less the baseline of a tare."""
-
-    def draw(self, values: Numbers, random: Numbers) -> Numbers:
-        """Return standard deviation and offset."""
-        return {"noise": values["noise"], "offset": values["offset"] * random["offset"]}
-
-    def apply(self, readings: Tensor, constants: Constants, time: Tensor, noise: Tensor | None) -> Tensor:
-        """Return readings with noise and offset."""
-        offset = constants.offset - constants.baseline
-        return readings.add_(offset if noise is None else noise.mul_(constants.noise) + offset)
-
-
-class Drift(AbstractEffect):
-    """A drift of each sensor from the first frame of a window or stream."""
-
-    def draw(self, values: Numbers, random: Numbers) -> Numbers:
-        """Return the drift per second."""
-        return {"drift": values["drift"] * random["drift"]}
-
-    def apply(self, readings: Tensor, constants: Constants, time: Tensor, noise: Tensor | None) -> Tensor:
-        """Return readings with the drift."""
-        return readings.add_(constants.drift * time[:, None]) if constants.drift.any() else readings
-
-
-class Quantise(AbstractEffect):
-    """The steps of the converter, which measures before the device subtracts its baseline."""
-
-    constants = ("quantum",)
-
-    def apply(self, readings: Tensor, constants: Constants, time: Tensor, noise: Tensor | None) -> Tensor:
-        """Return rounded readings."""
-        if not constants.quantum.any():
-            return readings
-        return quantize(readings + constants.baseline, constants.quantum) - constants.baseline
-
-
-# Settings of all effects, and a device that has them.
+# Settings of all imperfections, and a device that has them.
 
 
 _COMPARED = {
@@ -217,6 +92,8 @@ _COMPARED = {
     "drift": ("drift", " N/s"),
     "hysteresis": ("hysteresis", ""),
 }
+_AS_SET = ("hysteresis", "exponent", "exponent_at", "clip", "noise", "quantum")
+"""Settings that are constants of a device without a draw."""
 _SPREADS = ("gain_spread", "noise", "drift", "hysteresis", "time_constant", "exponent", "scale_spread")
 
 Spread = NonNegativeFloat | Annotated[tuple[NonNegativeFloat, NonNegativeFloat], RISING]
@@ -292,7 +169,7 @@ class ImperfectionSettings:
 @checked("device")
 @dataclass(kw_only=True)
 class Imperfection(ImperfectionSettings):
-    """A device's imperfections: effects, broken sensors and a tare.
+    """A device's imperfections: of sensors and converter, broken sensors and a tare.
 
     The report has gain, clip, noise and offset; the others are additions and off by default.
 
@@ -310,23 +187,13 @@ class Imperfection(ImperfectionSettings):
         """Return 1 or -1 per sensor, (S,): -1 where the values that the device sends fall with force."""
         return np.full(sensors, float(self.polarity)) if self.calibration is None else self.calibration.signs
 
-    @property
-    def analogue(self) -> tuple[AbstractEffect, ...]:
-        """The effects of the sensors, before the converter, in their order."""
-        return Hysteresis(), Lag(), Gain(), self._curve
-
-    @property
-    def converter(self) -> tuple[AbstractEffect, ...]:
-        """The effects of the converter, in their order."""
-        return Clip(), SensorNoise(), Drift(), Quantise()
-
-    @property
-    def _curve(self) -> SensorCurve:
-        return (
-            SensorCurve(table=self.table)
-            if self.calibration is None
-            else SensorCurve(self.calibration.tables)
-        )
+    def curves(self, constants: Constants) -> Curves | None:
+        """Return the curves of a device's sensors; None: all are linear."""
+        tables = {} if self.calibration is None else self.calibration.tables
+        if self.calibration is None and self.table is not None:
+            tables = dict.fromkeys(range(constants.dead.shape[-1]), self.table)
+        linear = not tables and bool((constants.exponent == 1).all())
+        return None if linear else Curves(constants.exponent, constants.exponent_at, tables)
 
     @property
     def dead_range(self) -> tuple[int, int]:
@@ -336,9 +203,8 @@ class Imperfection(ImperfectionSettings):
     @classmethod
     def of(cls, settings: ImperfectionSettings, calibration: str | None) -> "Imperfection":
         """Return imperfections of these settings, and of a file of ``skin calibrate`` where one is given."""
-        return cls(
-            **_settings(settings), calibration=None if calibration is None else read_calibration(calibration)
-        )
+        own = {entry.name: getattr(settings, entry.name) for entry in fields(ImperfectionSettings)}
+        return cls(**own, calibration=None if calibration is None else read_calibration(calibration))
 
     def constants(
         self,
@@ -378,7 +244,7 @@ class Imperfection(ImperfectionSettings):
         return Constants(**tensors | {"dead": tensors["dead"].bool(), "rate": rate})
 
     def _draw(self, shape: tuple[int, ...], generator: np.random.Generator) -> dict[str, np.ndarray]:
-        """Draw random numbers in a fixed order, and from them the constants of the effects.
+        """Draw random numbers in a fixed order, and from them the constants of a device.
 
         A neutral setting draws nothing, so that the constants of other settings stay the same.
         """
@@ -393,21 +259,30 @@ class Imperfection(ImperfectionSettings):
             for name in ("clip", "quantum", "exponent_at", "offset", "without_lag")
         }
         settings |= {name: _interpolate(bounds, fractions[name]) for name, bounds in ranges.items()}
-        random = {name: generator.standard_normal(shape) for name in ("gain", "offset")}
+        gain, offset = (generator.standard_normal(shape) for _ in range(2))
         rank = generator.random(shape).argsort(axis=-1).argsort(axis=-1)
-        random["idle"] = generator.standard_normal(shape)
-        random["drift"] = generator.standard_normal(shape) if settings["drift"].any() else np.zeros(shape)
+        idle = generator.standard_normal(shape)
+        drift = generator.standard_normal(shape) if settings["drift"].any() else np.zeros(shape)
         count = generator.integers(*self.dead_range, each, endpoint=True)
         level = np.where(rank < count, 0.0, self.clip)
         if self.stuck:
             stuck = (rank >= count) & (rank < count + self.stuck)
             level = np.where(stuck, generator.uniform(0, self.clip, shape), level)
-        random["scale"] = generator.standard_normal(each) if settings["scale_spread"].any() else np.zeros(())
-        random["lag"] = generator.random(each) if self.without_lag else np.zeros(())
-        values = {"dead": rank < count + self.stuck + self.saturated, "level": level, "idle": random["idle"]}
-        for effect in (*self.analogue, *self.converter):
-            values |= effect.draw(settings, random)
-        return values
+        scale = generator.standard_normal(each) if settings["scale_spread"].any() else np.zeros(())
+        lag = generator.random(each) if self.without_lag else np.zeros(())
+        own, common = (
+            np.exp(settings[f"{name}_spread"] * each) for name, each in (("gain", gain), ("scale", scale))
+        )
+        return {
+            "dead": rank < count + self.stuck + self.saturated,
+            "level": level,
+            "idle": idle,
+            "time_constant": settings["time_constant"] * (lag >= settings["without_lag"]),
+            "gain": own * common,
+            "offset": settings["offset"] * offset,
+            "drift": settings["drift"] * drift,
+            **{name: settings[name] for name in _AS_SET},
+        }
 
     def _take(self, shape: tuple[int, ...], generator: np.random.Generator) -> dict[str, np.ndarray]:
         """Take the values of the calibration, or, a device per gesture, draw from its ranges."""
@@ -466,25 +341,30 @@ class Imperfection(ImperfectionSettings):
 
     def undo_curve(self, readings: Tensor, constants: Constants) -> Tensor:
         """Return readings (B, T, S), N, without the curves of a calibration, as a live view gives them."""
-        curves = None if self.calibration is None else self._curve.curves(constants)
+        curves = None if self.calibration is None else self.curves(constants)
         return readings if curves is None else curves.straighten(readings)
 
     def is_static(self, constants: Constants) -> bool:
         """Return whether the sensors follow the force at once and in proportion to it."""
         in_time = constants.hysteresis.any() or constants.time_constant.any()
-        return not in_time and self._curve.curves(constants) is None
+        return not in_time and self.curves(constants) is None
 
     def sense(self, force: Tensor, constants: Constants, time: Tensor) -> Tensor:
         """Return the response of the sensors before the converter, (B, T, S), N.
+
+        Hysteresis, a first-order lag, the gain, and the curve, in this order.
 
         Args:
             force: (B, T, S), true readings, N.
             constants: of this device.
             time: of every frame, (T,), s.
         """
-        for effect in self.analogue:
-            force = effect.apply(force, constants, time, None)
-        return force
+        if constants.hysteresis.any():
+            force = apply_hysteresis(force, constants.hysteresis)
+        if constants.time_constant.any():
+            force = first_order_lag(force, constants.time_constant, time)
+        force, curves = force * constants.gain, self.curves(constants)
+        return force if curves is None else curves.bend(force)
 
     def _measure(
         self,
@@ -497,10 +377,9 @@ class Imperfection(ImperfectionSettings):
         if time is None:
             time = torch.arange(readings.shape[1], device=readings.device) / self.slowest
         output = self.sense(readings, constants, time)
+        clipped = output.clamp(-constants.clip, constants.clip)
         saturated = output.abs() > constants.clip
-        for effect in self.converter:
-            output = effect.apply(output, constants, time, noise.to(readings.device))
-        return output, saturated
+        return convert(clipped, constants, time, noise.to(readings.device)), saturated
 
 
 def outside(settings: Mapping[str, Any], ranges: Mapping[str, Any], rounding: float = 1e-6) -> list[str]:
@@ -527,7 +406,3 @@ def _interpolate(spread: Spread, fraction: np.ndarray) -> np.ndarray:
     """Interpolate between the limits of a range by a fraction, 0 to 1; a number is returned as it is."""
     minimum, maximum = spread if isinstance(spread, list | tuple) else (spread, spread)
     return np.asarray(minimum + (maximum - minimum) * fraction)
-
-
-def _settings(settings: ImperfectionSettings) -> dict[str, Any]:
-    return {entry.name: getattr(settings, entry.name) for entry in fields(ImperfectionSettings)}

@@ -9,7 +9,7 @@ from scipy.sparse import csr_array
 from scipy.special import ndtri
 from torch import Tensor
 
-from skin.device.imperfection import Constants, Imperfection
+from skin.device.imperfection import Constants, Imperfection, convert
 from skin.device.resampling import frame_ages, highest_each, resample
 
 _NUMBERS = tuple(np.geomspace(1, 1000, 61).tolist())  # of frames in an interval; between them, 0.001 s.d.
@@ -126,8 +126,7 @@ def _measure_each(
     highest, saturated = _read_each(sensed, fine, constants, ratios, shifts, window, noise)
     output = highest.to(force.device)
     time = ((torch.arange(window) + 0.5) / model_rate).to(output)
-    for effect in imperfection.converter[1:]:  # clipped, with noise
-        output = effect.apply(output, constants, time, None)
+    output = convert(output, constants, time, None)  # it is clipped, with noise
     dead = constants.dead.expand(output.shape)
     output = imperfection.undo_curve(output, constants)
     return output.masked_fill(dead, 0.0), ~dead, saturated.to(force.device) & ~dead

@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from statistics import fmean
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -17,9 +17,6 @@ from skin.evaluation.metrics import compute_metrics, count_confusions
 from skin.evaluation.operating_point import LABEL, OperatingPoint, Predictor
 from skin.evaluation.settings import StreamSettings
 from skin.touch.labels import ALARM, TOUCH_OR_NOT, Task
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 # Contact detection by a threshold (report, section 4.2).
 
@@ -353,37 +350,3 @@ def _measure_length(learner: Predictor, device: Simulated, window: float) -> flo
     except InputError as reason:
         return str(reason)
     return metrics["overall/accuracy"]
-
-
-def streams_frame(report: WindowReport) -> "pd.DataFrame":
-    """Return every figure of an evaluation on streams, as texts: measure, name, at, value."""
-    import pandas as pd  # not needed by skin live
-
-    rows: list[Sequence[object]] = []
-    for part in report.bins:
-        rows.append(["windows", "", part.name, part.count])
-        rows += (["accuracy", name, part.name, f"{v:.4f}"] for name, v in part.accuracy.items())
-        rows += (["majority", name, part.name, f"{v:.4f}"] for name, v in part.majority.items())
-    cells = ("idle said idle", "idle said touched", "touched said idle", "touched said touched")
-    for gate, counts in report.gates.items():
-        rows += ([cell, gate, "", int(n)] for cell, n in zip(cells, counts.flatten(), strict=True))
-    bins = (report.bins[0], report.bins[-1]) if report.bins else ()
-    parts = [f"accuracy {100 * part.overall:.1f} % at share {part.name}" for part in bins]
-    for gate, alarms in report.alarms.items():
-        rows += ([f"alarms {name}", gate, "", value] for name, value in vars(alarms).items())
-        low, high = alarms.range
-        parts.append(
-            f"gate {gate}: {alarms.per_hour:.1f} ({low:.1f} to {high:.1f}) false alarms per hour without "
-            f"touch, {alarms.found} of {alarms.dangerous} dangerous touches and {alarms.raised} of "
-            f"{alarms.safe} safe ones raised the alarm"
-        )
-    rows += [
-        ["threshold, N", "threshold", "", f"{report.threshold:.4f}"],
-        ["stream, h", "", "", report.hours],
-    ]
-    rows += (["window, s", "overall", f"{window:g}", value] for window, value in report.lengths.items())
-    trained = "windows of streams" if report.streamed else "whole touches"
-    parts.append(f"trained on {trained}; {report.point.sentence()}")
-    frame = pd.DataFrame(rows, columns=["measure", "name", "at", "value"]).map(str)
-    frame.attrs |= {"metrics": report.metrics(), "about": "; ".join(parts)}
-    return frame

@@ -13,9 +13,9 @@ from rich.progress import Progress
 
 from skin.body.base import require_memory
 from skin.core.files import MANIFEST
-from skin.device.balance import report_balance, summary_line
 from skin.device.base import AbstractDevice, in_threads
 from skin.device.files import DataSet, Manifest, describe_recording, write_recording
+from skin.device.simulated import report_balance, summary_line
 from skin.device.touches import Part
 from skin.errors import InputError
 from skin.runs.configuration import iterate_leaves, settings_hash, source_tags

@@ -1,4 +1,4 @@
-"""One run: build, train, evaluate, log; and evaluate it again on other touches."""
+"""One run: build, train, evaluate, log."""
 
 import json
 import logging
@@ -6,7 +6,7 @@ import math
 import os
 import shutil
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import replace
 from io import StringIO
@@ -25,24 +25,21 @@ from rich.console import Console
 from torch import Tensor
 
 from skin.core.messages import PARENT, quiet
-from skin.core.progress import Steps
-from skin.core.settings import option_name
-from skin.device.balance import report_balance
+from skin.device.simulated import report_balance
 from skin.errors import InputError
 from skin.evaluation.alarm import AlarmSource, choose_alarm_threshold, threshold_device
 from skin.evaluation.metrics import OUTCOMES, compute_metrics
-from skin.evaluation.report import Report, evaluate, metrics_table, publish_evaluation, write_probabilities
+from skin.evaluation.report import Report, evaluate, metrics_table
 from skin.evaluation.report import print_report as show
 from skin.evaluation.settings import check_evaluation
 from skin.learning.learner import AbstractLearner
 from skin.learning.network import LAST
 from skin.plot.figures import confusions, save_figure
-from skin.runs.build import build_data, build_device, build_learner, device_on_skin, load_model
+from skin.runs.build import build_data, build_device, build_learner, device_on_skin
 from skin.runs.configuration import (
     MACHINE,
     NETWORK,
     Config,
-    Tracking,
     iterate_leaves,
     name_option,
     name_run,
@@ -53,7 +50,7 @@ from skin.runs.configuration import (
     tags,
     unused_groups,
 )
-from skin.runs.run import TAG, find_run
+from skin.runs.run import TAG
 from skin.runs.store import Store, note_reuse
 from skin.touch.labels import Task
 
@@ -267,60 +264,3 @@ def log_report(store: Store, run: Run, report: Report, task: Task, values: dict[
         store.client.log_artifacts(run.info.run_id, folder)
     for column, reason in report.unavailable.items():
         store.client.set_tag(run.info.run_id, f"cannot_{column}", reason)
-
-
-# Evaluate a finished run again.
-
-
-# Expected seconds of each step, for the fraction in the progress.
-_STEPS = {
-    "loading the run and the threshold of its alarm": 20.0,
-    "reading or simulating the touches": 10.0,
-    "evaluating them": 30.0,
-}
-
-
-def evaluate_run(name: str, tracking: Tracking, trust: bool, folder: Path, changes: Sequence[str]) -> None:
-    """Evaluate a finished run on the touches that a command describes; print and log the metrics.
-
-    Args:
-        name, tracking, trust: of the run, as in :func:`skin.runs.run.find_run`.
-        folder: of the page.
-        changes: the overrides of the command line.
-
-    Raises:
-        InputError: the run cannot be loaded, or does not fit the touches.
-    """
-    quiet()
-    with Steps(_STEPS) as steps:
-        run = find_run(tracking, name, trust)
-        config = run.configured(changes)
-        settings, model = check_evaluation(config.evaluation), load_model(run, config)
-        device, learner, point = model.device, model.learner, model.point
-        steps.begin("reading or simulating the touches")
-        if device.real:
-            steps.stop()  # a person may be prompted
-        touches = device.touches("test")  # read before anything is logged, because a port may fail
-        steps.start()
-        steps.begin("evaluating them")
-        title = f"{run.title} ({run.identity})"
-        identity = {"evaluated": run.identity, "overrides": " ".join(changes)}
-        store = Store.open(config.tracking)
-        with store.run(f"evaluation of {run.title}", identity, run.identity) as evaluation:
-            # Evaluations do not overwrite each other's files.
-            path = folder / f"evaluation_{option_name(device)}_{evaluation.info.run_id[:8]}.md"
-            if touches.labels is None:
-                written = [path.with_suffix(".csv")]
-                probabilities = learner.probabilities(touches)
-                print(title, write_probabilities(probabilities, device.task, point, *written), sep="\n")
-            else:
-                report = evaluate(learner, device, settings, point)
-                log_report(store, evaluation, report, device.task, {})
-                words = f"`{' '.join(changes)}`" if changes else "the settings of the run"
-                count = len(report.predictions)
-                description = f"Run {title}, evaluated with {words}, {count} gestures."
-                written = publish_evaluation(path, report, device.task, run.title, description)
-                show(report, title)
-            for file in written:
-                store.client.log_artifact(evaluation.info.run_id, str(file))
-    print(*written, sep="\n")

@@ -104,7 +104,7 @@ class AbstractSampler(ABC):
 
     Attributes:
         labels: all labels by name: those of ``TOUCH``, then labels of one's own.
-        leak: see :func:`skin.device.balance.check_label_leakage`.
+        leak: see :func:`skin.device.simulated.check_label_leakage`.
 
     Raises:
         InputError: settings or pictures that cannot be used.

@@ -1,4 +1,4 @@
-"""Adapters: descriptions of what a board sends (``conf/adapter/``), and the formats that follow from them."""
+"""Adapters: descriptions of what a board sends (``conf/adapters/``), and the formats that follow."""
 
 import re
 from collections import Counter
@@ -45,6 +45,7 @@ from skin.wire.lines import (
 )
 from skin.wire.protocol import INVALID, OVER, SEPARATORS, Line, parse_header, parse_words
 
+_PLAIN = ("protocol", "auto")  # kinds that need no other setting
 _RUN = 12  # frames alike that show a format: that noise rises as often by chance is improbable
 
 
@@ -420,7 +421,7 @@ def read_adapter(described: str | Mapping[str, Any] | Adapter) -> Adapter:
     """Return an adapter.
 
     Args:
-        described: name of one in ``conf/adapter/``, path of a YAML file, or settings.
+        described: ``protocol``, ``auto``, one of ``conf/adapters/``, the path of a YAML file, or settings.
 
     Raises:
         InputError: there is no such adapter, or a setting is wrong.
@@ -428,16 +429,16 @@ def read_adapter(described: str | Mapping[str, Any] | Adapter) -> Adapter:
     if isinstance(described, Adapter):
         return described
     if isinstance(described, str):
-        shipped = {path.stem: path for path in sorted((CONF / "adapter").glob("*.yaml"))}
+        shipped = {path.stem: path for path in sorted((CONF / "adapters").glob("*.yaml"))}
         path = shipped.get(described, Path(described))
         try:
-            described_settings = load_yaml(path)
+            described_settings = {"kind": described} if described in _PLAIN else load_yaml(path)
         except (OSError, ValueError) as error:
             if path.suffix in (".yaml", ".yml"):
                 raise InputError(f"device.adapter={path} cannot be read: {error}") from error
             raise InputError(
-                f"there is no device.adapter={described}: there are {', '.join(shipped)}, or give a file, as "
-                "in device.adapter=board.yaml, which skin listen adapter=auto proposes"
+                f"there is no device.adapter={described}: there are {', '.join((*_PLAIN, *shipped))}, or "
+                "give a file, as in device.adapter=board.yaml, which skin listen adapter=auto proposes"
             ) from error
     else:
         described_settings = described

@@ -44,7 +44,7 @@ class Port:
     Args:
         port: ``/dev/ttyACM0``, ``COM3`` or ``socket://host:number``.
         baudrate: bits per second, for serial ports.
-        adapter: describes what the board sends: an option of ``conf/adapter/``, a YAML file, or the settings
+        adapter: describes what the board sends: an option of ``conf/adapters/``, a YAML file, or the settings
             of :class:`skin.wire.adapter.Adapter`.
         limits: smallest and largest value of a channel, as in
             :class:`skin.wire.channels.ChannelHealth`; None: the largest count, if the header gives

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from skin.calibration.bench import Units, read_bench_session, write_bench_session
-from skin.calibration.bench_protocol import emulate_session
 from skin.calibration.fit import check_force, fit_calibration
+from skin.calibration.known_loads import emulate_session
 from skin.calibration.wiring import Confirmed, wired_bench
 from skin.core.files import CONF
 from skin.core.safe_loading import load_yaml

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from skin.calibration.bench import BenchData, BenchSession
-from skin.calibration.bench_protocol import Protocol
 from skin.calibration.channel import Channel, Loads, fit_channel
 from skin.calibration.fit import evaluate_held_out, fit_calibration, print_calibration
+from skin.calibration.known_loads import Protocol
 from skin.calibration.wiring import find_quantum, measure_rest
 from skin.device.calibration import Calibration, Curves, read_calibration, write_calibration
 from skin.errors import InputError

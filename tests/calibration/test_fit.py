@@ -7,13 +7,13 @@ import torch
 from skin.body.base import Sheet
 from skin.body.layout import Grid
 from skin.calibration.bench import BenchData, Gauge, build_bench_data, per_newton
-from skin.calibration.bench_protocol import Protocol, emulate_session
 from skin.calibration.fit import (
     estimate_force,
     evaluate_held_out,
     fit_calibration,
     print_calibration,
 )
+from skin.calibration.known_loads import Protocol, emulate_session
 from skin.device.calibration import Calibration, write_calibration
 from skin.device.imperfection import Imperfection
 from skin.device.simulated import Simulated

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from skin.calibration.bench import BenchData
-from skin.calibration.bench_protocol import emulate_session
 from skin.calibration.fit import check_gauge
+from skin.calibration.known_loads import emulate_session
 from skin.errors import InputError
 from tests.calibration.test_fit import PROTOCOL, SLOW, device, session_of
 

@@ -5,9 +5,9 @@ import pytest
 import torch
 
 from skin.calibration.bench import BenchSession
-from skin.calibration.bench_protocol import Protocol
 from skin.calibration.known_loads import (
     KnownLoad,
+    Protocol,
     base_readings,
     emulate_placements,
     fit_known_load,

@@ -9,8 +9,8 @@ import pytest
 from skin.body.base import Sheet
 from skin.body.layout import File, Grid
 from skin.calibration.bench import BenchData, BenchSession, Gauge
-from skin.calibration.bench_protocol import Protocol, emulate_session
 from skin.calibration.fit import fit_calibration
+from skin.calibration.known_loads import Protocol, emulate_session
 from skin.calibration.wiring import (
     TURNS,
     Confirmed,

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from skin.device.balance import accuracy_from_shape, balance_text, check_label_leakage, class_balance
+from skin.device.simulated import accuracy_from_shape, balance_text, check_label_leakage, class_balance
 from skin.runs.build import build_device
 
 

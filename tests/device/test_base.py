@@ -6,13 +6,12 @@ import pytest
 import torch
 from hydra import compose, initialize_config_dir
 
-from skin.device.balance import report_balance
 from skin.device.base import AbstractDevice, split_groups
 from skin.device.files import write_recording
-from skin.device.simulated import Simulated
+from skin.device.simulated import Simulated, report_balance
 from skin.errors import InputError
 from skin.evaluation.alarm import threshold_gestures
-from skin.evaluation.metrics import measure_margins
+from skin.evaluation.margins import measure_margins
 from skin.evaluation.operating_point import OperatingPoint
 from skin.evaluation.report import touch_sets
 from skin.evaluation.settings import Evaluation

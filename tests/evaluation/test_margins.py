@@ -6,7 +6,7 @@ import torch
 from skin.device.base import AbstractDevice
 from skin.device.touches import Touches
 from skin.errors import InputError
-from skin.evaluation.metrics import ALARM_NAME, find_spans, measure_margins
+from skin.evaluation.margins import ALARM_NAME, find_spans, measure_margins
 from skin.evaluation.operating_point import OperatingPoint
 from skin.touch.labels import TOUCH
 

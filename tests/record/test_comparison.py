@@ -9,7 +9,7 @@ import pytest
 from skin.body.base import Sheet
 from skin.body.layout import Grid
 from skin.calibration.bench import write_bench_session
-from skin.calibration.bench_protocol import Protocol, emulate_session
+from skin.calibration.known_loads import Protocol, emulate_session
 from skin.core.files import CONF
 from skin.core.safe_loading import load_yaml
 from skin.device.resampling import Frame, Window

@@ -9,7 +9,7 @@ import torch
 
 from skin.body.base import Sheet
 from skin.body.layout import Grid
-from skin.calibration import bench, bench_protocol
+from skin.calibration import bench, known_loads
 from skin.core.files import CONF
 from skin.core.safe_loading import load_yaml
 from skin.device.files import read_recording
@@ -74,9 +74,9 @@ def test_a_gauge_tells_its_contacts():
 
 
 def test_presses_of_a_bench_session_have_them(device, tmp_path):
-    protocol = bench_protocol.Protocol(idle=3.0, rate=50.0, indenter="disc")
+    protocol = known_loads.Protocol(idle=3.0, rate=50.0, indenter="disc")
     gauge = protocol.gauge(np.array([[0.03, 0.03], [0.08, 0.08]]))
-    session = bench_protocol.emulate_session(device, gauge, protocol, np.random.default_rng(0))
+    session = known_loads.emulate_session(device, gauge, protocol, np.random.default_rng(0))
     path = bench.write_bench_session(session, tmp_path / "s.parquet")
     settings = load_yaml(CONF / "compare.yaml")["compare"]
     sides = compare_session(device, str(path), None, settings).touches

@@ -4,10 +4,10 @@ import pandas as pd
 import torch
 from PIL import Image
 
-from experiments.studies.measures import Streams
+from experiments.studies.measures import Streams, streams_frame
 from experiments.studies.pages import publish_page
 from skin.evaluation.operating_point import OperatingPoint
-from skin.evaluation.streams import Alarms, Bin, WindowReport, streams_frame
+from skin.evaluation.streams import Alarms, Bin, WindowReport
 
 NAMES = ("big", "dynamic", "press", "dangerous")
 FOUND = WindowReport(

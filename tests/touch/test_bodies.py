@@ -11,7 +11,7 @@ from sklearn.model_selection import cross_val_predict
 
 from skin.body.layout import Grid
 from skin.body.sheet import Sheet
-from skin.device.balance import accuracy_from_shape, check_label_leakage
+from skin.device.simulated import accuracy_from_shape, check_label_leakage
 from skin.errors import InputError
 from skin.mechanics.contact.prescribed import Prescribed
 from skin.touch.gestures import Fit, GestureSettings, TouchSampler, draw_bodies

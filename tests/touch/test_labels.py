@@ -5,8 +5,7 @@ import torch
 
 from skin.body.layout import Grid
 from skin.body.sheet import Sheet
-from skin.device.balance import class_balance
-from skin.device.simulated import Simulated
+from skin.device.simulated import Simulated, class_balance
 from skin.errors import InputError
 from skin.mechanics.simulator.naive import Naive
 from skin.touch.fingertips import read_touch

@@ -17,7 +17,7 @@ from skin.wire.proposal import propose
 from skin.wire.reader import Port, WireFeed
 
 PATIENT = 60.0  # s: machines are busy at times
-SHIPPED = sorted(path.stem for path in (CONF / "adapter").glob("*.yaml"))
+SHIPPED = sorted(path.stem for path in (CONF / "adapters").glob("*.yaml"))
 quickly = settings(
     max_examples=60, deadline=None, derandomize=True, database=None, suppress_health_check=list(HealthCheck)
 )

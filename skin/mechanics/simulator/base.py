@@ -212,10 +212,9 @@ def flatten(pressure: Tensor, shape: tuple[int, int], dtype: torch.dtype) -> Ten
 # Components xx, yy, zz, yz, xz, xy, and how often each stands in the tensor.
 _PAIRS = ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))
 _TIMES = torch.tensor([1.0, 1.0, 1.0, 2.0, 2.0, 2.0])
-_NUMBERS_AT_ONCE = 2**24
 
 
-def largest_strain(cells: Tensor, rows: Tensor) -> Tensor:
+def largest_strain(cells: Tensor, rows: Tensor, at_once: int = 2**24) -> Tensor:
     """Return the largest principal strain by size, (F,), under pressures on the cells (F, cells), Pa.
 
     Where the strain tensor is largest by its norm; a single component is its own principal strain.
@@ -223,10 +222,11 @@ def largest_strain(cells: Tensor, rows: Tensor) -> Tensor:
     Args:
         cells: (F, cells), Pa.
         rows: (C, places, cells), 1/Pa, with C = 1, or 6 for xx, yy, zz, yz, xz, xy.
+        at_once: numbers that are computed at a time.
     """
     components, positions, _ = rows.shape
     strains = []
-    for part in cells.split(max(1, _NUMBERS_AT_ONCE // (components * positions))):
+    for part in cells.split(max(1, at_once // (components * positions))):
         strain = (part @ rows.flatten(0, 1).T).unflatten(-1, (components, positions))
         if components == 1:
             strains.append(strain.abs().amax((1, 2)))

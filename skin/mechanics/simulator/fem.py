@@ -13,7 +13,6 @@ from skin.body.base import AbstractBody, Sensors, require_memory
 from skin.core.settings import checked
 from skin.errors import InputError
 from skin.mechanics import array_cache
-from skin.mechanics.array_cache import folder
 from skin.mechanics.simulator.base import AbstractSimulator, Response, factorised, flatten, largest_strain
 from skin.mechanics.simulator.plates import Constraint, Structure
 
@@ -94,8 +93,10 @@ def cached(structure: Structure, sensors: Sensors, folder: Path) -> Operator:
     key = array_cache.hashed(content, _SOURCES)
     shape = (len(sensors), body.cells[0] * body.cells[1])
     shapes = {field.name: shape for field in fields(Operator)}
-    path = folder / f"operator-{key}.npz"
-    return Operator(**array_cache.kept(path, key, shapes, lambda: vars(build(structure, sensors))))
+    arrays = array_cache.kept(
+        folder / f"operator-{key}.npz", key, shapes, lambda: vars(build(structure, sensors))
+    )
+    return Operator(**arrays)
 
 
 def _bytes(structure: Structure, sensors: int) -> float:
@@ -167,7 +168,7 @@ class PlatesAndBeams(AbstractSimulator):
         self.reading, self.constraint = reading, constraint
         self.shape = body.shape
         self._structure = Structure(body, constraint)
-        self.operator: Operator = cached(self._structure, sensors, folder(cache))
+        self.operator: Operator = cached(self._structure, sensors, array_cache.folder(cache))
         force = self.operator.applied if reading == "equation10" else self.operator.carried
         rows = np.concatenate([self.operator.sensor, self.operator.surface, force])
         self.register_buffer("transfer", torch.from_numpy(rows.T.copy()).float())

@@ -482,11 +482,6 @@ class BenchData:
         """Frames at the largest force of their press so far, (T,), bool."""
         return (self.applied[0] > 0) & (self.applied[0] >= 0.995 * self.peaks)
 
-    @property
-    def unloading(self) -> np.ndarray:
-        """Frames below the largest force of their press so far, (T,), bool."""
-        return (self.applied[0] > 0) & (self.applied[0] < 0.98 * self.peaks)
-
     @cached_property
     def releases(self) -> list[slice]:
         """Frames from each sudden release to the next press, one slice per such release."""

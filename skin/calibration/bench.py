@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
+import pandas as pd
 import pyarrow as pa
 import pyarrow.csv
 import pyarrow.parquet
@@ -471,11 +472,7 @@ class BenchData:
     def peaks(self) -> np.ndarray:
         """The largest force of the press so far, (T,), N."""
         force, press = self.applied
-        highest = np.zeros(len(force))
-        for number in range(len(self.gauge)):
-            mine = press == number
-            highest[mine] = np.maximum.accumulate(force[mine])
-        return highest
+        return pd.Series(force).groupby(press).cummax().to_numpy()
 
     @property
     def loading(self) -> np.ndarray:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
+import pandas as pd
 import pyarrow as pa
 import pyarrow.csv
 import pyarrow.parquet
@@ -471,21 +472,12 @@ class BenchData:
     def peaks(self) -> np.ndarray:
         """The largest force of the press so far, (T,), N."""
         force, press = self.applied
-        highest = np.zeros(len(force))
-        for number in range(len(self.gauge)):
-            mine = press == number
-            highest[mine] = np.maximum.accumulate(force[mine])
-        return highest
+        return pd.Series(force).groupby(press).cummax().to_numpy()
 
     @property
     def loading(self) -> np.ndarray:
         """Frames at the largest force of their press so far, (T,), bool."""
         return (self.applied[0] > 0) & (self.applied[0] >= 0.995 * self.peaks)
-
-    @property
-    def unloading(self) -> np.ndarray:
-        """Frames below the largest force of their press so far, (T,), bool."""
-        return (self.applied[0] > 0) & (self.applied[0] < 0.98 * self.peaks)
 
     @cached_property
     def releases(self) -> list[slice]:

@@ -11,13 +11,14 @@ from itertools import islice
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import torch
 from pydantic import PositiveFloat
 
 from skin.body.base import AbstractBody, Sensors
 from skin.calibration.bench import BenchSession, Gauge, per_newton, true_readings, write_bench_session
 from skin.calibration.fit import convert_to_newton
-from skin.calibration.wiring import MAD, find_medians, find_quantum, list_numbers, measure_rests
+from skin.calibration.wiring import MAD, find_quantum, list_numbers, measure_rests
 from skin.core.settings import configured
 from skin.device.calibration import Calibration
 from skin.device.resampling import Frame, StreamClock
@@ -82,8 +83,9 @@ def find_placements(session: BenchSession) -> Placements:
     time, raw = session.time, session.raw
     block = np.floor((time - time[0]) / _BLOCK).astype(int)
     _, first = np.unique(block, return_index=True)
-    parts = np.split(np.arange(len(time)), first[1:])
-    values = _fill(np.array([find_medians(raw[part]) for part in parts]))
+    medians = pd.DataFrame(raw).groupby(block).median()
+    # Of a block without a value, what is between those before and after it; 0 of a channel without any.
+    values = medians.interpolate(limit_direction="both").fillna(0.0).to_numpy()
     steps = np.array([find_quantum(column[np.isfinite(column)]) for column in raw.T])
     noise = MAD / np.sqrt(2) * np.median(np.abs(np.diff(values, axis=0)), axis=0)
     noise = np.maximum(noise, steps / np.sqrt(12))
@@ -109,18 +111,6 @@ def find_placements(session: BenchSession) -> Placements:
     few = noise * np.sqrt(1 / 5 + 1 / (2 * _AFTER))
     reached = (np.abs(change) > np.maximum(_LOADED * few, _STEPS * steps)).any(axis=0)
     return Placements(change, moments[:, 0], moments[:, 1], idle, few, unsteady, reached)
-
-
-def _fill(values: np.ndarray) -> np.ndarray:
-    """Return values with those before them where they are missing; 0 for a channel without any."""
-    filled = values.copy()
-    for channel in filled.T:
-        present = np.isfinite(channel)
-        if present.any():
-            channel[~present] = np.interp(np.flatnonzero(~present), np.flatnonzero(present), channel[present])
-        else:
-            channel[:] = 0.0
-    return filled
 
 
 def _find_loads(

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
+import pandas as pd
 from scipy.optimize import linear_sum_assignment
 from scipy.stats import theilslopes
 
@@ -107,10 +108,7 @@ def _spread(values: np.ndarray, step: float) -> np.ndarray:
     """Spread equal values evenly over their rounding step, so that medians resolve less than a step."""
     if step == 0:
         return values
-    _, group, count = np.unique(values, return_inverse=True, return_counts=True)
-    order = np.argsort(group, kind="stable")
-    rank = np.empty(len(values))
-    rank[order] = np.arange(len(values)) - np.repeat(np.cumsum(count) - count, count)
+    rank = pd.Series(values).groupby(values).cumcount().to_numpy()
     # Ranks follow time; a fixed shuffle keeps them from distorting a drift.
     position = (rank * 0.6180339887498949) % 1
     return values + step * (position - 0.5)
@@ -228,11 +226,7 @@ def find_polarity(responses: Responses, per_newton: np.ndarray) -> np.ndarray:
 
 def find_medians(values: np.ndarray) -> np.ndarray:
     """Return the median of each column, (S,); NaN where a column has no number."""
-    measured = np.isfinite(values).any(axis=0) if len(values) else np.zeros(values.shape[1], dtype=bool)
-    middle = np.full(values.shape[1], np.nan)
-    if measured.any():
-        middle[measured] = np.nanmedian(values[:, measured], axis=0)
-    return middle
+    return pd.DataFrame(values).median().to_numpy()
 
 
 Turn = Literal[

@@ -6,7 +6,6 @@ import os
 import re
 import sqlite3
 import warnings
-from collections.abc import Iterator
 
 from hydra.errors import CompactHydraException, HydraException, InstantiationException, OverrideParseException
 from omegaconf.errors import OmegaConfBaseException
@@ -41,7 +40,8 @@ def to_input_error(error: Exception) -> InputError | None:
     """Return an error as an InputError with a message for the user; None for bugs, which need a traceback."""
     if isinstance(error, InputError):
         return error
-    for link in _iterate_causes(error):
+    link: BaseException | None = error
+    while link is not None:  # libraries wrap errors of the system
         if isinstance(link, sqlite3.OperationalError) or type(link) is sqlite3.DatabaseError:
             return InputError(
                 f"the database of runs failed: {link}: make room, or give another one, as in "
@@ -53,6 +53,7 @@ def to_input_error(error: Exception) -> InputError | None:
                 f"cannot use {where}: {os.strerror(link.errno)}: make room or give another folder, and run "
                 "the same command again; what has finished is kept"
             )
+        link = link.__cause__ or (None if link.__suppress_context__ else link.__context__)
     if isinstance(error, OverrideParseException):
         return InputError(f"{error.override} cannot be read as an override: {one_line(error)}")
     if isinstance(error, InstantiationException):
@@ -71,14 +72,6 @@ def _is_argument(error: Exception) -> bool:
     """Return whether an error is about an argument, or about words of Hydra such as ``_partial_``."""
     text = str(error)
     return isinstance(error, TypeError) and ("argument" in text or text.startswith("Instantiation:"))
-
-
-def _iterate_causes(error: BaseException) -> Iterator[BaseException]:
-    """Yield an error and its causes: libraries wrap errors of the system."""
-    cause: BaseException | None = error
-    while cause is not None:
-        yield cause
-        cause = cause.__cause__ or (None if cause.__suppress_context__ else cause.__context__)
 
 
 def one_line(error: BaseException) -> str:

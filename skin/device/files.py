@@ -45,27 +45,26 @@ _Count = Annotated[int, Ge(1), Le(2**31 - 1)]  # rows, gestures and frames are n
 _Extent = Annotated[float, Gt(0), Lt(1e9)]
 
 
-@dataclass(frozen=True)
-class _Description:
-    """The entries of a description."""
-
-    format: int
-    units: dict
-    gestures: _Count
-    frames: _Count
-    rate: _Extent
-    positions: Annotated[list[tuple[float, float, float]], MinLen(1)]
-    footprint: tuple[_Extent, _Extent]
-    size: tuple[_Extent, _Extent]
-    task: dict
-    labelled: bool
-    force: bool
-    displacement: bool
-    saturated: bool
-    parameters: Annotated[list[str], ONCE]
-    metadata: dict
-    first: Annotated[int, Ge(0), Le(2**31 - 1)]
-    contacts: Annotated[int, Ge(0), Le(2**31 - 1)] = 0
+def _description(
+    format: int,
+    units: dict,
+    gestures: _Count,
+    frames: _Count,
+    rate: _Extent,
+    positions: Annotated[list[tuple[float, float, float]], MinLen(1)],
+    footprint: tuple[_Extent, _Extent],
+    size: tuple[_Extent, _Extent],
+    task: dict,
+    labelled: bool,
+    force: bool,
+    displacement: bool,
+    saturated: bool,
+    parameters: Annotated[list[str], ONCE],
+    metadata: dict,
+    first: Annotated[int, Ge(0), Le(2**31 - 1)],
+    contacts: Annotated[int, Ge(0), Le(2**31 - 1)] = 0,
+) -> None:
+    """Name the entries of a description, with their types."""
 
 
 def describe_recording(recording: Recording, first: int = 0) -> dict[str, Any]:
@@ -252,7 +251,7 @@ def _describe(path: Path) -> tuple[dict[str, Any], Task]:
     about = json.loads(stored[b"skin"])
     if isinstance(about, dict) and about.get("format") != FORMAT:
         raise ValueError(f"it has format {about.get('format')}, this version reads format {FORMAT}")
-    check_settings(_Description, about, f"{path}: description", whole=True)
+    check_settings(_description, about, f"{path}: description", whole=True)
     check_settings(Task, about["task"], f"{path}: task", whole=True)
     if about["units"] != UNITS:
         raise ValueError(f"it has the units {about['units']}, needed are {UNITS}: convert it before")

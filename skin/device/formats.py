@@ -24,7 +24,6 @@ from skin.core.settings import check_settings
 from skin.errors import InputError
 
 Column = str | int
-Position = tuple[float, float] | tuple[float, float, float]
 
 TIMES = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0}
 LENGTHS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "in": 0.0254}

@@ -237,14 +237,13 @@ def _reason(error: BaseException) -> str:
     return lines[-1] if lines else type(error).__name__
 
 
-@dataclass(frozen=True)
-class _Record:
-    """What is read of :data:`RECORD`; ``start_time`` in ms since 1970."""
-
-    run: str
-    start_time: Annotated[int, Ge(0), Le(2**53)]
-    tags: dict[str, str]
-    metrics: dict[str, float]
+def _read_entries(
+    run: str,
+    start_time: Annotated[int, Ge(0), Le(2**53)],
+    tags: dict[str, str],
+    metrics: dict[str, float],
+) -> None:
+    """Name what is read of :data:`RECORD`, with its types; ``start_time`` in ms since 1970."""
 
 
 def find_pretrained(name: str) -> "Run | None":
@@ -320,8 +319,8 @@ def _record(folder: Path) -> dict[str, Any]:
         raise InputError(
             f"{', '.join(altered)} in {folder} differs from {SUMS}: restore the folder, or {again}"
         )
-    needed = {name: record[name] for name in _Record.__annotations__ if name in record}
-    configured(_Record, needed, f"{RECORD} of {folder}")
+    needed = {name: record[name] for name in _read_entries.__annotations__ if name in record}
+    configured(_read_entries, needed, f"{RECORD} of {folder}")
     return record
 
 

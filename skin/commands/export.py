@@ -4,9 +4,11 @@
     skin export run=any_skin body=arm layout.path=sensors.csv
     skin live run=skin.onnx device=serial device.port=/dev/ttyACM0
     skin export run=latest format=folder name=my_skin licence=MIT
+    skin export run=any_skin format=thresholds export.rates=[100]
 
 The ONNX file holds a network, from readings to probabilities, and is compared with the run on simulated or
 recorded touches first. The folder holds any run: run=my_skin then selects it wherever a run is accepted.
+format=thresholds adds those of a skin to the folder of a pretrained model, where skin live finds them.
 """
 
 import sys
@@ -27,9 +29,11 @@ from skin.errors import InputError
 from skin.runs.configuration import Config, overrides, settings_of
 
 if TYPE_CHECKING:
+    from skin.evaluation.decisions import LiveConditions
     from skin.runs.build import TorchModel
 
 _THRESHOLDS = "choosing the thresholds of the alarm for touches"
+_USUAL = 100.0  # Hz
 # Expected seconds of each step, for the fraction that is done.
 _STEPS = {
     "loading the run and the threshold of its alarm": 25.0,
@@ -44,7 +48,7 @@ _STEPS = {
 def main(
     config: Config,
     run: str,
-    format: Literal["onnx", "folder"],
+    format: Literal["onnx", "folder", "thresholds"],
     out: str | None,
     name: str | None,
     licence: str | None,
@@ -65,7 +69,7 @@ def main(
     else:
         check_settings(_export_file, export, "export")
         with Steps(_STEPS) as steps:
-            _export_file(run, config, out, steps, **export)
+            _export_file(run, config, out, steps, **export, thresholds=format == "thresholds")
 
 
 def _export_file(
@@ -75,7 +79,8 @@ def _export_file(
     steps: Steps,
     touch: PositiveFloat | None,
     touches: Annotated[int, Ge(1)],
-    rates: Annotated[Sequence[PositiveFloat], MinLen(1)],
+    rates: Annotated[Sequence[PositiveFloat], MinLen(1)] | None,
+    thresholds: bool = False,
 ) -> None:
     """Write the network of a run for one skin, with the thresholds of its alarm.
 
@@ -86,7 +91,9 @@ def _export_file(
         steps: to be shown.
         touch: contact threshold, N above the baseline; None: as in the run.
         touches: number of touches on which the file is compared with the run.
-        rates: of devices, Hz, for each of which the threshold of the alarm is chosen.
+        rates: of devices, Hz, for each of which the threshold of the alarm is chosen; None: that of the run's
+            device, 100 Hz if it has many.
+        thresholds: only add the thresholds to those that ship with the model.
     """
     path = None if out is None else Path(out).expanduser()
     if path is not None and path.suffix != ".onnx":
@@ -106,6 +113,15 @@ def _export_file(
     run = find_run(config.tracking, name, config.trust)
     whole = run.configured(overrides())
     model = load_model(run, whole, touch=touch, one_skin=True)
+    rate = whole.device.get("rate") or model.rate
+    rates = rates or [rate if isinstance(rate, int | float) else _USUAL]
+    if thresholds:
+        from skin.evaluation.alarm import ship_thresholds
+        from skin.runs.run import renew_checksums
+
+        ship_thresholds(model.alarm, _conditions(model, rates), print)
+        renew_checksums(run)
+        return
     module = model.learner.pipeline(model.sites)  # refused before anything else is simulated
     if advice := equation10_warning(run.stored):
         print(advice, file=sys.stderr)
@@ -125,13 +141,18 @@ def _export_file(
     print(f"{path}: differs from the run by {difference:.1g} at most on {len(compared)} touches")
 
 
+def _conditions(model: "TorchModel", rates: Sequence[float]) -> "list[LiveConditions]":
+    """Return how live views watch devices of these rates, Hz, at ports."""
+    from skin.live.engine import DebounceSettings
+
+    return [model.live_conditions(rate, DebounceSettings().alarm, False) for rate in rates]
+
+
 def _choose_thresholds(model: "TorchModel", rates: Sequence[float]) -> dict[str, Any]:
     """Return thresholds and scores of the alarm by the rate of a device, Hz; 1 is refused: it raises none."""
     from skin.evaluation.alarm import choose_alarm_threshold
-    from skin.live.engine import DebounceSettings
 
-    patience = DebounceSettings().alarm
-    conditions = (model.live_conditions(rate, patience, False) for rate in rates)
+    conditions = _conditions(model, rates)
     points = {f"{live.rate:g}": choose_alarm_threshold(model.alarm, live, say=print) for live in conditions}
     hiding = [at.warning() for at in points.values() if at and at.useless]
     refused = "".join(f"{text}: skin live refuses the file at this rate\n" for text in hiding)

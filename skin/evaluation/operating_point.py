@@ -148,6 +148,7 @@ class OperatingPoint:
         rate: of the device, Hz, where the threshold was chosen for the alarm of the live view, which judges
             many windows of a touch; None: it was chosen for one window of each gesture.
         score: gives the probability that is compared; None: it is the model's.
+        provisional: it is a lower limit from few touches, so at least ``target`` of the safe ones raise it.
     """
 
     threshold: float
@@ -159,6 +160,7 @@ class OperatingPoint:
     found: int = 0
     rate: float | None = None
     score: DangerScore | None = None
+    provisional: bool = False
 
     @classmethod
     def default(cls, target: float) -> "OperatingPoint":
@@ -194,7 +196,8 @@ class OperatingPoint:
             return f"{rule}: not chosen on any gestures, its false-alarm rate is unknown"
         kind = "safe validation" if self.seed is None else "fresh safe"
         what = "gestures" if self.rate is None else f"touches at {self.rate:.3g} Hz"
-        text = f"{rule}, chosen on {self.safe} {kind} {what} for {100 * self.target:g} % false alarms"
+        rate = "at least " * self.provisional + f"{100 * self.target:g} % false alarms"
+        text = f"{rule}, chosen on {self.safe} {kind} {what} for {rate}"
         if self.dangerous:
             text += f", finds {100 * self.found / self.dangerous:.1f} % of {self.dangerous} dangerous ones"
         return text

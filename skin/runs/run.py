@@ -32,8 +32,8 @@ from skin.core.messages import one_line
 from skin.core.safe_loading import TEXT, file_sha256, load_yaml, parse_json, read_file, regular
 from skin.core.settings import check_targets, configured
 from skin.errors import InputError
+from skin.evaluation.alarm import THRESHOLDS
 from skin.evaluation.operating_point import LABEL, OperatingPoint, parse_operating_point
-from skin.learning.learner import AbstractLearner
 from skin.runs.configuration import (
     Config,
     Tracking,
@@ -48,6 +48,7 @@ if TYPE_CHECKING:
     from mlflow.entities import Run
 
     from skin.learning.data import TouchData
+    from skin.learning.learner import AbstractLearner
     from skin.runs.store import Store
 
 TAG = "operating_point"
@@ -99,6 +100,12 @@ class FinishedRun:
     def title(self) -> str:
         """The name of the run."""
         return str(self.run.info.run_name)
+
+    @property
+    def shipped(self) -> Path | None:
+        """The file with thresholds of a pretrained model, which may not exist; None of other runs."""
+        folder = urlsplit(self.run.info.artifact_uri).path
+        return None if self.store is not None else Path(url2pathname(folder)) / THRESHOLDS
 
     @cached_property
     def stored(self) -> Config:
@@ -154,7 +161,7 @@ class FinishedRun:
             reason = _reason(cause or error)
             raise InputError(f"{name} of run {self.identity} {refused}: {reason}") from error
 
-    def load_weights(self, learner: AbstractLearner, data: "TouchData") -> None:
+    def load_weights(self, learner: "AbstractLearner", data: "TouchData") -> None:
         """Load the weights into a learner.
 
         Raises:
@@ -290,8 +297,17 @@ def checksums(folder: Path, learned: str) -> str:
         learned: name of the file of weights.
     """
     return "".join(
-        f"{file_sha256(folder / name)}  {name}\n" for name in sorted((RECORD, CONFIG, CARD, learned))
+        f"{file_sha256(folder / name)}  {name}\n"
+        for name in sorted((RECORD, CONFIG, CARD, learned, THRESHOLDS))
+        if name != THRESHOLDS or (folder / name).is_file()
     )
+
+
+def renew_checksums(run: FinishedRun) -> None:
+    """Write the hashes of a pretrained model anew, after its thresholds were written."""
+    assert run.shipped is not None
+    folder = run.shipped.parent
+    (folder / SUMS).write_text(checksums(folder, Path(run.run.data.tags["learned"]).name), encoding="utf-8")
 
 
 def _record(folder: Path) -> dict[str, Any]:

@@ -1,5 +1,6 @@
 """The device on which the alarm's threshold is chosen, for a skin and for the imperfections of a device."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -13,7 +14,7 @@ from skin.errors import InputError
 from skin.evaluation import alarm
 from skin.evaluation.alarm import choose_alarm_threshold, profile_settings
 from skin.evaluation.decisions import LiveConditions
-from skin.evaluation.operating_point import OperatingPoint
+from skin.evaluation.operating_point import DangerScore, OperatingPoint
 from skin.runs.build import alarm_source
 from skin.runs.configuration import validate_config
 from skin.runs.run import TAG, FinishedRun
@@ -79,10 +80,12 @@ def test_a_profile_counts_at_the_rate_and_alignment_of_the_evaluated_device(hydr
     assert (unknown.rate, unknown.framed, unknown.without_lag) == ([10, 1000], 0.0, 0.0)
 
 
-def run_of(config, point):
+def run_of(config, point, folder=""):
     """Return as much of a run as its operating point is read from."""
     data = SimpleNamespace(tags={TAG: point.text()})
-    run = FinishedRun(None, SimpleNamespace(data=data, info=SimpleNamespace(run_id="abc")))
+    run = FinishedRun(
+        None, SimpleNamespace(data=data, info=SimpleNamespace(run_id="abc", artifact_uri=folder))
+    )
     run.__dict__["stored"] = config
     return run
 
@@ -133,7 +136,7 @@ def device_of(tmp_path, monkeypatch):
 
     def choose(device, learner, live, target, count):
         devices.append(device)
-        return STORED
+        return replace(STORED, score=DangerScore(1.0, 0.0, 0.0))
 
     def device_of(stored, config):
         alarm_point(stored, config, LiveConditions(100.0, 0.1, 2.0, 0.1, 3), say=print)
@@ -173,6 +176,22 @@ def test_touches_of_a_run_of_drawn_skins_are_measured_by_mild_devices(hydra, dev
     rough = hydra(*SKINS, "evaluation.profile=rough")
     assert device_of(skins, rough).noise == profile_settings("rough")["noise"]
     assert device_of(hydra("profile=rough"), hydra()).noise == profile_settings("rough")["noise"]
+
+
+def test_a_provisional_threshold_is_lower_until_the_final_one_is_kept_or_ships(hydra, tmp_path, monkeypatch):
+    monkeypatch.setenv("SKIN_CACHE", str(tmp_path / "cache"))
+    live, config = LiveConditions(20.0, 0.1, 2.0, 0.1, 3), hydra("evaluation.safe_gestures=400")
+    run = run_of(config, STORED, f"file://{tmp_path}")
+    source = alarm_source(run, Quiet(), config)
+    first = choose_alarm_threshold(source, live, say=print, quick=True)
+    assert (first.provisional, first.safe, first.dangerous) == (True, 200, 100)
+    alarm.ship_thresholds(source, [live], print)
+    final = choose_alarm_threshold(source, live, say=pytest.fail, quick=True)
+    assert (final.provisional, final.safe, final.rate) == (False, 400, 20.0)
+    assert first.threshold < final.threshold
+    kept = choose_alarm_threshold(replace(source, shipped=None), live, say=print)
+    assert kept == choose_alarm_threshold(replace(source, shipped=None), live, say=pytest.fail, quick=True)
+    assert (kept.threshold, kept.score) == (final.threshold, final.score)
 
 
 def test_a_threshold_that_hides_dangerous_touches_is_refused():

@@ -112,7 +112,7 @@ def _export_file(
     quiet()
     run = find_run(config.tracking, name, config.trust)
     whole = run.configured(overrides())
-    model = load_model(run, whole, touch=touch, one_skin=True)
+    model = load_model(run, whole, touch=touch, one_skin=True, alarm=not thresholds)
     rate = whole.device.get("rate") or model.rate
     rates = rates or [rate if isinstance(rate, int | float) else _USUAL]
     if thresholds:

@@ -13,11 +13,9 @@ model at a port of this machine and serves the page. Ctrl-C stops.
 import re
 from typing import Any
 
-from hydra import compose
-
 from skin.commands._command import command
 from skin.errors import InputError
-from skin.runs.configuration import Config, overrides, validate_config
+from skin.runs.configuration import Config, overrides
 
 _SKIN = {"body", "layout", "simulator"}
 _DEMO = (
@@ -38,7 +36,7 @@ def main(
 ) -> None:
     """Load a run or an exported model, open the skin, and show verdicts until the command is ended."""
     from skin.live.engine_builder import LiveSettings
-    from skin.live.view import emulated_skin, show
+    from skin.live.view import show
 
     words, settings = overrides(), LiveSettings.of(live)
     if not demo:
@@ -51,10 +49,8 @@ def main(
     replaced = given | (_SKIN if given & {"run", *_SKIN} else set())
     words = [*(word for word in _DEMO if _group(word) not in replaced), *words]
     skin = [word for word in words if _group(word) in {"touch", *_SKIN}]
-    with emulated_skin(run, config, skin) as device:
-        words = [*device, *(word for word in words if _group(word) != "touch")]
-        connected = validate_config(compose("live", words))
-        show(run, connected, words, settings, web or "web" not in given, seconds, own_mechanics=True)
+    words = [word for word in words if _group(word) != "touch"]
+    show(run, config, words, settings, web or "web" not in given, seconds, emulated=skin)
 
 
 def _group(word: str) -> str:

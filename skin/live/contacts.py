@@ -6,12 +6,10 @@ torch is not imported here, but in that process.
 """
 
 import os
-import signal
 from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from multiprocessing import get_context
 from multiprocessing.connection import Connection
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -19,6 +17,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from skin.errors import InputError
+from skin.evaluation.final_threshold import start_beside
 from skin.live.verdict import Verdict
 from skin.wire.channels import NewtonFrame, UnitConversion
 
@@ -327,14 +326,7 @@ class LiveContacts:
         """
         self._whole = whole
         self.explain("being prepared")
-        context = get_context("spawn")
-        self._pipe, end = context.Pipe()
-        self.process = context.Process(target=serve, args=(mechanics, end), name="skin-contacts", daemon=True)
-        # A process that begins while Ctrl-C is ignored ignores it for good.
-        handler = signal.signal(signal.SIGINT, signal.SIG_IGN)
-        self.process.start()
-        signal.signal(signal.SIGINT, handler)
-        end.close()
+        self.process, self._pipe = start_beside(serve, "skin-contacts", mechanics)
 
     def close(self) -> None:
         """End the process."""

@@ -120,6 +120,7 @@ class Display:
         notes: on the whole session.
         line: text with rate, lost frames and latency.
         closed: event, set at the end.
+        started: event, set once a view in the terminal shows the steps of the start.
         observers: called whenever the skin is assessed, and with each event of the operator.
     """
 
@@ -138,7 +139,7 @@ class Display:
     kept: int = 8192
 
     def __post_init__(self) -> None:
-        self.closed = Event()
+        self.closed, self.started = Event(), Event()
         self.notes: tuple[Note, ...] = ()
         self.observers: list[Observer] = []
         self.line = ""
@@ -220,7 +221,12 @@ class Display:
 
     def add_note(self, note: Note) -> None:
         """Add a note on the whole session."""
-        self.notes = (*(other for other in self.notes if other.code != note.code), note)
+        self.remove_note(note.code)
+        self.notes = (*self.notes, note)
+
+    def remove_note(self, code: str) -> None:
+        """Remove the note of a code on the whole session, if there is one."""
+        self.notes = tuple(note for note in self.notes if note.code != code)
 
     def request_tare(self, now: float, force: bool = False) -> str:
         """Request a new baseline at ``now``, s; return why it is refused, or an empty text.
@@ -319,6 +325,7 @@ class LiveLoop:
         status: s between two updates of the status.
         proved: s after the test in which sensors may prove dead.
         enough: frames for each one of the model: with n, a tap of one frame reads 1/n too low at worst.
+        refine: called between decisions, twice a second: it may change the engine's threshold.
 
     Attributes:
         verdicts: number of verdicts so far.
@@ -337,10 +344,11 @@ class LiveLoop:
         status: float = 0.5,
         proved: float = 10.0,
         enough: float = 10.0,
+        refine: Callable[[], object] = bool,
     ) -> None:
         self._skin, self._tare, self._engine, self._display = skin, tare, engine, display
         self._verify, self._clock, self._read_wait, self._at_once = verify, clock, wait, at_once
-        self._status, self._proved, self._enough = status, proved, enough
+        self._status, self._proved, self._enough, self._refine = status, proved, enough, refine
         self._received_at, self._maximum_dead, self._tested_at = clock(), inf, inf
         self._delays: deque[float] = deque(maxlen=2000)  # verdicts for the percentile of the delay
         self._updated_at = -inf
@@ -373,6 +381,7 @@ class LiveLoop:
         if now - self._updated_at >= self._status:
             self._updated_at = now
             self._display.line = self.line
+            self._refine()
             if not self._skin.stats.timing.trusted:
                 self._display.add_note(Note("clock", detail=self._skin.stats.clock))
 

@@ -33,7 +33,6 @@ from skin.core.safe_loading import TEXT, file_sha256, load_yaml, parse_json, rea
 from skin.core.settings import check_targets, configured
 from skin.errors import InputError
 from skin.evaluation.operating_point import LABEL, OperatingPoint, parse_operating_point
-from skin.learning.learner import AbstractLearner
 from skin.runs.configuration import (
     Config,
     Tracking,
@@ -48,6 +47,7 @@ if TYPE_CHECKING:
     from mlflow.entities import Run
 
     from skin.learning.data import TouchData
+    from skin.learning.learner import AbstractLearner
     from skin.runs.store import Store
 
 TAG = "operating_point"
@@ -99,6 +99,12 @@ class FinishedRun:
     def title(self) -> str:
         """The name of the run."""
         return str(self.run.info.run_name)
+
+    @property
+    def weights(self) -> Path | None:
+        """The file of weights of a pretrained model; None of other runs."""
+        folder = Path(url2pathname(urlsplit(self.run.info.artifact_uri).path))
+        return None if self.store is not None else folder / self.run.data.tags["learned"]
 
     @cached_property
     def stored(self) -> Config:
@@ -154,7 +160,7 @@ class FinishedRun:
             reason = _reason(cause or error)
             raise InputError(f"{name} of run {self.identity} {refused}: {reason}") from error
 
-    def load_weights(self, learner: AbstractLearner, data: "TouchData") -> None:
+    def load_weights(self, learner: "AbstractLearner", data: "TouchData") -> None:
         """Load the weights into a learner.
 
         Raises:

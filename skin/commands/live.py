@@ -11,6 +11,9 @@ model at a port of this machine and serves the page. Ctrl-C stops.
 """
 
 import re
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from threading import Thread
 from typing import Any
 
 from skin.commands._command import command
@@ -50,8 +53,43 @@ def main(
     words = [*(word for word in _DEMO if _group(word) not in replaced), *words]
     skin = [word for word in words if _group(word) in {"touch", *_SKIN}]
     words = [word for word in words if _group(word) != "touch"]
-    show(run, config, words, settings, web or "web" not in given, seconds, emulated=skin)
+    emulated = _emulated_skin(run, config, skin)
+    show(run, config, words, settings, web or "web" not in given, seconds, emulated)
 
 
 def _group(word: str) -> str:
     return re.split(r"[.=]", word, maxsplit=1)[0]
+
+
+@contextmanager
+def _emulated_skin(run: str, config: Config, overrides: Sequence[str]) -> Iterator[list[str]]:
+    """Emulate the skin of a run, without the imperfections of its training, at a port of this machine.
+
+    Args:
+        run: name of a run that was trained on a simulated skin.
+        config: of the command.
+        overrides: settings that replace those of the run.
+
+    Yields:
+        The settings of a device at this port, as overrides.
+
+    Raises:
+        InputError: there is no such run, or its skin cannot be emulated.
+    """
+    from skin.runs.build import build_device
+    from skin.runs.run import find_run
+    from skin.wire.emulator import Emulator, EmulatorSettings, Faults, open_port
+
+    emulated = find_run(config.tracking, run, config.trust).configured(["device=simulated", *overrides])
+    device = build_device(emulated).simulated("a skin is emulated")
+    port = open_port("tcp:0", None)
+    # At rest until the view has its baseline.
+    emulator = Emulator(device, port, EmulatorSettings(idle=10.0), Faults())
+    thread = Thread(target=emulator.run, name="skin-emulator", daemon=True)
+    thread.start()
+    try:
+        yield ["device=serial", f"device.port={port.address}", f"device.scale={emulator.converter.scale}"]
+    finally:
+        emulator.stop()
+        thread.join()
+        port.unplug()

@@ -21,6 +21,7 @@ import numpy as np
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from omegaconf import OmegaConf
+from scipy.special import bdtrik
 
 from skin.core import array_cache
 from skin.core.files import CONF, whole
@@ -61,7 +62,7 @@ DANGEROUS_TOUCHES = 400
 FITTED_TOUCHES = 300
 """Safe touches, and as many dangerous ones, to which a score is fitted; fits to 1200 found no more."""
 PROVISIONAL = 200, 100
-"""Safe and dangerous touches on which a provisional threshold is chosen: 4 s of one core."""
+"""Safe and dangerous touches of a provisional threshold: 4 s of one core; 100 of each fit its score."""
 _LOWER = 0.95  # probability that a provisional threshold is no higher than that of the wanted rate
 THRESHOLDS = "thresholds.json"
 """File beside the weights of a pretrained model: thresholds for touches, by the hash of what decides them."""
@@ -369,10 +370,10 @@ def _on_touches(
     devices = "" if profile is None else f" and devices of the profile {profile}"
     shipped = _shipped(source, say).get(array_cache.hashed(content, ()))
     # No threshold from few touches keeps a guarantee.
-    few = quick and missed is None and count > sum(PROVISIONAL)
-    if few and shipped is None and not file.is_file():
+    quick = quick and missed is None and count > sum(PROVISIONAL)
+    if quick and shipped is None and not file.is_file():
         say(f"choosing a provisional threshold of the alarm at {live.rate:.3g} Hz{devices}")
-        return _provisional(device, source.learner, live, target)
+        return _on_touches_of(device, source.learner, live, settings, count, quick=True)
 
     def choose() -> dict[str, np.ndarray]:
         others = "" if missed is None else f" and {touches_drawn(missed)} dangerous"
@@ -380,12 +381,10 @@ def _on_touches(
         return _numbers(_on_touches_of(device, source.learner, live, settings, count))
 
     kept = shipped or array_cache.kept(file, key, {"point": (4,), "score": (3,)}, choose)
-    threshold, *counts = map(float, kept["point"])
-    raised, dangerous, found = map(int, counts)
+    threshold, raised, dangerous, found = kept["point"]
+    counts = int(raised), device.data_seed, int(dangerous), int(found)
     score = DangerScore(*map(float, kept["score"]))
-    point = OperatingPoint(
-        threshold, target, count, raised, device.data_seed, dangerous, found, live.rate, score
-    )
+    point = OperatingPoint(float(threshold), target, count, *counts, live.rate, score)
     return _guaranteed(point, missed, profile)
 
 
@@ -412,7 +411,6 @@ def _describe(
     if path and settings.profile is None:
         device = device.replace(**_remaining(path), randomise=True, calibration=None)
     live = _snapped(live, device)
-    imperfections = {name: str(value) for name, value in vars(device.imperfection).items()}
     return (
         device,
         live,
@@ -422,7 +420,11 @@ def _describe(
             "skin": source.skin,
             "positions": device.sensors.positions.round(9).tolist(),
             # The conditions have the rate, and whether it is aligned.
-            "imperfections": {k: text for k, text in imperfections.items() if k not in ("rate", "aligned")},
+            "imperfections": {
+                name: str(value)
+                for name, value in vars(device.imperfection).items()
+                if name not in ("rate", "aligned")
+            },
             "live": asdict(live) | {"contact": round(live.contact, 3)},
             "profile": settings.profile,
             "target": settings.false_alarm_rate,
@@ -506,70 +508,45 @@ def _on_touches_of(
     live: LiveConditions,
     settings: Evaluation,
     count: int,
+    quick: bool = False,
 ) -> OperatingPoint:
     """Return the threshold that few of ``count`` safe touches pass, checked on dangerous ones.
 
     With ``settings.miss_rate`` it is the highest that finds most dangerous ones that count, and checked on
     safe ones. ``device`` measures each touch; with ``randomise``, by another device.
+
+    With ``quick`` it is a lower limit of that threshold, from few touches: with a probability of ``_LOWER``
+    no more than k of n safe touches pass the threshold of the wanted rate, k of the binomial distribution;
+    so the one that k pass is no higher, and hides no more dangerous touches. Scores of a part of the
+    decisions, and of touches that the score was fitted to, err downwards, too.
     """
     from skin.evaluation.touch_scores import decide_touches
 
     assert learner is not None
-    seed, fitted = device.data_seed, min(count, FITTED_TOUCHES)
-    target, missed = settings.false_alarm_rate, settings.miss_rate
+    target, missed, seed = settings.false_alarm_rate, settings.miss_rate, device.data_seed
     tests = DANGEROUS_TOUCHES if missed is None else touches_drawn(missed)
-    safe, others = _labels(device, fitted + max(count, tests))
-    chosen = np.concatenate([safe[:count], others[:tests], safe[count:][:fitted], others[tests:][:fitted]])
-    with Steps({"choosing the threshold of the alarm": 20.0}) as steps:
+    count, tests, fitted = (*PROVISIONAL, 100) if quick else (count, tests, min(count, FITTED_TOUCHES))
+    apart, allowed = (0, math.ceil(bdtrik(_LOWER, count, target))) if quick else (fitted, None)
+    enough = apart + max(count, tests) + 16  # of the 16 combinations some have one touch fewer
+    labels = device.sampler.balanced(2 * enough, generator(Stream.ALARM, seed, 1))
+    danger = labels[:, TOUCH.names.index(LABEL)]
+    safe, others = labels[~danger], labels[danger]
+    chosen = np.concatenate([safe[:count], others[:tests], safe[count:][:apart], others[tests:][:apart]])
+    with Steps({"choosing the threshold of the alarm": 4.0 if quick else 20.0}) as steps:
         # More threads than free cores take many times as long.
         decisions = decide_touches(
-            learner, device, live, chosen, seed, lambda done: steps.report(done / len(chosen))
+            learner, device, live, chosen, seed, lambda done: steps.report(done / len(chosen)), quick
         )
     tested = count + tests
-    score = decisions.fit(np.arange(tested, len(chosen)), np.arange(2 * fitted) >= fitted)
+    score = decisions.fit(np.arange(len(chosen))[-2 * fitted :], np.arange(2 * fitted) >= fitted)
     scores = decisions.scores(score)[:tested]
     safe_scores, others_scores = scores[:count], scores[count:]
     if missed is None:
-        threshold = _lowest_threshold(safe_scores, target)
+        threshold = _lowest_threshold(safe_scores, target, allowed)
     else:
         which = counted(decisions.peak.numpy(), decisions.sensed.numpy())
         others_scores = others_scores[which[count:tested]]
         threshold = threshold_for_misses(others_scores.numpy(), missed)
     point = OperatingPoint(threshold, target, count, 0, seed, len(others_scores), 0, live.rate, score)
     raised, found = (int(point.alarm(part).sum()) for part in (safe_scores, others_scores))
-    return replace(point, raised=raised, found=found)
-
-
-def _provisional(
-    device: "AbstractSimulated", learner: Predictor | None, live: LiveConditions, target: float
-) -> OperatingPoint:
-    """Return a lower limit of the threshold that ``target`` of the safe touches pass, from few touches.
-
-    With a probability of ``_LOWER`` no more than k of n safe touches pass the threshold of that rate, k of
-    the binomial distribution; so the one that k pass is no higher, and hides no more dangerous touches.
-    Scores of a part of the decisions, and of touches that the score was fitted to, err downwards, too.
-    """
-    from scipy.stats import binom
-
-    from skin.evaluation.touch_scores import decide_touches
-
-    assert learner is not None
-    count, dangerous = PROVISIONAL
-    safe, others = _labels(device, count)
-    chosen, seed = np.concatenate([safe[:count], others[:dangerous]]), device.data_seed
-    decisions = decide_touches(learner, device, live, chosen, seed, about_peak=True)
-    score = decisions.fit(np.arange(count - dangerous, len(chosen)), np.arange(2 * dangerous) >= dangerous)
-    scores = decisions.scores(score)
-    threshold = _lowest_threshold(scores[:count], target, int(binom.ppf(_LOWER, count, target)))
-    values = threshold, target, count, 0, seed, dangerous, 0, live.rate, score
-    point = OperatingPoint(*values, provisional=True)
-    alarms = point.alarm(scores)
-    return replace(point, raised=int(alarms[:count].sum()), found=int(alarms[count:].sum()))
-
-
-def _labels(device: "AbstractSimulated", count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return labels of ``count`` safe touches or more, and of as many dangerous ones."""
-    enough = count + 16  # of the 16 combinations some have one touch fewer
-    labels = device.sampler.balanced(2 * enough, generator(Stream.ALARM, device.data_seed, 1))
-    danger = labels[:, TOUCH.names.index(LABEL)]
-    return labels[~danger], labels[danger]
+    return replace(point, raised=raised, found=found, provisional=quick)

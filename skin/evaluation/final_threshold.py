@@ -4,10 +4,11 @@ import io
 import os
 import signal
 from collections.abc import Callable
-from contextlib import redirect_stderr, redirect_stdout, suppress
+from contextlib import redirect_stderr, suppress
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
+from threading import Thread
 from typing import Any
 
 from skin.errors import InputError
@@ -42,16 +43,19 @@ def _choose(source: AlarmSource, live: LiveConditions, pipe: Connection) -> None
     """Send the threshold, or why there is none; low priority keeps verdicts in time."""
     import torch
 
+    # Ends with the view, also where that is killed.
+    Thread(target=lambda: pipe.poll(None) and os._exit(1), daemon=True).start()
     if hasattr(os, "nice"):
         os.nice(10)  # below the estimates of contacts
     torch.set_num_threads(1)
-    with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
+    with redirect_stderr(io.StringIO()):  # of the progress
         try:
-            answer = choose_alarm_threshold(source, live, say=lambda text: None)
+            point = choose_alarm_threshold(source, live, say=lambda text: None)
+            assert point is not None
+            point.announced(lambda text: None)  # refuses one that hides dangerous touches
+            pipe.send(point)
         except InputError as error:
             pipe.send(str(error))
-        else:
-            pipe.send(answer)
 
 
 class FinalThreshold:
@@ -63,14 +67,13 @@ class FinalThreshold:
     """
 
     def __init__(self, source: AlarmSource, live: LiveConditions) -> None:
-        self._process, self._pipe = start_beside(_choose, "skin-threshold", source, live)
-        self._open = True
+        self.process, self._pipe = start_beside(_choose, "skin-threshold", source, live)
 
     def take(self) -> OperatingPoint | str | None:
-        """Return the threshold, or why it cannot be chosen, once it is known; None before and afterwards."""
-        if not self._open or not self._pipe.poll():
+        """Return the threshold, or why there is none, once that is known; None before and afterwards."""
+        if self._pipe.closed or not self._pipe.poll():
             return None
-        answer: OperatingPoint | str = "the process that chooses it has ended"
+        answer: OperatingPoint | str = "the process that chooses the final one has ended"
         with suppress(EOFError, OSError):
             answer = self._pipe.recv()
         self.close()
@@ -78,8 +81,6 @@ class FinalThreshold:
 
     def close(self) -> None:
         """End the process."""
-        if self._open:
-            self._open = False
-            self._process.kill()
-            self._process.join()
-            self._pipe.close()
+        self.process.kill()
+        self.process.join()
+        self._pipe.close()

@@ -21,12 +21,11 @@ from skin.evaluation.alarm import choose_alarm_threshold
 from skin.evaluation.decisions import DRIFT, minimum_visible
 from skin.evaluation.final_threshold import FinalThreshold
 from skin.evaluation.operating_point import DangerScore
-from skin.live.contacts import Mechanics
+from skin.inference.mechanics import Mechanics
 from skin.live.engine import DebounceSettings, Detection, Engine
 from skin.live.verdict import Note, sensor_list
 from skin.runs.configuration import Config
 from skin.runs.model import Model, OnnxModel
-from skin.runs.run import FinishedRun
 from skin.wire.channels import NewtonFrame, RawRange, UnitConversion, unit_conversion
 from skin.wire.reader import Port, SkinDisconnected, SkinTimeout
 from skin.wire.skin import SerialSource, Skin, Source
@@ -384,7 +383,7 @@ def watch_exported(
 
 
 def watch_run(
-    run: FinishedRun,
+    name: str,
     config: Config,
     live: LiveSettings,
     say: Callable[[str], None],
@@ -395,7 +394,7 @@ def watch_run(
     """Return a finished run and the device of a configuration.
 
     Args:
-        run: the run.
+        name: of the run.
         config: of the command.
         live: settings of the live view.
         say: called with each message for the user.
@@ -404,14 +403,16 @@ def watch_run(
         own_mechanics: the device has the mechanics of the run, though it is at a port.
 
     Raises:
-        InputError: it cannot be loaded, or the device cannot be opened.
+        InputError: there is no such run, it cannot be loaded, or the device cannot be opened.
     """
     import torch
 
     from skin.record.serial import open_source
     from skin.runs.build import build_device, equation10_warning, load_model
+    from skin.runs.run import find_run
 
     torch.set_num_threads(config.tracking.threads or 1)
+    run = find_run(config.tracking, name, config.trust)
     configured = run.configured(overrides)
     device = build_device(configured)
     # A port is opened first: that it is missing must not take as long to say as a run takes to load.

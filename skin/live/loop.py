@@ -104,7 +104,7 @@ class Display:
     Args:
         title: of the run.
         port: source of the frames.
-        positions: (S, 3), m.
+        positions: (S, 3), m; none until the skin is known.
         size: extent (x, y) of the sheet, m.
         top: upper end of the colour scale, N.
         window: length of the classified window, s.
@@ -120,7 +120,6 @@ class Display:
         notes: on the whole session.
         line: text with rate, lost frames and latency.
         closed: event, set at the end.
-        started: event, set once a view in the terminal shows the steps of the start.
         observers: called whenever the skin is assessed, and with each event of the operator.
     """
 
@@ -139,21 +138,25 @@ class Display:
     kept: int = 8192
 
     def __post_init__(self) -> None:
-        self.closed, self.started = Event(), Event()
+        self.closed = Event()
         self.notes: tuple[Note, ...] = ()
         self.observers: list[Observer] = []
         self.line = ""
-        self._lock = RLock()
-        sensors = len(self.positions)
-        first = np.zeros(sensors), np.zeros(sensors, dtype=bool)
-        self._frames: deque[tuple[np.ndarray, np.ndarray]] = deque([first], maxlen=self.kept)
-        self._valid, self._peak, self._contact = np.ones(sensors, dtype=bool), np.zeros(sensors), False
-        self._number = 0
+        self._lock, self._number, self._contact = RLock(), 0, False
+        self.place(self.positions)
         self._latest = Assessment(None, "waiting for the first frame", False)
         self._alarm_at, self._decided = -inf, deque([-inf])
         self._request: TareRequest = ""
         self._refusal: Refusal = ""
         self._refused_at = -inf
+
+    def place(self, positions: np.ndarray) -> None:
+        """Take the positions of the sensors (S, 3), m, before the first frame."""
+        sensors = len(positions)
+        first = np.zeros(sensors), np.zeros(sensors, dtype=bool)
+        with self._lock:
+            self._frames: deque[tuple[np.ndarray, np.ndarray]] = deque([first], maxlen=self.kept)
+            self._valid, self._peak, self.positions = ~first[1], first[0], positions
 
     def close(self, *_: object) -> None:
         """Let the loop and the views end."""
@@ -221,11 +224,10 @@ class Display:
 
     def add_note(self, note: Note) -> None:
         """Add a note on the whole session."""
-        self.remove_note(note.code)
-        self.notes = (*self.notes, note)
+        self.notes = (*(other for other in self.notes if other.code != note.code), note)
 
     def remove_note(self, code: str) -> None:
-        """Remove the note of a code on the whole session, if there is one."""
+        """Remove a note on the whole session, if there is one."""
         self.notes = tuple(note for note in self.notes if note.code != code)
 
     def request_tare(self, now: float, force: bool = False) -> str:
@@ -319,13 +321,13 @@ class LiveLoop:
         engine: gives verdicts.
         display: shows them.
         verify: called once, before the first decision; None: nothing is tested.
+        refine: called between decisions, twice a second: it may change the engine's threshold.
         clock: gives the host's monotonic time, s.
         wait: s that one read waits for a frame.
         at_once: frames that are taken together.
         status: s between two updates of the status.
         proved: s after the test in which sensors may prove dead.
         enough: frames for each one of the model: with n, a tap of one frame reads 1/n too low at worst.
-        refine: called between decisions, twice a second: it may change the engine's threshold.
 
     Attributes:
         verdicts: number of verdicts so far.
@@ -338,13 +340,13 @@ class LiveLoop:
         engine: Engine,
         display: Display,
         verify: Verify | None = None,
+        refine: Callable[[], object] = bool,
         clock: Callable[[], float] = monotonic,
         wait: float = 0.3,
         at_once: int = 1024,
         status: float = 0.5,
         proved: float = 10.0,
         enough: float = 10.0,
-        refine: Callable[[], object] = bool,
     ) -> None:
         self._skin, self._tare, self._engine, self._display = skin, tare, engine, display
         self._verify, self._clock, self._read_wait, self._at_once = verify, clock, wait, at_once

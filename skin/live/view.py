@@ -1,12 +1,13 @@
-"""The live view of ``skin live``: terminal, JSON lines, log of alarms, and the emulated skin of its demo."""
+"""The live view of ``skin live``: terminal, JSON lines, log of alarms."""
 
 import gc
 import signal
 import sys
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence, Set
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from functools import partial
+from math import inf
 from pathlib import Path
 from threading import Condition, Thread
 from time import monotonic
@@ -14,7 +15,6 @@ from typing import IO, Any
 
 import numpy as np
 from hydra import compose
-from hydra.utils import instantiate
 from rich.console import Console, Group, RenderableType
 from rich.live import Live
 from rich.panel import Panel
@@ -23,17 +23,15 @@ from rich.text import Text
 from skin.core.files import json_line, unwritable
 from skin.core.interrupt import ends_on_signal
 from skin.core.messages import quiet
-from skin.core.settings import check_groups
 from skin.errors import InputError
 from skin.evaluation.final_threshold import FinalThreshold
 from skin.live.contacts import LiveContacts, contact_text_lines
 from skin.live.engine import Engine
 from skin.live.engine_builder import LiveSettings, LiveSetup, watch_exported, watch_run
-from skin.live.loop import Display, DisplayState, LiveLoop, watch_age
+from skin.live.loop import Display, DisplayState, LiveLoop, Observer, watch_age
 from skin.live.verdict import Assessment, Note, contact_text, verdict_message
 from skin.runs.configuration import Config, validate_config
 from skin.runs.model import check_overrides
-from skin.runs.run import find_run
 from skin.wire.segmentation import typed_lines
 
 _say = Console(stderr=True, highlight=False).print
@@ -225,37 +223,7 @@ def _verdict(state: DisplayState) -> RenderableType:
     return Group(head, Text(), Text(words), Text("\n".join(filter(None, notes)), "yellow"))
 
 
-# The whole view, and the emulated skin of its demonstration.
-
-
-@contextmanager
-def emulated_skin(emulated: Config) -> Iterator[list[str]]:
-    """Emulate a skin, without the imperfections of the training of a run, at a port of this machine.
-
-    Args:
-        emulated: configuration of a run that was trained on a simulated skin, with ``device=simulated``.
-
-    Yields:
-        The settings of a device at this port, as overrides.
-
-    Raises:
-        InputError: the skin cannot be emulated.
-    """
-    from skin.runs.build import build_device
-    from skin.wire.emulator import Emulator, EmulatorSettings, Faults, open_port
-
-    device = build_device(emulated).simulated("a skin is emulated")
-    port = open_port("tcp:0", None)
-    # At rest until the view has its baseline.
-    emulator = Emulator(device, port, EmulatorSettings(idle=8.0), Faults())
-    thread = Thread(target=emulator.run, name="skin-emulator", daemon=True)
-    thread.start()
-    try:
-        yield ["device=serial", f"device.port={port.address}", f"device.scale={emulator.converter.scale}"]
-    finally:
-        emulator.stop()
-        thread.join()
-        port.unplug()
+# The whole view.
 
 
 def show(
@@ -265,7 +233,7 @@ def show(
     live: LiveSettings,
     web: bool,
     seconds: float | None,
-    emulated: Sequence[str] | None = None,
+    emulated: AbstractContextManager[Sequence[str]] | None = None,
 ) -> None:
     """Show the predictions of a run for a skin until the command is ended.
 
@@ -276,7 +244,8 @@ def show(
         live: settings of the view.
         web: whether to serve a page, too.
         seconds: duration, s; None: until the command is ended.
-        emulated: settings of the skin that is emulated at a port and watched; None: that of ``config`` is.
+        emulated: emulates a skin with the simulator of the run, and gives the settings of a device at its
+            port; None: the device is that of ``config``.
 
     Raises:
         InputError: the model, the device or the settings cannot be used.
@@ -284,104 +253,78 @@ def show(
     try:
         with ExitStack() as opened:
             opened.enter_context(ends_on_signal())
+            display = _open_page(live, web, opened)
             if run.endswith(".onnx"):
                 check_overrides(run, overrides)
                 setup = watch_exported(run, config.device, _say, opened)
-                model = setup.model
-                display = _open_page(model.title, model.positions, model.size, live, web, opened)
             else:
                 quiet()
-                setup, display = _watch_run(run, config, overrides, live, web, emulated, opened)
+                if emulated is not None:
+                    display.set_verdict(
+                        None, monotonic(), "the response of the emulated skin is being computed"
+                    )
+                    overrides = [*opened.enter_context(emulated), *overrides]
+                    config = validate_config(compose("live", list(overrides)))
+                display.set_verdict(
+                    None, monotonic(), "the model and the response of the skin are being loaded"
+                )
+                setup = watch_run(run, config, live, _say, overrides, opened, emulated is not None)
             _open_views(display, setup, live, opened)
-            _show_step(display, "the threshold of the alarm is being chosen")
+            display.set_verdict(None, monotonic(), "the threshold of the alarm is being chosen")
             source, engine, nominal, final = setup.watch(live, _say)
             if final is not None:
                 opened.callback(final.close)
                 display.add_note(Note("provisional"))
             if live.verdicts is None:
-                display.started.set()  # the view in the terminal says the rest
                 opened.enter_context(show_in_terminal(display, Console()))
             check = partial(setup.check, source, engine, nominal, live.selftest, _say, display.add_note)
             refine = partial(_refine, final, engine, display)
-            loop = LiveLoop(source.skin, source.tare, engine, display, check, refine=refine)
+            loop = LiveLoop(source.skin, source.tare, engine, display, check, refine)
             opened.callback(lambda: _say(f"{loop.verdicts} verdicts, {loop.line}"))
-            # A search for garbage among all that is loaded would stop the loop for 0.3 s, every few seconds.
-            gc.collect()
+            gc.collect()  # a search among all that is loaded would stop the loop for 0.3 s, again and again
             gc.freeze()
             loop.run(seconds)
     except KeyboardInterrupt:
         print("ended", file=sys.stderr)
 
 
-def _watch_run(
-    name: str,
-    config: Config,
-    overrides: Sequence[str],
-    live: LiveSettings,
-    web: bool,
-    emulated: Sequence[str] | None,
-    opened: ExitStack,
-) -> tuple[LiveSetup, Display]:
-    """Open the page, then load a run and open its device; arguments as those of :func:`show`."""
-    run = find_run(config.tracking, name, config.trust)
-    used = run.configured(overrides if emulated is None else ["device=simulated", *emulated])
-    check_groups({"body": used.body, "layout": used.layout})
-    body = instantiate(used.body)
-    positions = instantiate(used.layout).sensors(body).positions
-    display = _open_page(run.title, positions, body.size, live, web, opened)
-    if emulated is not None:
-        _show_step(display, "the response of the emulated skin is being computed")
-        device = opened.enter_context(emulated_skin(used))
-        overrides = [*device, *overrides]
-        config = validate_config(compose("live", overrides))
-    _show_step(display, "the model and the response of the skin are being loaded")
-    return watch_run(run, config, live, _say, overrides, opened, emulated is not None), display
-
-
-def _open_page(
-    title: str,
-    positions: np.ndarray,
-    size: tuple[float, float],
-    live: LiveSettings,
-    web: bool,
-    opened: ExitStack,
-) -> Display:
-    """Return what the views show, first on the page: nothing that takes seconds is needed for it."""
-    contacts = LiveContacts("being prepared" if live.contacts else "live.contacts=false")
+def _open_page(live: LiveSettings, web: bool, opened: ExitStack) -> Display:
+    """Return what the views show; first on the page, before anything else is loaded."""
+    contacts = LiveContacts("" if live.contacts else "live.contacts=false")
     opened.callback(contacts.close)
-    display = Display(title, "", positions, size, live.top, contacts=contacts, calm=live.patience.calm)
+    display = Display("", "", np.empty((0, 3)), (0, 0), live.top, contacts=contacts, calm=live.patience.calm)
     if web:
         from skin.live.web import serve_page
 
         _say(f"page: {opened.enter_context(serve_page(display, live.web_port))}")
+    display.observers.append(_tell_progress())
     opened.enter_context(watch_age(display))
-    Thread(target=_repeat_steps, args=(display,), name="skin-steps", daemon=True).start()
     return display
 
 
-def _show_step(display: Display, step: str) -> None:
-    """Show which step of the start begins."""
-    display.set_verdict(None, monotonic(), step)
-    _say(step)
+def _tell_progress(interval: float = 1.5, most: float = 60.0) -> Observer:
+    """Return what says why there is no verdict, at once and every 1.5 s, in the first minute."""
+    begun, told, last = monotonic(), -inf, ""
 
+    def observe(assessment: Assessment, now: float, event: str) -> None:
+        nonlocal told, last
+        if (
+            assessment.verdict is None
+            and now - begun < most
+            and (assessment.reason != last or now - told >= interval)
+        ):
+            told, last = now, assessment.reason
+            _say(f"{now - begun:.0f} s: {last}")
 
-def _repeat_steps(display: Display, interval: float = 1.5, most: int = 40) -> None:
-    """Say what the start waits for, until there is a verdict or another view says it."""
-    begun = monotonic()
-    for _ in range(most):
-        if display.started.wait(interval) or display.closed.is_set():
-            return
-        assessment = display.assess(monotonic())
-        if assessment.verdict is not None:
-            return
-        _say(f"{monotonic() - begun:.0f} s: {assessment.reason}")
+    return observe
 
 
 def _open_views(display: Display, setup: LiveSetup, live: LiveSettings, opened: ExitStack) -> None:
-    """Complete what the views show; start the estimates of contacts and all views but page and terminal."""
+    """Show the skin; start the estimates of contacts and all views but page and terminal."""
     model = setup.model
-    display.title, display.port = model.title, setup.name
-    display.positions, display.size, display.window = model.positions, model.size, model.window / model.rate
+    display.title, display.port, display.size = model.title, setup.name, model.size
+    display.window = model.window / model.rate
+    display.place(model.positions)
     try:
         if live.contacts:
             whole = lambda: setup.port is not None and setup.port.raw_range.whole  # noqa: E731
@@ -398,10 +341,10 @@ def _open_views(display: Display, setup: LiveSetup, live: LiveSettings, opened: 
 
 
 def _refine(final: FinalThreshold | None, engine: Engine, display: Display) -> None:
-    """Replace a provisional threshold once the final one is known."""
+    """Replace a provisional threshold once the final one is known; where there is none, say why."""
     point = None if final is None else final.take()
-    if isinstance(point, str) or (point is not None and point.useless):
-        _say(f"the threshold stays provisional: {point if isinstance(point, str) else point.warning()}")
+    if isinstance(point, str):
+        display.add_note(Note("provisional", detail=f", and stays so: {point}"))
     elif point is not None:
         engine.adopt(point.announced(_say), point.score)
         display.remove_note("provisional")

@@ -102,6 +102,8 @@ def _application(display: Display) -> Starlette:
     local = Middleware(TrustedHostMiddleware, allowed_hosts=[_HOST, "localhost"])
 
     async def info(request: Request) -> Response:
+        if not len(display.positions):
+            return Response(status_code=503)  # the page asks again
         named = {name: getattr(display, name) for name in ("title", "port", "top", "window", "size")}
         return JSONResponse(named | {"positions": display.positions.tolist()})
 

@@ -247,7 +247,7 @@ def alarm_source(run: FinishedRun, learner: Predictor, used: Config) -> AlarmSou
         partial(build_device, stored),
         stored=run.run.data.tags.get(TAG),
         profile=None if stored.evaluation is None else stored.evaluation.profile,
-        weights=run.weights,
+        weights=getattr(run.run.info, "weights", None),  # of a pretrained model
     )
 
 
@@ -258,8 +258,7 @@ def device_on_skin(trained: Config, skin: Mapping[str, Any]) -> Callable[[Mappin
         trained: configuration of the training.
         skin: settings of ``body``, ``layout`` and ``simulator``.
     """
-    skin = {group: skin[group] for group in ("body", "layout", "simulator")}
-    return partial(_build_on_skin, trained, skin)
+    return partial(_build_on_skin, trained, {group: skin[group] for group in ("body", "layout", "simulator")})
 
 
 def _build_on_skin(trained: Config, skin: Mapping[str, Any], device: Mapping[str, Any]) -> AbstractDevice:

@@ -100,12 +100,6 @@ class FinishedRun:
         """The name of the run."""
         return str(self.run.info.run_name)
 
-    @property
-    def weights(self) -> Path | None:
-        """The file of weights of a pretrained model; None of other runs."""
-        folder = Path(url2pathname(urlsplit(self.run.info.artifact_uri).path))
-        return None if self.store is not None else folder / self.run.data.tags["learned"]
-
     @cached_property
     def stored(self) -> Config:
         """The configuration of the run.
@@ -277,6 +271,7 @@ def find_pretrained(name: str) -> "Run | None":
         end_time=record["start_time"],  # a record does not say when the training ended
         artifact_uri=folder.as_uri(),
         run_name=folder.name,
+        weights=folder / record["tags"]["learned"],
     )
     data = SimpleNamespace(metrics=record["metrics"], tags=record["tags"])
     return cast("Run", SimpleNamespace(info=info, data=data))

@@ -81,12 +81,10 @@ def test_a_profile_counts_at_the_rate_and_alignment_of_the_evaluated_device(hydr
     assert (unknown.rate, unknown.framed, unknown.without_lag) == ([10, 1000], 0.0, 0.0)
 
 
-def run_of(config, point, folder=""):
+def run_of(config, point, weights=None):
     """Return as much of a run as its operating point is read from."""
-    data = SimpleNamespace(tags={TAG: point.text(), "learned": "weights.pt"})
-    run = FinishedRun(
-        None, SimpleNamespace(data=data, info=SimpleNamespace(run_id="abc", artifact_uri=folder))
-    )
+    data = SimpleNamespace(tags={TAG: point.text()})
+    run = FinishedRun(None, SimpleNamespace(data=data, info=SimpleNamespace(run_id="abc", weights=weights)))
     run.__dict__["stored"] = config
     return run
 
@@ -182,7 +180,7 @@ def test_touches_of_a_run_of_drawn_skins_are_measured_by_mild_devices(hydra, dev
 def test_a_provisional_threshold_is_lower_until_the_final_one_is_kept_or_ships(hydra, tmp_path, monkeypatch):
     monkeypatch.setenv("SKIN_CACHE", str(tmp_path / "cache"))
     live, config = LiveConditions(20.0, 0.1, 2.0, 0.1, 3), hydra("evaluation.safe_gestures=400")
-    run = run_of(config, STORED, f"file://{tmp_path}")
+    run = run_of(config, STORED, tmp_path / "weights.pt")
     source = alarm_source(run, Quiet(), config)
     first = choose_alarm_threshold(source, live, say=print, quick=True)
     assert (first.provisional, first.safe, first.dangerous) == (True, 200, 100)

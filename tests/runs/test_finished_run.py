@@ -50,8 +50,8 @@ RECORDED = Config(device={"_target_": "skin.device.recording.Recorded"})
 
 def stored_point(text=None, rate=0.02):
     """Return the operating point of a run on a recording with this tag, for a false-alarm rate."""
-    data = SimpleNamespace(tags={"learned": "x"} | ({} if text is None else {TAG: text}))
-    run = FinishedRun(None, SimpleNamespace(data=data, info=SimpleNamespace(run_id="abc", artifact_uri="")))
+    data = SimpleNamespace(tags={} if text is None else {TAG: text})
+    run = FinishedRun(None, SimpleNamespace(data=data, info=SimpleNamespace(run_id="abc")))
     run.__dict__["stored"] = RECORDED
     settings = Evaluation(devices=0, layouts=0, false_alarm_rate=rate)
     return choose_alarm_threshold(alarm_source(run, object(), replace(RECORDED, evaluation=settings)))

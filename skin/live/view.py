@@ -278,7 +278,7 @@ def show(
             if live.verdicts is None:
                 opened.enter_context(show_in_terminal(display, Console()))
             check = partial(setup.check, source, engine, nominal, live.selftest, _say, display.add_note)
-            refine = partial(_refine, final, engine, display)
+            refine = partial(adopt_final, final, engine, display)
             loop = LiveLoop(source.skin, source.tare, engine, display, check, refine)
             opened.callback(lambda: _say(f"{loop.verdicts} verdicts, {loop.line}"))
             gc.collect()  # a search among all that is loaded would stop the loop for 0.3 s, again and again
@@ -340,7 +340,7 @@ def _open_views(display: Display, setup: LiveSetup, live: LiveSettings, opened: 
         opened.enter_context(write_lines(display, stdout, display.close, VERDICTS))
 
 
-def _refine(final: FinalThreshold | None, engine: Engine, display: Display) -> None:
+def adopt_final(final: FinalThreshold | None, engine: Engine, display: Display) -> None:
     """Replace a provisional threshold once the final one is known; where there is none, say why."""
     point = None if final is None else final.take()
     if isinstance(point, str):

@@ -179,7 +179,9 @@ def test_touches_of_a_run_of_drawn_skins_are_measured_by_mild_devices(hydra, dev
 
 def test_a_provisional_threshold_is_lower_until_the_final_one_is_kept_or_ships(hydra, tmp_path, monkeypatch):
     monkeypatch.setenv("SKIN_CACHE", str(tmp_path / "cache"))
-    live, config = LiveConditions(20.0, 0.1, 2.0, 0.1, 3), hydra("evaluation.safe_gestures=400")
+    live, config = LiveConditions(20.0, 0.1, 2.0, 0.1, 3), hydra("evaluation.safe_gestures=320")
+    for count in ("DANGEROUS_TOUCHES", "FITTED_TOUCHES"):
+        monkeypatch.setattr(alarm, count, 100)
     run = run_of(config, STORED, tmp_path / "weights.pt")
     source = alarm_source(run, Quiet(), config)
     first = choose_alarm_threshold(source, live, say=print, quick=True)
@@ -187,7 +189,7 @@ def test_a_provisional_threshold_is_lower_until_the_final_one_is_kept_or_ships(h
     (tmp_path / "weights.pt").write_bytes(b"these")
     alarm.ship_thresholds(source, [live], print)
     final = choose_alarm_threshold(source, live, say=pytest.fail, quick=True)
-    assert (final.provisional, final.safe, final.rate) == (False, 400, 20.0)
+    assert (final.provisional, final.safe, final.rate) == (False, 320, 20.0)
     assert first.threshold < final.threshold
     # Shipped thresholds are those of the weights.
     (tmp_path / "weights.pt").write_bytes(b"others")

@@ -300,8 +300,17 @@ class TorchModel(Model):
         self.sites, threshold = example.positions, None if point is None else point.threshold
         identity, title = ("none", "untrained") if run is None else (run.identity, run.title)
         alarm = AlarmSource(title) if run is None or used is None else alarm_source(run, learner, used)
-        frames = example.readings.shape[1], example.rate, self.sites.numpy()
-        super().__init__(identity, title, device.task, *frames, device.size, threshold, alarm)
+        super().__init__(
+            identity,
+            title,
+            device.task,
+            example.readings.shape[1],
+            example.rate,
+            self.sites.numpy(),
+            device.size,
+            threshold,
+            alarm,
+        )
         self.learned, self._touch = touch is None and self.task.gate is not None, touch
 
     @cached_property

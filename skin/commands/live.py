@@ -38,8 +38,10 @@ def main(
     config: Config, run: str, demo: bool, web: bool, seconds: float | None, live: dict[str, Any]
 ) -> None:
     """Load a run or an exported model, open the skin, and show verdicts until the command is ended."""
+    from skin.core.messages import quiet
     from skin.live.engine_builder import LiveSettings
     from skin.live.view import show
+    from skin.runs.run import find_run
 
     words, settings = overrides(), LiveSettings.of(live)
     if not demo:
@@ -49,6 +51,8 @@ def main(
         raise InputError(f"demo=true emulates a skin at a port: leave out {devices[0]}, or demo=true")
     given = {_group(word) for word in words}
     run = run if "run" in given else "any_skin"
+    quiet()
+    find_run(config.tracking, run, config.trust)  # refused before a page is opened
     replaced = given | (_SKIN if given & {"run", *_SKIN} else set())
     words = [*(word for word in _DEMO if _group(word) not in replaced), *words]
     skin = [word for word in words if _group(word) in {"touch", *_SKIN}]

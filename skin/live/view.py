@@ -297,7 +297,8 @@ def _open_page(live: LiveSettings, web: bool, opened: ExitStack) -> Display:
         from skin.live.web import serve_page
 
         _say(f"page: {opened.enter_context(serve_page(display, live.web_port))}")
-    display.observers.append(_tell_progress())
+    if web or sys.stderr.isatty():  # other programs read standard output
+        display.observers.append(_tell_progress())
     opened.enter_context(watch_age(display))
     return display
 
@@ -322,8 +323,12 @@ def _tell_progress(interval: float = 1.5, most: float = 60.0) -> Observer:
 def _open_views(display: Display, setup: LiveSetup, live: LiveSettings, opened: ExitStack) -> None:
     """Show the skin; start the estimates of contacts and all views but page and terminal."""
     model = setup.model
-    display.title, display.port, display.size = model.title, setup.name, model.size
-    display.window = model.window / model.rate
+    display.title, display.port, display.size, display.window = (
+        model.title,
+        setup.name,
+        model.size,
+        model.window / model.rate,
+    )
     display.place(model.positions)
     try:
         if live.contacts:

@@ -4,9 +4,11 @@
     skin export run=any_skin body=arm layout.path=sensors.csv
     skin live run=skin.onnx device=serial device.port=/dev/ttyACM0
     skin export run=latest format=folder name=my_skin licence=MIT
+    skin export run=any_skin format=thresholds export.rates=[100]
 
 The ONNX file holds a network, from readings to probabilities, and is compared with the run on simulated or
 recorded touches first. The folder holds any run: run=my_skin then selects it wherever a run is accepted.
+format=thresholds adds those of a skin to the folder of a pretrained model, where skin live finds them.
 """
 
 import sys
@@ -27,9 +29,12 @@ from skin.errors import InputError
 from skin.runs.configuration import Config, overrides, settings_of
 
 if TYPE_CHECKING:
+    from skin.evaluation.decisions import LiveConditions
     from skin.runs.build import TorchModel
+    from skin.runs.run import FinishedRun
 
 _THRESHOLDS = "choosing the thresholds of the alarm for touches"
+_USUAL = 100.0  # Hz
 # Expected seconds of each step, for the fraction that is done.
 _STEPS = {
     "loading the run and the threshold of its alarm": 25.0,
@@ -44,7 +49,7 @@ _STEPS = {
 def main(
     config: Config,
     run: str,
-    format: Literal["onnx", "folder"],
+    format: Literal["onnx", "folder", "thresholds"],
     out: str | None,
     name: str | None,
     licence: str | None,
@@ -65,7 +70,10 @@ def main(
     else:
         check_settings(_export_file, export, "export")
         with Steps(_STEPS) as steps:
-            _export_file(run, config, out, steps, **export)
+            if format == "thresholds":
+                _ship_thresholds(run, config, export["touch"], export["rates"])
+            else:
+                _export_file(run, config, out, steps, **export)
 
 
 def _export_file(
@@ -75,7 +83,7 @@ def _export_file(
     steps: Steps,
     touch: PositiveFloat | None,
     touches: Annotated[int, Ge(1)],
-    rates: Annotated[Sequence[PositiveFloat], MinLen(1)],
+    rates: Annotated[Sequence[PositiveFloat], MinLen(1)] | None,
 ) -> None:
     """Write the network of a run for one skin, with the thresholds of its alarm.
 
@@ -86,15 +94,15 @@ def _export_file(
         steps: to be shown.
         touch: contact threshold, N above the baseline; None: as in the run.
         touches: number of touches on which the file is compared with the run.
-        rates: of devices, Hz, for each of which the threshold of the alarm is chosen.
+        rates: of devices, Hz, for each of which the threshold of the alarm is chosen; None: that of the run's
+            device, 100 Hz if it has many.
     """
     path = None if out is None else Path(out).expanduser()
     if path is not None and path.suffix != ".onnx":
         raise InputError(f"out={out} must end in .onnx: as in out=skin.onnx")
 
-    from skin.runs.build import equation10_warning, load_model
+    from skin.runs.build import equation10_warning
     from skin.runs.model import describe_skin
-    from skin.runs.run import find_run
 
     try:
         from skin.runs.onnx_writer import write_model
@@ -102,10 +110,7 @@ def _export_file(
         raise InputError(
             "skin export needs onnx, onnxscript and onnxruntime: pip install 'tactile-skin[export]'"
         ) from error
-    quiet()
-    run = find_run(config.tracking, name, config.trust)
-    whole = run.configured(overrides())
-    model = load_model(run, whole, touch=touch, one_skin=True)
+    run, whole, model, rates = _load(name, config, touch, rates)
     module = model.learner.pipeline(model.sites)  # refused before anything else is simulated
     if advice := equation10_warning(run.stored):
         print(advice, file=sys.stderr)
@@ -125,13 +130,41 @@ def _export_file(
     print(f"{path}: differs from the run by {difference:.1g} at most on {len(compared)} touches")
 
 
+def _ship_thresholds(name: str, config: Config, touch: float | None, rates: Sequence[float] | None) -> None:
+    """Add the thresholds of the alarm for a skin to those of a pretrained model; see :func:`_export_file`."""
+    from skin.evaluation.alarm import ship_thresholds
+
+    _, _, model, rates = _load(name, config, touch, rates, alarm=False)
+    ship_thresholds(model.alarm, _conditions(model, rates), print)
+
+
+def _load(
+    name: str, config: Config, touch: float | None, rates: Sequence[float] | None, alarm: bool = True
+) -> "tuple[FinishedRun, Config, TorchModel, Sequence[float]]":
+    """Return a run, its configuration for one skin, its model there, and the rates of devices, Hz."""
+    from skin.runs.build import load_model
+    from skin.runs.run import find_run
+
+    quiet()
+    run = find_run(config.tracking, name, config.trust)
+    used = run.configured(overrides())
+    model = load_model(run, used, touch=touch, one_skin=True, alarm=alarm)
+    rate = used.device.get("rate") or model.rate
+    return run, used, model, rates or [rate if isinstance(rate, int | float) else _USUAL]
+
+
+def _conditions(model: "TorchModel", rates: Sequence[float]) -> "list[LiveConditions]":
+    """Return how live views watch devices of these rates, Hz, at ports."""
+    from skin.live.engine import DebounceSettings
+
+    return [model.live_conditions(rate, DebounceSettings().alarm, False) for rate in rates]
+
+
 def _choose_thresholds(model: "TorchModel", rates: Sequence[float]) -> dict[str, Any]:
     """Return thresholds and scores of the alarm by the rate of a device, Hz; 1 is refused: it raises none."""
     from skin.evaluation.alarm import choose_alarm_threshold
-    from skin.live.engine import DebounceSettings
 
-    patience = DebounceSettings().alarm
-    conditions = (model.live_conditions(rate, patience, False) for rate in rates)
+    conditions = _conditions(model, rates)
     points = {f"{live.rate:g}": choose_alarm_threshold(model.alarm, live, say=print) for live in conditions}
     hiding = [at.warning() for at in points.values() if at and at.useless]
     refused = "".join(f"{text}: skin live refuses the file at this rate\n" for text in hiding)

@@ -11,13 +11,14 @@ model at a port of this machine and serves the page. Ctrl-C stops.
 """
 
 import re
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from threading import Thread
 from typing import Any
-
-from hydra import compose
 
 from skin.commands._command import command
 from skin.errors import InputError
-from skin.runs.configuration import Config, overrides, validate_config
+from skin.runs.configuration import Config, overrides
 
 _SKIN = {"body", "layout", "simulator"}
 _DEMO = (
@@ -37,8 +38,10 @@ def main(
     config: Config, run: str, demo: bool, web: bool, seconds: float | None, live: dict[str, Any]
 ) -> None:
     """Load a run or an exported model, open the skin, and show verdicts until the command is ended."""
+    from skin.core.messages import quiet
     from skin.live.engine_builder import LiveSettings
-    from skin.live.view import emulated_skin, show
+    from skin.live.view import show
+    from skin.runs.run import find_run
 
     words, settings = overrides(), LiveSettings.of(live)
     if not demo:
@@ -48,14 +51,49 @@ def main(
         raise InputError(f"demo=true emulates a skin at a port: leave out {devices[0]}, or demo=true")
     given = {_group(word) for word in words}
     run = run if "run" in given else "any_skin"
+    quiet()
+    find_run(config.tracking, run, config.trust)  # refused before a page is opened
     replaced = given | (_SKIN if given & {"run", *_SKIN} else set())
     words = [*(word for word in _DEMO if _group(word) not in replaced), *words]
     skin = [word for word in words if _group(word) in {"touch", *_SKIN}]
-    with emulated_skin(run, config, skin) as device:
-        words = [*device, *(word for word in words if _group(word) != "touch")]
-        connected = validate_config(compose("live", words))
-        show(run, connected, words, settings, web or "web" not in given, seconds, own_mechanics=True)
+    words = [word for word in words if _group(word) != "touch"]
+    emulated = _emulated_skin(run, config, skin)
+    show(run, config, words, settings, web or "web" not in given, seconds, emulated)
 
 
 def _group(word: str) -> str:
     return re.split(r"[.=]", word, maxsplit=1)[0]
+
+
+@contextmanager
+def _emulated_skin(run: str, config: Config, overrides: Sequence[str]) -> Iterator[list[str]]:
+    """Emulate the skin of a run, without the imperfections of its training, at a port of this machine.
+
+    Args:
+        run: name of a run that was trained on a simulated skin.
+        config: of the command.
+        overrides: settings that replace those of the run.
+
+    Yields:
+        The settings of a device at this port, as overrides.
+
+    Raises:
+        InputError: there is no such run, or its skin cannot be emulated.
+    """
+    from skin.runs.build import build_device
+    from skin.runs.run import find_run
+    from skin.wire.emulator import Emulator, EmulatorSettings, Faults, open_port
+
+    emulated = find_run(config.tracking, run, config.trust).configured(["device=simulated", *overrides])
+    device = build_device(emulated).simulated("a skin is emulated")
+    port = open_port("tcp:0", None)
+    # At rest until the view has its baseline.
+    emulator = Emulator(device, port, EmulatorSettings(idle=10.0), Faults())
+    thread = Thread(target=emulator.run, name="skin-emulator", daemon=True)
+    thread.start()
+    try:
+        yield ["device=serial", f"device.port={port.address}", f"device.scale={emulator.converter.scale}"]
+    finally:
+        emulator.stop()
+        thread.join()
+        port.unplug()

@@ -7,9 +7,11 @@ threshold that was chosen over many of them varies from skin to skin. That for s
 model. That of the live view, which judges many windows of a touch, depends on the rate of the device, too.
 """
 
+import json
 import logging
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import asdict, astuple, dataclass, field, fields, replace
 from math import log
 from pathlib import Path
@@ -19,10 +21,12 @@ import numpy as np
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from omegaconf import OmegaConf
+from scipy.special import bdtrik
 
-from skin.core.files import CONF
+from skin.core.files import CONF, whole
 from skin.core.progress import Steps
 from skin.core.rng import Stream, generator
+from skin.core.safe_loading import TEXT, parse_json, read_file
 from skin.device.calibration import read_calibration
 from skin.errors import InputError
 from skin.evaluation.decisions import LiveConditions
@@ -49,7 +53,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from skin.device.base import AbstractDevice
-    from skin.device.simulated import Simulated as AbstractSimulated
+    from skin.device.simulated import Simulated
     from skin.device.touches import Touches
 
 SAFE_TOUCHES = ENOUGH
@@ -58,6 +62,11 @@ DANGEROUS_TOUCHES = 400
 """Dangerous touches on which a threshold of the live view is checked: 75 % are then 71 to 79 % (95 %)."""
 FITTED_TOUCHES = 300
 """Safe touches, and as many dangerous ones, to which a score is fitted; fits to 1200 found no more."""
+PROVISIONAL = 200, 100
+"""Safe and dangerous touches of a provisional threshold: 4 s of one core; 100 of each fit its score."""
+_LOWER = 0.95  # probability that a provisional threshold is no higher than that of the wanted rate
+THRESHOLDS = "thresholds.json"
+"""File beside the weights of a pretrained model: thresholds for touches, by the hash of what decides them."""
 _USUAL = "mild"
 _EVERY = {"without_lag": 0.0, "framed": 0.0}  # every device is as described, whatever the training mixed in
 _DEVICE = "device"  # in place of a profile: the imperfections of the device that is evaluated
@@ -83,6 +92,7 @@ class AlarmSource:
         threshold: of an exported network, for single windows; None: no label ``dangerous``.
         thresholds: of an exported network: rate of a device, Hz -> threshold for touches.
         scores: of an exported network: rate -> the factors of :class:`DangerScore`.
+        weights: file of a pretrained model, beside which :data:`THRESHOLDS` ships; None: it is none.
     """
 
     name: str
@@ -99,6 +109,7 @@ class AlarmSource:
     threshold: float | None = None
     thresholds: Mapping[str, float] = field(default_factory=dict)
     scores: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
+    weights: Path | None = None
 
 
 def choose_alarm_threshold(
@@ -108,6 +119,7 @@ def choose_alarm_threshold(
     anew: bool = False,
     one_skin: bool = False,
     say: Callable[[str], None] = _log.warning,
+    quick: bool = False,
 ) -> OperatingPoint | None:
     """Return where a model raises the alarm; None if it has no label ``dangerous``.
 
@@ -127,6 +139,7 @@ def choose_alarm_threshold(
         anew: the model is new, so nothing stored holds.
         one_skin: the skin in use counts even if its device draws others.
         say: called with each message for the user.
+        quick: for touches, a provisional threshold will do where none is kept.
 
     Raises:
         InputError: the settings cannot be used, an exported network raises no alarm, a stored operating
@@ -140,7 +153,7 @@ def choose_alarm_threshold(
         return _exported_point(source, live, say)
     settings = check_evaluation(source.settings)
     if live is not None and (anew or "simulator" in source.trained):
-        return _on_touches(source, settings, live, say)
+        return _on_touches(source, settings, live, say, quick)
     if not anew:
         all_skins = "skins" in source.used and not one_skin
         if all_skins and settings.profile is not None:
@@ -203,7 +216,7 @@ def _stored_point(source: AlarmSource, settings: Evaluation) -> OperatingPoint |
 # The device whose touches decide.
 
 
-def threshold_device(source: AlarmSource) -> "AbstractSimulated":
+def threshold_device(source: AlarmSource) -> "Simulated":
     """Return the device whose fresh gestures determine the threshold of the alarm.
 
     It is the device of the training on the skin in use. If ``evaluation.profile`` is set, every gesture is
@@ -318,7 +331,7 @@ def threshold_gestures(device: "AbstractDevice", settings: Evaluation) -> "Touch
     return touches
 
 
-def _lowest_threshold(safe: "Tensor", target: float) -> float:
+def _lowest_threshold(safe: "Tensor", target: float, allowed: int | None = None) -> float:
     """Return the lowest threshold that keeps the false-alarm rate, a float32 number.
 
     At most k = floor(target (n + 1)) - 1 of n safe gestures raise the alarm. A new safe gesture then raises
@@ -328,9 +341,11 @@ def _lowest_threshold(safe: "Tensor", target: float) -> float:
     Args:
         safe: (n,), n > 0, probabilities of ``dangerous`` of safe gestures.
         target: largest rate.
+        allowed: k; None: as above.
     """
-    # 1e-9 keeps a product such as 0.29 * 100 from rounding below its whole number.
-    allowed = max(math.floor(target * (len(safe) + 1) + 1e-9) - 1, 0)
+    if allowed is None:
+        # 1e-9 keeps a product such as 0.29 * 100 from rounding below its whole number.
+        allowed = max(math.floor(target * (len(safe) + 1) + 1e-9) - 1, 0)
     return threshold_above(safe.detach().cpu().double().numpy(), allowed)
 
 
@@ -338,18 +353,57 @@ def _lowest_threshold(safe: "Tensor", target: float) -> float:
 
 
 def _on_touches(
-    source: AlarmSource, settings: Evaluation, live: LiveConditions, say: Callable[[str], None]
+    source: AlarmSource, settings: Evaluation, live: LiveConditions, say: Callable[[str], None], quick: bool
 ) -> OperatingPoint:
     """Return the point for safe touches as the live view judges them.
 
-    It is kept on disk, unless the device is given. Without a profile, a model that was trained on drawn skins
-    takes ``mild``, and a device with a calibration what that leaves.
+    It ships with the model or is kept on disk, unless the device is given.
     """
-    target, count = settings.false_alarm_rate, min(settings.safe_gestures, SAFE_TOUCHES)
+    target, missed = settings.false_alarm_rate, settings.miss_rate
+    count = min(settings.safe_gestures, SAFE_TOUCHES)
     if source.device is not None:
         device = source.device.simulated("touches are simulated")
         point = _on_touches_of(device, source.learner, _snapped(live, device), settings, count)
-        return _guaranteed(point, settings)
+        return _guaranteed(point, missed, settings.profile)
+    device, live, content = _describe(source, settings, live)
+    key, profile = array_cache.hashed(content, _sources()), content["profile"]
+    file = array_cache.folder(None) / f"threshold_{key[:16]}.npz"
+    devices = "" if profile is None else f" and devices of the profile {profile}"
+    shipped = _shipped(source, say).get(array_cache.hashed(content, ()))
+    # No threshold from few touches keeps a guarantee.
+    quick = quick and missed is None and count > sum(PROVISIONAL)
+    if quick and shipped is None and not file.is_file():
+        say(f"choosing a provisional threshold of the alarm at {live.rate:.3g} Hz{devices}")
+        return _on_touches_of(device, source.learner, live, settings, count, quick=True)
+
+    def choose() -> dict[str, np.ndarray]:
+        others = "" if missed is None else f" and {touches_drawn(missed)} dangerous"
+        say(f"choosing the alarm's threshold on {count} safe{others} touches at {live.rate:.3g} Hz{devices}")
+        return _numbers(_on_touches_of(device, source.learner, live, settings, count))
+
+    kept = shipped or array_cache.kept(file, key, {"point": (4,), "score": (3,)}, choose)
+    threshold, raised, dangerous, found = kept["point"]
+    counts = int(raised), device.data_seed, int(dangerous), int(found)
+    score = DangerScore(*map(float, kept["score"]))
+    point = OperatingPoint(float(threshold), target, count, *counts, live.rate, score)
+    return _guaranteed(point, missed, profile)
+
+
+def _numbers(point: OperatingPoint) -> dict[str, np.ndarray]:
+    """Return what is kept of a point for touches."""
+    assert point.score is not None
+    counts = point.threshold, point.raised, point.dangerous, point.found
+    return {"point": np.array(counts), "score": np.array(astuple(point.score))}
+
+
+def _describe(
+    source: AlarmSource, settings: Evaluation, live: LiveConditions
+) -> "tuple[Simulated, LiveConditions, dict[str, Any]]":
+    """Return the device that measures the touches, the conditions, and all that decides the threshold.
+
+    Without a profile, a model that was trained on drawn skins takes ``mild``, and a device with a calibration
+    what that leaves.
+    """
     path = source.used.get("calibration") if source.used.get("port") else None
     if settings.profile is None and path is None and "skins" in source.trained:
         # Such trainings have devices so different that a threshold for all of them hides dangerous touches.
@@ -358,49 +412,79 @@ def _on_touches(
     if path and settings.profile is None:
         device = device.replace(**_remaining(path), randomise=True, calibration=None)
     live = _snapped(live, device)
-    content = {
-        "model": source.name,
-        "device": source.trained,
-        "skin": source.skin,
-        "positions": device.sensors.positions.round(9).tolist(),
-        "imperfections": {name: str(value) for name, value in vars(device.imperfection).items()},
-        "live": asdict(live),
-        "target": target,
-        "missed": settings.miss_rate,
-        "count": count,
-    }
-    key = array_cache.hashed(content, _sources())
-
-    def choose() -> dict[str, np.ndarray]:
-        devices = "" if settings.profile is None else f" and devices of the profile {settings.profile}"
-        others = "" if settings.miss_rate is None else f" and {touches_drawn(settings.miss_rate)} dangerous"
-        say(f"choosing the alarm's threshold on {count} safe{others} touches at {live.rate:.3g} Hz{devices}")
-        point = _on_touches_of(device, source.learner, live, settings, count)
-        assert point.score is not None
-        counts = point.threshold, point.raised, point.dangerous, point.found
-        return {"point": np.array(counts), "score": np.array(astuple(point.score))}
-
-    file = array_cache.folder(None) / f"threshold_{key[:16]}.npz"
-    kept = array_cache.kept(file, key, {"point": (4,), "score": (3,)}, choose)
-    threshold, *counts = kept["point"].tolist()
-    raised, dangerous, found = (int(number) for number in counts)
-    score = DangerScore(*kept["score"].tolist())
-    point = OperatingPoint(
-        threshold, target, count, raised, device.data_seed, dangerous, found, live.rate, score
+    return (
+        device,
+        live,
+        {
+            "model": source.name,
+            "device": source.trained,
+            "skin": source.skin,
+            "positions": device.sensors.positions.round(9).tolist(),
+            # The conditions have the rate, and whether it is aligned.
+            "imperfections": {
+                name: str(value)
+                for name, value in vars(device.imperfection).items()
+                if name not in ("rate", "aligned")
+            },
+            "live": asdict(live) | {"contact": round(live.contact, 3)},
+            "profile": settings.profile,
+            "target": settings.false_alarm_rate,
+            "missed": settings.miss_rate,
+            "count": min(settings.safe_gestures, SAFE_TOUCHES),
+        },
     )
-    return _guaranteed(point, settings)
 
 
-def _guaranteed(point: OperatingPoint, settings: Evaluation) -> OperatingPoint:
+def _guaranteed(point: OperatingPoint, missed: float | None, profile: str | None) -> OperatingPoint:
     """Return a point with the guarantee that it was chosen for, if any."""
-    if settings.miss_rate is None:
+    if missed is None:
         return point
-    conditions = f"{settings.profile or 'this device'}, {point.rate:.3g} Hz"
+    conditions = f"{profile or 'this device'}, {point.rate:.3g} Hz"
     misses = point.dangerous - point.found
-    return replace(point, guarantee=Guarantee(settings.miss_rate, point.dangerous, misses, conditions))
+    return replace(point, guarantee=Guarantee(missed, point.dangerous, misses, conditions))
 
 
-def _snapped(live: LiveConditions, device: "AbstractSimulated") -> LiveConditions:
+def _shipped(source: AlarmSource, say: Callable[[str], None]) -> dict[str, Any]:
+    """Return the thresholds that ship with a model; none, with a notice, if they belong to other weights."""
+    if source.weights is None or not (file := source.weights.with_name(THRESHOLDS)).is_file():
+        return {}
+    with suppress(OSError, ValueError, TypeError, LookupError):
+        content = parse_json(read_file(file, TEXT))
+        if content["hash"] == array_cache.hashed(content["skins"], [source.weights]):
+            return dict(content["skins"])
+    say(f"{file} is damaged or of other weights, and not used: skin export format=thresholds makes it anew")
+    return {}
+
+
+def ship_thresholds(
+    source: AlarmSource, conditions: Iterable[LiveConditions], say: Callable[[str], None]
+) -> None:
+    """Choose thresholds for touches anew, and add them to those that ship with a pretrained model.
+
+    Args:
+        source: the model on a skin.
+        conditions: of the live views.
+        say: called with each message for the user.
+
+    Raises:
+        InputError: the model is not pretrained, or the file cannot be written.
+    """
+    if source.weights is None:
+        raise InputError(f"{source.name} is no pretrained model: thresholds ship with those of models/ only")
+    skins, settings = _shipped(source, say), check_evaluation(source.settings)
+    for live in conditions:
+        device, snapped, content = _describe(source, settings, live)
+        point = _on_touches_of(device, source.learner, snapped, settings, content["count"])
+        say(point.sentence())
+        numbers = {name: values.tolist() for name, values in _numbers(point).items()}
+        about = {"sensors": len(device.sensors), "rate": snapped.rate}
+        skins[array_cache.hashed(content, ())] = about | numbers
+    shipped = {"hash": array_cache.hashed(skins, [source.weights]), "skins": skins}
+    with whole(source.weights.with_name(THRESHOLDS)) as partial:
+        partial.write_text(json.dumps(shipped, indent=1, sort_keys=True) + "\n", encoding="utf-8")
+
+
+def _snapped(live: LiveConditions, device: "Simulated") -> LiveConditions:
     """Return the conditions at the nearest of some multiples of the model's rate.
 
     A measured rate is never the same twice, and the threshold would be chosen anew at each start.
@@ -420,43 +504,50 @@ def _sources() -> list[Path]:
 
 
 def _on_touches_of(
-    device: "AbstractSimulated",
+    device: "Simulated",
     learner: Predictor | None,
     live: LiveConditions,
     settings: Evaluation,
     count: int,
+    quick: bool = False,
 ) -> OperatingPoint:
     """Return the threshold that few of ``count`` safe touches pass, checked on dangerous ones.
 
     With ``settings.miss_rate`` it is the highest that finds most dangerous ones that count, and checked on
     safe ones. ``device`` measures each touch; with ``randomise``, by another device.
+
+    With ``quick`` it is a lower limit of that threshold, from few touches: with a probability of ``_LOWER``
+    no more than k of n safe touches pass the threshold of the wanted rate, k of the binomial distribution;
+    so the one that k pass is no higher, and hides no more dangerous touches. Scores of a part of the
+    decisions, and of touches that the score was fitted to, err downwards, too.
     """
     from skin.evaluation.touch_scores import decide_touches
 
     assert learner is not None
-    seed, fitted = device.data_seed, min(count, FITTED_TOUCHES)
-    target, missed = settings.false_alarm_rate, settings.miss_rate
+    target, missed, seed = settings.false_alarm_rate, settings.miss_rate, device.data_seed
     tests = DANGEROUS_TOUCHES if missed is None else touches_drawn(missed)
-    enough = fitted + max(count, tests) + 16  # of the 16 combinations some have one touch fewer
+    count, tests, fitted = (*PROVISIONAL, 100) if quick else (count, tests, min(count, FITTED_TOUCHES))
+    apart, allowed = (0, math.ceil(bdtrik(_LOWER, count, target))) if quick else (fitted, None)
+    enough = apart + max(count, tests) + 16  # of the 16 combinations some have one touch fewer
     labels = device.sampler.balanced(2 * enough, generator(Stream.ALARM, seed, 1))
     danger = labels[:, TOUCH.names.index(LABEL)]
     safe, others = labels[~danger], labels[danger]
-    chosen = np.concatenate([safe[:count], others[:tests], safe[count:][:fitted], others[tests:][:fitted]])
-    with Steps({"choosing the threshold of the alarm": 20.0}) as steps:
+    chosen = np.concatenate([safe[:count], others[:tests], safe[count:][:apart], others[tests:][:apart]])
+    with Steps({"choosing the threshold of the alarm": 4.0 if quick else 20.0}) as steps:
         # More threads than free cores take many times as long.
         decisions = decide_touches(
-            learner, device, live, chosen, seed, lambda done: steps.report(done / len(chosen))
+            learner, device, live, chosen, seed, lambda done: steps.report(done / len(chosen)), quick
         )
     tested = count + tests
-    score = decisions.fit(np.arange(tested, len(chosen)), np.arange(2 * fitted) >= fitted)
+    score = decisions.fit(np.arange(len(chosen))[-2 * fitted :], np.arange(2 * fitted) >= fitted)
     scores = decisions.scores(score)[:tested]
     safe_scores, others_scores = scores[:count], scores[count:]
     if missed is None:
-        threshold = _lowest_threshold(safe_scores, target)
+        threshold = _lowest_threshold(safe_scores, target, allowed)
     else:
         which = counted(decisions.peak.numpy(), decisions.sensed.numpy())
         others_scores = others_scores[which[count:tested]]
         threshold = threshold_for_misses(others_scores.numpy(), missed)
     point = OperatingPoint(threshold, target, count, 0, seed, len(others_scores), 0, live.rate, score)
     raised, found = (int(point.alarm(part).sum()) for part in (safe_scores, others_scores))
-    return replace(point, raised=raised, found=found)
+    return replace(point, raised=raised, found=found, provisional=quick)

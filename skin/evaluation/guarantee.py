@@ -9,9 +9,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import brentq
-from scipy.special import betainc, betaln
-from scipy.stats import beta, binom
+from scipy.special import bdtr, betainc, betaincinv, betaln
 
 from skin.errors import InputError
 
@@ -36,13 +34,13 @@ def counted(peak: np.ndarray, sensed: np.ndarray) -> np.ndarray:
 
 def miss_bound(misses: int, touches: int, confidence: float = CONFIDENCE) -> float:
     """Return the upper bound of the fraction of missed touches (Clopper and Pearson, 1934)."""
-    return 1.0 if misses >= touches else float(beta.ppf(confidence, misses + 1, touches - misses))
+    return 1.0 if misses >= touches else float(betaincinv(misses + 1, touches - misses, confidence))
 
 
 def allowed_misses(touches: int, rate: float, confidence: float = CONFIDENCE) -> int:
     """Return the largest number of misses whose bound is at most ``rate``; -1: there are too few touches."""
-    most = int(binom.ppf(1 - confidence, touches, rate))
-    return most if binom.cdf(most, touches, rate) <= 1 - confidence else most - 1
+    chances = bdtr(np.arange(touches + 1), touches, rate)
+    return int(np.searchsorted(chances, 1 - confidence, side="right")) - 1
 
 
 def touches_needed(rate: float, confidence: float = CONFIDENCE) -> int:
@@ -110,6 +108,8 @@ def anytime_bound(misses: int, presses: int, confidence: float = CONFIDENCE) -> 
     fractions from 0 to p, over that at p is a martingale if p is true, and a supermartingale if more are
     missed (Ville, 1939; Robbins, 1970). The bound is the p at which it reaches 1 / (1 - ``confidence``).
     """
+    from scipy.optimize import brentq  # takes half a second to import
+
     if misses >= presses:
         return 1.0
     ends = misses + 1.0, presses - misses + 1.0

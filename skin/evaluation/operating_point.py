@@ -151,6 +151,7 @@ class OperatingPoint:
         score: gives the probability that is compared; None: it is the model's.
         guarantee: that few dangerous touches are missed, for which the threshold was chosen in place of
             ``target``; ``dangerous`` are those that count.
+        provisional: it is a lower limit from few touches, so at least ``target`` of the safe ones raise it.
     """
 
     threshold: float
@@ -163,6 +164,7 @@ class OperatingPoint:
     rate: float | None = None
     score: DangerScore | None = None
     guarantee: Guarantee | None = None
+    provisional: bool = False
 
     @classmethod
     def default(cls, target: float) -> "OperatingPoint":
@@ -201,7 +203,8 @@ class OperatingPoint:
             return f"{rule}: {self.guarantee.sentence()}; {rate}"
         kind = "safe validation" if self.seed is None else "fresh safe"
         what = "gestures" if self.rate is None else f"touches at {self.rate:.3g} Hz"
-        text = f"{rule}, chosen on {self.safe} {kind} {what} for {100 * self.target:g} % false alarms"
+        rate = "at least " * self.provisional + f"{100 * self.target:g} % false alarms"
+        text = f"{rule}, chosen on {self.safe} {kind} {what} for {rate}"
         if self.dangerous:
             text += f", finds {100 * self.found / self.dangerous:.1f} % of {self.dangerous} dangerous ones"
         return text

@@ -74,10 +74,15 @@ def disc_readings(
     The only part of inference that calls the mechanics.
     """
     touches = torch.from_numpy(np.column_stack([discs, np.ones(len(discs))])).float()
-    home = next(simulator.buffers()).device
+    touches = touches.to(next(simulator.buffers()).device)
     with torch.no_grad():
-        readings = fingertip_readings(simulator, body, touches.to(home), rim)
-    return readings.cpu().numpy().astype(np.float64)
+        sensors = fingertip_readings(simulator, body, touches[:1], rim).shape[1]
+        # Small results that are kept between large ones would hold the memory of these: up to 1 GB.
+        readings = np.empty((len(discs), sensors))
+        for first in range(0, len(discs), _AT_ONCE):
+            part = slice(first, first + _AT_ONCE)
+            readings[part] = fingertip_readings(simulator, body, touches[part], rim).cpu().numpy()
+    return readings
 
 
 class Boxes(NamedTuple):
@@ -115,6 +120,7 @@ _POWERS = [(i, j) for i, j in product(range(4), repeat=2) if i + j <= 3]
 _EXPONENTS = np.array(_POWERS).T
 _RADII = 4  # Chebyshev points over the radii
 _PATCH = 0.002  # m, largest side of a patch
+_AT_ONCE = 64  # discs
 
 
 class CandidateReadings:

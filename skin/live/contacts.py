@@ -6,12 +6,10 @@ torch is not imported here, but in that process.
 """
 
 import os
-import signal
 from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
-from multiprocessing import get_context
+from dataclasses import replace
 from multiprocessing.connection import Connection
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -19,19 +17,14 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from skin.errors import InputError
+from skin.evaluation.final_threshold import start_beside
+from skin.inference.mechanics import QUIET, Mechanics
 from skin.live.verdict import Verdict
 from skin.wire.channels import NewtonFrame, UnitConversion
 
 if TYPE_CHECKING:
-    from skin.body.base import AbstractBody, Sensors
-    from skin.device.simulated import Simulated as AbstractSimulated
     from skin.inference.noise import Noise
     from skin.inference.posterior import ContactEstimate, FrameEstimate, Posterior
-    from skin.mechanics.simulator.base import AbstractSimulator
-
-QUIET = 1e-3
-"""N, least noise: a device without any would make each reading certain."""
-
 
 # What is known of contacts, as JSON data.
 
@@ -127,72 +120,6 @@ def _words(contact: dict[str, Any]) -> str:
 
 
 # What is sent to the process.
-
-
-@dataclass(frozen=True)
-class Mechanics:
-    """What contacts are estimated with.
-
-    Attributes:
-        simulator: ``simulator(body, sensors)`` gives readings that add up. The process builds it, from the
-            cache on the disk: its factors cannot be sent.
-        body, sensors: the skin.
-        noise: of a device of this kind, as far as it is known before its tare.
-    """
-
-    simulator: "Callable[[AbstractBody, Sensors], AbstractSimulator]"
-    body: "AbstractBody"
-    sensors: "Sensors"
-    noise: "Noise"
-
-    @classmethod
-    def of(
-        cls, device: "AbstractSimulated | None", calibrated: bool, gain: float = 0.02, placed: float = 0.001
-    ) -> "Mechanics":
-        """Return the mechanics of a run's skin.
-
-        Args:
-            device: that simulates the skin; None: it has no mechanics.
-            calibrated: the gains of the watched device are known; otherwise they vary as those of the
-                training do.
-            gain: standard deviation of the gains of a calibrated device.
-            placed: m, standard deviation of the positions of sensors, as made by hand.
-
-        Raises:
-            InputError: there are no mechanics, or readings of contacts do not add up.
-        """
-        from skin.inference.noise import Noise
-
-        advice = "use run=any_skin, or a run of simulator=solid"
-        if device is None:
-            raise InputError(f"this model has no simulated skin: {advice}")
-        if getattr(device.model, "reading", None) == "equation10":
-            raise InputError(f"readings of equation 10 do not add up: {advice}")
-        settings = device.imperfection
-        noise = max(float(np.mean(settings.noise)), QUIET)
-        gain = gain if calibrated else float(np.mean(settings.gain_spread))
-        offset = 0.0 if settings.tare else settings.offset
-        nominal = Noise(noise, gain=gain, offset=offset, position=placed)
-        return cls(device.simulator, device.body, device.sensors, nominal)
-
-    def posterior(self) -> "Posterior":
-        """Return the estimator, for a skin that is watched all the time and therefore idle most of it.
-
-        Touches are ten times less frequent than by default, in the same proportions. By default the prior
-        expects a touch, which few sensors that feel nothing cannot rule out between them.
-
-        Raises:
-            InputError: readings of the simulator do not add up.
-        """
-        from skin.inference.candidates import FingertipPrior
-        from skin.inference.posterior import Posterior
-
-        return Posterior(
-            self.simulator(self.body, self.sensors),
-            self.noise,
-            self.body,
-            FingertipPrior(numbers=(0.93, 0.04, 0.015, 0.005), large=0.01),
-        )
 
 
 class MeanReadings(NamedTuple):
@@ -339,14 +266,7 @@ class LiveContacts:
         """
         self._whole = whole
         self.explain("being prepared")
-        context = get_context("spawn")
-        self._pipe, end = context.Pipe()
-        self.process = context.Process(target=serve, args=(mechanics, end), name="skin-contacts", daemon=True)
-        # A process that begins while Ctrl-C is ignored ignores it for good.
-        handler = signal.signal(signal.SIGINT, signal.SIG_IGN)
-        self.process.start()
-        signal.signal(signal.SIGINT, handler)
-        end.close()
+        self.process, self._pipe = start_beside(serve, "skin-contacts", mechanics)
 
     def close(self) -> None:
         """End the process."""

@@ -19,8 +19,9 @@ from skin.device.resampling import Frame
 from skin.errors import InputError
 from skin.evaluation.alarm import choose_alarm_threshold
 from skin.evaluation.decisions import DRIFT, minimum_visible
+from skin.evaluation.final_threshold import FinalThreshold
 from skin.evaluation.operating_point import DangerScore
-from skin.live.contacts import Mechanics
+from skin.inference.mechanics import Mechanics
 from skin.live.engine import DebounceSettings, Detection, Engine
 from skin.live.verdict import Note, sensor_list
 from skin.runs.configuration import Config
@@ -265,10 +266,13 @@ class LiveSetup:
     begin: Callable[[], Source]
     mechanics: Callable[[], Mechanics]
 
-    def watch(self, live: LiveSettings, say: Callable[[str], None]) -> tuple[Source, Engine, Engine]:
+    def watch(
+        self, live: LiveSettings, say: Callable[[str], None]
+    ) -> tuple[Source, Engine, Engine, FinalThreshold | None]:
         """Choose the threshold, which may take seconds; return the source, and an engine for its frames.
 
-        The second engine has the settings that the model brings.
+        The second engine has the settings that the model brings. Where the threshold is provisional, the
+        final one is being chosen in a process.
 
         Args:
             live: settings of the live view.
@@ -278,17 +282,19 @@ class LiveSetup:
             InputError: no contact threshold is known, or no threshold raises an alarm as seldom as wanted.
         """
         model, given, usual, conditions = self.model, live.patience.above, None, None
-        danger = None
+        danger = final = None
         if given is None and model.alarms:
             rate = model.rate if self.port is None else measured_rate(self.port.skin)
             conditions = model.live_conditions(rate, live.patience.alarm, self.port is None)
         if given is not None or model.alarms:
-            point = choose_alarm_threshold(model.alarm, conditions, given, say=say)
+            point = choose_alarm_threshold(model.alarm, conditions, given, say=say, quick=True)
             # A threshold of the command line is tested against the usual one.
             if point is None or given is not None:
                 usual = model.threshold
             else:
                 usual, danger = point.announced(say), point.score
+                if point.provisional and conditions is not None:
+                    final = FinalThreshold(model.alarm, conditions)
         if conditions is not None and self.port is not None:
             # Frames that waited meanwhile would delay the verdicts about those of now.
             with suppress(SkinTimeout, SkinDisconnected):
@@ -298,7 +304,7 @@ class LiveSetup:
         engine = engine_settings(model, patience, live.touch, live.drift, danger)
         source = self.port or self.begin()
         source.tare.glitches.fractions = engine.fractions
-        return source, engine, nominal
+        return source, engine, nominal, final
 
     def check(
         self,

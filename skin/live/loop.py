@@ -104,7 +104,7 @@ class Display:
     Args:
         title: of the run.
         port: source of the frames.
-        positions: (S, 3), m.
+        positions: (S, 3), m; none until the skin is known.
         size: extent (x, y) of the sheet, m.
         top: upper end of the colour scale, N.
         window: length of the classified window, s.
@@ -142,17 +142,21 @@ class Display:
         self.notes: tuple[Note, ...] = ()
         self.observers: list[Observer] = []
         self.line = ""
-        self._lock = RLock()
-        sensors = len(self.positions)
-        first = np.zeros(sensors), np.zeros(sensors, dtype=bool)
-        self._frames: deque[tuple[np.ndarray, np.ndarray]] = deque([first], maxlen=self.kept)
-        self._valid, self._peak, self._contact = np.ones(sensors, dtype=bool), np.zeros(sensors), False
-        self._number = 0
+        self._lock, self._number, self._contact = RLock(), 0, False
+        self.place(self.positions)
         self._latest = Assessment(None, "waiting for the first frame", False)
         self._alarm_at, self._decided = -inf, deque([-inf])
         self._request: TareRequest = ""
         self._refusal: Refusal = ""
         self._refused_at = -inf
+
+    def place(self, positions: np.ndarray) -> None:
+        """Take the positions of the sensors (S, 3), m, before the first frame."""
+        sensors = len(positions)
+        first = np.zeros(sensors), np.zeros(sensors, dtype=bool)
+        with self._lock:
+            self._frames: deque[tuple[np.ndarray, np.ndarray]] = deque([first], maxlen=self.kept)
+            self._valid, self._peak, self.positions = ~first[1], first[0], positions
 
     def close(self, *_: object) -> None:
         """Let the loop and the views end."""
@@ -221,6 +225,10 @@ class Display:
     def add_note(self, note: Note) -> None:
         """Add a note on the whole session."""
         self.notes = (*(other for other in self.notes if other.code != note.code), note)
+
+    def remove_note(self, code: str) -> None:
+        """Remove a note on the whole session, if there is one."""
+        self.notes = tuple(note for note in self.notes if note.code != code)
 
     def request_tare(self, now: float, force: bool = False) -> str:
         """Request a new baseline at ``now``, s; return why it is refused, or an empty text.
@@ -313,6 +321,7 @@ class LiveLoop:
         engine: gives verdicts.
         display: shows them.
         verify: called once, before the first decision; None: nothing is tested.
+        refine: called between decisions, twice a second: it may change the engine's threshold.
         clock: gives the host's monotonic time, s.
         wait: s that one read waits for a frame.
         at_once: frames that are taken together.
@@ -331,6 +340,7 @@ class LiveLoop:
         engine: Engine,
         display: Display,
         verify: Verify | None = None,
+        refine: Callable[[], object] = bool,
         clock: Callable[[], float] = monotonic,
         wait: float = 0.3,
         at_once: int = 1024,
@@ -340,7 +350,7 @@ class LiveLoop:
     ) -> None:
         self._skin, self._tare, self._engine, self._display = skin, tare, engine, display
         self._verify, self._clock, self._read_wait, self._at_once = verify, clock, wait, at_once
-        self._status, self._proved, self._enough = status, proved, enough
+        self._status, self._proved, self._enough, self._refine = status, proved, enough, refine
         self._received_at, self._maximum_dead, self._tested_at = clock(), inf, inf
         self._delays: deque[float] = deque(maxlen=2000)  # verdicts for the percentile of the delay
         self._updated_at = -inf
@@ -373,6 +383,7 @@ class LiveLoop:
         if now - self._updated_at >= self._status:
             self._updated_at = now
             self._display.line = self.line
+            self._refine()
             if not self._skin.stats.timing.trusted:
                 self._display.add_note(Note("clock", detail=self._skin.stats.clock))
 

@@ -23,6 +23,7 @@ NOTES = {
     "near_threshold": "probably dangerous, but below the threshold of the alarm",
     "unverified": "{text}",
     "clock": "{text}",
+    "provisional": "the threshold of the alarm is provisional and raises more false alarms{text}",
 }
 """Code of each note -> its sentence, the gravest first."""
 

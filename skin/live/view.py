@@ -1,17 +1,20 @@
-"""The live view of ``skin live``: terminal, JSON lines, log of alarms, and the emulated skin of its demo."""
+"""The live view of ``skin live``: terminal, JSON lines, log of alarms."""
 
 import gc
 import signal
 import sys
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence, Set
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from functools import partial
+from math import inf
 from pathlib import Path
 from threading import Condition, Thread
 from time import monotonic
 from typing import IO, Any
 
+import numpy as np
+from hydra import compose
 from rich.console import Console, Group, RenderableType
 from rich.live import Live
 from rich.panel import Panel
@@ -21,11 +24,13 @@ from skin.core.files import json_line, unwritable
 from skin.core.interrupt import ends_on_signal
 from skin.core.messages import quiet
 from skin.errors import InputError
+from skin.evaluation.final_threshold import FinalThreshold
 from skin.live.contacts import LiveContacts, contact_text_lines
+from skin.live.engine import Engine
 from skin.live.engine_builder import LiveSettings, LiveSetup, watch_exported, watch_run
-from skin.live.loop import Display, DisplayState, LiveLoop, watch_age
-from skin.live.verdict import Assessment, contact_text, verdict_message
-from skin.runs.configuration import Config
+from skin.live.loop import Display, DisplayState, LiveLoop, Observer, watch_age
+from skin.live.verdict import Assessment, Note, contact_text, verdict_message
+from skin.runs.configuration import Config, validate_config
 from skin.runs.model import check_overrides
 from skin.wire.segmentation import typed_lines
 
@@ -218,41 +223,7 @@ def _verdict(state: DisplayState) -> RenderableType:
     return Group(head, Text(), Text(words), Text("\n".join(filter(None, notes)), "yellow"))
 
 
-# The whole view, and the emulated skin of its demonstration.
-
-
-@contextmanager
-def emulated_skin(run: str, config: Config, overrides: Sequence[str]) -> Iterator[list[str]]:
-    """Emulate the skin of a run, without the imperfections of its training, at a port of this machine.
-
-    Args:
-        run: name of a run that was trained on a simulated skin.
-        config: of the command.
-        overrides: settings that replace those of the run.
-
-    Yields:
-        The settings of a device at this port, as overrides.
-
-    Raises:
-        InputError: there is no such run, or its skin cannot be emulated.
-    """
-    from skin.runs.build import build_device
-    from skin.runs.run import find_run
-    from skin.wire.emulator import Emulator, EmulatorSettings, Faults, open_port
-
-    quiet()
-    emulated = find_run(config.tracking, run, config.trust).configured(["device=simulated", *overrides])
-    device = build_device(emulated).simulated("a skin is emulated")
-    port = open_port("tcp:0", None)
-    emulator = Emulator(device, port, EmulatorSettings(), Faults())
-    thread = Thread(target=emulator.run, name="skin-emulator", daemon=True)
-    thread.start()
-    try:
-        yield ["device=serial", f"device.port={port.address}", f"device.scale={emulator.converter.scale}"]
-    finally:
-        emulator.stop()
-        thread.join()
-        port.unplug()
+# The whole view.
 
 
 def show(
@@ -262,7 +233,7 @@ def show(
     live: LiveSettings,
     web: bool,
     seconds: float | None,
-    own_mechanics: bool = False,
+    emulated: AbstractContextManager[Sequence[str]] | None = None,
 ) -> None:
     """Show the predictions of a run for a skin until the command is ended.
 
@@ -273,7 +244,8 @@ def show(
         live: settings of the view.
         web: whether to serve a page, too.
         seconds: duration, s; None: until the command is ended.
-        own_mechanics: the skin at the port is emulated with the simulator of the run.
+        emulated: emulates a skin with the simulator of the run, and gives the settings of a device at its
+            port; None: the device is that of ``config``.
 
     Raises:
         InputError: the model, the device or the settings cannot be used.
@@ -281,50 +253,103 @@ def show(
     try:
         with ExitStack() as opened:
             opened.enter_context(ends_on_signal())
+            display = _open_page(live, web, opened)
             if run.endswith(".onnx"):
                 check_overrides(run, overrides)
                 setup = watch_exported(run, config.device, _say, opened)
             else:
                 quiet()
-                setup = watch_run(run, config, live, _say, overrides, opened, own_mechanics)
-            display = _open_views(setup, live, web, opened)
-            source, engine, nominal = setup.watch(live, _say)
+                if emulated is not None:
+                    display.set_verdict(
+                        None, monotonic(), "the response of the emulated skin is being computed"
+                    )
+                    overrides = [*opened.enter_context(emulated), *overrides]
+                    config = validate_config(compose("live", list(overrides)))
+                display.set_verdict(
+                    None, monotonic(), "the model and the response of the skin are being loaded"
+                )
+                setup = watch_run(run, config, live, _say, overrides, opened, emulated is not None)
+            _open_views(display, setup, live, opened)
+            display.set_verdict(None, monotonic(), "the threshold of the alarm is being chosen")
+            source, engine, nominal, final = setup.watch(live, _say)
+            if final is not None:
+                opened.callback(final.close)
+                display.add_note(Note("provisional"))
             if live.verdicts is None:
                 opened.enter_context(show_in_terminal(display, Console()))
             check = partial(setup.check, source, engine, nominal, live.selftest, _say, display.add_note)
-            loop = LiveLoop(source.skin, source.tare, engine, display, check)
+            refine = partial(adopt_final, final, engine, display)
+            loop = LiveLoop(source.skin, source.tare, engine, display, check, refine)
             opened.callback(lambda: _say(f"{loop.verdicts} verdicts, {loop.line}"))
-            # A search for garbage among all that is loaded would stop the loop for 0.3 s, every few seconds.
-            gc.collect()
+            gc.collect()  # a search among all that is loaded would stop the loop for 0.3 s, again and again
             gc.freeze()
             loop.run(seconds)
     except KeyboardInterrupt:
         print("ended", file=sys.stderr)
 
 
-def _open_views(setup: LiveSetup, live: LiveSettings, web: bool, opened: ExitStack) -> Display:
-    """Start the estimates of contacts and all views but the terminal; return what they show."""
+def _open_page(live: LiveSettings, web: bool, opened: ExitStack) -> Display:
+    """Return what the views show; first on the page, before anything else is loaded."""
     contacts = LiveContacts("" if live.contacts else "live.contacts=false")
     opened.callback(contacts.close)
+    display = Display("", "", np.empty((0, 3)), (0, 0), live.top, contacts=contacts, calm=live.patience.calm)
+    if web:
+        from skin.live.web import serve_page
+
+        _say(f"page: {opened.enter_context(serve_page(display, live.web_port))}")
+    if web or sys.stderr.isatty():  # other programs read standard output
+        display.observers.append(_tell_progress())
+    opened.enter_context(watch_age(display))
+    return display
+
+
+def _tell_progress(interval: float = 1.5, most: float = 60.0) -> Observer:
+    """Return what says why there is no verdict, at once and every 1.5 s, in the first minute."""
+    begun, told, last = monotonic(), -inf, ""
+
+    def observe(assessment: Assessment, now: float, event: str) -> None:
+        nonlocal told, last
+        if (
+            assessment.verdict is None
+            and now - begun < most
+            and (assessment.reason != last or now - told >= interval)
+        ):
+            told, last = now, assessment.reason
+            _say(f"{now - begun:.0f} s: {last}")
+
+    return observe
+
+
+def _open_views(display: Display, setup: LiveSetup, live: LiveSettings, opened: ExitStack) -> None:
+    """Show the skin; start the estimates of contacts and all views but page and terminal."""
+    model = setup.model
+    display.title, display.port, display.size, display.window = (
+        model.title,
+        setup.name,
+        model.size,
+        model.window / model.rate,
+    )
+    display.place(model.positions)
     try:
         if live.contacts:
-            contacts.start(setup.mechanics(), lambda: setup.port is not None and setup.port.raw_range.whole)
+            whole = lambda: setup.port is not None and setup.port.raw_range.whole  # noqa: E731
+            display.contacts.start(setup.mechanics(), whole)
     except InputError as error:
-        contacts.explain(str(error))
+        display.contacts.explain(str(error))
         _say(f"no contacts: {error}")
-    model, span = setup.model, setup.model.window / setup.model.rate
-    skin = model.positions, model.size
-    display = Display(model.title, setup.name, *skin, live.top, span, contacts, live.patience.calm)
-    display.set_verdict(None, monotonic(), "the threshold of the alarm is being chosen")
     if live.log is not None:
         opened.enter_context(log_alarms(display, Path(live.log).expanduser()))
     if live.verdicts is not None:
         # A file of its own, and never closed: lines that a reader did not take would fail once more.
         stdout = open(sys.stdout.fileno(), "w", closefd=False)  # noqa: SIM115
         opened.enter_context(write_lines(display, stdout, display.close, VERDICTS))
-    if web:
-        from skin.live.web import serve_page
 
-        _say(f"page: {opened.enter_context(serve_page(display, live.web_port))}")
-    opened.enter_context(watch_age(display))
-    return display
+
+def adopt_final(final: FinalThreshold | None, engine: Engine, display: Display) -> None:
+    """Replace a provisional threshold once the final one is known; where there is none, say why."""
+    point = None if final is None else final.take()
+    if isinstance(point, str):
+        display.add_note(Note("provisional", detail=f", and stays so: {point}"))
+    elif point is not None:
+        engine.adopt(point.announced(_say), point.score)
+        display.remove_note("provisional")

@@ -100,11 +100,16 @@ def _application(display: Display) -> Starlette:
 
     # Other host names are refused, so that pages of other sites cannot read the skin.
     local = Middleware(TrustedHostMiddleware, allowed_hosts=[_HOST, "localhost"])
-    named = {name: getattr(display, name) for name in ("title", "port", "top", "window", "size")}
-    info = named | {"positions": display.positions.tolist()}
+
+    async def info(request: Request) -> Response:
+        if not len(display.positions):
+            return Response(status_code=503)  # the page asks again
+        named = {name: getattr(display, name) for name in ("title", "port", "top", "window", "size")}
+        return JSONResponse(named | {"positions": display.positions.tolist()})
+
     routes = [
         Route("/", FileResponse(_PAGE, media_type="text/html", headers={"Cache-Control": "no-store"})),
-        Route("/skin.json", JSONResponse(info)),
+        Route("/skin.json", info),
         Route("/pictures", pictures),
         Route("/tare", tare, methods=["POST"]),
     ]

@@ -37,7 +37,7 @@ from skin.runs.model import Model, ModelMetadata, OnnxModel
 from skin.runs.run import TAG, FinishedRun, find_run
 
 _FAINT = 0.3  # N, default contact threshold
-_MANY = 4000  # windows of streams, a tenth of which tunes the contact threshold
+_MANY = 400  # windows of streams that tune the contact threshold
 
 
 @dataclass(frozen=True)
@@ -247,18 +247,22 @@ def alarm_source(run: FinishedRun, learner: Predictor, used: Config) -> AlarmSou
         partial(build_device, stored),
         stored=run.run.data.tags.get(TAG),
         profile=None if stored.evaluation is None else stored.evaluation.profile,
+        weights=getattr(run.run.info, "weights", None),  # of a pretrained model
     )
 
 
 def device_on_skin(trained: Config, skin: Mapping[str, Any]) -> Callable[[Mapping[str, Any]], AbstractDevice]:
-    """Return a function of the settings of a device that builds it on a skin.
+    """Return a function of the settings of a device that builds it on a skin; it can be sent to a process.
 
     Args:
         trained: configuration of the training.
         skin: settings of ``body``, ``layout`` and ``simulator``.
     """
-    skin = {group: skin[group] for group in ("body", "layout", "simulator")}
-    return lambda device: build_device(replace(trained, **skin, device={**device, **skin}))
+    return partial(_build_on_skin, trained, {group: skin[group] for group in ("body", "layout", "simulator")})
+
+
+def _build_on_skin(trained: Config, skin: Mapping[str, Any], device: Mapping[str, Any]) -> AbstractDevice:
+    return build_device(replace(trained, **skin, device={**device, **skin}))
 
 
 # The model of a run.
@@ -296,8 +300,17 @@ class TorchModel(Model):
         self.sites, threshold = example.positions, None if point is None else point.threshold
         identity, title = ("none", "untrained") if run is None else (run.identity, run.title)
         alarm = AlarmSource(title) if run is None or used is None else alarm_source(run, learner, used)
-        frames = example.readings.shape[1], example.rate, self.sites.numpy()
-        super().__init__(identity, title, device.task, *frames, device.size, threshold, alarm)
+        super().__init__(
+            identity,
+            title,
+            device.task,
+            example.readings.shape[1],
+            example.rate,
+            self.sites.numpy(),
+            device.size,
+            threshold,
+            alarm,
+        )
         self.learned, self._touch = touch is None and self.task.gate is not None, touch
 
     @cached_property
@@ -315,8 +328,8 @@ class TorchModel(Model):
             raise InputError(
                 "this run has no contact threshold: give live.touch=0.3 (N), or train on streams"
             )
-        streams = self.device.reference.replace(stream=True, direction=False, tare=True, gestures=_MANY)
-        touches = streams.touches("validation")
+        streams = self.device.reference.replace(stream=True, direction=False, tare=True)
+        touches = streams.fresh_touches(_MANY)
         return ContactThreshold.tuned(rise(touches), touches.known_labels[:, -1] > 0.5).minimum
 
     @cached_property

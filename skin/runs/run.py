@@ -33,7 +33,6 @@ from skin.core.safe_loading import TEXT, load_yaml, parse_json, read_file, regul
 from skin.core.settings import check_targets, configured
 from skin.errors import InputError
 from skin.evaluation.operating_point import LABEL, OperatingPoint, parse_operating_point
-from skin.learning.learner import AbstractLearner
 from skin.runs.configuration import (
     Config,
     Tracking,
@@ -48,6 +47,7 @@ if TYPE_CHECKING:
     from mlflow.entities import Run
 
     from skin.learning.data import TouchData
+    from skin.learning.learner import AbstractLearner
     from skin.runs.store import Store
 
 TAG = "operating_point"
@@ -154,7 +154,7 @@ class FinishedRun:
             reason = _reason(cause or error)
             raise InputError(f"{name} of run {self.identity} {refused}: {reason}") from error
 
-    def load_weights(self, learner: AbstractLearner, data: "TouchData") -> None:
+    def load_weights(self, learner: "AbstractLearner", data: "TouchData") -> None:
         """Load the weights into a learner.
 
         Raises:
@@ -270,6 +270,7 @@ def find_pretrained(name: str) -> "Run | None":
         end_time=record["start_time"],  # a record does not say when the training ended
         artifact_uri=folder.as_uri(),
         run_name=folder.name,
+        weights=folder / record["tags"]["learned"],
     )
     data = SimpleNamespace(metrics=record["metrics"], tags=record["tags"])
     return cast("Run", SimpleNamespace(info=info, data=data))

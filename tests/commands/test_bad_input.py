@@ -29,7 +29,7 @@ PORT = "device.port=/dev/ttyACM77"
         ("emulate format=xml", "format=xml must be 'text' or 'binary'"),
         ("emulate gestures=-1", "gestures=-1 is below 0: give a number above 0"),
         ("emulate emulate.rate=0", "emulate.rate=0 must be greater than 0"),
-        ("export format=zip", "format=zip must be 'onnx' or 'folder'"),
+        ("export format=zip", "format=zip must be 'onnx', 'folder' or 'thresholds'"),
         ("export name=small", "only a folder takes name and licence: add format=folder, or leave them out"),
         ("export export.rates=[]", "export.rates=[] has too few entries"),
         ("export out=x.txt", "out=x.txt must end in .onnx"),

@@ -52,36 +52,49 @@ def test_the_page_shows_an_emulated_skin_until_a_signal_ends_both(begin, tmp_pat
         page = page_of(demo)
         with urlopen(page, timeout=PATIENCE) as answer:
             assert b"<!doctype html>" in answer.read()
+        touched = next(picture for picture in pictures(page) if picture["contacts"]["state"] == "contacts")
         with urlopen(f"{page}/skin.json", timeout=PATIENCE) as answer:
             known = json.load(answer)
-        assert known["title"] == "any_skin"
-        assert len(known["positions"]) == 36
+        assert (known["title"], len(known["positions"])) == ("any_skin", 36)
         assert known["port"].startswith("socket://127.0.0.1:")
-        touched = next(picture for picture in pictures(page) if picture["contacts"]["state"] == "contacts")
         assert len(touched["contacts"]["contacts"]) == touched["contacts"]["number"]
         assert " kPa" in touched["contact_text"][1]
         touched = next(picture for picture in pictures(page) if picture.get("touched"))
         assert len(touched["words"]) == 4
-        # The emulator is a thread; only contacts have a process.
-        (estimating,) = psutil.Process(demo.pid).children()
+        children = psutil.Process(demo.pid).children()
         demo.send_signal(number)
         assert demo.wait(PATIENCE) == code, demo.err
-    estimating.wait(PATIENCE)
+    psutil.wait_procs(children, PATIENCE)
+    assert not any(child.is_running() for child in children)
     assert refuses(page)
     assert refuses(known["port"])
     assert "Traceback" not in demo.err
 
 
 @pytest.mark.slow("chooses a threshold anew")
-def test_the_page_is_there_while_the_threshold_is_chosen(begin, tmp_path, monkeypatch):
+@pytest.mark.parametrize("killed", [False, True])
+def test_verdicts_begin_with_a_provisional_threshold(begin, tmp_path, monkeypatch, killed):
     monkeypatch.setenv("SKIN_CACHE", str(tmp_path))
-    with begin(tmp_path, "live", "demo=true", "live.web_port=0") as demo:
-        first = next(pictures(page_of(demo)))
-        assert "choosing the alarm's threshold" not in demo.err.partition("page: ")[0]
-        assert first["stale"]
-        assert "threshold of the alarm is being chosen" in json.dumps(first)
+    words = "layout=grid", "layout.rows=3", "layout.columns=3", "evaluation.safe_gestures=400"
+    with begin(tmp_path, "live", "demo=true", "live.web_port=0", *words) as demo:
+        shown = pictures(page_of(demo))
+        assert "model" not in demo.err.partition("page: ")[0]
+        assert next(shown)["stale"]
+        assert any("threshold of the alarm is being chosen" in json.dumps(picture) for picture in shown)
+        notes = ({note["code"]: note["text"] for note in one["notes"]} for one in shown if not one["stale"])
+        assert "provisional" in next(notes)
+        view = psutil.Process(demo.pid)
+        choosing = next(child for _ in notes for child in view.children() if child.nice() == 10)
+        children = view.children()
+        if killed:
+            choosing.kill()
+            assert any("stays so: the process" in told.get("provisional", "") for told in notes)
+        else:
+            assert any("provisional" not in told for told in notes)
         demo.send_signal(signal.SIGINT)
         assert demo.wait(PATIENCE) == 0, demo.err
+        psutil.wait_procs(children, PATIENCE)
+        assert not any(child.is_running() for child in children)
 
 
 @pytest.mark.slow("generates thousands of touches")
@@ -97,9 +110,12 @@ def test_what_is_killed_leaves_no_process_and_no_port(begin, tmp_path):
         tmp_path, "live", "demo=true", "live.web_port=0", "live.patience.above=0.97", "web=true"
     ) as demo:
         page = page_of(demo)
-        (estimating,) = psutil.Process(demo.pid).children()
+        next(picture for picture in pictures(page) if not picture["stale"])
+        children = psutil.Process(demo.pid).children()
         demo.send_signal(signal.SIGKILL)
-        estimating.wait(PATIENCE)
+        psutil.wait_procs(children, PATIENCE)
+        assert children
+        assert not any(child.is_running() for child in children)
     assert refuses(page)
 
 

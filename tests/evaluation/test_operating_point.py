@@ -347,6 +347,18 @@ class Onset(Largest):
         return torch.sigmoid(change)[:, None].expand(-1, 4)
 
 
+def test_no_score_of_a_part_of_the_decisions_is_higher(drawn):
+    labels = balanced(64, generator(Stream.TEST, 8))
+    every, part = (
+        touch_scores.decide_touches(Largest(), drawn, watching(100.0), labels, 9, about_peak=part).scores(
+            None
+        )
+        for part in (False, True)
+    )
+    assert (part <= every).all()
+    assert float((part == every).float().mean()) > 0.5
+
+
 def test_one_decision_raises_more_alarms_than_two_and_a_slow_device_needs_one(drawn):
     two, one = (decide(drawn, Onset(), 100.0, patience=patience) for patience in (0.1, 0))
     assert (one >= two).all()

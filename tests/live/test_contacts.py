@@ -20,11 +20,11 @@ from skin.body.layout import Grid
 from skin.device.resampling import Frame
 from skin.errors import InputError
 from skin.inference.candidates import disc_readings
+from skin.inference.mechanics import Mechanics
 from skin.inference.noise import Noise
 from skin.live.contacts import (
     LiveContacts,
     MeanReadings,
-    Mechanics,
     average_readings,
     contact_message,
     contact_text_lines,

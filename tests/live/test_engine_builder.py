@@ -137,7 +137,7 @@ def test_the_settings_of_the_file_and_of_the_command(with_thresholds, skin):
         device = {"port": skin, "labels": "announced"}
         setup = watch_exported(str(path), device, said.append, opened)
         assert not any("alarm above" in text for text in said)  # the views open before
-        source, _, nominal = setup.watch(LIVE, said.append)
+        source, _, nominal, _ = setup.watch(LIVE, said.append)
     assert (setup.model.title, len(setup.model.positions), setup.name) == ("untrained", 6, source.name)
     assert said[-1] == f"alarm above {threshold:.4f}"
     assert ("single windows" in said[-2]) == (threshold == 0.25)
@@ -174,7 +174,7 @@ def test_the_command_replaces_settings_of_the_file(model, skin):
     said, other = [], replace(LIVE, touch=0.5, patience=DebounceSettings(above=0.75))
     with ExitStack() as opened:
         setup = watch_exported(str(model), {"port": skin}, said.append, opened)
-        _, engine, nominal = setup.watch(other, said.append)
+        _, engine, nominal, _ = setup.watch(other, said.append)
     assert said[-1] == "alarm above 0.75"
     assert (engine.detection.threshold, nominal.detection.threshold) == (0.5, 0.3)
 

@@ -1,5 +1,6 @@
 """The device on which the alarm's threshold is chosen, for a skin and for the imperfections of a device."""
 
+import json
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -80,10 +81,10 @@ def test_a_profile_counts_at_the_rate_and_alignment_of_the_evaluated_device(hydr
     assert (unknown.rate, unknown.framed, unknown.without_lag) == ([10, 1000], 0.0, 0.0)
 
 
-def run_of(config, point):
+def run_of(config, point, weights=None):
     """Return as much of a run as its operating point is read from."""
     data = SimpleNamespace(tags={TAG: point.text()})
-    run = FinishedRun(None, SimpleNamespace(data=data, info=SimpleNamespace(run_id="abc")))
+    run = FinishedRun(None, SimpleNamespace(data=data, info=SimpleNamespace(run_id="abc", weights=weights)))
     run.__dict__["stored"] = config
     return run
 
@@ -174,6 +175,32 @@ def test_touches_of_a_run_of_drawn_skins_are_measured_by_mild_devices(hydra, dev
     rough = hydra(*SKINS, "evaluation.profile=rough")
     assert device_of(skins, rough).noise == profile_settings("rough")["noise"]
     assert device_of(hydra("profile=rough"), hydra()).noise == profile_settings("rough")["noise"]
+
+
+def test_a_provisional_threshold_is_lower_until_the_final_one_is_kept_or_ships(hydra, tmp_path, monkeypatch):
+    monkeypatch.setenv("SKIN_CACHE", str(tmp_path / "cache"))
+    live, config = LiveConditions(20.0, 0.1, 2.0, 0.1, 3), hydra("evaluation.safe_gestures=320")
+    for count in ("DANGEROUS_TOUCHES", "FITTED_TOUCHES"):
+        monkeypatch.setattr(alarm, count, 100)
+    run = run_of(config, STORED, tmp_path / "weights.pt")
+    source = alarm_source(run, Quiet(), config)
+    first = choose_alarm_threshold(source, live, say=print, quick=True)
+    assert (first.provisional, first.safe, first.dangerous) == (True, 200, 100)
+    (tmp_path / "weights.pt").write_bytes(b"these")
+    alarm.ship_thresholds(source, [live], print)
+    final = choose_alarm_threshold(source, live, say=pytest.fail, quick=True)
+    assert (final.provisional, final.safe, final.rate) == (False, 320, 20.0)
+    assert first.threshold < final.threshold
+    # Shipped thresholds are those of the weights.
+    (tmp_path / "weights.pt").write_bytes(b"others")
+    said = []
+    assert choose_alarm_threshold(source, live, say=said.append, quick=True) == first
+    assert "thresholds.json is damaged or of other weights, and not used" in said[0]
+    assert choose_alarm_threshold(source, live, say=print) == final
+    kept = replace(source, weights=None)
+    assert choose_alarm_threshold(kept, live, say=pytest.fail, quick=True) == final
+    alarm.ship_thresholds(source, [], print)  # leaves those of other weights out
+    assert json.loads((tmp_path / alarm.THRESHOLDS).read_text())["skins"] == {}
 
 
 def test_a_threshold_that_hides_dangerous_touches_is_refused():

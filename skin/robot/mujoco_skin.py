@@ -6,30 +6,25 @@ from the compliance of the skin. How deep bodies overlap in MuJoCo has no effect
 """
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections import defaultdict
+from collections.abc import Callable
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from skin.body.base import AbstractBody, Sensors
 from skin.body.layout import AbstractLayout
-from skin.core.settings import option_name
 from skin.errors import InputError
 from skin.inference.noise import Noise
 from skin.inference.posterior import FrameEstimate, Posterior
-from skin.mechanics.contact.rigid import solve_contact, surface_compliance
+from skin.mechanics.contact.pressing import Press, Pressing
 from skin.mechanics.simulator.base import AbstractSimulator
 from skin.mechanics.simulator.solid import Solid
 
-if TYPE_CHECKING:
-    from mujoco import MjData, MjModel
-
-_FAR = 100.0  # m, from the skin to the common origin of all rays, which are then parallel to 1 mrad
-_SEEN = np.array([0, 1, 0, 0, 0, 0], np.uint8)  # the group of the geom that rays see
-_ROUNDING = 1e-6  # m
+# m: from the skin to the common origin of all rays, which are then parallel to 1 mrad; and of positions.
+_FAR, _ROUNDING = 100.0, 1e-6
+_SEEN = np.array([0, 1, 0, 0, 0, 0], np.uint8)  # the group of the geoms that rays see
 
 
 def load_mujoco() -> Any:
@@ -45,40 +40,28 @@ def load_mujoco() -> Any:
     return mujoco
 
 
-class Press(NamedTuple):
-    """How a geom presses on a skin.
-
-    Attributes:
-        geom: its number in the model.
-        gap: (H * W,), m, from each cell to the geom along the normal at the contact, up to a constant;
-            infinite where the geom is not above the cell, or higher than the skin is thick.
-        force: (3,), N, along x and y of the chart, and into the skin.
-    """
-
-    geom: int
-    gap: np.ndarray
-    force: np.ndarray
-
-
 class MujocoSurface:
     """The surface of a skin in a MuJoCo model.
 
     Args:
-        model: the model.
+        model: ``mujoco.MjModel``.
         site: name of the site in the middle of the skin's surface. Its x and y axes are those of the chart, z
-            points out of the skin.
+            points out of the skin. The geom of the site's body that lies under it carries the skin.
         body: the skin.
-        geom: name of the geom that carries the skin; None: the geom of the site's body that is nearest to the
-            site.
+
+    Attributes:
+        geom: number of the geom that carries the skin.
 
     Raises:
-        InputError: MuJoCo is not installed, there is no such site or geom, or the site's body has no geom
-            there.
+        InputError: MuJoCo is not installed, there is no such site, or no geom of its body lies under it.
     """
 
-    def __init__(self, model: "MjModel", site: str, body: AbstractBody, geom: str | None = None) -> None:
+    def __init__(self, model: Any, site: str, body: AbstractBody) -> None:
         self._mujoco, self._model, self._body = load_mujoco(), model, body
-        self._site = _number(model, "site", site)
+        try:
+            self._site = model.site(site).id
+        except KeyError as error:
+            raise InputError(f"the model has no site {site!r}: {error.args[0]}") from error
         x, y = ((np.arange(count) + 0.5) * cell for count, cell in zip(body.cells, body.cell, strict=True))
         cells = np.stack([*np.meshgrid(x, y), np.zeros(body.shape)], axis=-1).reshape(-1, 3)
         middle = np.array([*body.size, 0.0]) / 2
@@ -86,166 +69,112 @@ class MujocoSurface:
         # In the frame of the site.
         self._points = (body.locate(cells) - body.locate(middle)) @ axes.T
         self._frames = body.frame(cells) @ axes.T
-        self.geom = self._carrier(site, geom)
+        self.geom = self._find_carrier(site)
 
-    def _carrier(self, site: str, geom: str | None) -> int:
+    def _find_carrier(self, site: str) -> int:
         """Return the number of the geom under the site; warn where it does not carry the whole skin."""
-        model, data = self._model, self._mujoco.MjData(self._model)
-        self._mujoco.mj_kinematics(model, data)
+        data = self._mujoco.MjData(self._model)
+        self._mujoco.mj_kinematics(self._model, data)
         points, axes = self._place(data)
-        position, inward = data.site_xpos[self._site], -axes[:, 2]
-        owner = model.site_bodyid[self._site]
-        choice = [number for number in range(model.ngeom) if model.geom_bodyid[number] == owner]
-        if geom is not None:
-            choice = [_number(model, "geom", geom)]
-        depths = [abs(self._distances(data, each, position[None], -inward)[0]) for each in choice]
-        if not np.isfinite(depths).any():
+        owner = self._model.site_bodyid[self._site]
+        depth, numbers = self._cast(data, self._model.geom_bodyid == owner, points, axes[:, 2])
+        carrier = int(numbers[(self._points**2).sum(1).argmin()])
+        # An arm's surface lies below the plane of the site.
+        beyond = (numbers != carrier) | (np.abs(depth) > self._body.thickness + np.ptp(self._points[:, 2]))
+        if carrier < 0 or beyond.all():
             raise InputError(
-                f"site {site} of body {model.body(owner).name or owner} lies on "
-                f"{'no geom' if geom is None else f'another geom than {geom}'}: put it on the surface of the "
-                "geom that carries the skin, in the same body, with z outwards"
+                f"site {site} of body {self._model.body(owner).name or owner} lies on no geom: put it on the "
+                "surface of the geom that carries the skin, in the same body, with z outwards"
             )
-        carrier = choice[int(np.argmin(depths))]
-        depth = self._distances(data, carrier, points, -inward)
-        beyond = int((~(np.abs(depth) <= max(self._body.thickness, np.ptp(self._points[:, 2])))).sum())
-        if beyond:
+        if beyond.any():
             warnings.warn(
-                f"{beyond} of {len(depth)} cells of the skin lie beyond geom "
-                f"{model.geom(carrier).name or carrier}, where nothing can press it: lower body.size, or "
-                f"move site {site}",
+                f"{beyond.sum()} of {len(beyond)} cells of the skin lie beyond geom "
+                f"{self._model.geom(carrier).name or carrier}, where nothing can press it: lower body.size, "
+                f"or move site {site}",
                 UserWarning,
                 stacklevel=4,
             )
         return carrier
 
-    def presses(self, data: "MjData") -> list[Press]:
+    def presses(self, data: Any) -> list[Press]:
         """Return what each geom that touches the skin does; contacts beside the skin do not count.
 
         Args:
-            data: after ``mj_step`` or ``mj_forward``.
+            data: ``mujoco.MjData`` after ``mj_step`` or ``mj_forward``.
         """
-        contact, groups = data.contact, dict[int, list[tuple[int, np.ndarray, np.ndarray]]]()
+        contact, wrench = data.contact, np.zeros(6)
         mine = contact.geom == self.geom
+        # A flex has no geom; an excluded contact has no force.
         rows = np.flatnonzero(mine.any(1) & (contact.geom >= 0).all(1) & (contact.efc_address >= 0))
-        if not len(rows):
-            return []
-        (points, axes), wrench = self._place(data), np.zeros(6)
+        points, axes = self._place(data)
+        touches = defaultdict[int, list[tuple[int, np.ndarray]]](list)
         for row in rows:
             self._mujoco.mj_contactForce(self._model, data, row, wrench)
-            # The force acts on the second geom.
-            sign = 1 if mine[row, 1] else -1
             away = contact.pos[row] - points
             cell = int((away**2).sum(1).argmin())
             frame = self._frames[cell] @ axes.T
+            force = frame @ contact.frame[row].reshape(3, 3).T @ wrench[:3]
+            force *= mine[row] @ [-1, 1]  # it acts on the second geom
             beside = np.abs(frame[:2] @ away[cell]) > np.array(self._body.cell) / 2 + _ROUNDING
-            force = sign * frame @ contact.frame[row].reshape(3, 3).T @ wrench[:3]
             if force[2] > 0 and not beside.any():
-                other = int(contact.geom[row, 0 if mine[row, 1] else 1])
-                groups.setdefault(other, []).append((cell, force, frame[2]))
-        return [self._press(data, points, axes, geom, parts) for geom, parts in groups.items()]
+                touches[contact.geom[row].sum() - self.geom].append((cell, force))
+        return [self._press(data, points, axes, *touch) for touch in touches.items()]
 
     def _press(
         self,
-        data: "MjData",
+        data: Any,
         points: np.ndarray,
         axes: np.ndarray,
         geom: int,
-        parts: Sequence[tuple[int, np.ndarray, np.ndarray]],
+        parts: list[tuple[int, np.ndarray]],
     ) -> Press:
-        """Return the press of a geom from cell, force and inward normal of each of its contacts."""
-        force = np.sum([part[1] for part in parts], axis=0)
-        inward = np.sum([part[1][2] * part[2] for part in parts], axis=0)
-        inward /= np.linalg.norm(inward)
-        gap = self._distances(data, geom, points, inward)
-        gap[self._frames[:, 2] @ axes.T @ inward <= 0] = np.inf  # cells of the far side of a curved skin
+        """Return the press of a geom from the cell and the force of each of its contacts."""
+        normals = self._frames[:, 2] @ axes.T
+        inward = sum(force[2] * normals[cell] for cell, force in parts)
+        inward = inward / np.linalg.norm(inward)
+        gap, _ = self._cast(data, [geom], points, inward)
+        gap[normals @ inward <= 0] = np.inf  # on the far side of a curved skin
         if not np.isfinite(gap).any():  # it is between the middles of cells
             gap[parts[0][0]] = 0.0
         gap -= gap.min()
-        return Press(geom, np.where(gap <= self._body.thickness, gap, np.inf), force)
+        # It does not sink in deeper than the skin is thick.
+        gap[gap > self._body.thickness] = np.inf
+        return Press(gap, np.sum([force for _, force in parts], axis=0))
 
-    def _place(self, data: "MjData") -> tuple[np.ndarray, np.ndarray]:
+    def _place(self, data: Any) -> tuple[np.ndarray, np.ndarray]:
         """Return the middles of the cells (N, 3), m, and the axes of the site as columns, in the world."""
         axes = data.site_xmat[self._site].reshape(3, 3)
         return data.site_xpos[self._site] + self._points @ axes.T, axes
 
-    def _distances(self, data: "MjData", geom: int, points: np.ndarray, inward: np.ndarray) -> np.ndarray:
-        """Return how far a geom is from points (N, 3), m, against ``inward``; infinite where it is not.
+    def _cast(self, data: Any, geoms: Any, points: np.ndarray, back: np.ndarray) -> tuple[Any, np.ndarray]:
+        """Cast rays from behind points (N, 3), m, through them.
 
-        Rays begin behind the points, so that it may overlap with the skin. They see nothing else.
+        Args:
+            data: with the positions of all geoms.
+            geoms: index of the geoms that rays see.
+            points: m, in the world.
+            back: unit vector to the origin of the rays.
+
+        Returns:
+            How far the first geom is from each point, (N,), m: negative where it is before the point,
+            infinite where there is none; and its number, -1 where there is none.
         """
-        model = self._model
-        origin = points.mean(axis=0) + _FAR * inward
-        rays = points - origin
-        lengths = np.linalg.norm(rays, axis=1)
+        model, origin = self._model, points.mean(axis=0) + _FAR * back
+        lengths = np.linalg.norm(points - origin, axis=1)
         hits, numbers = np.empty(len(points)), np.empty(len(points), np.int32)
         settings = {name: getattr(model, name).copy() for name in ("geom_group", "geom_matid", "geom_rgba")}
         try:
             model.geom_group[:] = 0
             # Rays pass through what is invisible.
-            model.geom_group[geom], model.geom_matid[geom], model.geom_rgba[geom] = 1, -1, 1
-            vectors = (rays / lengths[:, None]).ravel()
+            model.geom_group[geoms], model.geom_matid[geoms], model.geom_rgba[geoms] = 1, -1, 1
+            vectors = ((points - origin) / lengths[:, None]).ravel()
             self._mujoco.mj_multiRay(
                 model, data, origin, vectors, _SEEN, True, -1, numbers, hits, None, len(points), 2 * _FAR
             )
         finally:
             for name, values in settings.items():
                 getattr(model, name)[:] = values
-        return np.where(hits >= 0, hits - lengths, np.inf)
-
-
-def _number(model: "MjModel", kind: str, name: str) -> int:
-    """Return the number of a named site or geom."""
-    count, get = getattr(model, f"n{kind}"), getattr(model, kind)
-    names = [get(number).name for number in range(count)]
-    if name not in names or not name:
-        known = ", ".join(filter(None, names)) or "none with a name"
-        raise InputError(f"the model has no {kind} {name!r}: give one of its {kind}s ({known})")
-    return names.index(name)
-
-
-class Pressing:
-    """Pressure and readings of presses on a skin.
-
-    Args:
-        simulator: of the skin; its surface must be compliant.
-        body: the skin.
-
-    Raises:
-        InputError: the simulator has no compliance.
-    """
-
-    def __init__(self, simulator: AbstractSimulator, body: AbstractBody) -> None:
-        self.simulator, self._body = simulator, body
-        self.compliance = surface_compliance(simulator, body)
-        if not simulator.feels_shear:
-            warnings.warn(
-                f"simulator={option_name(simulator)} has normal forces only: friction is left out",
-                UserWarning,
-                stacklevel=3,
-            )
-
-    def pressures(self, presses: Sequence[Press]) -> Tensor:
-        """Return the pressure of each press alone, (P, H, W), Pa; its sum is the force into the skin."""
-        pressure = torch.zeros(len(presses), len(self.compliance))
-        if presses:
-            gaps = np.stack([press.gap for press in presses])
-            near = np.flatnonzero(np.isfinite(gaps).any(axis=0))
-            totals = np.array([press.force[2] for press in presses]) / np.prod(self._body.cell)
-            compliance = self.compliance[near[:, None], near]
-            solved = solve_contact(
-                compliance, torch.from_numpy(gaps[:, near]), torch.from_numpy(totals), iterations=1000
-            )
-            pressure[:, near] = solved.pressure
-        return pressure.unflatten(1, self._body.shape)
-
-    @torch.no_grad()
-    def readings(self, presses: Sequence[Press], pressures: Tensor) -> Tensor:
-        """Return the readings (P, S), N, of presses with pressures (P, H, W), Pa."""
-        shear = None
-        if self.simulator.feels_shear:
-            forces = np.array([press.force for press in presses]).reshape(-1, 3)
-            shear = torch.from_numpy(forces[:, :2] / forces[:, 2:])
-        return self.simulator(pressures, shear).readings
+        return np.where(hits >= 0, hits - lengths, np.inf), numbers
 
 
 class MujocoSkin:
@@ -253,17 +182,18 @@ class MujocoSkin:
 
     Each geom that touches is solved alone: its force, as MuJoCo computes it, is distributed as the shape of
     the geom and the compliance of the skin demand. Readings add up. That one geom lowers the surface under
-    another is left out, which holds for objects farther apart than the skin is thick. Friction is a shear of
-    each geom in proportion to its pressure. Objects are rigid; flexes of MuJoCo are not felt.
+    another is left out, which holds for objects farther apart than the skin is thick. Objects do not tilt:
+    an eccentric force presses like a central one. Friction is a shear of each geom in proportion to its
+    pressure. Objects are rigid; flexes of MuJoCo are not felt.
 
     Args:
-        model: the model; it is changed and restored while rays are cast: threads need models of their own.
+        model: ``mujoco.MjModel``. It is changed and restored while rays are cast: threads need models of
+            their own.
         site: name of the site in the middle of the skin's surface, with the chart's axes, and z outwards.
         body: the skin.
         layout: of its sensors.
         simulator: ``simulator(body, sensors)``; it needs a compliant surface.
-        noise: of the readings, which :meth:`contacts` expects.
-        geom: name of the geom that carries the skin; None: that of the site's body under the site.
+        noise: of the readings, which :meth:`contacts` expects; None: 0.05 N.
 
     Attributes:
         sensors: S sensors.
@@ -271,20 +201,19 @@ class MujocoSkin:
         posterior: estimates contacts from readings.
 
     Raises:
-        InputError: as of :class:`MujocoSurface` and :class:`Pressing`.
+        InputError: as of :class:`MujocoSurface`, or the simulator has no compliance.
     """
 
     def __init__(
         self,
-        model: "MjModel",
+        model: Any,
         site: str,
         body: AbstractBody,
         layout: AbstractLayout,
         simulator: Callable[[AbstractBody, Sensors], AbstractSimulator] = Solid,
         noise: Noise | None = None,
-        geom: str | None = None,
     ) -> None:
-        self.surface = MujocoSurface(model, site, body, geom)
+        self.surface = MujocoSurface(model, site, body)
         self.body, self.sensors, self.noise = body, layout.sensors(body), noise or Noise(0.05)
         self._pressing = Pressing(simulator(body, self.sensors), body)
 
@@ -293,17 +222,19 @@ class MujocoSkin:
         """The posterior of this skin; to prepare it takes a second."""
         return Posterior(self._pressing.simulator, self.noise, self.body)
 
-    def pressure(self, data: "MjData") -> np.ndarray:
-        """Return the pressure on the cells, (H, W), Pa."""
+    def pressure(self, data: Any) -> np.ndarray:
+        """Return the pressure on the cells, (H, W), Pa; ``data`` is that of :meth:`read`."""
         return self._pressing.pressures(self.surface.presses(data)).sum(0).numpy()
 
-    def read(self, data: "MjData") -> np.ndarray:
-        """Return the true readings (S,), N, after ``mj_step`` or ``mj_forward``: no noise is added."""
-        presses = self.surface.presses(data)
-        return self._pressing.readings(presses, self._pressing.pressures(presses)).sum(0).double().numpy()
+    def read(self, data: Any) -> np.ndarray:
+        """Return the true readings (S,), N, without noise.
 
-    def contacts(self, data: "MjData") -> FrameEstimate:
-        """Return where and how hard the skin is touched, as its readings tell (:class:`Posterior`)."""
-        estimate = self.posterior.estimate(self.read(data))
-        assert isinstance(estimate, FrameEstimate)
-        return estimate
+        Args:
+            data: ``mujoco.MjData`` after ``mj_step`` or ``mj_forward``.
+        """
+        presses = self.surface.presses(data)
+        return self._pressing.frames(presses, [0] * len(presses), 1)[1][0].double().numpy()
+
+    def contacts(self, data: Any) -> FrameEstimate:
+        """Return where and how hard the skin is touched, as its readings tell; ``data`` as in ``read``."""
+        return self.posterior.estimate_touch(self.read(data))

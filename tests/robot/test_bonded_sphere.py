@@ -12,8 +12,8 @@ from skfem.helpers import grad
 
 from skin.body.layout import Grid
 from skin.body.sheet import Sheet
+from skin.mechanics.contact.pressing import Press, Pressing
 from skin.mechanics.simulator.solid import Solid
-from skin.robot.mujoco_skin import Press, Pressing
 
 THICKNESS, YOUNG, POISSON, EXTENT = 0.03, 170e3, 0.499, 0.0339
 LAYER = [{"material": "EcoFlex 00-30", "thickness": THICKNESS}]
@@ -100,7 +100,7 @@ def test_a_sphere_sinks_in_as_scikit_fem_says(pressing, sphere, approach, off):
 
     def press(force: float) -> tuple[float, np.ndarray]:
         """Return how far the sphere sinks in, m, and the pressure, Pa."""
-        found = pressing.pressures([Press(0, gap - gap.min(), np.array([0, 0, force]))])[0]
+        found = pressing.pressures([Press(gap - gap.min(), np.array([0, 0, force]))])[0]
         pressure = found.flatten().double().numpy()
         return float((compliance @ pressure + gap)[pressure > 0].mean()), pressure
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from skin.errors import InputError
-from skin.robot.mujoco import draw_shape, press_world
+from skin.robot.mujoco import draw_object, press_world
 from skin.runs.build import build_device
 from skin.touch.labels import TOUCH
 
@@ -69,8 +69,8 @@ def test_splits_are_drawn_by_seed_and_imperfections_by_another(device, configure
 def test_an_object_rests_on_its_lowest_point_and_within_its_extent(kind):
     import mujoco
 
-    shape = draw_shape(kind, np.array([0.3, 0.6]), 0.16)
-    model = mujoco.MjModel.from_xml_string(press_world(shape, 0.0, 0.3, BODY))
+    geoms, half, _ = draw_object(kind, np.array([0.3, 0.6]), 0.16)
+    model = mujoco.MjModel.from_xml_string(press_world(geoms, 0.0, 0.3, BODY))
     data = mujoco.MjData(model)
     data.qpos[2] = 1e-4
     mujoco.mj_forward(model, data)
@@ -78,7 +78,7 @@ def test_an_object_rests_on_its_lowest_point_and_within_its_extent(kind):
     data.qpos[2] = -1e-4
     mujoco.mj_forward(model, data)
     assert data.ncon > 0
-    assert (np.abs(data.contact.pos[:, :2]) <= shape.half + 1e-6).all()
+    assert (np.abs(data.contact.pos[:, :2]) <= half + 1e-6).all()
 
 
 def test_a_curved_body_and_unknown_objects_are_refused(configured):

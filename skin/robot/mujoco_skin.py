@@ -63,12 +63,12 @@ class MujocoSurface:
         except KeyError as error:
             raise InputError(f"the model has no site {site!r}: {error.args[0]}") from error
         x, y = ((np.arange(count) + 0.5) * cell for count, cell in zip(body.cells, body.cell, strict=True))
-        cells = np.stack([*np.meshgrid(x, y), np.zeros(body.shape)], axis=-1).reshape(-1, 3)
+        self._cells = np.stack([*np.meshgrid(x, y), np.zeros(body.shape)], axis=-1).reshape(-1, 3)
         middle = np.array([*body.size, 0.0]) / 2
-        axes = body.frame(middle) * np.array([[1.0], [1.0], [-1.0]])
+        self._axes = body.frame(middle) * np.array([[1.0], [1.0], [-1.0]])
         # In the frame of the site.
-        self._points = (body.locate(cells) - body.locate(middle)) @ axes.T
-        self._frames = body.frame(cells) @ axes.T
+        self._points = (body.locate(self._cells) - body.locate(middle)) @ self._axes.T
+        self._frames = body.frame(self._cells) @ self._axes.T
         self.geom = self._find_carrier(site)
 
     def _find_carrier(self, site: str) -> int:
@@ -110,12 +110,12 @@ class MujocoSurface:
         touches = defaultdict[int, list[tuple[int, np.ndarray]]](list)
         for row in rows:
             self._mujoco.mj_contactForce(self._model, data, row, wrench)
-            away = contact.pos[row] - points
-            cell = int((away**2).sum(1).argmin())
-            frame = self._frames[cell] @ axes.T
+            cell = int(((contact.pos[row] - points) ** 2).sum(1).argmin())
+            off = self._frames[cell] @ axes.T @ (contact.pos[row] - points[cell]) * [1, 1, 0]
+            frame = self._body.frame(self._cells[cell] + off) @ self._axes.T @ axes.T
             force = frame @ contact.frame[row].reshape(3, 3).T @ wrench[:3]
             force *= mine[row] @ [-1, 1]  # it acts on the second geom
-            beside = np.abs(frame[:2] @ away[cell]) > np.array(self._body.cell) / 2 + _ROUNDING
+            beside = np.abs(off[:2]) > np.array(self._body.cell) / 2 + _ROUNDING
             if force[2] > 0 and not beside.any():
                 touches[contact.geom[row].sum() - self.geom].append((cell, force))
         return [self._press(data, points, axes, *touch) for touch in touches.items()]

@@ -7,12 +7,16 @@ import numpy as np
 import pytest
 import torch
 
+from skin.body.arm import Arm
 from skin.body.layout import Grid
 from skin.body.sheet import Sheet
 from skin.errors import InputError
+from skin.mechanics.contact.pressing import Pressing
 from skin.mechanics.simulator.solid import Solid
 from skin.robot import MujocoSkin
 from skin.robot.mujoco_skin import MujocoSurface
+from tests.mechanics.contact.test_rigid import BODY as HALF_SPACE
+from tests.mechanics.contact.test_rigid import HalfSpace
 
 from .conftest import BODY, LAYOUT, OBJECTS
 
@@ -96,6 +100,33 @@ def test_an_invisible_object_is_felt_and_one_beside_the_skin_is_not(world, cover
     (press,) = small.presses(data)
     assert press.force[2] == pytest.approx(9.81, rel=0.01)
     assert np.isfinite(press.gap).sum() > 4
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.7, 1.3])
+def test_a_ball_on_an_arm_presses_along_the_normal(turn):
+    arm = Arm(cells=(32, 16), layers=BODY.layers, radius=0.05, length=0.16, angle=3.0)
+    out = np.array([np.sin(turn), 0, np.cos(turn)])
+    mujoco = pytest.importorskip("mujoco", reason="pip install 'tactile-skin[mujoco]'")
+    model = mujoco.MjModel.from_xml_string(
+        f"""<mujoco><option gravity="0 0 0"/><worldbody>
+        <body><geom type="cylinder" size="0.05 0.08" zaxis="0 1 0"/><site name="skin" pos="0 0 0.05"/></body>
+        <body pos="{0.07 * out[0]} 0.02 {0.07 * out[2]}"><joint type="slide" axis="{out[0]} 0 {out[2]}"/>
+        <geom type="sphere" size="0.02" mass="1"/></body></worldbody></mujoco>"""
+    )
+    data = mujoco.MjData(model)
+    data.xfrc_applied[2, :3] = -5 * out
+    mujoco.mj_step(model, data, 500)
+    (press,) = MujocoSurface(model, "skin", arm).presses(data)
+    assert press.force == pytest.approx([0, 0, 5], abs=0.01)
+    row, column = np.unravel_index(press.gap.argmin(), arm.shape)
+    middle = [(column + 0.5) * arm.cell[0], (row + 0.5) * arm.cell[1]]
+    assert middle == pytest.approx([0.075 + 0.05 * turn, 0.1], abs=0.006)
+    assert np.isfinite(press.gap).sum() < 0.3 * press.gap.size  # neither the far side nor the rest
+
+
+def test_a_surface_without_shear_says_that_friction_is_left_out():
+    with pytest.warns(UserWarning, match="has normal forces only: friction is left out"):
+        Pressing(HalfSpace(), HALF_SPACE)
 
 
 @pytest.mark.slow("500 readings")

@@ -374,9 +374,13 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
 
     def _apply_imperfections(self, true: Recording, noise: np.random.Generator) -> Recording:
         """Return true readings with the imperfections of the device."""
-        constants = None if self.randomise else self.constants
-        ongoing = self.sampler.settings.ongoing > 0
-        return with_imperfections(true, self.imperfection, constants, noise, ongoing)
+        return with_imperfections(
+            true,
+            self.imperfection,
+            None if self.randomise else self.constants,
+            noise,
+            ongoing=self.sampler.settings.ongoing > 0,
+        )
 
 
 def with_imperfections(
@@ -399,6 +403,8 @@ def with_imperfections(
     if constants is None:
         constants = draw_constants(imperfection, force.shape[2], rate, noise, len(true))
     readings, valid, saturated = measure(imperfection, constants, force, rate, noise, ongoing)
-    clipped = {"clipped": saturated.flatten(1).any(1).float()}
-    touches = replace(true.touches, readings=readings, valid=valid, saturated=saturated)
-    return replace(true, touches=touches, parameters=true.parameters | clipped)
+    return replace(
+        true,
+        touches=replace(true.touches, readings=readings, valid=valid, saturated=saturated),
+        parameters=true.parameters | {"clipped": saturated.flatten(1).any(1).float()},
+    )

@@ -16,6 +16,8 @@ if TYPE_CHECKING:
     from skin.inference.candidates import FingertipPrior as FingertipPrior
     from skin.inference.noise import Noise as Noise
     from skin.inference.posterior import Posterior as Posterior
+    from skin.mechanics.contact.rigid import solve_contact as solve_contact
+    from skin.mechanics.contact.rigid import surface_compliance as surface_compliance
     from skin.mechanics.simulator.fem import PlatesAndBeams as PlatesAndBeams
     from skin.mechanics.simulator.solid import Solid as Solid
     from skin.runs.build import load_run as load_run
@@ -25,6 +27,7 @@ if TYPE_CHECKING:
 __version__ = "0.2.0"
 __all__ = ["Arm", "Grid", "InputError", "LayoutFile", "PlatesAndBeams", "Sheet", "Solid"]
 __all__ += ["FingertipPrior", "Noise", "Posterior", "data", "load_run", "open_skin", "read_recording"]
+__all__ += ["solve_contact", "surface_compliance"]
 
 _PLACES = {
     "FingertipPrior": "skin.inference.candidates",
@@ -41,6 +44,8 @@ _PLACES = {
     "load_run": "skin.runs.build",
     "open_skin": "skin.wire.skin",
     "read_recording": "skin.device.files",
+    "solve_contact": "skin.mechanics.contact.rigid",
+    "surface_compliance": "skin.mechanics.contact.rigid",
 }
 
 

@@ -19,6 +19,7 @@ ROOMS = [
     "mechanics",
     "device",
     "inference",
+    "robot",
     "learning",
     "wire",
     "plot",

@@ -20,7 +20,7 @@ from skin.body.layout import AbstractLayout
 from skin.core.rng import Stream, generator
 from skin.core.settings import checked
 from skin.device.base import AbstractDevice, Split, grouped, joined, split_rows, split_slices
-from skin.device.imperfection import Imperfection, ImperfectionSettings
+from skin.device.imperfection import Constants, Imperfection, ImperfectionSettings
 from skin.device.resampling import check_rate
 from skin.device.sampling import draw_constants, idle_excess, measure
 from skin.device.touches import Part, Recording, Touches, TouchStream, draw_timeline, only_touches
@@ -569,11 +569,37 @@ class Simulated(ImperfectionSettings, AbstractDevice):
 
     def _apply_imperfections(self, true: Recording, noise: np.random.Generator) -> Recording:
         """Return true readings with the imperfections of the device."""
-        force, constants, rate = true.touches.readings, self.constants, self.model_rate
-        if self.randomise:
-            constants = draw_constants(self.imperfection, len(self.sensors), rate, noise, len(true))
-        ongoing = self.sampler.settings.ongoing > 0
-        readings, valid, saturated = measure(self.imperfection, constants, force, rate, noise, ongoing)
-        clipped = {"clipped": saturated.flatten(1).any(1).float()}
-        touches = replace(true.touches, readings=readings, valid=valid, saturated=saturated)
-        return replace(true, touches=touches, parameters=true.parameters | clipped)
+        return with_imperfections(
+            true,
+            self.imperfection,
+            None if self.randomise else self.constants,
+            noise,
+            ongoing=self.sampler.settings.ongoing > 0,
+        )
+
+
+def with_imperfections(
+    true: Recording,
+    imperfection: Imperfection,
+    constants: Constants | None,
+    noise: np.random.Generator,
+    ongoing: bool = False,
+) -> Recording:
+    """Return true readings with the imperfections of a device.
+
+    Args:
+        true: touches without imperfections.
+        imperfection: of the device.
+        constants: of the device; None: another device, drawn, measures each touch.
+        noise: source of the noise.
+        ongoing: as in :func:`skin.device.sampling.measure`.
+    """
+    force, rate = true.touches.readings, true.touches.rate
+    if constants is None:
+        constants = draw_constants(imperfection, force.shape[2], rate, noise, len(true))
+    readings, valid, saturated = measure(imperfection, constants, force, rate, noise, ongoing)
+    return replace(
+        true,
+        touches=replace(true.touches, readings=readings, valid=valid, saturated=saturated),
+        parameters=true.parameters | {"clipped": saturated.flatten(1).any(1).float()},
+    )

@@ -44,8 +44,8 @@ def device(request, tmp_path_factory) -> AbstractDevice:
 
 def test_other_devices_have_tests_of_their_own():
     others = {path.stem for path in (CONF / "device").glob("*.yaml")} - set(EVERYWHERE)
-    assert others == {"serial", "skins"}
-    rooms = [Path(__file__).parent, Path(__file__).parents[1] / "record"]
+    assert others == {"mujoco", "serial", "skins"}
+    rooms = [Path(__file__).parents[1] / room for room in ("device", "record", "robot")]
     assert all(any((room / f"test_{name}.py").is_file() for room in rooms) for name in others)
 
 

@@ -215,6 +215,15 @@ def stabilise_checkerboard(compliance: Tensor, body: AbstractBody) -> Tensor:
     return compliance + lacking * (torch.eye(len(board)).to(compliance) - smooth)
 
 
+def surface_compliance(simulator: AbstractSimulator, body: AbstractBody) -> Tensor:
+    """Return the compliance (N, N), m/Pa, of the N cells of a skin for :func:`solve_contact`, float32.
+
+    Raises:
+        InputError: the simulator has no compliance.
+    """
+    return stabilise_checkerboard(simulator.compliance().detach().cpu().double(), body).float()
+
+
 def _filter(count: int) -> Tensor:
     """Return the filter (1/4, 1/2, 1/4), (count, count), reflected at both ends; rows sum to 1."""
     rows = torch.eye(count, dtype=torch.float64)
@@ -476,7 +485,7 @@ class Rigid(AbstractContact):
     ) -> None:
         self.relief, self.fillet = relief, fillet
         self.tolerance, self.iterations = tolerance, iterations
-        self.compliance = stabilise_checkerboard(simulator.compliance().detach().cpu().double(), body).float()
+        self.compliance = surface_compliance(simulator, body)
 
     def press(self, trajectories: Trajectories, problem: ContactProblem) -> ContactResult:
         """Return the pressure at a force that gives the wanted classes, if there is one."""

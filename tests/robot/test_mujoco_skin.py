@@ -1,0 +1,169 @@
+"""A skin under objects of a MuJoCo model."""
+
+import sys
+from time import process_time
+
+import numpy as np
+import pytest
+import torch
+
+from skin.body.arm import Arm
+from skin.body.layout import Grid
+from skin.body.sheet import Sheet
+from skin.errors import InputError
+from skin.mechanics.simulator.solid import Solid
+from skin.robot import MujocoSkin
+from skin.robot.mujoco_skin import MujocoSurface
+from skin.robot.pressing import Pressing
+from tests.mechanics.contact.test_rigid import BODY as HALF_SPACE
+from tests.mechanics.contact.test_rigid import HalfSpace
+
+from .conftest import BODY, LAYOUT, OBJECTS
+
+CELL = float(np.prod(BODY.cell))
+
+
+@pytest.fixture(scope="module")
+def solid() -> Solid:
+    return Solid(BODY, LAYOUT.sensors(BODY), divisions=2, refinement=1)
+
+
+@pytest.fixture(scope="module")
+def covered(solid):
+    """Return a function that puts a skin, solved once, on the pad of a model."""
+    return lambda model, site="skin": MujocoSkin(model, site, BODY, LAYOUT, lambda body, sensors: solid)
+
+
+@pytest.mark.parametrize("name", OBJECTS)
+def test_the_pressure_sums_to_the_weight_of_an_object(world, covered, name):
+    model, data = world((name, 0.013, -0.02))
+    pressure = covered(model).pressure(data)
+    assert pressure.sum() * CELL == pytest.approx(9.81 * OBJECTS[name][2], rel=0.01)
+    y, x = np.indices(BODY.shape) + 0.5
+    centre = [(pressure * along).sum() / pressure.sum() * 0.01 - 0.08 for along in (x, y)]
+    assert centre == pytest.approx([0.013, -0.02], abs=0.005)  # half a cell
+
+
+def test_readings_of_two_objects_are_the_sum_of_each_alone(world, covered):
+    places = ("ball", -0.04, -0.04), ("box", 0.03, 0.03)
+    both, first, second = (
+        covered(model).read(data) for model, data in (world(*places), world(places[0]), world(places[1]))
+    )
+    assert both == pytest.approx(first + second, abs=1e-3 * both.max())
+    model, data = world(*places)
+    presses = covered(model).surface.presses(data)
+    assert sorted(press.force[2] for press in presses) == pytest.approx([9.81, 29.43], rel=0.01)
+
+
+def test_friction_is_a_shear(world, covered, solid):
+    """5 N push a box of 3 kg, which friction holds."""
+    model, data = world(("box", 0.0, 0.0), push=5.0)
+    skin = covered(model)
+    (press,) = skin.surface.presses(data)
+    assert press.force == pytest.approx([5.0, 0.0, 29.43], abs=0.1)
+    pressure = torch.from_numpy(skin.pressure(data))
+    shear = torch.tensor([press.force[0] / press.force[2], 0.0])
+    expected = solid(pressure[None], shear[None]).readings[0].numpy()
+    assert skin.read(data) == pytest.approx(expected, abs=1e-4)
+    assert np.abs(skin.read(data) - solid(pressure[None]).readings[0].numpy()).max() > 0.01
+
+
+def test_a_turned_pad_turns_the_chart(world, covered):
+    model, data = world(("ball", 0.0, 0.05), turn=90.0)
+    (press,) = covered(model).surface.presses(data)
+    row, column = np.unravel_index(press.gap.argmin(), BODY.shape)
+    assert (row in (7, 8), column) == (True, 12)  # the middles of cells are at 4.5 and 5.5 cm
+
+
+@pytest.mark.slow("prepares a posterior")
+def test_the_posterior_finds_the_object(world, covered):
+    model, data = world(("ball", 0.03, -0.005))
+    estimate = covered(model).contacts(data)
+    (contact,) = estimate.contacts
+    assert estimate.fingertip
+    assert contact.position - 0.08 == pytest.approx([0.03, -0.005], abs=0.008)
+    assert contact.force == pytest.approx(9.81, abs=2 * contact.force_deviation)
+
+
+def test_an_untouched_skin_reads_nothing_and_the_model_is_as_before(world, covered):
+    model, data = world()
+    before = model.geom_group.copy(), model.geom_rgba.copy(), model.geom_matid.copy()
+    assert not covered(model).read(data).any()
+    assert all(map(np.array_equal, before, (model.geom_group, model.geom_rgba, model.geom_matid)))
+
+
+def test_an_invisible_object_is_felt_and_one_beside_the_skin_is_not(world, covered):
+    model, data = world(("ball", 0.02, 0.02), ("box", 0.088, -0.03))
+    model.geom_rgba[:, 3] = 0
+    # Half of the box's corners are beyond a skin that is smaller than its pad.
+    small = MujocoSurface(model, "skin", Sheet((0.1, 0.1), (10, 10), BODY.layers))
+    (press,) = small.presses(data)
+    assert press.force[2] == pytest.approx(9.81, rel=0.01)
+    assert np.isfinite(press.gap).sum() > 4
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.7, 1.3])
+def test_a_ball_on_an_arm_presses_along_the_normal(turn):
+    arm = Arm(cells=(32, 16), layers=BODY.layers, radius=0.05, length=0.16, angle=3.0)
+    out = np.array([np.sin(turn), 0, np.cos(turn)])
+    mujoco = pytest.importorskip("mujoco", reason="pip install 'tactile-skin[mujoco]'")
+    model = mujoco.MjModel.from_xml_string(
+        f"""<mujoco><option gravity="0 0 0"/><worldbody>
+        <body><geom type="cylinder" size="0.05 0.08" zaxis="0 1 0"/><site name="skin" pos="0 0 0.05"/></body>
+        <body pos="{0.07 * out[0]} 0.02 {0.07 * out[2]}"><joint type="slide" axis="{out[0]} 0 {out[2]}"/>
+        <geom type="sphere" size="0.02" mass="1"/></body></worldbody></mujoco>"""
+    )
+    data = mujoco.MjData(model)
+    data.xfrc_applied[2, :3] = -5 * out
+    mujoco.mj_step(model, data, 500)
+    (press,) = MujocoSurface(model, "skin", arm).presses(data)
+    assert press.force == pytest.approx([0, 0, 5], abs=0.01)
+    row, column = np.unravel_index(press.gap.argmin(), arm.shape)
+    middle = [(column + 0.5) * arm.cell[0], (row + 0.5) * arm.cell[1]]
+    assert middle == pytest.approx([0.075 + 0.05 * turn, 0.1], abs=0.006)
+    assert np.isfinite(press.gap).sum() < 0.3 * press.gap.size  # neither the far side nor the rest
+
+
+def test_a_surface_without_shear_says_that_friction_is_left_out():
+    with pytest.warns(UserWarning, match="has normal forces only: friction is left out"):
+        Pressing(HalfSpace(), HALF_SPACE)
+
+
+@pytest.mark.slow("500 readings")
+def test_a_reading_of_25_sensors_takes_at_most_5_ms(world):
+    """Processor time of the 99th percentile on one thread, the best of five hundreds; 32 x 32 cells."""
+    body = Sheet((0.16, 0.16), (32, 32), BODY.layers)
+    model, data = world(("ball", 0.013, -0.02))
+    solid = Solid(body, LAYOUT.sensors(body), divisions=2, refinement=1)
+    skin, times = MujocoSkin(model, "skin", body, LAYOUT, lambda body, sensors: solid), []
+    for _ in range(500):
+        begin = process_time()
+        skin.read(data)
+        times.append(process_time() - begin)
+    # Other processes take the cache of the processor, and so its time.
+    assert np.percentile(np.reshape(times, (5, 100)), 99, axis=1).min() < 0.005
+
+
+@pytest.mark.parametrize(
+    ("site", "said"),
+    [
+        ("skn", r"^the model has no site 'skn': .*'above', 'free', 'skin'"),
+        ("free", "^site free of body air lies on no geom: put it on the surface"),
+        ("above", "^site above of body table lies on no geom"),
+    ],
+)
+def test_what_cannot_carry_a_skin_is_refused_in_a_sentence(world, covered, site, said):
+    with pytest.raises(InputError, match=said):
+        covered(world()[0], site)
+
+
+def test_a_skin_larger_than_its_geom_is_noted(world):
+    wide = Sheet((0.18, 0.16), (18, 16), BODY.layers)
+    with pytest.warns(UserWarning, match="^32 of 288 cells of the skin lie beyond geom pad"):
+        MujocoSurface(world()[0], "skin", wide)
+
+
+def test_without_the_package_one_sentence_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "mujoco", None)
+    with pytest.raises(InputError, match=r"^MuJoCo is not installed: pip install 'tactile-skin\[mujoco\]'$"):
+        MujocoSkin(None, "skin", BODY, Grid(5, 5))

@@ -1,5 +1,6 @@
 """Simulated readings at the rate of a device, reduced to the rate of a model like those of a real one."""
 
+from dataclasses import replace
 from functools import cache
 from itertools import pairwise
 
@@ -11,6 +12,7 @@ from torch import Tensor
 
 from skin.device.imperfection import Constants, Imperfection, convert
 from skin.device.resampling import frame_ages, highest_each, resample
+from skin.device.touches import Recording
 
 _NUMBERS = tuple(np.geomspace(1, 1000, 61).tolist())  # of frames in an interval; between them, 0.001 s.d.
 _SENSED = 5  # times the model's rate, of hysteresis, lag and curve; odd, so that a frame of the model is one
@@ -284,3 +286,30 @@ def _highest_of(number: float, quantiles: int = 20_000) -> float:
         return 0.0
     probability = (np.arange(quantiles) + 0.5) / quantiles
     return float(ndtri(probability ** (1 / number)).mean())
+
+
+def with_imperfections(
+    true: Recording,
+    imperfection: Imperfection,
+    constants: Constants | None,
+    noise: np.random.Generator,
+    ongoing: bool = False,
+) -> Recording:
+    """Return true readings with the imperfections of a device.
+
+    Args:
+        true: touches without imperfections.
+        imperfection: of the device.
+        constants: of the device; None: another device, drawn, measures each touch.
+        noise: source of the noise.
+        ongoing: as in :func:`measure`.
+    """
+    force, rate = true.touches.readings, true.touches.rate
+    if constants is None:
+        constants = draw_constants(imperfection, force.shape[2], rate, noise, len(true))
+    readings, valid, saturated = measure(imperfection, constants, force, rate, noise, ongoing)
+    return replace(
+        true,
+        touches=replace(true.touches, readings=readings, valid=valid, saturated=saturated),
+        parameters=true.parameters | {"clipped": saturated.flatten(1).any(1).float()},
+    )

@@ -20,9 +20,9 @@ from skin.body.layout import AbstractLayout
 from skin.core.rng import Stream, generator
 from skin.core.settings import checked
 from skin.device.base import AbstractDevice, Split, grouped, joined, split_rows, split_slices
-from skin.device.imperfection import Constants, Imperfection, ImperfectionSettings
+from skin.device.imperfection import Imperfection, ImperfectionSettings
 from skin.device.resampling import check_rate
-from skin.device.sampling import draw_constants, idle_excess, measure
+from skin.device.sampling import draw_constants, idle_excess, with_imperfections
 from skin.device.touches import Part, Recording, Touches, TouchStream, draw_timeline, only_touches
 from skin.errors import InputError
 from skin.mechanics.contact.prescribed import Prescribed
@@ -576,30 +576,3 @@ class Simulated(ImperfectionSettings, AbstractDevice):
             noise,
             ongoing=self.sampler.settings.ongoing > 0,
         )
-
-
-def with_imperfections(
-    true: Recording,
-    imperfection: Imperfection,
-    constants: Constants | None,
-    noise: np.random.Generator,
-    ongoing: bool = False,
-) -> Recording:
-    """Return true readings with the imperfections of a device.
-
-    Args:
-        true: touches without imperfections.
-        imperfection: of the device.
-        constants: of the device; None: another device, drawn, measures each touch.
-        noise: source of the noise.
-        ongoing: as in :func:`skin.device.sampling.measure`.
-    """
-    force, rate = true.touches.readings, true.touches.rate
-    if constants is None:
-        constants = draw_constants(imperfection, force.shape[2], rate, noise, len(true))
-    readings, valid, saturated = measure(imperfection, constants, force, rate, noise, ongoing)
-    return replace(
-        true,
-        touches=replace(true.touches, readings=readings, valid=valid, saturated=saturated),
-        parameters=true.parameters | {"clipped": saturated.flatten(1).any(1).float()},
-    )

@@ -16,8 +16,8 @@ from skin.core.settings import checked
 from skin.device.base import AbstractDevice, Blank, Split, split_rows
 from skin.device.imperfection import Imperfection, ImperfectionSettings
 from skin.device.resampling import check_rate
-from skin.device.sampling import draw_constants
-from skin.device.simulated import cover_surface, with_imperfections
+from skin.device.sampling import draw_constants, with_imperfections
+from skin.device.simulated import cover_surface
 from skin.device.touches import Recording, Touches
 from skin.errors import InputError
 from skin.mechanics.geometry import sensor_geometry

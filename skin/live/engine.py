@@ -67,13 +67,11 @@ class Debounce:
 
     def __call__(self, answer: bool, t: float, period: float) -> bool:
         """Return the debounced value after an answer at ``t`` that lasts for ``period``, s."""
-        if answer == self.state:
-            self._since = None
-            return self.state
-        self._since = t if self._since is None else self._since
+        since = t if self._since is None else self._since
         # Rounding of the clock must not cost a frame.
-        if t - self._since + period >= (self.rise if answer else self.fall) - 1e-6:
-            self.state, self._since = answer, None
+        if t - since + period >= (self.rise if answer else self.fall) - 1e-6:
+            self.state = answer
+        self._since = None if answer == self.state else since
         return self.state
 
 

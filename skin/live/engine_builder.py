@@ -133,13 +133,9 @@ class SelfTest:
         """
         engine, raised = replace(engine), list[bool]()
         for number, sensor in enumerate(self._sensors):
-            engine.reset(noise=conversion.noise)
             press = strength * self.presses[sensor]
             rest, stream = _press(number, number >= len(self.presses), press, conversion, device)
-            engine.remember(stream[:rest])  # nothing to decide yet
-            # Judged six at once; those behind the alarm are left out.
-            pieces = (stream[first : first + 6] for first in range(rest, len(stream), 6))
-            raised.append(any(verdict.dangerous for piece in pieces for verdict in engine.push(piece)))
+            raised.append(raises_alarm(engine, stream, conversion.noise, rest))
         return np.array(raised)
 
     def _suspect(self, conversion: UnitConversion) -> str:
@@ -157,8 +153,26 @@ class SelfTest:
             "live.drift": used.detection.drift != nominal.detection.drift,
             "live.patience": used.patience != nominal.patience,
         }
-        named = [name for name, differs in differing.items() if differs]
-        return " or ".join(named) or "device.limits, device.scale or device.calibration"
+        named = " or ".join(name for name, differs in differing.items() if differs)
+        return named or "device.limits, device.scale or device.calibration"
+
+
+def raises_alarm(
+    engine: Engine, stream: Sequence[NewtonFrame], noise: np.ndarray | None, rest: int = 0
+) -> bool:
+    """Return whether a touch of the untouched skin raises the alarm.
+
+    Args:
+        engine: is reset.
+        stream: the readings.
+        noise: (S,), N, standard deviation of the untouched skin; None: unknown.
+        rest: number of readings at the beginning on which there is nothing to decide.
+    """
+    engine.reset(noise=noise)
+    engine.remember(stream[:rest])
+    # Judged six at once; those behind the alarm are left out.
+    pieces = (stream[first : first + 6] for first in range(rest, len(stream), 6))
+    return any(verdict.dangerous for piece in pieces for verdict in engine.push(piece))
 
 
 def _press(

@@ -8,7 +8,8 @@ the touches to come are drawn as these were. torch is not imported.
 import math
 from collections import defaultdict
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 from scipy.optimize import brentq
@@ -17,6 +18,7 @@ from scipy.stats import beta, binom
 
 from skin.device.resampling import Frame
 from skin.errors import InputError
+from skin.evaluation.decisions import LiveConditions
 from skin.wire.channels import NewtonFrame
 from skin.wire.tare import FEWEST, MakeConversion, Tare
 
@@ -25,6 +27,7 @@ MARGIN = 1.1
 CONFIDENCE = 0.95
 SAFE = 0.9
 """Times the limit, below which a press counts as safe."""
+_SAME = 0.1  # relative difference of rates: a measured one is never the same twice
 _APART = 1e-6  # scores closer than this may have another order on another processor
 
 
@@ -243,6 +246,10 @@ class Guarantee:
         misses: k of them.
         conditions: profile of the devices and their rate, in words.
         confidence: of the bound.
+        device_rate: of the devices, Hz.
+        patience: of the live view, s.
+        lapsed: why it does not hold for a live view, in words; empty: it holds, or nobody has looked.
+        verified: a second reference has confirmed the scale of the device in use, or it needs none.
     """
 
     rate: float
@@ -250,10 +257,33 @@ class Guarantee:
     misses: int
     conditions: str
     confidence: float = CONFIDENCE
+    device_rate: float = 0.0
+    patience: float = 0.0
+    lapsed: str = ""
+    verified: bool = True
+
+    def on_device(self, as_chosen: bool, verified: bool) -> "Guarantee":
+        """Return the guarantee for a device: it lapses with another contact threshold or drift."""
+        lapsed = self.lapsed or "live.touch or live.drift is another than it was made for" * (not as_chosen)
+        return replace(self, lapsed=lapsed, verified=verified)
+
+    def state(self, changed: Sequence[int]) -> Literal["valid", "unverified", "lapsed"]:
+        """Return whether it holds for a live view; ``changed``: sensors that a watch reports."""
+        return "lapsed" if self.lapsed or changed else "valid" if self.verified else "unverified"
+
+    def under(self, live: LiveConditions) -> "Guarantee":
+        """Return the guarantee for a live view: it lapses at another rate or patience than its own."""
+        lapsed = ""
+        if abs(self.device_rate / live.rate - 1) > _SAME:
+            lapsed = f"the device sends {live.rate:.3g} frames a second, and not {self.device_rate:.3g}"
+        elif live.patience != self.patience:
+            lapsed = f"live.patience.alarm is {live.patience:g} s, and not {self.patience:g}"
+        return replace(self, lapsed=lapsed)
 
     def sentence(self) -> str:
         """Return the promise in words, with its conditions."""
+        lapsed = f"; lapsed, as {self.lapsed}" if self.lapsed else ""
         return (
             f"in simulation, above {MARGIN:g} x the limit and on a sensor: at most {100 * self.rate:g} % "
-            f"missed, {100 * self.confidence:g} %, {self.touches:,} touches, {self.conditions}"
+            f"missed, {100 * self.confidence:g} %, {self.touches:,} touches, {self.conditions}{lapsed}"
         )

@@ -20,6 +20,7 @@ from skin.evaluation.decisions import (
     longest_shown,
     present_as_press,
 )
+from skin.evaluation.guarantee import Guarantee
 from skin.evaluation.operating_point import DangerScore
 from skin.live.verdict import LASTING, Note, Verdict, order_notes
 from skin.touch.labels import ALARM, RELEASE, Task
@@ -144,6 +145,7 @@ class Engine:
         presses: (S, S), N, readings of a press at the limit of ``dangerous`` on each sensor: where no valid
             one rises by the threshold, the position is unknown. None: each sensor feels what is on itself.
         danger: combines the model's probability of ``dangerous`` with the largest reading; None: the model's.
+        guarantee: of the threshold; it lapses while a watch reports a sensor. None: there is none.
 
     Attributes:
         window: of the latest readings, N.
@@ -162,6 +164,7 @@ class Engine:
     patience: DebounceSettings = field(default_factory=DebounceSettings)
     presses: np.ndarray | None = None
     danger: DangerScore | None = None
+    guarantee: Guarantee | None = None
     changed: tuple[int, ...] = field(default=(), init=False)
 
     def __post_init__(self) -> None:
@@ -332,6 +335,9 @@ class Engine:
             "masked": masked,
         }
         notes = [Note(code, _numbers(which)) for code, which in sensors.items() if which.any()]
+        if self.guarantee is not None:
+            code = "guarantee_" + self.guarantee.state(self.changed)
+            notes.append(Note(code, detail=self.guarantee.sentence()))
         notes += [Note("unreadable")] * self._losses.excessive + [Note("pause", seconds=self._pause)] * paused
         return _numbers(blind), tuple(notes)
 

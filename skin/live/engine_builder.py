@@ -82,9 +82,12 @@ class SelfTest:
             for which in (~raised, expected & ~raised & valid)
         )
         text = f"self-test: {raised.sum()} of {len(raised)} dangerous presses raise the alarm"
-        undeclared = "the device declares no range, so its scale is not checked"
         silence = f"not on {silent}; " if silent else ""
-        scale = "only its range tests the scale" if device.known else undeclared
+        scale = (
+            "only its range tests the scale"
+            if device.known
+            else "the device declares no range, so its scale is not checked"
+        )
         say(f"{text}, {expected.sum()} with nominal settings; {silence}{scale}")
         text += f", not {expected.sum()}" + (f"; {missed} cannot raise it" if missed else "")
         if expected.mean() < self.minimum:
@@ -116,9 +119,8 @@ class SelfTest:
     @property
     def _nominal(self) -> Engine:
         """An engine with nominal settings and a plausible contact threshold."""
-        detection = self.nominal.detection
-        threshold = min(detection.threshold, self.plausible)
-        return replace(self.nominal, detection=replace(detection, threshold=threshold))
+        threshold = min(self.nominal.detection.threshold, self.plausible)
+        return replace(self.nominal, detection=replace(self.nominal.detection, threshold=threshold))
 
     def find(
         self,
@@ -133,8 +135,8 @@ class SelfTest:
         """
         engine, raised = replace(engine), list[bool]()
         for number, sensor in enumerate(self._sensors):
-            press = strength * self.presses[sensor]
-            rest, stream = _press(number, number >= len(self.presses), press, conversion, device)
+            slow, press = number >= len(self.presses), strength * self.presses[sensor]
+            rest, stream = _press(number, slow, press, conversion, device)
             raised.append(raises_alarm(engine, stream, conversion.noise, rest))
         return np.array(raised)
 
@@ -153,8 +155,10 @@ class SelfTest:
             "live.drift": used.detection.drift != nominal.detection.drift,
             "live.patience": used.patience != nominal.patience,
         }
-        named = " or ".join(name for name, differs in differing.items() if differs)
-        return named or "device.limits, device.scale or device.calibration"
+        return (
+            " or ".join(name for name, differs in differing.items() if differs)
+            or "device.limits, device.scale or device.calibration"
+        )
 
 
 def raises_alarm(
@@ -292,7 +296,7 @@ class LiveSetup:
             InputError: no contact threshold is known, or no threshold raises an alarm as seldom as wanted.
         """
         model, given, usual, conditions = self.model, live.patience.above, None, None
-        danger = None
+        danger = promise = None
         if given is None and model.alarms:
             rate = model.rate if self.port is None else measured_rate(self.port.skin)
             conditions = model.live_conditions(rate, live.patience.alarm, self.port is None)
@@ -302,7 +306,7 @@ class LiveSetup:
             if point is None or given is not None:
                 usual = model.threshold
             else:
-                usual, danger = point.announced(say), point.score
+                usual, danger, promise = point.announced(say), point.score, point.guarantee
         if conditions is not None and self.port is not None:
             # Frames that waited meanwhile would delay the verdicts about those of now.
             with suppress(SkinTimeout, SkinDisconnected):
@@ -310,6 +314,7 @@ class LiveSetup:
         nominal = engine_settings(model, DebounceSettings(above=usual), danger=danger)
         patience = replace(live.patience, above=usual if given is None else given)
         engine = engine_settings(model, patience, live.touch, live.drift, danger)
+        engine.guarantee = promise
         source = self.port or self.begin()
         source.tare.glitches.fractions = engine.fractions
         return source, engine, nominal
@@ -345,6 +350,10 @@ class LiveSetup:
             say(found.text)
         if found.state == "unverified":
             add_note(Note("unverified", detail=found.text))
+        if engine.guarantee is not None:
+            engine.guarantee = engine.guarantee.on_device(
+                engine.detection == nominal.detection, found.state != "unverified"
+            )
         stored, raised = found.check.rest if found.check else source.calibrated_rest, None
         if stored is not None and conversion.rest is not None:
             raised = conversion.rest - conversion.newtons(np.asarray(stored))
@@ -470,14 +479,18 @@ def engine_settings(
             f"{model.title} estimates {', '.join(model.task.names)}: skin live shows labels or classes, so "
             "give a run of those"
         )
-    contact = model.contact if touch is None else touch
     return Engine(
         model.probabilities,
         model.task,
         len(model.positions),
         model.window,
         model.rate,
-        Detection(contact, drift / 600, model.learned and touch is None, model.longest),
+        Detection(
+            model.contact if touch is None else touch,
+            drift / 600,
+            model.learned and touch is None,
+            model.longest,
+        ),
         patience,
         model.presses,
         danger,

@@ -23,6 +23,9 @@ NOTES = {
     "near_threshold": "probably dangerous, but below the threshold of the alarm",
     "unverified": "{text}",
     "clock": "{text}",
+    "guarantee_lapsed": "a guarantee that has lapsed: {text}",
+    "guarantee_unverified": "a guarantee for a device whose scale is unverified: {text}",
+    "guarantee_valid": "guarantee: {text}",
 }
 """Code of each note -> its sentence, the gravest first."""
 

@@ -281,8 +281,7 @@ def per_newton(simulator: AbstractSimulator, body: AbstractBody, gauge: Gauge) -
     Raises:
         InputError: a position outside the sheet, a radius that is not above 0, or an unknown indenter.
     """
-    rows = gauge.first
-    position, radius = gauge.position[rows], gauge.radius[rows]
+    position, radius = gauge.position[gauge.first], gauge.radius[gauge.first]
     if (position < 0).any() or (position > body.size).any():
         wrong = position[((position < 0) | (position > body.size)).any(axis=1)][0]
         raise InputError(
@@ -291,17 +290,15 @@ def per_newton(simulator: AbstractSimulator, body: AbstractBody, gauge: Gauge) -
         )
     if not (radius > 0).all():
         raise InputError(f"radius_m must be above 0 m, got {radius.min():g}")
-    images = pressed_images(body, gauge)
-    return torch.cat([simulator(image).readings for image in images]).double().numpy()
+    return torch.cat([simulator(image).readings for image in pressed_images(body, gauge)]).double().numpy()
 
 
 def pressed_images(body: AbstractBody, gauge: Gauge) -> Iterator[torch.Tensor]:
     """Yield the pressure of each press under 1 N, (1, H, W), Pa."""
     shapes, kind, scale = _indenters(body, gauge)
     for number, row in enumerate(gauge.first):
-        one, at = slice(number, number + 1), slice(row, row + 1)
-        pressure = shapes.render(kind[one], gauge.angle[at], scale[one], gauge.position[at])
-        yield pressure / float(np.prod(body.cell))
+        pose = kind[[number]], gauge.angle[[row]], scale[[number]], gauge.position[[row]]
+        yield shapes.render(*pose) / float(np.prod(body.cell))
 
 
 def pressed_peaks(body: AbstractBody, gauge: Gauge) -> np.ndarray:

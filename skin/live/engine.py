@@ -336,8 +336,8 @@ class Engine:
         }
         notes = [Note(code, _numbers(which)) for code, which in sensors.items() if which.any()]
         if self.guarantee is not None:
-            code = "guarantee_" + self.guarantee.state(self.changed)
-            notes.append(Note(code, detail=self.guarantee.sentence()))
+            code, text = f"guarantee_{self.guarantee.state(self.changed)}", self.guarantee.sentence()
+            notes.append(Note(code, detail=text))
         notes += [Note("unreadable")] * self._losses.excessive + [Note("pause", seconds=self._pause)] * paused
         return _numbers(blind), tuple(notes)
 

@@ -19,6 +19,7 @@ from skin.device.resampling import Frame
 from skin.errors import InputError
 from skin.evaluation.alarm import choose_alarm_threshold
 from skin.evaluation.decisions import DRIFT, minimum_visible
+from skin.evaluation.guarantee import Guarantee
 from skin.evaluation.operating_point import DangerScore
 from skin.live.contacts import Mechanics
 from skin.live.engine import DebounceSettings, Detection, Engine
@@ -82,13 +83,12 @@ class SelfTest:
             for which in (~raised, expected & ~raised & valid)
         )
         text = f"self-test: {raised.sum()} of {len(raised)} dangerous presses raise the alarm"
-        silence = f"not on {silent}; " if silent else ""
         scale = (
             "only its range tests the scale"
             if device.known
             else "the device declares no range, so its scale is not checked"
         )
-        say(f"{text}, {expected.sum()} with nominal settings; {silence}{scale}")
+        say(f"{text}, {expected.sum()} with nominal settings; {silent and f'not on {silent}; '}{scale}")
         text += f", not {expected.sum()}" + (f"; {missed} cannot raise it" if missed else "")
         if expected.mean() < self.minimum:
             raise InputError(
@@ -135,8 +135,9 @@ class SelfTest:
         """
         engine, raised = replace(engine), list[bool]()
         for number, sensor in enumerate(self._sensors):
-            slow, press = number >= len(self.presses), strength * self.presses[sensor]
-            rest, stream = _press(number, slow, press, conversion, device)
+            rest, stream = _press(
+                number, number >= len(self.presses), strength * self.presses[sensor], conversion, device
+            )
             raised.append(raises_alarm(engine, stream, conversion.noise, rest))
         return np.array(raised)
 
@@ -148,12 +149,11 @@ class SelfTest:
                 "quarter may): they are dead, or the mask of broken sensors (device.calibration, or a tare "
                 "at the limit)"
             )
-        used, nominal = self.used, self._nominal
+        used, nominal = self.used.detection, self._nominal.detection
         differing = {
-            "the contact threshold of the model or live.touch": used.detection.threshold
-            != nominal.detection.threshold,
-            "live.drift": used.detection.drift != nominal.detection.drift,
-            "live.patience": used.patience != nominal.patience,
+            "the contact threshold of the model or live.touch": used.threshold != nominal.threshold,
+            "live.drift": used.drift != nominal.drift,
+            "live.patience": self.used.patience != self.nominal.patience,
         }
         return (
             " or ".join(name for name, differs in differing.items() if differs)
@@ -175,8 +175,11 @@ def raises_alarm(
     engine.reset(noise=noise)
     engine.remember(stream[:rest])
     # Judged six at once; those behind the alarm are left out.
-    pieces = (stream[first : first + 6] for first in range(rest, len(stream), 6))
-    return any(verdict.dangerous for piece in pieces for verdict in engine.push(piece))
+    return any(
+        verdict.dangerous
+        for first in range(rest, len(stream), 6)
+        for verdict in engine.push(stream[first : first + 6])
+    )
 
 
 def _press(
@@ -261,8 +264,11 @@ class LiveSettings:
         Raises:
             InputError: a setting is unknown or invalid.
         """
-        patience = configured(DebounceSettings, live["patience"], "live.patience")
-        return configured(cls, {**live, "patience": patience}, "live")
+        return configured(
+            cls,
+            {**live, "patience": configured(DebounceSettings, live["patience"], "live.patience")},
+            "live",
+        )
 
 
 @dataclass(frozen=True)
@@ -313,8 +319,7 @@ class LiveSetup:
                 self.port.skin.read(10**6, 0.0)  # more than any queue holds
         nominal = engine_settings(model, DebounceSettings(above=usual), danger=danger)
         patience = replace(live.patience, above=usual if given is None else given)
-        engine = engine_settings(model, patience, live.touch, live.drift, danger)
-        engine.guarantee = promise
+        engine = engine_settings(model, patience, live.touch, live.drift, danger, promise)
         source = self.port or self.begin()
         source.tare.glitches.fractions = engine.fractions
         return source, engine, nominal
@@ -460,6 +465,7 @@ def engine_settings(
     touch: float | None = None,
     drift: float = 600 * DRIFT,
     danger: DangerScore | None = None,
+    guarantee: Guarantee | None = None,
 ) -> Engine:
     """Return an engine for a model.
 
@@ -469,7 +475,7 @@ def engine_settings(
         touch: contact threshold, N above the baseline; None: that of the model, and the learned label
             ``touch`` counts as touch, too.
         drift: N in ten minutes that the baseline may follow without touch.
-        danger: as in :class:`Engine`.
+        danger, guarantee: as in :class:`Engine`.
 
     Raises:
         InputError: ``touch`` is neither given nor known, or the model estimates targets.
@@ -494,6 +500,7 @@ def engine_settings(
         patience,
         model.presses,
         danger,
+        guarantee,
     )
 
 

@@ -338,16 +338,16 @@ def judge_presses(
     peak = settings.danger.excess(
         pressure, force, end - gauge.time[gauge.first] > settings.thresholds.duration
     )
-    unit = 1.0 if scale is None and calibration is None else scale
+    scale = 1.0 if scale is None and calibration is None else scale
     press = np.maximum(*(gauge.at(moment)[1] for moment in (time, time - RELEASE)))
     alarmed, works = replay_presses(
         alarms,
-        lambda baseline, header: unit_conversion(raw.shape[1], baseline, unit, calibration, header),
+        lambda baseline, header: unit_conversion(raw.shape[1], baseline, scale, calibration, header),
         *(rate, time, raw, press, len(gauge)),
     )
     column, row = (device.sensors.positions[:, :2] / device.body.cell).astype(int).T
-    images = (image[0] / image.max() for image in pressed_images(device.body, gauge))
-    shares = np.stack([image[row, column].numpy() for image in images])
+    images = pressed_images(device.body, gauge)
+    shares = np.stack([(image[0, row, column] / image.max()).numpy() for image in images])
     return peak, peak * (shares * works).max(axis=1), alarmed
 
 

@@ -346,9 +346,8 @@ def judge_presses(
         *(rate, time, raw, press, len(gauge)),
     )
     column, row = (device.sensors.positions[:, :2] / device.body.cell).astype(int).T
-    images = pressed_images(device.body, gauge)
-    shares = np.stack([(image[0, row, column] / image.max()).numpy() for image in images])
-    return peak, peak * (shares * works).max(axis=1), alarmed
+    shares = [image[0, row, column] / image.max() for image in pressed_images(device.body, gauge)]
+    return peak, peak * (np.stack(shares) * works).max(axis=1), alarmed
 
 
 def _touches(device: Simulated, pairs: Sequence[Pair]) -> list[Touches]:

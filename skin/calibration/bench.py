@@ -2,7 +2,7 @@
 
 import json
 import logging
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -282,8 +282,7 @@ def per_newton(simulator: AbstractSimulator, body: AbstractBody, gauge: Gauge) -
     Raises:
         InputError: a position outside the sheet, a radius that is not above 0, or an unknown indenter.
     """
-    rows = gauge.first
-    position, radius, angle = gauge.position[rows], gauge.radius[rows], gauge.angle[rows]
+    position, radius = gauge.position[gauge.first], gauge.radius[gauge.first]
     if (position < 0).any() or (position > body.size).any():
         wrong = position[((position < 0) | (position > body.size)).any(axis=1)][0]
         raise InputError(
@@ -292,11 +291,15 @@ def per_newton(simulator: AbstractSimulator, body: AbstractBody, gauge: Gauge) -
         )
     if not (radius > 0).all():
         raise InputError(f"radius_m must be above 0 m, got {radius.min():g}")
+    return torch.cat([simulator(image).readings for image in pressed_images(body, gauge)]).double().numpy()
+
+
+def pressed_images(body: AbstractBody, gauge: Gauge) -> Iterator[torch.Tensor]:
+    """Yield the pressure of each press under 1 N, (1, H, W), Pa."""
     shapes, kind, scale = _indenters(body, gauge)
-    area = float(np.prod(body.cell))
-    pieces = [slice(number, number + 1) for number in range(len(kind))]
-    images = (shapes.render(kind[n], angle[n], scale[n], position[n]) / area for n in pieces)
-    return torch.cat([simulator(image).readings for image in images]).double().numpy()
+    for number, row in enumerate(gauge.first):
+        pose = kind[[number]], gauge.angle[[row]], scale[[number]], gauge.position[[row]]
+        yield shapes.render(*pose) / float(np.prod(body.cell))
 
 
 def pressed_peaks(body: AbstractBody, gauge: Gauge) -> np.ndarray:

@@ -4,16 +4,25 @@
     skin compare session=bench.csv presses=gauge.csv run=latest
 
 The session holds gestures (of `skin record`) or presses of a bench. Writes compare.md and compare.png into
-out=; run= compares the predictions of a run, too.
+out=; run= compares the predictions of a run, too, and tests its alarm on presses.
 """
 
-from typing import Any
+import sys
+from dataclasses import replace
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from skin.commands._command import command
 from skin.core.files import results
 from skin.core.messages import quiet
 from skin.errors import InputError
-from skin.runs.configuration import Config
+from skin.runs.configuration import Config, overrides
+
+if TYPE_CHECKING:
+    from skin.calibration.bench import BenchData
+    from skin.device.simulated import Simulated
 
 
 @command("compare")
@@ -38,5 +47,37 @@ def main(
     description = f"Session {session}, simulated by {type(device.model).__name__}{calibrated}"
     comparison = compare_session(device, session, presses, compare)
     agreement = [] if run is None else compare_predictions(run, config, comparison, device)
+    if compare["miss_rate"] is not None and (run is None or comparison.bench is None):
+        raise InputError("compare.miss_rate needs presses of known force, and run= whose alarm they test")
+    if run is not None and comparison.bench is not None:
+        agreement += _test_alarm(run, config, comparison.bench, device, compare)
     page, picture = publish_comparison(comparison, agreement, description, compare["shown"], results(out))
     print(page.read_text(encoding="utf-8"), page, picture, sep="\n")
+
+
+def _test_alarm(
+    name: str, config: Config, bench: "BenchData", device: "Simulated", compare: dict[str, Any]
+) -> list[str]:
+    """Return what presses show of the alarm of a run, as the live view of a device at a port raises it."""
+    from skin.evaluation.alarm import choose_alarm_threshold
+    from skin.evaluation.guarantee import describe_presses
+    from skin.live.engine import DebounceSettings
+    from skin.live.engine_builder import engine_settings, raises_alarm
+    from skin.record.comparison import judge_presses
+    from skin.runs.build import load_model
+    from skin.runs.run import find_run
+
+    run = find_run(config.tracking, name, config.trust)
+    trained = run.configured([word for word in overrides() if not word.startswith(("device=", "device."))])
+    used = replace(trained, device={**config.device, "port": "that of the session"})
+    model = load_model(run, trained, used, alarm=False)
+    if not model.alarms:
+        return []
+    rate, patience = 1 / float(np.median(np.diff(bench.session.time))), DebounceSettings()
+    conditions, say = model.live_conditions(rate, patience.alarm, False), partial(print, file=sys.stderr)
+    point = choose_alarm_threshold(model.alarm, conditions, say=say)
+    assert point is not None
+    patience = replace(patience, above=point.announced(say))
+    alarms = partial(raises_alarm, engine_settings(model, patience, danger=point.score))
+    judged = judge_presses(device, bench, compare["scale"], model.rate, alarms)
+    return [f"- {point.sentence()}", *describe_presses(*judged, compare["miss_rate"])]

@@ -171,4 +171,10 @@ def _choose_thresholds(model: "TorchModel", rates: Sequence[float]) -> dict[str,
     print(refused, end="", file=sys.stderr)
     thresholds = {rate: 1.0 if at.useless else at.threshold for rate, at in points.items() if at}
     scores = {rate: astuple(at.score) for rate, at in points.items() if at and at.score}
-    return {"thresholds": thresholds, "scores": scores or None}
+    kept = ("rate", "touches", "misses", "conditions", "confidence", "device_rate", "patience")
+    promises = {
+        rate: {name: getattr(at.guarantee, name) for name in kept}
+        for rate, at in points.items()
+        if at and at.guarantee
+    }
+    return {"thresholds": thresholds, "scores": scores or None, "guarantees": promises or None}

@@ -93,6 +93,7 @@ class AlarmSource:
         thresholds: of an exported network: rate of a device, Hz -> threshold for touches.
         scores: of an exported network: rate -> the factors of :class:`DangerScore`.
         weights: file of a pretrained model, beside which :data:`THRESHOLDS` ships; None: it is none.
+        guarantees: of an exported network: rate -> what its threshold guarantees.
     """
 
     name: str
@@ -110,6 +111,7 @@ class AlarmSource:
     thresholds: Mapping[str, float] = field(default_factory=dict)
     scores: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
     weights: Path | None = None
+    guarantees: Mapping[str, Guarantee] = field(default_factory=dict)
 
 
 def choose_alarm_threshold(
@@ -147,13 +149,15 @@ def choose_alarm_threshold(
             :func:`threshold_device`.
     """
     if above is not None:
-        say(f"alarm above {above:g}")
+        promised = source.guarantees or (source.settings and source.settings.miss_rate)
+        say(f"alarm above {above:g}" + ", for which no guarantee holds" * bool(promised))
         return OperatingPoint(above, math.nan, 0, 0, None)
     if source.learner is None:
         return _exported_point(source, live, say)
     settings = check_evaluation(source.settings)
     if live is not None and (anew or "simulator" in source.trained):
-        return _on_touches(source, settings, live, say, quick)
+        point = _on_touches(source, settings, live, say, quick)
+        return point if point.guarantee is None else replace(point, guarantee=_fixed(point, live).under(live))
     if not anew:
         all_skins = "skins" in source.used and not one_skin
         if all_skins and settings.profile is not None:
@@ -168,7 +172,7 @@ def _exported_point(
     source: AlarmSource, live: LiveConditions | None, say: Callable[[str], None]
 ) -> OperatingPoint | None:
     """Return the point of an exported network for the rate of a device that is nearest."""
-    threshold, score = source.threshold, None
+    threshold, score, guarantee = source.threshold, None, None
     if threshold is None:
         return None
     if live is not None:
@@ -177,6 +181,9 @@ def _exported_point(
             say(f"the device sends {live.rate:.3g} frames a second: threshold for {nearest} Hz, per touch")
             threshold = source.thresholds[nearest]
             score = DangerScore(*source.scores[nearest]) if nearest in source.scores else None
+            if nearest in source.guarantees:
+                guarantee = source.guarantees[nearest].under(live)
+                say(guarantee.sentence())
         else:
             say("the threshold was chosen for single windows: a touch has many, and raises more false alarms")
         if threshold >= 1:
@@ -184,7 +191,7 @@ def _exported_point(
                 f"{source.name} has no threshold that raises an alarm: give live.patience.above=0.5"
             )
         say(f"alarm above {threshold:.4f}")
-    return OperatingPoint(threshold, math.nan, 0, 0, None, score=score)
+    return OperatingPoint(threshold, math.nan, 0, 0, None, score=score, guarantee=guarantee)
 
 
 def _stored_point(source: AlarmSource, settings: Evaluation) -> OperatingPoint | None:
@@ -482,6 +489,12 @@ def ship_thresholds(
     shipped = {"hash": array_cache.hashed(skins, [source.weights]), "skins": skins}
     with whole(source.weights.with_name(THRESHOLDS)) as partial:
         partial.write_text(json.dumps(shipped, indent=1, sort_keys=True) + "\n", encoding="utf-8")
+
+
+def _fixed(point: OperatingPoint, live: LiveConditions) -> Guarantee:
+    """Return the guarantee of a point for touches with the rate and the patience that it was chosen for."""
+    assert point.guarantee is not None
+    return replace(point.guarantee, device_rate=point.rate or live.rate, patience=live.patience)
 
 
 def _snapped(live: LiveConditions, device: "Simulated") -> LiveConditions:

@@ -6,16 +6,26 @@ the touches to come are drawn as these were. torch is not imported.
 """
 
 import math
-from dataclasses import dataclass
+from collections import defaultdict
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 from scipy.special import bdtr, betainc, betaincinv, betaln
 
+from skin.device.resampling import Frame
 from skin.errors import InputError
+from skin.evaluation.decisions import LiveConditions
+from skin.wire.channels import NewtonFrame
+from skin.wire.tare import FEWEST, MakeConversion, Tare
 
 MARGIN = 1.1
 """Times the limit, above which a touch counts: nearer to it, gains known to 5 % decide what is dangerous."""
 CONFIDENCE = 0.95
+SAFE = 0.9
+"""Times the limit, below which a press counts as safe."""
+_SAME = 0.1  # relative difference of rates: a measured one is never the same twice
 _APART = 1e-6  # scores closer than this may have another order on another processor
 
 
@@ -139,9 +149,91 @@ def check_presses(misses: int, presses: int, rate: float, confidence: float = CO
     if anytime_bound(misses, presses, confidence) > rate:
         needed = presses_needed(rate, misses, confidence)
         raise InputError(
-            f"{misses} misses of {presses} presses do not show at most {100 * rate:g} % missed, with "
-            f"{100 * confidence:g} %: {needed} presses are needed for this, if no more are missed"
+            f"{misses} misses of {presses} presses above {MARGIN:g} x the limit and on a valid sensor do not "
+            f"show at most {100 * rate:g} % missed, with {100 * confidence:g} %: {needed} presses are needed "
+            "for this, if no more are missed"
         )
+
+
+def describe_presses(
+    peak: np.ndarray, sensed: np.ndarray, alarmed: np.ndarray, rate: float | None = None
+) -> list[str]:
+    """Return what presses show of an alarm, and how many more show less, as items of a list in Markdown.
+
+    Args:
+        peak, sensed: (P,), as in :func:`counted`.
+        alarmed: (P,), bool.
+        rate: largest fraction of missed presses that they must show; None: any.
+
+    Raises:
+        InputError: they do not show it.
+    """
+    dangerous, safe = counted(peak, sensed), peak < SAFE
+    missed = np.flatnonzero(dangerous & ~alarmed)
+    k, n = len(missed), int(dangerous.sum())
+    if rate is not None:
+        check_presses(k, n, rate)
+    named = f" (numbers {', '.join(map(str, missed[:10]))}{', ...' * (k > 10)})" if k else ""
+    more = {wanted: presses_needed(wanted, k) - n for wanted in (0.05, 0.01)}
+    shown = [
+        f"{100 * wanted:g} % needs {f'{count} more' if count > 0 else 'no more'}"
+        for wanted, count in more.items()
+    ]
+    return [
+        f"- presses above {MARGIN:g} x the limit and on a valid sensor: {n} of {len(peak)}, {k} missed"
+        f"{named}",
+        f"- at most {100 * anytime_bound(k, n):.1f} % missed, with {100 * CONFIDENCE:g} %, however many you "
+        f"add; to show {' and '.join(shown)}, none of them missed",
+        f"- presses below {SAFE:g} x the limit: {safe.sum()}, {(safe & alarmed).sum()} raise the alarm",
+    ]
+
+
+def replay_presses(
+    alarms: Callable[[Sequence[NewtonFrame], np.ndarray | None], bool],
+    convert: MakeConversion,
+    rate: float,
+    time: np.ndarray,
+    raw: np.ndarray,
+    press: np.ndarray,
+    count: int,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return which presses raise the alarm, (P,), bool, and which sensors work in them, (P, S), bool.
+
+    Each press begins with an untouched skin, and with a new tare if the pause before it is long enough.
+
+    Args:
+        alarms: tells whether a live view raises the alarm during frames, given the noise of the untouched
+            skin (S,), N.
+        convert: makes the conversion of values to N.
+        rate: of the model, Hz.
+        time: of T frames, s.
+        raw: their values, (T, S); NaN where there is none, a whole row where the frame was lost.
+        press: (T,), number of the press at each frame; -1: none.
+        count: P.
+
+    Raises:
+        InputError: the skin was never at rest before a press.
+    """
+    tare = Tare(convert, FEWEST / rate, rate)
+    streams, noise, latest = defaultdict[int, list[NewtonFrame]](list), dict[int, np.ndarray | None](), -1
+    values, received = np.zeros(raw.shape[1]), np.flatnonzero(np.isfinite(raw).any(axis=1))
+    for row, lost in zip(received, np.diff(received, prepend=received[:1] - 1) - 1, strict=True):
+        number, t, valid = int(press[row]), float(time[row]), np.isfinite(raw[row])
+        values = np.where(valid, raw[row], values)
+        readings = tare.add(Frame(None, t, t, values, valid, 0, int(lost)), number >= 0)
+        if number < 0 <= latest:
+            tare.restart()
+        latest = number
+        if readings is not None and tare.conversion is not None and number >= 0:
+            streams[number].append(readings)
+            noise[number] = tare.conversion.noise
+    if not streams:
+        raise InputError(f"no press can be judged: {tare.status or 'none follows a rest of the skin'}")
+    alarmed, works = np.zeros(count, dtype=bool), np.zeros((count, len(values)), dtype=bool)
+    for number, stream in streams.items():
+        alarmed[number] = alarms(stream, noise[number])
+        works[number] = np.mean([readings.usable for readings in stream], axis=0) > 0.5
+    return alarmed, works
 
 
 @dataclass(frozen=True)
@@ -154,6 +246,10 @@ class Guarantee:
         misses: k of them.
         conditions: profile of the devices and their rate, in words.
         confidence: of the bound.
+        device_rate: of the devices, Hz.
+        patience: of the live view, s.
+        lapsed: why it does not hold for a live view, in words; empty: it holds, or nobody has looked.
+        verified: a second reference has confirmed the scale of the device in use, or it needs none.
     """
 
     rate: float
@@ -161,10 +257,33 @@ class Guarantee:
     misses: int
     conditions: str
     confidence: float = CONFIDENCE
+    device_rate: float = 0.0
+    patience: float = 0.0
+    lapsed: str = ""
+    verified: bool = True
+
+    def on_device(self, as_chosen: bool, verified: bool) -> "Guarantee":
+        """Return the guarantee for a device: it lapses with another contact threshold or drift."""
+        lapsed = self.lapsed or "live.touch or live.drift is another than it was made for" * (not as_chosen)
+        return replace(self, lapsed=lapsed, verified=verified)
+
+    def state(self, changed: Sequence[int]) -> Literal["valid", "unverified", "lapsed"]:
+        """Return whether it holds for a live view; ``changed``: sensors that a watch reports."""
+        return "lapsed" if self.lapsed or changed else "valid" if self.verified else "unverified"
+
+    def under(self, live: LiveConditions) -> "Guarantee":
+        """Return the guarantee for a live view: it lapses at another rate or patience than its own."""
+        lapsed = ""
+        if abs(self.device_rate / live.rate - 1) > _SAME:
+            lapsed = f"the device sends {live.rate:.3g} frames a second, and not {self.device_rate:.3g}"
+        elif live.patience != self.patience:
+            lapsed = f"live.patience.alarm is {live.patience:g} s, and not {self.patience:g}"
+        return replace(self, lapsed=lapsed)
 
     def sentence(self) -> str:
         """Return the promise in words, with its conditions."""
+        lapsed = f"; lapsed, as {self.lapsed}" if self.lapsed else ""
         return (
             f"in simulation, above {MARGIN:g} x the limit and on a sensor: at most {100 * self.rate:g} % "
-            f"missed, {100 * self.confidence:g} %, {self.touches:,} touches, {self.conditions}"
+            f"missed, {100 * self.confidence:g} %, {self.touches:,} touches, {self.conditions}{lapsed}"
         )

@@ -20,6 +20,7 @@ from skin.evaluation.decisions import (
     longest_shown,
     present_as_press,
 )
+from skin.evaluation.guarantee import Guarantee
 from skin.evaluation.operating_point import DangerScore
 from skin.live.verdict import LASTING, Note, Verdict, order_notes
 from skin.touch.labels import ALARM, RELEASE, Task
@@ -67,13 +68,11 @@ class Debounce:
 
     def __call__(self, answer: bool, t: float, period: float) -> bool:
         """Return the debounced value after an answer at ``t`` that lasts for ``period``, s."""
-        if answer == self.state:
-            self._since = None
-            return self.state
-        self._since = t if self._since is None else self._since
+        since = t if self._since is None else self._since
         # Rounding of the clock must not cost a frame.
-        if t - self._since + period >= (self.rise if answer else self.fall) - 1e-6:
-            self.state, self._since = answer, None
+        if t - since + period >= (self.rise if answer else self.fall) - 1e-6:
+            self.state = answer
+        self._since = None if answer == self.state else since
         return self.state
 
 
@@ -146,6 +145,7 @@ class Engine:
         presses: (S, S), N, readings of a press at the limit of ``dangerous`` on each sensor: where no valid
             one rises by the threshold, the position is unknown. None: each sensor feels what is on itself.
         danger: combines the model's probability of ``dangerous`` with the largest reading; None: the model's.
+        guarantee: of the threshold; it lapses while a watch reports a sensor. None: there is none.
 
     Attributes:
         window: of the latest readings, N.
@@ -164,6 +164,7 @@ class Engine:
     patience: DebounceSettings = field(default_factory=DebounceSettings)
     presses: np.ndarray | None = None
     danger: DangerScore | None = None
+    guarantee: Guarantee | None = None
     changed: tuple[int, ...] = field(default=(), init=False)
 
     def __post_init__(self) -> None:
@@ -338,6 +339,9 @@ class Engine:
             "masked": masked,
         }
         notes = [Note(code, _numbers(which)) for code, which in sensors.items() if which.any()]
+        if self.guarantee is not None:
+            code, text = f"guarantee_{self.guarantee.state(self.changed)}", self.guarantee.sentence()
+            notes.append(Note(code, detail=text))
         notes += [Note("unreadable")] * self._losses.excessive + [Note("pause", seconds=self._pause)] * paused
         return _numbers(blind), tuple(notes)
 

@@ -20,6 +20,7 @@ from skin.errors import InputError
 from skin.evaluation.alarm import choose_alarm_threshold
 from skin.evaluation.decisions import DRIFT, minimum_visible
 from skin.evaluation.final_threshold import FinalThreshold
+from skin.evaluation.guarantee import Guarantee
 from skin.evaluation.operating_point import DangerScore
 from skin.inference.mechanics import Mechanics
 from skin.live.engine import DebounceSettings, Detection, Engine
@@ -83,10 +84,12 @@ class SelfTest:
             for which in (~raised, expected & ~raised & valid)
         )
         text = f"self-test: {raised.sum()} of {len(raised)} dangerous presses raise the alarm"
-        undeclared = "the device declares no range, so its scale is not checked"
-        silence = f"not on {silent}; " if silent else ""
-        scale = "only its range tests the scale" if device.known else undeclared
-        say(f"{text}, {expected.sum()} with nominal settings; {silence}{scale}")
+        scale = (
+            "only its range tests the scale"
+            if device.known
+            else "the device declares no range, so its scale is not checked"
+        )
+        say(f"{text}, {expected.sum()} with nominal settings; {silent and f'not on {silent}; '}{scale}")
         text += f", not {expected.sum()}" + (f"; {missed} cannot raise it" if missed else "")
         if expected.mean() < self.minimum:
             raise InputError(
@@ -117,9 +120,8 @@ class SelfTest:
     @property
     def _nominal(self) -> Engine:
         """An engine with nominal settings and a plausible contact threshold."""
-        detection = self.nominal.detection
-        threshold = min(detection.threshold, self.plausible)
-        return replace(self.nominal, detection=replace(detection, threshold=threshold))
+        threshold = min(self.nominal.detection.threshold, self.plausible)
+        return replace(self.nominal, detection=replace(self.nominal.detection, threshold=threshold))
 
     def find(
         self,
@@ -134,13 +136,10 @@ class SelfTest:
         """
         engine, raised = replace(engine), list[bool]()
         for number, sensor in enumerate(self._sensors):
-            engine.reset(noise=conversion.noise)
-            press = strength * self.presses[sensor]
-            rest, stream = _press(number, number >= len(self.presses), press, conversion, device)
-            engine.remember(stream[:rest])  # nothing to decide yet
-            # Judged six at once; those behind the alarm are left out.
-            pieces = (stream[first : first + 6] for first in range(rest, len(stream), 6))
-            raised.append(any(verdict.dangerous for piece in pieces for verdict in engine.push(piece)))
+            rest, stream = _press(
+                number, number >= len(self.presses), strength * self.presses[sensor], conversion, device
+            )
+            raised.append(raises_alarm(engine, stream, conversion.noise, rest))
         return np.array(raised)
 
     def _suspect(self, conversion: UnitConversion) -> str:
@@ -151,15 +150,37 @@ class SelfTest:
                 "quarter may): they are dead, or the mask of broken sensors (device.calibration, or a tare "
                 "at the limit)"
             )
-        used, nominal = self.used, self._nominal
+        used, nominal = self.used.detection, self._nominal.detection
         differing = {
-            "the contact threshold of the model or live.touch": used.detection.threshold
-            != nominal.detection.threshold,
-            "live.drift": used.detection.drift != nominal.detection.drift,
-            "live.patience": used.patience != nominal.patience,
+            "the contact threshold of the model or live.touch": used.threshold != nominal.threshold,
+            "live.drift": used.drift != nominal.drift,
+            "live.patience": self.used.patience != self.nominal.patience,
         }
-        named = [name for name, differs in differing.items() if differs]
-        return " or ".join(named) or "device.limits, device.scale or device.calibration"
+        return (
+            " or ".join(name for name, differs in differing.items() if differs)
+            or "device.limits, device.scale or device.calibration"
+        )
+
+
+def raises_alarm(
+    engine: Engine, stream: Sequence[NewtonFrame], noise: np.ndarray | None, rest: int = 0
+) -> bool:
+    """Return whether a touch of the untouched skin raises the alarm.
+
+    Args:
+        engine: is reset.
+        stream: the readings.
+        noise: (S,), N, standard deviation of the untouched skin; None: unknown.
+        rest: number of readings at the beginning on which there is nothing to decide.
+    """
+    engine.reset(noise=noise)
+    engine.remember(stream[:rest])
+    # Judged six at once; those behind the alarm are left out.
+    return any(
+        verdict.dangerous
+        for first in range(rest, len(stream), 6)
+        for verdict in engine.push(stream[first : first + 6])
+    )
 
 
 def _press(
@@ -244,8 +265,11 @@ class LiveSettings:
         Raises:
             InputError: a setting is unknown or invalid.
         """
-        patience = configured(DebounceSettings, live["patience"], "live.patience")
-        return configured(cls, {**live, "patience": patience}, "live")
+        return configured(
+            cls,
+            {**live, "patience": configured(DebounceSettings, live["patience"], "live.patience")},
+            "live",
+        )
 
 
 @dataclass(frozen=True)
@@ -282,7 +306,7 @@ class LiveSetup:
             InputError: no contact threshold is known, or no threshold raises an alarm as seldom as wanted.
         """
         model, given, usual, conditions = self.model, live.patience.above, None, None
-        danger = final = None
+        danger = final = promise = None
         if given is None and model.alarms:
             rate = model.rate if self.port is None else measured_rate(self.port.skin)
             conditions = model.live_conditions(rate, live.patience.alarm, self.port is None)
@@ -292,7 +316,7 @@ class LiveSetup:
             if point is None or given is not None:
                 usual = model.threshold
             else:
-                usual, danger = point.announced(say), point.score
+                usual, danger, promise = point.announced(say), point.score, point.guarantee
                 if point.provisional and conditions is not None:
                     final = FinalThreshold(model.alarm, conditions)
         if conditions is not None and self.port is not None:
@@ -301,7 +325,7 @@ class LiveSetup:
                 self.port.skin.read(10**6, 0.0)  # more than any queue holds
         nominal = engine_settings(model, DebounceSettings(above=usual), danger=danger)
         patience = replace(live.patience, above=usual if given is None else given)
-        engine = engine_settings(model, patience, live.touch, live.drift, danger)
+        engine = engine_settings(model, patience, live.touch, live.drift, danger, promise)
         source = self.port or self.begin()
         source.tare.glitches.fractions = engine.fractions
         return source, engine, nominal, final
@@ -337,6 +361,10 @@ class LiveSetup:
             say(found.text)
         if found.state == "unverified":
             add_note(Note("unverified", detail=found.text))
+        if engine.guarantee is not None:
+            engine.guarantee = engine.guarantee.on_device(
+                engine.detection == nominal.detection, found.state != "unverified"
+            )
         stored, raised = found.check.rest if found.check else source.calibrated_rest, None
         if stored is not None and conversion.rest is not None:
             raised = conversion.rest - conversion.newtons(np.asarray(stored))
@@ -443,6 +471,7 @@ def engine_settings(
     touch: float | None = None,
     drift: float = 600 * DRIFT,
     danger: DangerScore | None = None,
+    guarantee: Guarantee | None = None,
 ) -> Engine:
     """Return an engine for a model.
 
@@ -452,7 +481,7 @@ def engine_settings(
         touch: contact threshold, N above the baseline; None: that of the model, and the learned label
             ``touch`` counts as touch, too.
         drift: N in ten minutes that the baseline may follow without touch.
-        danger: as in :class:`Engine`.
+        danger, guarantee: as in :class:`Engine`.
 
     Raises:
         InputError: ``touch`` is neither given nor known, or the model estimates targets.
@@ -462,17 +491,22 @@ def engine_settings(
             f"{model.title} estimates {', '.join(model.task.names)}: skin live shows labels or classes, so "
             "give a run of those"
         )
-    contact = model.contact if touch is None else touch
     return Engine(
         model.probabilities,
         model.task,
         len(model.positions),
         model.window,
         model.rate,
-        Detection(contact, drift / 600, model.learned and touch is None, model.longest),
+        Detection(
+            model.contact if touch is None else touch,
+            drift / 600,
+            model.learned and touch is None,
+            model.longest,
+        ),
         patience,
         model.presses,
         danger,
+        guarantee,
     )
 
 

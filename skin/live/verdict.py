@@ -24,6 +24,9 @@ NOTES = {
     "unverified": "{text}",
     "clock": "{text}",
     "provisional": "the threshold of the alarm is provisional and raises more false alarms{text}",
+    "guarantee_lapsed": "a guarantee that has lapsed: {text}",
+    "guarantee_unverified": "a guarantee for a device whose scale is unverified: {text}",
+    "guarantee_valid": "guarantee: {text}",
 }
 """Code of each note -> its sentence, the gravest first."""
 

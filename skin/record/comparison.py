@@ -4,7 +4,7 @@ A session of ``skin record`` holds gestures, one of a bench holds presses. Both 
 simulated and what was measured, with one page and one figure.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import islice
@@ -20,6 +20,7 @@ from skin.calibration.bench import (
     BenchData,
     Units,
     build_bench_data,
+    pressed_images,
     pressed_peaks,
     read_bench_session,
     read_gauge,
@@ -32,10 +33,12 @@ from skin.device.resampling import resample
 from skin.device.simulated import Simulated
 from skin.device.touches import Touches
 from skin.errors import InputError
+from skin.evaluation.guarantee import replay_presses
 from skin.plot.figures import COLOURS, save_figure
 from skin.record.session import check_session, read_session
 from skin.runs.configuration import Config
-from skin.touch.labels import TOUCH
+from skin.touch.labels import RELEASE, TOUCH
+from skin.wire.channels import NewtonFrame, unit_conversion
 from skin.wire.emulator import Gesture, emulated_gestures, gestures_with_labels
 from skin.wire.segmentation import label_text
 
@@ -106,11 +109,13 @@ class SessionComparison:
         things: ``presses`` or ``gestures``.
         pairs: touch by touch.
         touches: both sides as a model sees them, simulated and measured.
+        bench: of which the presses are; None of gestures.
     """
 
     things: str
     pairs: Sequence[Pair]
     touches: Sequence[Touches]
+    bench: BenchData | None = None
 
 
 def compare_session(
@@ -298,7 +303,51 @@ def compare_presses(device: Simulated, bench: BenchData, scale: float | None) ->
     peaks = pressed_peaks(device.body, gauge)
     contacts = torch.from_numpy(np.stack([gauge.contacts(times[pair.number], peaks) for pair in pairs]))
     touches = [replace(side, contacts=contacts.float()) for side in _touches(device, pairs)]
-    return SessionComparison("presses", pairs, touches)
+    return SessionComparison("presses", pairs, touches, bench)
+
+
+def judge_presses(
+    device: Simulated,
+    bench: BenchData,
+    scale: float | None,
+    rate: float,
+    alarms: Callable[[Sequence[NewtonFrame], np.ndarray | None], bool],
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return what :func:`skin.evaluation.guarantee.describe_presses` needs of the presses of a session.
+
+    The pressure of a press is that of its picture under the gauge's force. It is on a sensor if it exceeds
+    the limit at the centre of a valid one.
+
+    Args:
+        device: with its calibration, if any.
+        bench: the session and what pressed it.
+        scale: N per unit of the session; None: the calibration's, or 1.
+        rate: of the model, Hz.
+        alarms: as in :func:`skin.evaluation.guarantee.replay_presses`.
+
+    Returns:
+        The largest excess, that at valid sensors, multiples of the limit, and alarms, bool, (P,) each.
+
+    Raises:
+        InputError: the skin was never at rest before a press.
+    """
+    gauge, time, raw = bench.gauge, bench.session.time, bench.session.raw
+    force, calibration = np.maximum.reduceat(gauge.force, gauge.first), device.imperfection.calibration
+    end = np.maximum.reduceat(np.where(gauge.force > 0, gauge.time, -np.inf), gauge.first)
+    settings, pressure = device.sampler.settings, force * pressed_peaks(device.body, gauge)
+    peak = settings.danger.excess(
+        pressure, force, end - gauge.time[gauge.first] > settings.thresholds.duration
+    )
+    scale = 1.0 if scale is None and calibration is None else scale
+    press = np.maximum(*(gauge.at(moment)[1] for moment in (time, time - RELEASE)))
+    alarmed, works = replay_presses(
+        alarms,
+        lambda baseline, header: unit_conversion(raw.shape[1], baseline, scale, calibration, header),
+        *(rate, time, raw, press, len(gauge)),
+    )
+    column, row = (device.sensors.positions[:, :2] / device.body.cell).astype(int).T
+    shares = [image[0, row, column] / image.max() for image in pressed_images(device.body, gauge)]
+    return peak, peak * (np.stack(shares) * works).max(axis=1), alarmed
 
 
 def _touches(device: Simulated, pairs: Sequence[Pair]) -> list[Touches]:

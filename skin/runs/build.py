@@ -388,6 +388,7 @@ class TorchModel(Model):
                 f"{self.title} estimates {', '.join(self.task.names)}, and no labels: skin export "
                 "writes models of labels or classes"
             )
+        reference = self.device.reference
         return ModelMetadata(
             run=self.identity,
             title=self.title,
@@ -400,13 +401,20 @@ class TorchModel(Model):
             window=self.window,
             positions=self.positions.tolist(),
             size=self.size,
-            saturation=None if self.device.reference is None else self.device.reference.imperfection.clip,
+            saturation=None if reference is None else reference.imperfection.clip,
             threshold=self.threshold,
             contact=self.contact,
             learned=self.learned,
             longest=self.longest,
             thresholds=dict(thresholds) if thresholds else None,
             presses=None if self.presses is None else self.presses.round(4).tolist(),
+            limits=None
+            if reference is None
+            else {
+                name: limit
+                for name, limit in asdict(reference.sampler.settings.danger).items()
+                if np.isfinite(limit)
+            },
         )
 
 

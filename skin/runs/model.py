@@ -26,6 +26,7 @@ from skin.core.settings import ONCE, check_groups, configured
 from skin.errors import InputError
 from skin.evaluation.alarm import AlarmSource
 from skin.evaluation.decisions import LiveConditions
+from skin.evaluation.guarantee import Guarantee
 from skin.evaluation.operating_point import LABEL
 from skin.touch.labels import Task
 
@@ -173,6 +174,10 @@ class ModelMetadata:
         scores: rate of a device, Hz -> ``odds``, ``level`` and ``offset`` of what is compared with the
             threshold for touches (:class:`skin.evaluation.operating_point.DangerScore`); None: the network's
             probability is.
+        limits: above which a touch is dangerous: pressures, Pa, and forces, N, without those that are none;
+            None if unknown.
+        guarantees: rate of a device, Hz -> the attributes of what its threshold guarantees
+            (:class:`skin.evaluation.guarantee.Guarantee`); None: it was not chosen for that.
     """
 
     run: str
@@ -195,6 +200,8 @@ class ModelMetadata:
     thresholds: dict[str, float] | None = None
     presses: list[list[float]] | None = None
     scores: dict[str, tuple[float, float, float]] | None = None
+    limits: dict[str, float] | None = None
+    guarantees: dict[str, dict[str, Any]] | None = None
 
     @property
     def task(self) -> Task:
@@ -366,6 +373,10 @@ class OnnxModel(Model):
             threshold=threshold,
             thresholds=metadata.thresholds or {},
             scores=metadata.scores or {},
+            guarantees={
+                rate: configured(Guarantee, one, f"guarantee of {self.path}")
+                for rate, one in (metadata.guarantees or {}).items()
+            },
         )
         facts = metadata.run, metadata.title, metadata.task, metadata.window, metadata.rate
         super().__init__(*facts, positions, metadata.size, threshold, alarm)

@@ -15,12 +15,14 @@ import numpy as np
 import pytest
 
 from skin.core.files import ROOT
+from skin.device.resampling import Frame
 from skin.errors import InputError
 from skin.evaluation.operating_point import OperatingPoint
 from skin.learning.network import Network
 from skin.live.engine import DebounceSettings
 from skin.live.engine_builder import LiveSettings, measured_rate, watch_exported
 from skin.runs.onnx_writer import write_model
+from skin.wire.channels import unit_conversion
 from skin.wire.protocol import Header, encode_header, encode_line
 from skin.wire.skin import open_skin
 from tests.wire.memory import Sent
@@ -177,6 +179,43 @@ def test_the_command_replaces_settings_of_the_file(model, skin):
         _, engine, nominal, _ = setup.watch(other, said.append)
     assert said[-1] == "alarm above 0.75"
     assert (engine.detection.threshold, nominal.detection.threshold) == (0.5, 0.3)
+
+
+PROMISE = {"rate": 0.001, "touches": 3000, "misses": 0, "conditions": "mild", "patience": 0.1}
+"""A guarantee as in the metadata of a file, but for the rate of the devices."""
+
+
+@pytest.mark.parametrize(
+    ("device_rate", "other", "reason"),
+    [
+        (100.0, {}, ""),
+        (200.0, {}, "the device sends 100 frames a second, and not 200"),
+        (100.0, {"patience": DebounceSettings(alarm=0.05)}, "live.patience.alarm is 0.05 s, and not 0.1"),
+        (100.0, {"touch": 0.5}, "live.touch or live.drift is another"),
+    ],
+    ids=["same", "rate", "patience", "touch"],
+)
+def test_a_guarantee_of_a_file_holds_or_has_lapsed(trained, skin, tmp_path, device_rate, other, reason):
+    of, touches = trained
+    promise = {"100": PROMISE | {"device_rate": device_rate}}
+    described = replace(of.describe({"100": 0.35}), guarantees=promise)
+    assert described.limits == {"pressure": 90.5e3, "tap_pressure": 90.5e3}
+    write_model(of.learner.pipeline(of.sites), described, touches, tmp_path / "skin.onnx")
+    said, notes, conversion = [], [], unit_conversion(6, None, 1.0, None, None)
+    with ExitStack() as opened:
+        setup = watch_exported(str(tmp_path / "skin.onnx"), {"port": skin}, said.append, opened)
+        source, engine, nominal = setup.watch(replace(LIVE, **other), said.append)[:3]
+        setup.check(source, engine, nominal, False, said.append, notes.append, conversion)
+    lapse = f"; lapsed, as {reason}" if reason and not other.get("touch") else ""
+    assert any(text.endswith(f"at most 0.1 % missed, 95 %, 3,000 touches, mild{lapse}") for text in said)
+    rest = np.zeros(6), np.ones(6, dtype=bool)
+    stream = [conversion.convert(Frame(None, t, t, *rest)) for t in np.arange(0.0, 1.0, 0.01).tolist()]
+    note = next(note for note in engine.push(stream[:50])[-1].notes if note.code.startswith("guarantee"))
+    # Nothing has confirmed the scale of this device.
+    assert note.code == ("guarantee_lapsed" if reason else "guarantee_unverified")
+    assert reason in note.text
+    engine.changed = (2,)
+    assert "guarantee_lapsed" in [note.code for note in engine.push(stream[50:])[-1].notes]
 
 
 @pytest.mark.slow("starts a process that imports anew")

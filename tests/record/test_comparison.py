@@ -1,6 +1,7 @@
 """Touches of a session beside their simulation: what was put in comes out."""
 
 from dataclasses import replace
+from functools import partial
 from itertools import islice
 
 import numpy as np
@@ -8,18 +9,22 @@ import pytest
 
 from skin.body.base import Sheet
 from skin.body.layout import Grid
-from skin.calibration.bench import write_bench_session
+from skin.calibration.bench import build_bench_data, write_bench_session
 from skin.calibration.known_loads import Protocol, emulate_session
 from skin.core.files import CONF
 from skin.core.safe_loading import load_yaml
 from skin.device.resampling import Frame, Window
 from skin.device.simulated import Simulated
 from skin.errors import InputError
+from skin.evaluation.guarantee import describe_presses
+from skin.live.engine import Detection, Engine
+from skin.live.engine_builder import raises_alarm
 from skin.mechanics.simulator.naive import Naive
 from skin.record.comparison import (
     compare_gestures,
     compare_session,
     describe_agreement,
+    judge_presses,
     publish_comparison,
 )
 from skin.record.session import SessionLog
@@ -142,3 +147,33 @@ def test_presses_are_compared_as_gestures_are(device, tmp_path):
     path, picture = publish_comparison(comparison, [], "Here.", 2, tmp_path)
     assert "gain ratio of readings (recorded over simulated), median: 0.800" in path.read_text()
     assert picture.stat().st_size > 10_000
+
+
+def loud(readings, valid):
+    """Say that a window is dangerous if a reading is above 1 N."""
+    return np.repeat((readings * valid).max(axis=(1, 2))[:, None] > 1, 4, axis=1).astype(float)
+
+
+def test_a_press_that_the_engine_misses_counts_if_it_is_above_the_limit_and_on_a_valid_sensor(device):
+    protocol, randomness = Protocol(rate=50.0, peak=60.0, steps=(1.0,)), np.random.default_rng(0)
+    rows = protocol.gauge(np.tile(device.sensors.positions[:, :2], (3, 1)))
+    weak, beside = rows.press >= 18, rows.press == 17
+    rows = replace(rows, force=np.where(weak, 0.15, 1.0) * rows.force)
+    rows = replace(rows, position=np.where(beside[:, None], 0.055, rows.position))
+    session = emulate_session(device, rows, protocol, randomness)
+    press, raw = rows.at(session.time)[1], session.raw.copy()
+    raw[press == 2] *= 0.01  # the skin hardly felt it
+    raw[:, 8] = np.nan  # presses 8, 17 and 26 are on no valid sensor
+    raw[np.flatnonzero(press == 3)[::7]] = np.nan
+    bench = build_bench_data(device, replace(session, raw=raw), None)
+    engine = Engine(loud, TOUCH, 9, device.window, device.model_rate, Detection(0.5))
+    judged = judge_presses(device, bench, None, device.model_rate, partial(raises_alarm, engine))
+    peak, sensed, alarmed = judged
+    assert (peak > 1.1).tolist() == [True] * 18 + [False] * 9
+    assert np.flatnonzero(sensed < 1).tolist() == [8, *range(17, 27)]
+    assert np.flatnonzero(~alarmed[:17]).tolist() == [2, 8]
+    lines = describe_presses(*judged)
+    assert "16 of 27, 1 missed (numbers 2)" in lines[0]
+    assert "below 0.9 x the limit: 9, 8 raise the alarm" in lines[2]
+    with pytest.raises(InputError, match=r"1 misses of 16 presses .* needed"):
+        describe_presses(*judged, 0.05)

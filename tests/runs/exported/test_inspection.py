@@ -131,3 +131,10 @@ def test_outputs_that_are_no_probabilities_are_refused(tmp_path):
     made.graph.initializer[1].float_data[0] = float("nan")
     with pytest.raises(InputError, match="does not give probabilities"):
         OnnxModel(write(made, tmp_path / "skin.onnx"))
+
+
+def test_a_description_of_an_earlier_version_has_no_limits_and_no_guarantees():
+    stored = json.loads(ABOUT.text())
+    text = json.dumps({name: value for name, value in stored.items() if name not in ("limits", "guarantees")})
+    read = ModelMetadata.parse({KEY: text}, "skin.onnx")
+    assert (read.limits, read.guarantees, read.run) == (None, None, ABOUT.run)

@@ -12,8 +12,6 @@ from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from skin.commands._command import command
 from skin.core.files import results
 from skin.core.messages import quiet
@@ -59,6 +57,8 @@ def _test_alarm(
     name: str, config: Config, bench: "BenchData", device: "Simulated", compare: dict[str, Any]
 ) -> list[str]:
     """Return what presses show of the alarm of a run, as the live view of a device at a port raises it."""
+    import numpy as np
+
     from skin.evaluation.alarm import choose_alarm_threshold
     from skin.evaluation.guarantee import describe_presses
     from skin.live.engine import DebounceSettings
@@ -72,6 +72,8 @@ def _test_alarm(
     used = replace(trained, device={**config.device, "port": "that of the session"})
     model = load_model(run, trained, used, alarm=False)
     if not model.alarms:
+        if compare["miss_rate"] is not None:
+            raise InputError(f"run={name} has no label dangerous: leave compare.miss_rate out")
         return []
     rate, patience = 1 / float(np.median(np.diff(bench.session.time))), DebounceSettings()
     conditions, say = model.live_conditions(rate, patience.alarm, False), partial(print, file=sys.stderr)

@@ -89,7 +89,7 @@ class Subject:
         run, point = self.trained.run, self.trained.point
         if run is not None:
             point = choose_alarm_threshold(alarm_source(run, self.learner, self.config))
-        return point or OperatingPoint.default(check_evaluation(self.config.evaluation).false_alarm_rate)
+        return point or OperatingPoint(0.5, check_evaluation(self.config.evaluation).false_alarm_rate)
 
 
 StudyMeasure = Callable[[Subject], pd.DataFrame]

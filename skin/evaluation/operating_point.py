@@ -140,8 +140,8 @@ class OperatingPoint:
 
     Attributes:
         threshold: exactly representable as float32, so that comparisons do not depend on the precision.
-        target: largest wanted false-alarm rate.
-        safe: number of safe gestures on which it was chosen; 0: the default of 0.5 was not chosen on any.
+        target: largest wanted false-alarm rate; NaN: unknown.
+        safe: number of safe gestures on which it was chosen; 0: it was given, or is a default.
         raised: how many of them raise the alarm.
         seed: of the fresh gestures on which it was chosen; None: it was chosen on a validation split.
         dangerous: number of dangerous gestures among those on which it was chosen.
@@ -155,21 +155,16 @@ class OperatingPoint:
     """
 
     threshold: float
-    target: float
-    safe: int
-    raised: int
-    seed: int | None
+    target: float = math.nan
+    safe: int = 0
+    raised: int = 0
+    seed: int | None = None
     dangerous: int = 0
     found: int = 0
     rate: float | None = None
     score: DangerScore | None = None
     guarantee: Guarantee | None = None
     provisional: bool = False
-
-    @classmethod
-    def default(cls, target: float) -> "OperatingPoint":
-        """Return a threshold of 0.5, whose false-alarm rate is unknown."""
-        return cls(0.5, target, 0, 0, None)
 
     @property
     def silent(self) -> bool:

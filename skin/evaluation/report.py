@@ -95,12 +95,11 @@ def evaluate(
         settings: number of other devices and layouts.
         point: operating point of the alarm; None where the task has no label ``dangerous``.
     """
-    task, metrics, cannot = device.task, dict[str, float](), dict[str, str]()
+    task, cannot = device.task, dict[str, str]()
     recording = None if device.simulation is None else device.recording("test", complete=False)
     same = device.touches("test") if recording is None else recording.touches
     probabilities = learner.probabilities(same)
-    computed = compute_metrics(probabilities, same.known_labels, task, point)
-    metrics |= {f"same/{name}": value for name, value in computed.items()}
+    scored = {"same": (probabilities, same.known_labels)}
     for column, sets in touch_sets(device, settings).items():
         try:
             pairs = [(learner.probabilities(touches), touches.known_labels) for touches in sets]
@@ -109,8 +108,12 @@ def evaluate(
             continue
         if pairs:
             predicted, true = (torch.cat(parts) for parts in zip(*pairs, strict=True))
-            computed = compute_metrics(predicted, true, task, point)
-            metrics |= {f"{column}/{name}": value for name, value in computed.items()}
+            scored[column] = predicted, true
+    metrics = {
+        f"{column}/{name}": value
+        for column, of_set in scored.items()
+        for name, value in compute_metrics(*of_set, task, point).items()
+    }
     never = same.known_labels.isnan().all(dim=0)
     if unknown := [name for name, missing in zip(task.names, never, strict=True) if missing]:
         cannot["labels"] = f"the touches of the test tell nothing of {', '.join(unknown)}"

@@ -163,8 +163,7 @@ def _choose_thresholds(source: "AlarmSource", conditions: "Sequence[LiveConditio
 
     points = {f"{live.rate:g}": choose_alarm_threshold(source, live, say=print) for live in conditions}
     hiding = [at.warning() for at in points.values() if at and at.useless]
-    refused = "".join(f"{text}: skin live refuses the file at this rate\n" for text in hiding)
-    print(refused, end="", file=sys.stderr)
+    sys.stderr.writelines(f"{text}: skin live refuses the file at this rate\n" for text in hiding)
     thresholds = {rate: 1.0 if at.useless else at.threshold for rate, at in points.items() if at}
     scores = {rate: astuple(at.score) for rate, at in points.items() if at and at.score}
     promises = {

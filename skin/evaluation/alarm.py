@@ -145,8 +145,8 @@ def choose_alarm_threshold(
             :func:`threshold_device`.
     """
     if above is not None:
-        promised = source.settings and source.settings.miss_rate
-        promised = promised or any(point.guarantee for point in source.points.values())
+        exported = any(point.guarantee for point in source.points.values())
+        promised = exported or (source.settings and source.settings.miss_rate)
         say(f"alarm above {above:g}" + ", for which no guarantee holds" * bool(promised))
         return OperatingPoint(above)
     if source.learner is None:
@@ -476,9 +476,11 @@ def ship_thresholds(
         device, snapped, content = _describe(source, settings, live)
         point = _on_touches_of(device, source.learner, snapped, settings, content["count"])
         say(point.sentence())
-        numbers = {name: values.tolist() for name, values in _numbers(point).items()}
-        about = {"sensors": len(device.sensors), "rate": snapped.rate}
-        skins[array_cache.hashed(content, ())] = about | numbers
+        skins[array_cache.hashed(content, ())] = {
+            "sensors": len(device.sensors),
+            "rate": snapped.rate,
+            **{name: values.tolist() for name, values in _numbers(point).items()},
+        }
     shipped = {"hash": array_cache.hashed(skins, [source.weights]), "skins": skins}
     with whole(source.weights.with_name(THRESHOLDS)) as partial:
         partial.write_text(json.dumps(shipped, indent=1, sort_keys=True) + "\n", encoding="utf-8")

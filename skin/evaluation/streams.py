@@ -330,8 +330,10 @@ def _listen(
             raised[name].append(point.alarm(probabilities[:, dangerous]) & gate(touches, probabilities))
     gesture = stream.timeline.window_content(starts, device.window)[0]
     truth = stream.timeline.movie.labels[:, TOUCH_OR_NOT.names.index(ALARM)] > 0.5
-    hours = stride / rate / 3600
-    return {name: count_alarms(torch.cat(parts), gesture, truth, hours) for name, parts in raised.items()}
+    return {
+        name: count_alarms(torch.cat(parts), gesture, truth, hours=stride / rate / 3600)
+        for name, parts in raised.items()
+    }
 
 
 def _frames(seconds: float, rate: float, name: str) -> int:

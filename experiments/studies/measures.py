@@ -29,7 +29,7 @@ from skin.device.simulated import Simulated
 from skin.device.touches import Recording
 from skin.errors import InputError
 from skin.evaluation.alarm import choose_alarm_threshold
-from skin.evaluation.margins import ALARM_NAME, MarginReport, measure_margins
+from skin.evaluation.margins import ALARM_NAME, measure_margins
 from skin.evaluation.metrics import compute_metrics, encode
 from skin.evaluation.operating_point import OperatingPoint
 from skin.evaluation.settings import StreamSettings, check_evaluation
@@ -89,7 +89,7 @@ class Subject:
         run, point = self.trained.run, self.trained.point
         if run is not None:
             point = choose_alarm_threshold(alarm_source(run, self.learner, self.config))
-        return point or OperatingPoint.default(check_evaluation(self.config.evaluation).false_alarm_rate)
+        return point or OperatingPoint(0.5, check_evaluation(self.config.evaluation).false_alarm_rate)
 
 
 StudyMeasure = Callable[[Subject], pd.DataFrame]
@@ -129,7 +129,10 @@ class Margins:
     gestures: Annotated[int, Ge(1)] = 20000
 
     def __call__(self, subject: Subject) -> pd.DataFrame:
-        return margins_frame(measure_margins(subject.learner, subject.device, self.gestures, subject.point()))
+        point = subject.point()
+        frame, reached = measure_margins(subject.learner, subject.device, self.gestures, point)
+        frame.attrs["about"] = f"{describe_margins(frame)}; {point.sentence()}; {reached.sentence()}"
+        return frame
 
     def page(self, frame: pd.DataFrame, title: str) -> Page:
         """Return the page of a run: said against measure over threshold, errors by reading."""
@@ -159,41 +162,20 @@ class Margins:
         return Page(frame.attrs["about"], tables, data, draw_panels(title, panels))
 
 
-def margins_frame(report: MarginReport) -> pd.DataFrame:
-    """Return touches by their measure over its threshold, and by the highest reading.
-
-    Columns: label, by, low, high, touches, said, wrong; ``mean`` of the measure, and ``lower`` and ``upper``
-    end of the interval of said over touches. Limits are texts.
-    """
-    rows = [
-        {"label": name, "by": "threshold", "low": str(span.low), "high": str(span.high),
-         "touches": span.count, "said": str(span.said), "wrong": span.wrong, "mean": span.mean,
-         "lower": span.range[0], "upper": span.range[1]}
-        for name, spans in report.spans.items()
-        for span in spans
-    ]  # fmt: skip
-    rows += [
-        {"label": name, "by": "reading", "low": str(group.low), "high": str(group.high),
-         "touches": group.count, "said": "", "wrong": group.wrong[name]}
-        for name in TOUCH.names
-        for group in report.faint
-    ]  # fmt: skip
-    frame = pd.DataFrame(rows)
+def describe_margins(frame: pd.DataFrame) -> str:
+    """Return in words where the errors lie that :func:`measure_margins` found."""
     low, high = frame.low.astype(float), frame.high.astype(float)
     spans = frame.by == "threshold"
     close = frame[spans & (low >= 0.9) & (high <= 1.1)].groupby("label").wrong.sum()
     weak = frame[~spans & (high <= 1.0)].groupby("label").wrong.sum()  # N
     wrong = frame[spans].groupby("label").wrong.sum()
     clear = frame[spans & (frame.label == ALARM_NAME) & (low >= 1.1)]
-    about = (
+    return (
         f"within 10 % of their thresholds lie {close.get('big', 0)} of {wrong.big} errors of big and "
         f"{close.get('dangerous', 0)} of {wrong.dangerous} of dangerous; no reading passes 1 N in "
         f"{weak.get('dynamic', 0)} of {wrong.dynamic} errors of dynamic; {clear.wrong.sum()} of "
-        f"{clear.touches.sum()} touches more than 10 % above the threshold of dangerous raise "
-        f"no alarm; {report.point.sentence()}; {report.reached.sentence()}"
+        f"{clear.touches.sum()} touches more than 10 % above the threshold of dangerous raise no alarm"
     )
-    frame.attrs |= {"metrics": report.metrics, "about": about}
-    return frame
 
 
 class Streams(StreamSettings):

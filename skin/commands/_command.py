@@ -313,9 +313,11 @@ def _help(description: str, name: str, given: Any) -> str:
         lines.append(f"  {group:{width}}  {shown}")
     own = [part.config_path for part in listed if part.config_path and "/" not in part.config_path]
     texts = [_text(folders, part) for part in reversed(own) if part != "command"]
-    for group, option in chosen.items():
-        if option and (text := _text(folders, f"{group}/{option}")):
-            texts.append(f"{group}:\n{indent(text, '  ')}")
+    texts += [
+        f"{group}:\n{indent(text, '  ')}"
+        for group, option in chosen.items()
+        if option and (text := _text(folders, f"{group}/{option}"))
+    ]
     groups = "\n".join(["Groups, as in GROUP=OPTION; [what is chosen]:", *lines])
     syntax = "Settings, as in NAME=VALUE or GROUP.NAME=VALUE:"
     return "\n\n".join([description.strip(), groups, syntax, indent("\n\n".join(texts), "  ")])

@@ -35,8 +35,7 @@ def main(
     if device.simulation is None:
         scene = read_scene(device, index or 0)
     else:
-        field = view == "skin3d"
-        scene = simulate_scene(device.simulation, labels, shape, config.seed, field)
+        scene = simulate_scene(device.simulation, labels, shape, config.seed, view == "skin3d")
     path = Path(out).expanduser()
     path = (still if path.suffix == ".png" else write_animation)(scene, str(view), path)
     print(f"{path}: {scene.title}, {len(scene.readings)} frames at {scene.rate:g} Hz")

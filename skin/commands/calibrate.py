@@ -43,7 +43,6 @@ def main(
 
     from skin.calibration import bench, known_loads
     from skin.calibration.fit import fit_presses, print_calibration
-    from skin.calibration.known_loads import write_demo_session
     from skin.calibration.wiring import Confirmed, device_channels, wired_bench
     from skin.device.calibration import write_calibration
     from skin.runs.build import build_device
@@ -52,10 +51,12 @@ def main(
     units = bench.Units(calibrate["force_scale"], calibrate["time_scale"])
     device = build_device(config).simulated("a calibration fits the simulation to a skin")
     load = known_loads.KnownLoad.of(weight, base, device.size) if by_load else None
-    if calibrate["demo"] and load is not None:
-        print(known_loads.write_demo_placements(device, load, calibrate, session))
-    elif calibrate["demo"]:
-        print(write_demo_session(device, calibrate, session))
+    if calibrate["demo"]:
+        print(
+            known_loads.write_demo_session(device, calibrate, session)
+            if load is None
+            else known_loads.write_demo_placements(device, load, calibrate, session)
+        )
     shape, metadata = (calibrate["indenter"], calibrate["radius"]), dict[str, Any](session=session)
     recorded = bench.read_bench_session(session, *shape, calibrate["unit"], units)
     if load is not None:

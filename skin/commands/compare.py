@@ -7,12 +7,11 @@ The session holds gestures (of `skin record`) or presses of a bench. Writes comp
 out=; run= compares the predictions of a run, too, and tests its alarm on presses.
 """
 
-import sys
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from skin.commands._command import command
+from skin.commands._command import command, notify
 from skin.core.files import results
 from skin.core.messages import quiet
 from skin.errors import InputError
@@ -76,10 +75,10 @@ def _test_alarm(
             raise InputError(f"run={name} has no label dangerous: leave compare.miss_rate out")
         return []
     rate, patience = 1 / float(np.median(np.diff(bench.session.time))), DebounceSettings()
-    conditions, say = model.live_conditions(rate, patience.alarm, False), partial(print, file=sys.stderr)
-    point = choose_alarm_threshold(model.alarm, conditions, say=say)
+    conditions = model.live_conditions(rate, patience.alarm, False)
+    point = choose_alarm_threshold(model.alarm, conditions, say=notify)
     assert point is not None
-    patience = replace(patience, above=point.announced(say))
+    patience = replace(patience, above=point.announced(notify))
     alarms = partial(raises_alarm, engine_settings(model, patience, danger=point.score))
     judged = judge_presses(device, bench, compare["scale"], model.rate, alarms)
     return [f"- {point.sentence()}", *describe_presses(*judged, compare["miss_rate"])]

@@ -35,7 +35,14 @@ def main(
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     opened = open_port(port, link)
     try:
-        emulator = Emulator(device, opened, settings, failures, format == "binary", _notify)
+        emulator = Emulator(
+            device,
+            opened,
+            settings,
+            failures,
+            format == "binary",
+            lambda t, text: print(f"{t:8.2f} s  {text}", flush=True),
+        )
         # Includes the first line, because its reader may stop the command at once.
         with suppress(KeyboardInterrupt):
             print(opened.address, flush=True)
@@ -45,7 +52,3 @@ def main(
         print(f"{emulator.frames} frames")
     finally:
         opened.unplug()
-
-
-def _notify(t: float, text: str) -> None:
-    print(f"{t:8.2f} s  {text}", flush=True)

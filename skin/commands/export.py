@@ -29,6 +29,7 @@ from skin.errors import InputError
 from skin.runs.configuration import Config, overrides, settings_of
 
 if TYPE_CHECKING:
+    from skin.evaluation.alarm import AlarmSource
     from skin.evaluation.decisions import LiveConditions
     from skin.runs.build import TorchModel
     from skin.runs.run import FinishedRun
@@ -110,7 +111,7 @@ def _export_file(
         raise InputError(
             "skin export needs onnx, onnxscript and onnxruntime: pip install 'tactile-skin[export]'"
         ) from error
-    run, whole, model, rates = _load(name, config, touch, rates)
+    run, whole, model, conditions = _load(name, config, touch, rates)
     module = model.learner.pipeline(model.sites)  # refused before anything else is simulated
     if advice := equation10_warning(run.stored):
         print(advice, file=sys.stderr)
@@ -118,13 +119,13 @@ def _export_file(
     described = replace(model.describe(), skin=describe_skin(settings_of(whole), model.positions))
     if "simulator" in run.stored.device and model.threshold is not None:
         steps.begin(_THRESHOLDS)
-        described = replace(described, **_choose_thresholds(model, rates))
+        described = replace(described, **_choose_thresholds(model.alarm, conditions))
     path = path or results(None) / f"{run.title.split()[0]}_{run.identity[:8]}.onnx"
     steps.begin("simulating touches to compare")
-    device = model.device
-    if device.reference is not None:  # a tenth of the gestures is the validation split
-        device = device.reference.replace(gestures=10 * max(10, touches))
-    compared = device.touches("test" if model.device.reference is None else "validation")[:touches]
+    if (device := model.device.reference) is None:
+        compared = model.device.touches("test")[:touches]
+    else:  # a tenth of the gestures is the validation split
+        compared = device.replace(gestures=10 * max(10, touches)).touches("validation")[:touches]
     steps.begin("writing the file and comparing it")
     difference = write_model(module, described, compared, path)
     print(f"{path}: differs from the run by {difference:.1g} at most on {len(compared)} touches")
@@ -134,14 +135,15 @@ def _ship_thresholds(name: str, config: Config, touch: float | None, rates: Sequ
     """Add the thresholds of the alarm for a skin to those of a pretrained model; see :func:`_export_file`."""
     from skin.evaluation.alarm import ship_thresholds
 
-    _, _, model, rates = _load(name, config, touch, rates, alarm=False)
-    ship_thresholds(model.alarm, _conditions(model, rates), print)
+    _, _, model, conditions = _load(name, config, touch, rates, alarm=False)
+    ship_thresholds(model.alarm, conditions, print)
 
 
 def _load(
     name: str, config: Config, touch: float | None, rates: Sequence[float] | None, alarm: bool = True
-) -> "tuple[FinishedRun, Config, TorchModel, Sequence[float]]":
-    """Return a run, its configuration for one skin, its model there, and the rates of devices, Hz."""
+) -> "tuple[FinishedRun, Config, TorchModel, list[LiveConditions]]":
+    """Return a run, its configuration for one skin, its model there, and how live views watch it at ports."""
+    from skin.live.engine import DebounceSettings
     from skin.runs.build import load_model
     from skin.runs.run import find_run
 
@@ -150,30 +152,24 @@ def _load(
     used = run.configured(overrides())
     model = load_model(run, used, touch=touch, one_skin=True, alarm=alarm)
     rate = used.device.get("rate") or model.rate
-    return run, used, model, rates or [rate if isinstance(rate, int | float) else _USUAL]
+    rates = rates or [rate if isinstance(rate, int | float) else _USUAL]
+    patience = DebounceSettings().alarm
+    return run, used, model, [model.live_conditions(rate, patience, False) for rate in rates if model.alarms]
 
 
-def _conditions(model: "TorchModel", rates: Sequence[float]) -> "list[LiveConditions]":
-    """Return how live views watch devices of these rates, Hz, at ports."""
-    from skin.live.engine import DebounceSettings
-
-    return [model.live_conditions(rate, DebounceSettings().alarm, False) for rate in rates]
-
-
-def _choose_thresholds(model: "TorchModel", rates: Sequence[float]) -> dict[str, Any]:
+def _choose_thresholds(source: "AlarmSource", conditions: "Sequence[LiveConditions]") -> dict[str, Any]:
     """Return thresholds and scores of the alarm by the rate of a device, Hz; 1 is refused: it raises none."""
     from skin.evaluation.alarm import choose_alarm_threshold
 
-    conditions = _conditions(model, rates)
-    points = {f"{live.rate:g}": choose_alarm_threshold(model.alarm, live, say=print) for live in conditions}
+    points = {f"{live.rate:g}": choose_alarm_threshold(source, live, say=print) for live in conditions}
     hiding = [at.warning() for at in points.values() if at and at.useless]
-    refused = "".join(f"{text}: skin live refuses the file at this rate\n" for text in hiding)
-    print(refused, end="", file=sys.stderr)
+    sys.stderr.writelines(f"{text}: skin live refuses the file at this rate\n" for text in hiding)
     thresholds = {rate: 1.0 if at.useless else at.threshold for rate, at in points.items() if at}
     scores = {rate: astuple(at.score) for rate, at in points.items() if at and at.score}
-    kept = ("rate", "touches", "misses", "conditions", "confidence", "device_rate", "patience")
     promises = {
-        rate: {name: getattr(at.guarantee, name) for name in kept}
+        rate: {
+            name: value for name, value in vars(at.guarantee).items() if name not in ("lapsed", "verified")
+        }
         for rate, at in points.items()
         if at and at.guarantee
     }

@@ -40,8 +40,7 @@ def main(config: Config, n: int | None, seconds: float | None, adapter: Any) -> 
     if settings.frames.kind == "auto":
         _propose(settings, _ENOUGH if seconds is None else min(seconds, _ENOUGH))
         return
-    sensors = None if n is None else range(n)
-    with open_skin(settings, sensors) as skin:
+    with open_skin(settings, None if n is None else range(n)) as skin:
         listener = PortMonitor(skin)
         try:
             with suppress(KeyboardInterrupt):

@@ -89,11 +89,9 @@ class AlarmSource:
         device: whose fresh gestures, or validation split, decide; None: that of :func:`threshold_device`.
         stored: text of the point that the training chose for single windows; None: it has none.
         profile: for which it was chosen.
-        threshold: of an exported network, for single windows; None: no label ``dangerous``.
-        thresholds: of an exported network: rate of a device, Hz -> threshold for touches.
-        scores: of an exported network: rate -> the factors of :class:`DangerScore`.
+        exported: point of an exported network, for single windows; None: no label ``dangerous``.
+        points: of an exported network: rate of a device, Hz -> point for touches.
         weights: file of a pretrained model, beside which :data:`THRESHOLDS` ships; None: it is none.
-        guarantees: of an exported network: rate -> what its threshold guarantees.
     """
 
     name: str
@@ -107,11 +105,9 @@ class AlarmSource:
     device: "AbstractDevice | None" = None
     stored: str | None = None
     profile: str | None = None
-    threshold: float | None = None
-    thresholds: Mapping[str, float] = field(default_factory=dict)
-    scores: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
+    exported: OperatingPoint | None = None
+    points: Mapping[str, OperatingPoint] = field(default_factory=dict)
     weights: Path | None = None
-    guarantees: Mapping[str, Guarantee] = field(default_factory=dict)
 
 
 def choose_alarm_threshold(
@@ -149,15 +145,15 @@ def choose_alarm_threshold(
             :func:`threshold_device`.
     """
     if above is not None:
-        promised = source.guarantees or (source.settings and source.settings.miss_rate)
+        exported = any(point.guarantee for point in source.points.values())
+        promised = exported or (source.settings and source.settings.miss_rate)
         say(f"alarm above {above:g}" + ", for which no guarantee holds" * bool(promised))
-        return OperatingPoint(above, math.nan, 0, 0, None)
+        return OperatingPoint(above)
     if source.learner is None:
         return _exported_point(source, live, say)
     settings = check_evaluation(source.settings)
     if live is not None and (anew or "simulator" in source.trained):
-        point = _on_touches(source, settings, live, say, quick)
-        return point if point.guarantee is None else replace(point, guarantee=_fixed(point, live).under(live))
+        return _on_touches(source, settings, live, say, quick)
     if not anew:
         all_skins = "skins" in source.used and not one_skin
         if all_skins and settings.profile is not None:
@@ -172,26 +168,23 @@ def _exported_point(
     source: AlarmSource, live: LiveConditions | None, say: Callable[[str], None]
 ) -> OperatingPoint | None:
     """Return the point of an exported network for the rate of a device that is nearest."""
-    threshold, score, guarantee = source.threshold, None, None
-    if threshold is None:
-        return None
-    if live is not None:
-        if source.thresholds:
-            nearest = min(source.thresholds, key=lambda text: abs(log(float(text) / live.rate)))
-            say(f"the device sends {live.rate:.3g} frames a second: threshold for {nearest} Hz, per touch")
-            threshold = source.thresholds[nearest]
-            score = DangerScore(*source.scores[nearest]) if nearest in source.scores else None
-            if nearest in source.guarantees:
-                guarantee = source.guarantees[nearest].under(live)
-                say(guarantee.sentence())
-        else:
-            say("the threshold was chosen for single windows: a touch has many, and raises more false alarms")
-        if threshold >= 1:
-            raise InputError(
-                f"{source.name} has no threshold that raises an alarm: give live.patience.above=0.5"
-            )
-        say(f"alarm above {threshold:.4f}")
-    return OperatingPoint(threshold, math.nan, 0, 0, None, score=score, guarantee=guarantee)
+    point = source.exported
+    if point is None or live is None:
+        return point
+    if source.points:
+        nearest = min(source.points, key=lambda text: abs(log(float(text) / live.rate)))
+        say(f"the device sends {live.rate:.3g} frames a second: threshold for {nearest} Hz, per touch")
+        point = source.points[nearest]
+        if point.guarantee is not None:
+            promise = point.guarantee.under(live)
+            say(promise.sentence())
+            point = replace(point, guarantee=promise)
+    else:
+        say("the threshold was chosen for single windows: a touch has many, and raises more false alarms")
+    if point.silent:
+        raise InputError(f"{source.name} has no threshold that raises an alarm: give live.patience.above=0.5")
+    say(f"alarm above {point.threshold:.4f}")
+    return point
 
 
 def _stored_point(source: AlarmSource, settings: Evaluation) -> OperatingPoint | None:
@@ -211,7 +204,7 @@ def _stored_point(source: AlarmSource, settings: Evaluation) -> OperatingPoint |
         point = _on_gestures(source.learner, source.original(), settings)
         message = None if point is None else f"{lacks}, it is chosen now: {point.sentence()}"
     else:
-        point = point or OperatingPoint.default(target)
+        point = point or OperatingPoint(0.5, target)
         message = (
             f"{lacks} and its device draws no fresh gestures: {point.sentence()}; train it again to store one"
         )
@@ -293,11 +286,10 @@ def _remaining(path: str) -> dict[str, Any]:
     values, curves = calibration.values(), calibration.curves
     if curves is not None:
         values |= {"clip": curves.straighten(values["clip"]), "noise": values["noise"] / curves.slopes}
-    names = ("noise", "hysteresis", "time_constant")
-    left = {name: float(np.median(values[name])) for name in names}
-    clip = float(np.median(values["clip"]))
-    limit = {"clip": clip} if np.isfinite(clip) else {}
-    return _EVERY | left | limit | {"gain_spread": 0.02, "dead": 0, "tare": True}
+    left = {name: float(np.median(values[name])) for name in ("noise", "hysteresis", "time_constant", "clip")}
+    if math.isinf(left["clip"]):
+        del left["clip"]  # as of a device without a limit
+    return _EVERY | left | {"gain_spread": 0.02, "dead": 0, "tare": True}
 
 
 # The choice on gestures, one window of each.
@@ -311,7 +303,7 @@ def _on_gestures(learner: Predictor, device: "AbstractDevice", settings: Evaluat
     labels, probabilities = touches.known_labels, learner.probabilities(touches)
     probability, dangerous = dangerous_column(probabilities, labels, device.task)
     if dangerous.all():
-        return OperatingPoint.default(target)
+        return OperatingPoint(0.5, target)
     seed = None if device.simulation is None else device.simulation.data_seed
     point = OperatingPoint(_lowest_threshold(probability[~dangerous], target), target, 0, 0, seed)
     return replace(point, **asdict(point.reached(probabilities, labels, device.task)))
@@ -328,13 +320,11 @@ def threshold_gestures(device: "AbstractDevice", settings: Evaluation) -> "Touch
     if simulation is None or LABEL not in device.task.names:
         return device.touches("validation")
     # Half of the sampled gestures are safe; some windows of streams show no touch.
-    count = 2 * settings.safe_gestures
-    for _ in range(6):  # up to 32 times as many, where few are safe
-        touches = simulation.fresh_touches(count)
+    for doubled in range(1, 7):  # up to 32 times as many, where few are safe
+        touches = simulation.fresh_touches(2**doubled * settings.safe_gestures)
         _, dangerous = dangerous_column(touches.known_labels, touches.known_labels, device.task)
         if int((~dangerous).sum()) >= settings.safe_gestures:
             break
-        count *= 2
     return touches
 
 
@@ -371,29 +361,29 @@ def _on_touches(
     if source.device is not None:
         device = source.device.simulated("touches are simulated")
         point = _on_touches_of(device, source.learner, _snapped(live, device), settings, count)
-        return _guaranteed(point, missed, settings.profile)
-    device, live, content = _describe(source, settings, live)
+        return _guaranteed(point, missed, settings.profile, live)
+    device, snapped, content = _describe(source, settings, live)
     key, profile = array_cache.hashed(content, _sources()), content["profile"]
     file = array_cache.folder(None) / f"threshold_{key[:16]}.npz"
-    devices = "" if profile is None else f" and devices of the profile {profile}"
+    at = f"at {snapped.rate:.3g} Hz" + ("" if profile is None else f" and devices of the profile {profile}")
     shipped = _shipped(source, say).get(array_cache.hashed(content, ()))
     # No threshold from few touches keeps a guarantee.
     quick = quick and missed is None and count > sum(PROVISIONAL)
     if quick and shipped is None and not file.is_file():
-        say(f"choosing a provisional threshold of the alarm at {live.rate:.3g} Hz{devices}")
-        return _on_touches_of(device, source.learner, live, settings, count, quick=True)
+        say(f"choosing a provisional threshold of the alarm {at}")
+        return _on_touches_of(device, source.learner, snapped, settings, count, quick=True)
 
     def choose() -> dict[str, np.ndarray]:
         others = "" if missed is None else f" and {touches_drawn(missed)} dangerous"
-        say(f"choosing the alarm's threshold on {count} safe{others} touches at {live.rate:.3g} Hz{devices}")
-        return _numbers(_on_touches_of(device, source.learner, live, settings, count))
+        say(f"choosing the alarm's threshold on {count} safe{others} touches {at}")
+        return _numbers(_on_touches_of(device, source.learner, snapped, settings, count))
 
     kept = shipped or array_cache.kept(file, key, {"point": (4,), "score": (3,)}, choose)
-    threshold, raised, dangerous, found = kept["point"]
+    threshold, raised, dangerous, found = map(float, kept["point"])
     counts = int(raised), device.data_seed, int(dangerous), int(found)
     score = DangerScore(*map(float, kept["score"]))
-    point = OperatingPoint(float(threshold), target, count, *counts, live.rate, score)
-    return _guaranteed(point, missed, profile)
+    point = OperatingPoint(threshold, target, count, *counts, snapped.rate, score)
+    return _guaranteed(point, missed, profile, live)
 
 
 def _numbers(point: OperatingPoint) -> dict[str, np.ndarray]:
@@ -442,13 +432,16 @@ def _describe(
     )
 
 
-def _guaranteed(point: OperatingPoint, missed: float | None, profile: str | None) -> OperatingPoint:
-    """Return a point with the guarantee that it was chosen for, if any."""
-    if missed is None:
+def _guaranteed(
+    point: OperatingPoint, missed: float | None, profile: str | None, live: LiveConditions
+) -> OperatingPoint:
+    """Return a point with the guarantee that it was chosen for, if any, as it is under a live view."""
+    if missed is None or point.rate is None:
         return point
+    counts = point.dangerous, point.dangerous - point.found
     conditions = f"{profile or 'this device'}, {point.rate:.3g} Hz"
-    misses = point.dangerous - point.found
-    return replace(point, guarantee=Guarantee(missed, point.dangerous, misses, conditions))
+    promise = Guarantee(missed, *counts, conditions, device_rate=point.rate, patience=live.patience)
+    return replace(point, guarantee=promise.under(live))
 
 
 def _shipped(source: AlarmSource, say: Callable[[str], None]) -> dict[str, Any]:
@@ -483,18 +476,14 @@ def ship_thresholds(
         device, snapped, content = _describe(source, settings, live)
         point = _on_touches_of(device, source.learner, snapped, settings, content["count"])
         say(point.sentence())
-        numbers = {name: values.tolist() for name, values in _numbers(point).items()}
-        about = {"sensors": len(device.sensors), "rate": snapped.rate}
-        skins[array_cache.hashed(content, ())] = about | numbers
+        skins[array_cache.hashed(content, ())] = {
+            "sensors": len(device.sensors),
+            "rate": snapped.rate,
+            **{name: values.tolist() for name, values in _numbers(point).items()},
+        }
     shipped = {"hash": array_cache.hashed(skins, [source.weights]), "skins": skins}
     with whole(source.weights.with_name(THRESHOLDS)) as partial:
         partial.write_text(json.dumps(shipped, indent=1, sort_keys=True) + "\n", encoding="utf-8")
-
-
-def _fixed(point: OperatingPoint, live: LiveConditions) -> Guarantee:
-    """Return the guarantee of a point for touches with the rate and the patience that it was chosen for."""
-    assert point.guarantee is not None
-    return replace(point.guarantee, device_rate=point.rate or live.rate, patience=live.patience)
 
 
 def _snapped(live: LiveConditions, device: "Simulated") -> LiveConditions:
@@ -551,15 +540,15 @@ def _on_touches_of(
         decisions = decide_touches(
             learner, device, live, chosen, seed, lambda done: steps.report(done / len(chosen)), quick
         )
-    tested = count + tests
     score = decisions.fit(np.arange(len(chosen))[-2 * fitted :], np.arange(2 * fitted) >= fitted)
-    scores = decisions.scores(score)[:tested]
-    safe_scores, others_scores = scores[:count], scores[count:]
+    tested = slice(count, count + tests)
+    scores = decisions.scores(score)
+    safe_scores, others_scores = scores[:count], scores[tested]
     if missed is None:
         threshold = _lowest_threshold(safe_scores, target, allowed)
     else:
-        which = counted(decisions.peak.numpy(), decisions.sensed.numpy())
-        others_scores = others_scores[which[count:tested]]
+        which = counted(decisions.peak[tested].numpy(), decisions.sensed[tested].numpy())
+        others_scores = others_scores[which]
         threshold = threshold_for_misses(others_scores.numpy(), missed)
     point = OperatingPoint(threshold, target, count, 0, seed, len(others_scores), 0, live.rate, score)
     raised, found = (int(point.alarm(part).sum()) for part in (safe_scores, others_scores))

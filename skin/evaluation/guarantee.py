@@ -6,13 +6,14 @@ the touches to come are drawn as these were. torch is not imported.
 """
 
 import math
+from bisect import bisect_left
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from scipy.special import bdtr, betainc, betaincinv, betaln
+from scipy.special import bdtr, betainc, betaln
 
 from skin.device.resampling import Frame
 from skin.errors import InputError
@@ -40,11 +41,6 @@ def counted(peak: np.ndarray, sensed: np.ndarray) -> np.ndarray:
 
 
 # Touches that are all there before the bound is taken.
-
-
-def miss_bound(misses: int, touches: int, confidence: float = CONFIDENCE) -> float:
-    """Return the upper bound of the fraction of missed touches (Clopper and Pearson, 1934)."""
-    return 1.0 if misses >= touches else float(betaincinv(misses + 1, touches - misses, confidence))
 
 
 def allowed_misses(touches: int, rate: float, confidence: float = CONFIDENCE) -> int:
@@ -132,27 +128,10 @@ def anytime_bound(misses: int, presses: int, confidence: float = CONFIDENCE) -> 
     return float(brentq(excess, max(misses / presses, 1e-12), 1 - 1e-12))
 
 
-def presses_needed(rate: float, misses: int = 0, confidence: float = CONFIDENCE) -> int:
+def presses_needed(rate: float, misses: int = 0) -> int:
     """Return the least number of presses, with some missed, whose anytime-valid bound is at most ``rate``."""
-    low, high = misses, misses + 2
-    while anytime_bound(misses, high, confidence) > rate:
-        low, high = high, 2 * high
-    while high - low > 1:
-        middle = (low + high) // 2
-        enough = anytime_bound(misses, middle, confidence) <= rate
-        low, high = (low, middle) if enough else (middle, high)
-    return high
-
-
-def check_presses(misses: int, presses: int, rate: float, confidence: float = CONFIDENCE) -> None:
-    """Raise InputError, with the number that is needed, unless presses show at most ``rate`` missed."""
-    if anytime_bound(misses, presses, confidence) > rate:
-        needed = presses_needed(rate, misses, confidence)
-        raise InputError(
-            f"{misses} misses of {presses} presses above {MARGIN:g} x the limit and on a valid sensor do not "
-            f"show at most {100 * rate:g} % missed, with {100 * confidence:g} %: {needed} presses are needed "
-            "for this, if no more are missed"
-        )
+    most = range(math.ceil(100 * (misses + 1) / rate))  # whose bound is far below the rate
+    return bisect_left(most, True, key=lambda presses: anytime_bound(misses, presses) <= rate)
 
 
 def describe_presses(
@@ -171,8 +150,12 @@ def describe_presses(
     dangerous, safe = counted(peak, sensed), peak < SAFE
     missed = np.flatnonzero(dangerous & ~alarmed)
     k, n = len(missed), int(dangerous.sum())
-    if rate is not None:
-        check_presses(k, n, rate)
+    if rate is not None and anytime_bound(k, n) > rate:
+        raise InputError(
+            f"{k} misses of {n} presses above {MARGIN:g} x the limit and on a valid sensor do not show "
+            f"at most {100 * rate:g} % missed, with {100 * CONFIDENCE:g} %: {presses_needed(rate, k)} "
+            "presses are needed for this, if no more are missed"
+        )
     named = f" (numbers {', '.join(map(str, missed[:10]))}{', ...' * (k > 10)})" if k else ""
     more = {wanted: presses_needed(wanted, k) - n for wanted in (0.05, 0.01)}
     shown = [

@@ -1,9 +1,10 @@
 """Errors of a learner by distance from the class boundary and by strength of the touch."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from itertools import pairwise
+from typing import Any
 
+import pandas as pd
 import torch
 from scipy.stats import binomtest
 from torch import Tensor
@@ -12,8 +13,7 @@ from skin.device.base import AbstractDevice
 from skin.evaluation.metrics import compute_metrics
 from skin.evaluation.operating_point import LABEL, OperatingPoint, Predictor, Reached
 from skin.learning.features import above_idle
-from skin.touch.labels import TOUCH, Thresholds
-from skin.touch.movie import Measures
+from skin.touch.labels import TOUCH
 
 ALARM_NAME = "alarm"
 """Name of the prediction "dangerous" at the operating point; the label itself uses a threshold of 0.5."""
@@ -22,75 +22,9 @@ _SHARES = (0, 0.5, 0.8, 0.9, 0.95, 1, 1.05, 1.1, 1.25, 2, torch.inf)  # of the t
 _STRENGTHS = (0, 0.3, 0.5, 1, 2, 5, torch.inf)  # N; a touch of 0.3 N is six times the noise
 
 
-@dataclass(frozen=True)
-class Span:
-    """The touches whose measure, relative to its threshold, lies in (low, high].
-
-    Attributes:
-        low: lower end.
-        high: upper end; the label holds above 1.
-        mean: mean relative measure.
-        count: number of touches.
-        said: number of touches for which the learner predicts the label.
-    """
-
-    low: float
-    high: float
-    mean: float
-    count: int
-    said: int
-
-    @property
-    def wrong(self) -> int:
-        """Number of wrong predictions."""
-        return self.said if self.high <= 1 else self.count - self.said
-
-    @property
-    def range(self) -> tuple[float, float]:
-        """95 % confidence interval of the predicted fraction, exact (Clopper and Pearson, 1934)."""
-        low, high = binomtest(self.said, self.count).proportion_ci(0.95)
-        return float(low), float(high)
-
-
-@dataclass(frozen=True)
-class Faint:
-    """The touches whose largest reading above the idle level lies in (low, high].
-
-    Attributes:
-        low: lower end, N.
-        high: upper end, N.
-        count: number of touches.
-        wrong: label -> number of wrong predictions.
-    """
-
-    low: float
-    high: float
-    count: int
-    wrong: dict[str, int]
-
-
-@dataclass(frozen=True)
-class MarginReport:
-    """Result of :func:`measure_margins`.
-
-    Attributes:
-        spans: label, or ``ALARM`` -> its spans in ascending order.
-        faint: by strength, ascending.
-        point: operating point of ``ALARM``.
-        reached: its alarms.
-        metrics: of all touches (:func:`skin.evaluation.metrics.compute_metrics`).
-    """
-
-    spans: dict[str, list[Span]]
-    faint: list[Faint]
-    point: OperatingPoint
-    reached: Reached
-    metrics: dict[str, float]
-
-
 def measure_margins(
     learner: Predictor, device: AbstractDevice, gestures: int, point: OperatingPoint
-) -> MarginReport:
+) -> tuple[pd.DataFrame, Reached]:
     """Return a learner's errors on test touches by the measures that define the labels, and by strength.
 
     Args:
@@ -98,6 +32,11 @@ def measure_margins(
         device: its device, or another.
         gestures: number of test touches.
         point: operating point of the alarm.
+
+    Returns:
+        Rows of :func:`span_rows` for each label and ``ALARM_NAME``, and for each label rows by the largest
+        reading above the idle level, N, with ``wrong`` alone; ``attrs["metrics"]`` of all touches
+        (:func:`skin.evaluation.metrics.compute_metrics`). And the alarms.
 
     Raises:
         InputError: the device is not simulated, so that the measures are not known.
@@ -112,49 +51,47 @@ def measure_margins(
     columns = [device.task.names.index(name) for name in TOUCH.names]
     probabilities = learner.probabilities(touches)[:, columns]
     predicted, parameters = probabilities > 0.5, recording.parameters
-    measures = Measures(*(parameters[name] for name in Measures._fields))
-    settings = simulation.sampler.settings
-    fractions = _fractions(measures, settings.thresholds, settings.frames.duration)
-    fractions[:, TOUCH.names.index(LABEL)] = parameters.get("excess", fractions[:, TOUCH.names.index(LABEL)])
-    spans = {name: find_spans(predicted[:, n], fractions[:, n]) for n, name in enumerate(TOUCH.names)}
+    settings, thresholds = simulation.sampler.settings, simulation.sampler.settings.thresholds
+    limits = thresholds.area, thresholds.travel, settings.frames.duration, thresholds.pressure
+    measures = ("area", "travel", "frames", "pressure")  # in the order of TOUCH
+    fractions = [parameters[name] / limit for name, limit in zip(measures, limits, strict=True)]
     danger = TOUCH.names.index(LABEL)
-    spans[ALARM_NAME] = find_spans(point.alarm(probabilities[:, danger]), fractions[:, danger])
-    wrong = predicted != (labels > 0.5)
-    faint = [
-        Faint(
-            low,
-            high,
-            int(inside.sum()),
-            dict(zip(TOUCH.names, wrong[inside].sum(dim=0).tolist(), strict=True)),
-        )
-        for low, high, inside in _split_ranges(_STRENGTHS, above_idle(touches).amax(dim=(1, 2)))
-    ]
-    overall = compute_metrics(probabilities, labels, TOUCH, point)
-    return MarginReport(spans, faint, point, point.reached(probabilities, labels, TOUCH), overall)
+    fractions[danger] = parameters.get("excess", fractions[danger])
+    said = [*predicted.T, point.alarm(probabilities[:, danger])]
+    names, fractions = [*TOUCH.names, ALARM_NAME], [*fractions, fractions[danger]]
+    rows = [row for each in zip(names, said, fractions, strict=True) for row in span_rows(*each)]
+    strengths = [*_split_ranges(_STRENGTHS, above_idle(touches).amax(dim=(1, 2)))]
+    rows += [
+        {"label": name, "by": "reading", "low": str(low), "high": str(high), "touches": int(inside.sum()),
+         "said": "", "wrong": int(wrong[inside].sum())}
+        for name, wrong in zip(TOUCH.names, (predicted != (labels > 0.5)).T, strict=True)
+        for low, high, inside in strengths
+    ]  # fmt: skip
+    frame = pd.DataFrame(rows)
+    frame.attrs["metrics"] = compute_metrics(probabilities, labels, TOUCH, point)
+    return frame, point.reached(probabilities, labels, TOUCH)
 
 
-def find_spans(predicted: Tensor, fractions: Tensor) -> list[Span]:
-    """Return the spans that are not empty.
+def span_rows(name: str, said: Tensor, fractions: Tensor) -> Iterator[dict[str, Any]]:
+    """Yield a row for each range of the measure that holds some touches; the label holds above 1.
+
+    Its values: ``low`` and ``high`` end, as texts; number of ``touches``, of those ``said`` to have the
+    label, as a text, and of the ``wrong``; ``mean`` of the measure; ``lower`` and ``upper`` end of the 95 %
+    confidence interval of said over touches, exact (Clopper and Pearson, 1934).
 
     Args:
-        predicted: (B,), bool, whether the learner predicts the label.
+        name: of the label.
+        said: (B,), bool, whether the learner predicts it.
         fractions: (B,), measure divided by its threshold.
     """
-    return [
-        Span(low, high, float(fractions[inside].mean()), int(inside.sum()), int(predicted[inside].sum()))
-        for low, high, inside in _split_ranges(_SHARES, fractions)
-    ]
-
-
-def _fractions(measures: Measures, thresholds: Thresholds, longest_tap: int) -> Tensor:
-    """Return each measure divided by its threshold, (B, 4), in the order of ``TOUCH``."""
-    pairs = (
-        (measures.area, thresholds.area),
-        (measures.travel, thresholds.travel),
-        (measures.frames, longest_tap),
-        (measures.pressure, thresholds.pressure),
-    )
-    return torch.stack([measure / threshold for measure, threshold in pairs], dim=1)
+    for low, high, inside in _split_ranges(_SHARES, fractions):
+        touches, yes = int(inside.sum()), int(said[inside].sum())
+        lower, upper = binomtest(yes, touches).proportion_ci(0.95)
+        yield {
+            "label": name, "by": "threshold", "low": str(low), "high": str(high), "touches": touches,
+            "said": str(yes), "wrong": yes if high <= 1 else touches - yes,
+            "mean": float(fractions[inside].mean()), "lower": float(lower), "upper": float(upper),
+        }  # fmt: skip
 
 
 def _split_ranges(edges: Sequence[float], values: Tensor) -> Iterator[tuple[float, float, Tensor]]:

@@ -3,16 +3,25 @@
 torch is not imported. :mod:`skin.evaluation.alarm` chooses the threshold.
 """
 
+import io
 import json
 import math
+import os
+import signal
 from collections.abc import Callable
+from contextlib import redirect_stderr, suppress
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Protocol
+from multiprocessing import get_context
+from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
+from threading import Thread
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from scipy.special import expit, logit
 
 from skin.errors import InputError
+from skin.evaluation.decisions import LiveConditions
 from skin.evaluation.guarantee import Guarantee
 from skin.evaluation.settings import ENOUGH
 from skin.touch.labels import ALARM, Task
@@ -21,6 +30,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from skin.device.touches import Touches
+    from skin.evaluation.alarm import AlarmSource
 
 LABEL = ALARM
 _SURE = 1e-6  # probabilities of a network in single precision hold no more
@@ -140,8 +150,8 @@ class OperatingPoint:
 
     Attributes:
         threshold: exactly representable as float32, so that comparisons do not depend on the precision.
-        target: largest wanted false-alarm rate.
-        safe: number of safe gestures on which it was chosen; 0: the default of 0.5 was not chosen on any.
+        target: largest wanted false-alarm rate; NaN: unknown.
+        safe: number of safe gestures on which it was chosen; 0: it was given, or is a default.
         raised: how many of them raise the alarm.
         seed: of the fresh gestures on which it was chosen; None: it was chosen on a validation split.
         dangerous: number of dangerous gestures among those on which it was chosen.
@@ -155,21 +165,16 @@ class OperatingPoint:
     """
 
     threshold: float
-    target: float
-    safe: int
-    raised: int
-    seed: int | None
+    target: float = math.nan
+    safe: int = 0
+    raised: int = 0
+    seed: int | None = None
     dangerous: int = 0
     found: int = 0
     rate: float | None = None
     score: DangerScore | None = None
     guarantee: Guarantee | None = None
     provisional: bool = False
-
-    @classmethod
-    def default(cls, target: float) -> "OperatingPoint":
-        """Return a threshold of 0.5, whose false-alarm rate is unknown."""
-        return cls(0.5, target, 0, 0, None)
 
     @property
     def silent(self) -> bool:
@@ -278,3 +283,77 @@ def dangerous_column(probabilities: "Tensor", labels: "Tensor", task: Task) -> "
     column = task.names.index(LABEL)
     rows = task.counts(labels)[:, column]
     return probabilities[rows, column], labels[rows, column] > 0.5
+
+
+# The point that follows a provisional one, from all touches, chosen in a process beside a live view.
+
+
+def start_beside(target: Callable[..., object], name: str, *arguments: Any) -> tuple[BaseProcess, Connection]:
+    """Start a process beside a live view; to be called in the main thread.
+
+    Args:
+        target: its function, of the arguments and of the other end of the pipe.
+        name: of the process.
+        arguments: that can be sent to it.
+
+    Returns:
+        The process, and the end of the pipe.
+    """
+    context = get_context("spawn")
+    pipe, end = context.Pipe()
+    process = context.Process(target=target, args=(*arguments, end), name=name, daemon=True)
+    # A process that begins while Ctrl-C is ignored ignores it for good.
+    handler = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    process.start()
+    signal.signal(signal.SIGINT, handler)
+    end.close()
+    return process, pipe
+
+
+def _choose(source: "AlarmSource", live: LiveConditions, pipe: Connection) -> None:
+    """Send the threshold, or why there is none; low priority keeps verdicts in time."""
+    import torch
+
+    from skin.evaluation.alarm import choose_alarm_threshold
+
+    # Ends with the view, also where that is killed.
+    Thread(target=lambda: pipe.poll(None) and os._exit(1), daemon=True).start()
+    if hasattr(os, "nice"):
+        os.nice(10)  # below the estimates of contacts
+    torch.set_num_threads(1)
+    with redirect_stderr(io.StringIO()):  # of the progress
+        try:
+            point = choose_alarm_threshold(source, live, say=lambda text: None)
+            assert point is not None
+            point.announced(lambda text: None)  # refuses one that hides dangerous touches
+            pipe.send(point)
+        except InputError as error:
+            pipe.send(str(error))
+
+
+class FinalThreshold:
+    """The threshold that follows a provisional one, and the process that chooses it.
+
+    Args:
+        source: the model and what it is used on.
+        live: conditions of the live view.
+    """
+
+    def __init__(self, source: "AlarmSource", live: LiveConditions) -> None:
+        self.process, self._pipe = start_beside(_choose, "skin-threshold", source, live)
+
+    def take(self) -> OperatingPoint | str | None:
+        """Return the threshold, or why there is none, once that is known; None before and afterwards."""
+        if self._pipe.closed or not self._pipe.poll():
+            return None
+        answer: OperatingPoint | str = "the process that chooses the final one has ended"
+        with suppress(EOFError, OSError):
+            answer = self._pipe.recv()
+        self.close()
+        return answer
+
+    def close(self) -> None:
+        """End the process."""
+        self.process.kill()
+        self.process.join()
+        self._pipe.close()

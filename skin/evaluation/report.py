@@ -1,7 +1,7 @@
 """Evaluation of a learner on its own device, unseen devices and unseen layouts, as a table and as a page."""
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from math import isnan
 from pathlib import Path
@@ -76,8 +76,11 @@ def touch_sets(device: AbstractDevice, settings: Evaluation) -> dict[str, Iterat
     """
     sets: dict[str, Iterator[Touches]] = {"holdout": (device.touches("holdout") for _ in range(1))}
     if (simulation := device.simulation) is not None:
-        sets["device_shift"] = _devices(simulation, settings)
-        sets["unseen_layout"] = _layouts(simulation, settings)
+        # Devices of the same kind; the default one has seed 0.
+        siblings = (simulation.replace(seed=1 + number) for number in range(settings.devices))
+        sets["device_shift"] = _share_out(siblings, settings.devices)
+        # A gesture whose dangerous pressure no sensor of a layout would feel takes another path there.
+        sets["unseen_layout"] = _share_out(scattered_devices(simulation, settings.layouts), settings.layouts)
     return sets
 
 
@@ -92,11 +95,11 @@ def evaluate(
         settings: number of other devices and layouts.
         point: operating point of the alarm; None where the task has no label ``dangerous``.
     """
-    task, metrics, cannot = device.task, dict[str, float](), dict[str, str]()
-    same, drawn = _test(device)
+    task, cannot = device.task, dict[str, str]()
+    recording = None if device.simulation is None else device.recording("test", complete=False)
+    same = device.touches("test") if recording is None else recording.touches
     probabilities = learner.probabilities(same)
-    computed = compute_metrics(probabilities, same.known_labels, task, point)
-    metrics |= {f"same/{name}": value for name, value in computed.items()}
+    scored = {"same": (probabilities, same.known_labels)}
     for column, sets in touch_sets(device, settings).items():
         try:
             pairs = [(learner.probabilities(touches), touches.known_labels) for touches in sets]
@@ -105,8 +108,12 @@ def evaluate(
             continue
         if pairs:
             predicted, true = (torch.cat(parts) for parts in zip(*pairs, strict=True))
-            computed = compute_metrics(predicted, true, task, point)
-            metrics |= {f"{column}/{name}": value for name, value in computed.items()}
+            scored[column] = predicted, true
+    metrics = {
+        f"{column}/{name}": value
+        for column, of_set in scored.items()
+        for name, value in compute_metrics(*of_set, task, point).items()
+    }
     never = same.known_labels.isnan().all(dim=0)
     if unknown := [name for name, missing in zip(task.names, never, strict=True) if missing]:
         cannot["labels"] = f"the touches of the test tell nothing of {', '.join(unknown)}"
@@ -118,32 +125,13 @@ def evaluate(
         None if point is None or LABEL in unknown else point.reached(probabilities, same.known_labels, task)
     )
     outcomes = encode(probabilities, same.known_labels, task, point)
-    predictions = _predictions(probabilities, same, task, drawn)
+    predictions = _predictions(probabilities, same, task, {} if recording is None else recording.parameters)
     return Report(metrics, cannot, table, predictions, point, reached, outcomes, device.split)
 
 
-def _test(device: AbstractDevice) -> tuple[Touches, dict[str, Tensor]]:
-    """Return the test touches and, where they were simulated, how each was drawn."""
-    if device.simulation is None:
-        return device.touches("test"), {}
-    recording = device.recording("test", complete=False)
-    return recording.touches, recording.parameters
-
-
-def _devices(device: Simulated, settings: Evaluation) -> Iterator[Touches]:
-    """Yield the fraction of the test touches that each of some other devices of the same kind measures."""
-    for number in range(settings.devices):
-        sibling = device.replace(seed=1 + number)  # the default device has 0
-        yield sibling.touches("test")[number :: settings.devices]
-
-
-def _layouts(device: Simulated, settings: Evaluation) -> Iterator[Touches]:
-    """Yield the fraction of the test touches for each of some other layouts.
-
-    A gesture whose dangerous pressure no sensor of a layout would feel takes another path there.
-    """
-    for number, other in enumerate(scattered_devices(device, settings.layouts)):
-        yield other.touches("test")[number :: settings.layouts]
+def _share_out(devices: Iterable[Simulated], count: int) -> Iterator[Touches]:
+    """Return the fraction of the test touches that each of ``count`` devices measures, drawn lazily."""
+    return (device.touches("test")[number::count] for number, device in enumerate(devices))
 
 
 def scattered_devices(device: Simulated, count: int) -> Iterator[Simulated]:

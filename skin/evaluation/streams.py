@@ -202,23 +202,32 @@ class WindowReport:
 
     def metrics(self) -> dict[str, float]:
         """Return all values under names that MLflow accepts."""
-        values: dict[str, float] = {
+        whole = {
             "stream/hours": self.hours,
             "gate/threshold/least": self.threshold,
             "alarms/threshold": self.point.threshold,
         }
-        for entry in self.bins:
-            values |= {f"share/{entry.name}/{name}/accuracy": value for name, value in entry.accuracy.items()}
-            values[f"share/{entry.name}/overall/accuracy"] = entry.overall
-        for gate, counts in self.gates.items():
-            values[f"gate/{gate}/accuracy"] = float(counts.diag().sum() / counts.sum())
-        for gate, alarms in self.alarms.items():
-            values[f"alarms/{gate}/false_per_hour"] = alarms.per_hour
-            values[f"alarms/{gate}/found"] = alarms.found / max(alarms.dangerous, 1)
-            values[f"alarms/{gate}/raised_by_safe"] = alarms.raised / max(alarms.safe, 1)
-        for window, value in self.lengths.items():
-            values |= {} if isinstance(value, str) else {f"window/{window:g}/overall/accuracy": value}
-        return values
+        bins = {
+            f"share/{entry.name}/{name}/accuracy": value
+            for entry in self.bins
+            for name, value in (*entry.accuracy.items(), ("overall", entry.overall))
+        }
+        gates = {f"gate/{g}/accuracy": float(n.diag().sum() / n.sum()) for g, n in self.gates.items()}
+        alarms = {
+            f"alarms/{gate}/{name}": value
+            for gate, its in self.alarms.items()
+            for name, value in (
+                ("false_per_hour", its.per_hour),
+                ("found", its.found / max(its.dangerous, 1)),
+                ("raised_by_safe", its.raised / max(its.safe, 1)),
+            )
+        }
+        lengths = {
+            f"window/{window:g}/overall/accuracy": value
+            for window, value in self.lengths.items()
+            if not isinstance(value, str)
+        }
+        return whole | bins | gates | alarms | lengths
 
 
 def evaluate_windows(
@@ -321,8 +330,10 @@ def _listen(
             raised[name].append(point.alarm(probabilities[:, dangerous]) & gate(touches, probabilities))
     gesture = stream.timeline.window_content(starts, device.window)[0]
     truth = stream.timeline.movie.labels[:, TOUCH_OR_NOT.names.index(ALARM)] > 0.5
-    hours = stride / rate / 3600
-    return {name: count_alarms(torch.cat(parts), gesture, truth, hours) for name, parts in raised.items()}
+    return {
+        name: count_alarms(torch.cat(parts), gesture, truth, hours=stride / rate / 3600)
+        for name, parts in raised.items()
+    }
 
 
 def _frames(seconds: float, rate: float, name: str) -> int:

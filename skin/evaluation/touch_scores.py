@@ -112,18 +112,14 @@ def decide_touches(
             learner, device, live, readings[contact], valid[contact.nonzero()[:, 0]]
         )
         peak = danger.measure(movie, device.body) / danger.above
-        sensed = peak * _sensed_pressure(movie, footprints, valid) / movie.parameters["pressure"].clamp(1.0)
+        means = (movie.frames.flatten(1) @ footprints.T)[movie.index] * movie.scale[:, :, None]
+        felt = means.amax(dim=1).where(valid, 0.0).amax(dim=1)  # Pa, the largest over a valid sensor
+        sensed = peak * felt / movie.parameters["pressure"].clamp(1.0)
         parts.append((probabilities, readings.amax(dim=(2, 3)), contact, peak, sensed))
         if report is not None:
             report(first + len(batch))
     joined = [torch.cat(part) for part in zip(*parts, strict=True)]
     return TouchDecisions(live.decisions(_round_rate(device, live)), *joined)
-
-
-def _sensed_pressure(movie: Movie, footprints: Tensor, valid: Tensor) -> Tensor:
-    """Return the largest mean pressure over the footprint (S, H * W) of a valid sensor (B, S), (B,), Pa."""
-    means = (movie.frames.flatten(1) @ footprints.T)[movie.index] * movie.scale[:, :, None]
-    return means.amax(dim=1).where(valid, 0.0).amax(dim=1)
 
 
 def _round_rate(device: Simulated, live: LiveConditions) -> float:

@@ -17,7 +17,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from skin.errors import InputError
-from skin.evaluation.final_threshold import start_beside
+from skin.evaluation.operating_point import start_beside
 from skin.inference.mechanics import QUIET, Mechanics
 from skin.live.verdict import Verdict
 from skin.wire.channels import NewtonFrame, UnitConversion

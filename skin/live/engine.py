@@ -340,8 +340,9 @@ class Engine:
         }
         notes = [Note(code, _numbers(which)) for code, which in sensors.items() if which.any()]
         if self.guarantee is not None:
-            code, text = f"guarantee_{self.guarantee.state(self.changed)}", self.guarantee.sentence()
-            notes.append(Note(code, detail=text))
+            notes.append(
+                Note(f"guarantee_{self.guarantee.state(self.changed)}", detail=self.guarantee.sentence())
+            )
         notes += [Note("unreadable")] * self._losses.excessive + [Note("pause", seconds=self._pause)] * paused
         return _numbers(blind), tuple(notes)
 

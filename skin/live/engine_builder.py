@@ -19,9 +19,8 @@ from skin.device.resampling import Frame
 from skin.errors import InputError
 from skin.evaluation.alarm import choose_alarm_threshold
 from skin.evaluation.decisions import DRIFT, minimum_visible
-from skin.evaluation.final_threshold import FinalThreshold
 from skin.evaluation.guarantee import Guarantee
-from skin.evaluation.operating_point import DangerScore
+from skin.evaluation.operating_point import DangerScore, FinalThreshold
 from skin.inference.mechanics import Mechanics
 from skin.live.engine import DebounceSettings, Detection, Engine
 from skin.live.verdict import Note, sensor_list

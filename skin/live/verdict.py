@@ -75,9 +75,9 @@ def order_notes(notes: Iterable[Note]) -> tuple[Note, ...]:
 
 
 def summarize_notes(notes: Sequence[Note]) -> str:
-    """Return the gravest of ordered notes in full, and the number of the others; empty without notes."""
-    more = len(notes) - 1
-    return "" if not notes else notes[0].text + (f" (and {more} more note{'s' * (more > 1)})" if more else "")
+    """Return the gravest of ordered notes, and the number of the others; empty if nothing is wrong."""
+    text, *others = [note.text for note in notes if note.code != "guarantee_valid"] or [""]
+    return text + (f" (and {len(others)} more note{'s' * (len(others) > 1)})" if others else "")
 
 
 @dataclass(frozen=True)

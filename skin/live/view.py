@@ -24,7 +24,7 @@ from skin.core.files import json_line, unwritable
 from skin.core.interrupt import ends_on_signal
 from skin.core.messages import quiet
 from skin.errors import InputError
-from skin.evaluation.final_threshold import FinalThreshold
+from skin.evaluation.operating_point import FinalThreshold
 from skin.live.contacts import LiveContacts, contact_text_lines
 from skin.live.engine import Engine
 from skin.live.engine_builder import LiveSettings, LiveSetup, watch_exported, watch_run

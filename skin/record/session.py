@@ -177,15 +177,17 @@ class SessionLog:
         self._folder = folder
         self.frames: list[tuple[float, Frame]] = []
         if not folder.exists() or not any(folder.glob("*")):
-            text = files.json_line({**metadata, "sum": json_sum(metadata)})
-            files.write(text + "\n", folder / "about.json")
+            files.write(
+                files.json_line({**metadata, "sum": json_sum(metadata)}) + "\n", folder / "about.json"
+            )
         stored = read_session(folder)
         check_session(folder, stored.metadata, metadata)
         self.metadata, self.done = stored.metadata, set(stored.gestures)
-        ends = [(table["time"][-1].as_py(), table["segment"][-1].as_py()) for table in stored.tables]
-        last = max(ends, default=(-1.0, -1))
-        self.time: float = last[0]
-        self._first, self._segment, self._anchor = last[1] + 1, -1, 0.0
+        ends: list[tuple[float, int]] = [
+            (table["time"][-1].as_py(), table["segment"][-1].as_py()) for table in stored.tables
+        ]
+        self.time, last = max(ends, default=(-1.0, -1))
+        self._first, self._segment, self._anchor = last + 1, -1, 0.0
 
     def add(self, frame: Frame, now: float) -> None:
         """Add a frame, which is written with the next gesture.
@@ -210,10 +212,9 @@ class SessionLog:
         begin = f"frames_{1000 * self.frames[0][0]:09.0f}"
         name = f"{begin if taken is None else f'gesture_{taken[0].number:05d}'}.parquet"
         content = {"file": name, "number": None} | ({} if taken is None else self._describe(*taken))
-        table = self._table(content["number"], 0 if taken is None else len(taken[0].frames))
+        table = self._table(content, 0 if taken is None else len(taken[0].frames))
         path = self._folder / name
         with files.whole(path, "out=FOLDER; the gestures before are kept") as partial:
-            table = table.replace_schema_metadata({_KEY: files.json_line(content)})
             write_parquet(table, partial, compression="zstd")
             if path.exists():  # damaged: its gesture was asked for again
                 path.replace(path.with_suffix(".damaged"))
@@ -236,8 +237,8 @@ class SessionLog:
             "states": _states(window.valid, window.saturated).tolist(),
         }
 
-    def _table(self, number: int | None, inside: int) -> pa.Table:
-        """Return the frames; ``number`` is that of the gesture whose the last ``inside`` ones are."""
+    def _table(self, content: Mapping[str, Any], inside: int) -> pa.Table:
+        """Return the frames, with their description; the last ``inside`` ones are those of its gesture."""
         time, frames = [t for t, _ in self.frames], [frame for _, frame in self.frames]
         values, valid = (np.stack([getattr(frame, name) for frame in frames]) for name in ("values", "valid"))
         none = np.zeros(values.shape[1], dtype=bool)
@@ -248,11 +249,11 @@ class SessionLog:
             "lost": [frame.lost for frame in frames],
             "after": [frame.after for frame in frames],
             "segment": [self._first + frame.segment for frame in frames],
-            "gesture": pa.array([None] * (len(frames) - inside) + [number] * inside, pa.int64()),
+            "gesture": pa.array([None] * (len(frames) - inside) + [content["number"]] * inside, pa.int64()),
         }
         for name, rows in (("raw", values), ("state", _states(valid, limited))):
             columns |= zip(numbered(name, len(none)), rows.T, strict=True)
-        return pa.table(columns)
+        return pa.table(columns, metadata={_KEY: files.json_line(content)})
 
 
 def _states(valid: np.ndarray, saturated: np.ndarray) -> np.ndarray:

@@ -22,8 +22,7 @@ from skin.device.touches import Recording, Touches
 from skin.errors import InputError
 from skin.mechanics.geometry import sensor_geometry
 from skin.mechanics.simulator.base import AbstractSimulator
-from skin.robot.mujoco_skin import MujocoSurface, load_mujoco
-from skin.robot.pressing import Press, Pressing
+from skin.robot.mujoco_skin import MujocoSurface, Press, Pressing, load_mujoco
 from skin.touch.fingertips import read_touch
 from skin.touch.labels import TOUCH, report_labels
 from skin.touch.movie import Movie, measure_gestures

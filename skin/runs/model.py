@@ -27,7 +27,7 @@ from skin.errors import InputError
 from skin.evaluation.alarm import AlarmSource
 from skin.evaluation.decisions import LiveConditions
 from skin.evaluation.guarantee import Guarantee
-from skin.evaluation.operating_point import LABEL
+from skin.evaluation.operating_point import LABEL, DangerScore, OperatingPoint
 from skin.touch.labels import Task
 
 if TYPE_CHECKING:
@@ -368,16 +368,19 @@ class OnnxModel(Model):
         self.path = Path(path).expanduser()
         content, metadata = inspect(self.path)
         self.metadata, positions, threshold = metadata, np.array(metadata.positions), metadata.threshold
-        alarm = AlarmSource(
-            str(self.path),
-            threshold=threshold,
-            thresholds=metadata.thresholds or {},
-            scores=metadata.scores or {},
-            guarantees={
-                rate: configured(Guarantee, one, f"guarantee of {self.path}")
-                for rate, one in (metadata.guarantees or {}).items()
-            },
-        )
+        scores, promises = metadata.scores or {}, metadata.guarantees or {}
+        points = {
+            rate: OperatingPoint(
+                above,
+                score=DangerScore(*scores[rate]) if rate in scores else None,
+                guarantee=configured(Guarantee, promises[rate], f"guarantee of {self.path}")
+                if rate in promises
+                else None,
+            )
+            for rate, above in (metadata.thresholds or {}).items()
+        }
+        single = None if threshold is None else OperatingPoint(threshold)
+        alarm = AlarmSource(str(self.path), exported=single, points=points)
         facts = metadata.run, metadata.title, metadata.task, metadata.window, metadata.rate
         super().__init__(*facts, positions, metadata.size, threshold, alarm)
         self.contact, self.learned, self.longest = metadata.contact, metadata.learned, metadata.longest

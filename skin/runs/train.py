@@ -1,4 +1,4 @@
-"""One run: build, train, evaluate, log."""
+"""One run: build, train, evaluate, log; evaluate again."""
 
 import json
 import logging
@@ -6,7 +6,7 @@ import math
 import os
 import shutil
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import replace
 from io import StringIO
@@ -24,18 +24,21 @@ from pytorch_lightning.utilities import rank_zero_only
 from rich.console import Console
 from torch import Tensor
 
+from skin.core.files import results
 from skin.core.messages import PARENT, quiet
+from skin.core.progress import Steps
+from skin.core.settings import option_name
 from skin.device.simulated import report_balance
 from skin.errors import InputError
 from skin.evaluation.alarm import AlarmSource, choose_alarm_threshold, threshold_device
 from skin.evaluation.metrics import OUTCOMES, compute_metrics
-from skin.evaluation.report import Report, evaluate, metrics_table
+from skin.evaluation.report import Report, evaluate, metrics_table, publish_evaluation, write_probabilities
 from skin.evaluation.report import print_report as show
 from skin.evaluation.settings import check_evaluation
 from skin.learning.learner import AbstractLearner
 from skin.learning.network import LAST
 from skin.plot.figures import confusions, save_figure
-from skin.runs.build import build_data, build_device, build_learner, device_on_skin
+from skin.runs.build import build_data, build_device, build_learner, device_on_skin, load_model
 from skin.runs.configuration import (
     MACHINE,
     NETWORK,
@@ -50,12 +53,18 @@ from skin.runs.configuration import (
     tags,
     unused_groups,
 )
-from skin.runs.run import TAG
+from skin.runs.run import TAG, find_run
 from skin.runs.store import Store, note_reuse
 from skin.touch.labels import Task
 
 _log = logging.getLogger(__name__)
 
+# Expected seconds of each step, for the fraction in the progress.
+_EVALUATION = {
+    "loading the run and the threshold of its alarm": 20.0,
+    "reading or simulating the touches": 10.0,
+    "evaluating them": 30.0,
+}
 _VALIDATION = "best_val_"  # begins the names of metrics of what was learned on the validation split
 
 
@@ -142,6 +151,52 @@ def _objective(name: str | None, metrics: Mapping[str, float]) -> float:
         )
     # Runs of earlier versions have none.
     return scores.get(name or f"{_VALIDATION}accuracy", scores.get(f"{_VALIDATION}r2", math.nan))
+
+
+def evaluate_run(config: Config, name: str, out: str | None, changes: Sequence[str]) -> None:
+    """Evaluate a finished run on other touches, or on a skin; print, write and log what is found.
+
+    Args:
+        config: of the command.
+        name: of the run.
+        out: folder of the files; None: ``results``.
+        changes: overrides of the configuration of the run.
+
+    Raises:
+        InputError: the run, its device or a setting cannot be used.
+    """
+    quiet()
+    with Steps(_EVALUATION) as steps:
+        finished = find_run(config.tracking, name, config.trust)
+        configured = finished.configured(changes)
+        settings, model = check_evaluation(configured.evaluation), load_model(finished, configured)
+        device, learner, point = model.device, model.learner, model.point
+        steps.begin("reading or simulating the touches")
+        if device.real:
+            steps.stop()  # a person may be prompted
+        touches = device.touches("test")  # read before anything is logged, because a port may fail
+        steps.start()
+        steps.begin("evaluating them")
+        title = f"{finished.title} ({finished.identity})"
+        tags = {"evaluated": finished.identity, "overrides": " ".join(changes)}
+        store = Store.open(configured.tracking)
+        with store.run(f"evaluation of {finished.title}", tags, finished.identity) as evaluation:
+            # Evaluations do not overwrite each other's files.
+            path = results(out) / f"evaluation_{option_name(device)}_{evaluation.info.run_id[:8]}.md"
+            if touches.labels is None:
+                written = [path.with_suffix(".csv")]
+                probabilities = learner.probabilities(touches)
+                print(title, write_probabilities(probabilities, device.task, point, *written), sep="\n")
+            else:
+                report = evaluate(learner, device, settings, point)
+                log_report(store, evaluation, report, device.task, {})
+                words = f"`{' '.join(changes)}`" if changes else "the settings of the run"
+                description = f"Run {title}, evaluated with {words}, {len(report.predictions)} gestures."
+                written = publish_evaluation(path, report, device.task, finished.title, description)
+                show(report, title)
+            for file in written:
+                store.client.log_artifact(evaluation.info.run_id, str(file))
+    print(*written, sep="\n")
 
 
 class RunLogger(MLFlowLogger):

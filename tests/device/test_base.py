@@ -21,7 +21,7 @@ from skin.runs.build import build_device
 from skin.runs.configuration import validate_config
 
 CONF = Path(__file__).parents[2] / "conf"
-POINT = OperatingPoint.default(0.02)
+POINT = OperatingPoint(0.5, 0.02)
 SMALL = ["data.gestures=50", "device.test_gestures=20", "simulator=naive"]
 
 

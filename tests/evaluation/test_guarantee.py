@@ -12,7 +12,7 @@ from skin.core.rng import Stream, generator
 from skin.errors import InputError
 from skin.evaluation import guarantee, touch_scores
 from skin.evaluation.decisions import LiveConditions
-from skin.evaluation.guarantee import anytime_bound, miss_bound, threshold_for_misses
+from skin.evaluation.guarantee import anytime_bound, threshold_for_misses
 from skin.runs.build import build_device
 from skin.touch.sampler import balanced
 
@@ -37,10 +37,7 @@ class Largest:
 )
 def test_as_many_misses_are_allowed_as_the_binomial_tail_says(touches, rate, allowed):
     assert guarantee.allowed_misses(touches, rate) == allowed
-    assert miss_bound(allowed + 1, touches) > rate
-    if allowed >= 0:
-        assert miss_bound(allowed, touches) <= rate
-        assert binom.cdf(allowed, touches, miss_bound(allowed, touches)) == pytest.approx(0.05)
+    assert binom.cdf(allowed, touches, rate) <= 0.05 < binom.cdf(allowed + 1, touches, rate)
     assert guarantee.touches_needed(rate) == math.ceil(math.log(0.05) / math.log(1 - rate))
 
 
@@ -87,14 +84,15 @@ def test_presses_without_a_miss_buy_a_bound():
     bounds = [anytime_bound(misses, 100) for misses in range(101)]
     assert bounds == sorted(bounds)
     assert bounds[-1] == 1 == anytime_bound(0, 0)
-    assert miss_bound(3, 100) < bounds[3]  # what may be read at any time costs a little
+    assert beta(4, 97).ppf(0.95) < bounds[3]  # what may be read at any time costs a little
 
 
 def test_too_few_touches_or_presses_are_told_how_many_are_needed():
     needed = guarantee.presses_needed(0.05)
-    guarantee.check_presses(0, needed, 0.05)
+    pressed = np.full(needed, 1.2), np.full(needed, 1.2), np.ones(needed, dtype=bool)
+    assert f"{needed} of {needed}, 0 missed" in guarantee.describe_presses(*pressed, 0.05)[0]
     with pytest.raises(InputError, match=f"0 misses of {needed - 1} presses .* {needed} presses are needed"):
-        guarantee.check_presses(0, needed - 1, 0.05)
+        guarantee.describe_presses(*(values[1:] for values in pressed), 0.05)
     with pytest.raises(
         InputError, match=r"2994 touches cannot show at most 0.1 % missed, .* 2995 are needed"
     ):

@@ -12,7 +12,7 @@ from skin.core.files import CONF
 from skin.errors import InputError
 from skin.evaluation.alarm import AlarmSource, choose_alarm_threshold
 from skin.evaluation.decisions import LiveConditions
-from skin.evaluation.final_threshold import FinalThreshold
+from skin.evaluation.operating_point import FinalThreshold
 from skin.live.engine import Detection, Engine
 from skin.live.loop import Display
 from skin.live.verdict import Note

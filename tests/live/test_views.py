@@ -19,7 +19,7 @@ from skin.device.resampling import Frame
 from skin.errors import InputError
 from skin.live import loop, web
 from skin.live.loop import Display
-from skin.live.verdict import Note, Verdict, contact_text
+from skin.live.verdict import Note, Verdict, contact_text, verdict_message
 from skin.live.view import screen, show_in_terminal
 from skin.wire.channels import UnitConversion
 
@@ -102,6 +102,19 @@ def test_the_terminal_shows_the_alarm_and_the_probability():
     assert "strongest reading 6.2 N, sensor 2" in text
     assert "contacts unknown: this view estimates none" in text
     assert "99.9 Hz" in text
+
+
+def test_a_valid_guarantee_is_no_reason_and_hides_none():
+    subject = display()
+    subject.add_note(Note("guarantee_valid", detail="at most 0.1 % missed"))
+    for verdict in (replace(PRESSED, touched=False), PRESSED):
+        subject.set_verdict(verdict, now := monotonic())
+        state = subject.state(now)
+        message = verdict_message(subject.assess(now), state.notes, state.contacts, now)
+        assert (message["reason"], message["notes"][0]["code"]) == ("", "guarantee_valid")
+        assert "missed" not in shown(subject)
+    subject.add_note(Note("clock", detail="late"))
+    assert subject.state(monotonic()).reason == "late"
 
 
 def test_the_page_gets_pictures_and_needs_nothing_from_elsewhere():

@@ -13,7 +13,7 @@ from skfem.helpers import grad
 from skin.body.layout import Grid
 from skin.body.sheet import Sheet
 from skin.mechanics.simulator.solid import Solid
-from skin.robot.pressing import Press, Pressing
+from skin.robot.mujoco_skin import Press, Pressing
 
 THICKNESS, YOUNG, POISSON, EXTENT = 0.03, 170e3, 0.499, 0.0339
 LAYER = [{"material": "EcoFlex 00-30", "thickness": THICKNESS}]

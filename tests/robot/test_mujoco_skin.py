@@ -13,8 +13,7 @@ from skin.body.sheet import Sheet
 from skin.errors import InputError
 from skin.mechanics.simulator.solid import Solid
 from skin.robot import MujocoSkin
-from skin.robot.mujoco_skin import MujocoSurface
-from skin.robot.pressing import Pressing
+from skin.robot.mujoco_skin import MujocoSurface, Pressing
 from tests.mechanics.contact.test_rigid import BODY as HALF_SPACE
 from tests.mechanics.contact.test_rigid import HalfSpace
 

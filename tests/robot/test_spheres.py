@@ -11,8 +11,7 @@ from skin.body.sheet import Sheet
 from skin.inference.noise import Noise
 from skin.inference.posterior import Posterior
 from skin.mechanics.simulator.solid import Solid
-from skin.robot.mujoco_skin import MujocoSurface
-from skin.robot.pressing import Pressing
+from skin.robot.mujoco_skin import MujocoSurface, Pressing
 
 mujoco = pytest.importorskip("mujoco", reason="pip install 'tactile-skin[mujoco]'")
 COUNT = 500

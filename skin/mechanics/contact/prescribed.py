@@ -44,8 +44,7 @@ class Prescribed(AbstractContact):
         reached = np.minimum(limit, most * (peak / (width * height)))
         highest_cell = trajectories.peak * (reached / problem.settings.thresholds.pressure)
         force = highest_cell * (width * height) / peak
-        owner = torch.from_numpy(trajectories.owner)
-        frames *= torch.from_numpy(force / (width * height)).float()[owner, None, None]
+        frames *= torch.from_numpy((force / (width * height))[trajectories.owner]).float()[:, None, None]
         return ContactResult(
             frames, force, highest_cell, force > human, np.zeros(len(force), bool), area=area
         )

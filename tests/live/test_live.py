@@ -123,9 +123,9 @@ def test_a_skin_that_lost_its_power_is_found_again(begin, store, tmp_path):
     peers, stop = [], Event()
 
     def serve():
-        """Send for three seconds and fall silent without closing; send on in the next connection."""
+        """Send until the view has begun, fall silent without closing; send on in the next connection."""
         rng = np.random.default_rng(0)
-        for frames in (300, 10**6):
+        for frames in (3000, 10**6):  # 30 s
             peers.append(server.accept()[0])
             peers[-1].sendall(encode_header(Header(n=25, rate=100.0, unit="N")))
             for number in range(frames):

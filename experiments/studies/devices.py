@@ -45,7 +45,7 @@ class TouchAlarms:
     The threshold is chosen on other touches than those that are counted, as ``evaluation`` says. Rates are
     given with exact 95 % intervals: of false alarms, of all safe touches and of those below 0.9 times the
     limit (``clear_false_alarm``); of safe touches whose danger is unknown; of missed touches above 1.1 times
-    the limit, and of those of them that are on a sensor (``failure``).
+    the limit, of the big and small ones, and of those that are on a sensor (``failure``).
 
     Args:
         safe: number of safe touches that are counted.
@@ -79,9 +79,12 @@ class TouchAlarms:
         touches = decide_touches(model.learner, counts, live, labels, self.seed)
         alarms, peak = point.alarm(touches.scores(point.score)).numpy(), touches.peak.numpy()
         likely = (touches._replace(row=1).scores(point.score) > 0.5).numpy()
+        above, big = peak > MARGIN, labels[:, TOUCH.names.index("big")]
         groups = {
             "failure": ~alarms[counted(peak, touches.sensed.numpy())][: self.dangerous],
-            "missed": ~alarms[peak > MARGIN],
+            "missed": ~alarms[above],
+            "missed_big": ~alarms[above & big],
+            "missed_small": ~alarms[above & ~big],
             "unknown": (likely & ~alarms)[safe],
             "false_alarm": alarms[safe],
             "clear_false_alarm": alarms[peak < 2 - MARGIN],

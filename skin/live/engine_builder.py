@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from functools import partial
-from time import monotonic
+from time import monotonic, sleep
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -27,7 +27,7 @@ from skin.live.verdict import Note, sensor_list
 from skin.runs.configuration import Config
 from skin.runs.model import Model, OnnxModel
 from skin.wire.channels import NewtonFrame, RawRange, UnitConversion, unit_conversion
-from skin.wire.reader import Port, SkinDisconnected, SkinTimeout
+from skin.wire.reader import Port, SkinTimeout
 from skin.wire.skin import SerialSource, Skin, Source
 
 _OVERRIDE = "live.selftest=false skips this test"
@@ -319,9 +319,8 @@ class LiveSetup:
                 if point.provisional and conditions is not None:
                     final = FinalThreshold(model.alarm, conditions)
         if conditions is not None and self.port is not None:
-            # Frames that waited meanwhile would delay the verdicts about those of now.
-            with suppress(SkinTimeout, SkinDisconnected):
-                self.port.skin.read(10**6, 0.0)  # more than any queue holds
+            # Of the frames that waited, the latest give the baseline; others would delay verdicts about now.
+            self.port.skin.skip(self.port.tare.seconds + 0.2)
         nominal = engine_settings(model, DebounceSettings(above=usual), danger=danger)
         patience = replace(live.patience, above=usual if given is None else given)
         engine = engine_settings(model, patience, live.touch, live.drift, danger, promise)
@@ -520,7 +519,7 @@ def measured_rate(
 ) -> float:
     """Return the rate of a device, Hz: measured, else that of its header, else the usual one.
 
-    Waits for its first frames, which are discarded, and until they arrive at the rate of the device's clock:
+    Waits for its first frame, which is discarded, and until frames arrive at the rate of the device's clock:
     its unit may have to be inferred.
 
     Args:
@@ -533,9 +532,10 @@ def measured_rate(
         clock: gives the host's monotonic time, s.
     """
     begin, before = clock(), skin.stats.frames
+    with suppress(SkinTimeout):
+        skin.read(1, patience)
     while (passed := clock() - begin) < patience:
-        with suppress(SkinTimeout):
-            skin.read(1, patience / 10)
+        sleep(0.01)
         stats = skin.stats
         arrived = (stats.frames - before) / max(passed, shown)
         if stats.frames >= enough and arrived / bursts < stats.rate_hz < arrived * bursts:

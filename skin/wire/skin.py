@@ -147,6 +147,11 @@ class Skin:
             self._stats.frames += self._decoder is None
         return frames
 
+    def skip(self, kept: float) -> None:
+        """Discard the waiting frames that arrived more than ``kept`` s ago."""
+        while self._frames and self._clock() - self._frames[0].t_host > kept:
+            self.read(1)
+
     def tare(self, seconds: float = 1.0, force: bool = False) -> np.ndarray:
         """Set the baseline to the readings of the untouched skin, and return it, (S,).
 

@@ -247,6 +247,7 @@ class Tare:
         lags: frames of the longest block that is recognised when it is sent again and again.
 
     Attributes:
+        seconds: as given.
         conversion: of values to N; None until unit and baseline are known.
         state: what the tare is waiting for; empty if for nothing.
         warning: message about what the latest baseline lacks; empty if nothing.
@@ -265,7 +266,7 @@ class Tare:
         limited: float = 0.5,
         lags: int = 1000,
     ) -> None:
-        self._conversion, self._header, self._seconds, self._rate = conversion, header, seconds, rate
+        self._conversion, self._header, self.seconds, self._rate = conversion, header, seconds, rate
         self._interval, self._limited, self._lags = interval, limited, lags
         self.conversion: UnitConversion | None = None
         self._untared: UnitConversion | None = None
@@ -293,7 +294,7 @@ class Tare:
         Args:
             force: take it from the next frames, even if the skin seems touched.
         """
-        if self._seconds and self.conversion is not None:
+        if self.seconds and self.conversion is not None:
             self._quiet.clear()
             self._tried, self._deadline, self._forced = -inf, inf, force
             self.state = "quiet"
@@ -342,7 +343,7 @@ class Tare:
                 raise
             self.state = "header"
             return
-        if not self._seconds:
+        if not self.seconds:
             self.conversion, self.state = self._untared, ""
         elif touched and not self._forced:
             self._quiet.clear()
@@ -350,9 +351,9 @@ class Tare:
         else:
             # One segment: a device that restarts often would otherwise never get a baseline.
             self._quiet.append(frame._replace(t=time, segment=0))
-            while time - self._quiet[0].t > 1.5 * self._seconds:
+            while time - self._quiet[0].t > 1.5 * self.seconds:
                 self._quiet.pop(0)
-            if time - self._quiet[0].t < self._seconds:
+            if time - self._quiet[0].t < self.seconds:
                 self.state = "quiet"
             elif time - self._tried >= self._interval:
                 self._tried = time
@@ -360,7 +361,7 @@ class Tare:
 
     def _try_baseline(self) -> None:
         """Take the baseline from the latest frames if they are enough and quiet."""
-        intervals = int(self._seconds * self._rate + 1e-6)
+        intervals = int(self.seconds * self._rate + 1e-6)
         window = Window(max(1, intervals), self._rate, len(self._quiet[-1].values))
         for frame in self._quiet:
             window.add(frame)

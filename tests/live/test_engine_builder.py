@@ -68,16 +68,16 @@ def model(trained, tmp_path_factory):
 
 
 @pytest.fixture
-def skin():
+def skin(request):
     """Return the address of a skin of six sensors that is touched for one of five seconds, without end."""
-    stop = Event()
+    stop, touched_from = Event(), getattr(request, "param", 4.0)
 
     def serve():
         rng, peer = np.random.default_rng(0), server.accept()[0]
         peer.sendall(encode_header(Header(n=6, rate=RATE, unit="N")))
         with peer, suppress(OSError):  # the reader has ended
             for number in range(10**6):
-                touched = 3.0 * (number / RATE % 5.0 > 4.0)
+                touched = 3.0 * (number / RATE % 5.0 > touched_from)
                 values = rng.normal(touched, 0.02, size=6).round(4)
                 peer.sendall(encode_line(values, number, round(1e6 * number / RATE)))
                 if stop.wait(1 / RATE):
@@ -163,13 +163,18 @@ def test_the_rate_of_a_device_is_that_of_its_arrivals_until_its_clock_is_known(a
         assert measured_rate(skin) == pytest.approx(RATE, rel=0.3)
 
 
-def test_no_frame_that_waited_while_the_threshold_was_chosen_is_judged(model, skin):
+@pytest.mark.parametrize("skin", [5.0], ids=["untouched"], indirect=True)
+def test_frames_that_waited_while_the_threshold_was_chosen_give_the_baseline_alone(model, skin):
     """The first verdicts would tell of touches of some seconds ago, and those of now would be late."""
     with ExitStack() as opened:
         setup = watch_exported(str(model), {"port": skin}, print, opened)
-        sleep(1.5)
-        (frame,) = setup.watch(LIVE, print)[0].skin.read(1)
-        assert monotonic() - frame.t_host < 0.5
+        sleep(3.0)
+        source, begun = setup.watch(LIVE, print)[0], monotonic()
+        while source.tare.conversion is None:
+            (frame,) = source.skin.read(1)
+            source.tare.add(frame)
+        assert frame.t_host > begun - 0.5
+        assert monotonic() - begun < 0.5
 
 
 def test_the_command_replaces_settings_of_the_file(model, skin):

@@ -23,14 +23,15 @@ from skin.core.rng import Stream, generator
 from skin.device.resampling import Frame
 from skin.device.simulated import Simulated
 from skin.evaluation.alarm import AlarmSource, choose_alarm_threshold
+from skin.evaluation.decisions import LiveConditions
 from skin.evaluation.guarantee import MARGIN, counted
 from skin.evaluation.metrics import compute_metrics
-from skin.evaluation.operating_point import LABEL
+from skin.evaluation.operating_point import LABEL, OperatingPoint
 from skin.evaluation.touch_scores import decide_touches
 from skin.live.engine import DebounceSettings, Engine
 from skin.live.engine_builder import engine_settings
 from skin.plot.figures import COLOURS
-from skin.runs.build import build_device, load_model
+from skin.runs.build import TorchModel, build_device, load_model
 from skin.runs.configuration import recompose
 from skin.touch.labels import TOUCH
 from skin.touch.shapes import Shapes
@@ -65,11 +66,7 @@ class TouchAlarms:
         model, purpose = load_model(run, subject.config), "touches are simulated"
         device = subject.device.simulated(purpose)
         counts = build_device(recompose(subject.config, self.actual)).simulated(purpose)
-        rate = float(np.ravel(device.rate)[0])
-        live = model.live_conditions(rate, DebounceSettings().alarm, rate <= device.model_rate)
-        source = AlarmSource("this run", subject.config.evaluation, model.learner, device=device)
-        point = choose_alarm_threshold(source, live, anew=True)
-        assert point is not None  # it has the label
+        live, point = _choose_point(subject, model, float(np.ravel(device.rate)[0]))
         # A few more, because not all of them are on a sensor and far above the limit.
         drawn = max(self.safe, self.dangerous * 5 // 4)
         labels = counts.sampler.balanced(2 * drawn, generator(Stream.TEST, 7))
@@ -98,6 +95,16 @@ class TouchAlarms:
         found = ", ".join(f"{name} {those.sum()} of {len(those)}" for name, those in groups.items())
         frame.attrs["about"] = f"{subject.condition}: {point.sentence()}\n{found}"
         return frame
+
+
+def _choose_point(subject: Subject, model: TorchModel, rate: float) -> tuple[LiveConditions, OperatingPoint]:
+    """Return the conditions of the live view of a device at ``rate``, Hz, and its threshold, chosen anew."""
+    device = subject.device.simulated("touches are simulated")
+    live = model.live_conditions(rate, DebounceSettings().alarm, rate <= device.model_rate)
+    source = AlarmSource("this run", subject.config.evaluation, model.learner, device=device)
+    point = choose_alarm_threshold(source, live, anew=True)
+    assert point is not None  # it has the label
+    return live, point
 
 
 # Time to the alarm: dangerous touches of many courses pass an engine, frame by frame.
@@ -131,8 +138,9 @@ class Holds:
         trained, rows = subject.trained.run, list[dict[str, Any]]()
         assert trained is not None
         model = load_model(trained, subject.config)
-        debounce = DebounceSettings(above=model.threshold)
-        engine = engine_settings(model, debounce, self.touch, self.drift)
+        point = _choose_point(subject, model, self.rate)[1]
+        debounce = DebounceSettings(above=point.threshold)
+        engine = engine_settings(model, debounce, self.touch, self.drift, point.score)
         device = model.device.simulated("held touches are simulated").replace(stream=False)
         for course, load in self.courses.items():
             number = max(1, self.gestures // 10) if load and load[0][-1] >= 60 else self.gestures

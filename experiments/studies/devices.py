@@ -73,7 +73,8 @@ class TouchAlarms:
         danger = labels[:, TOUCH.names.index(LABEL)]
         kinds = np.flatnonzero(~danger)[: self.safe], np.flatnonzero(danger)[: self.dangerous * 5 // 4]
         labels, safe = labels[np.concatenate(kinds)], ~danger[np.concatenate(kinds)]
-        touches = decide_touches(model.learner, counts, live, labels, self.seed)
+        known = point.score, point.threshold
+        touches = decide_touches(model.learner, counts, live, labels, self.seed, enough=known)
         alarms, peak = point.alarm(touches.scores(point.score)).numpy(), touches.peak.numpy()
         likely = (touches._replace(row=1).scores(point.score) > 0.5).numpy()
         above, big = peak > MARGIN, labels[:, TOUCH.names.index("big")]

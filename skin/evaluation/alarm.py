@@ -13,6 +13,7 @@ import math
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import asdict, astuple, dataclass, field, fields, replace
+from functools import partial
 from math import log
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -64,6 +65,7 @@ FITTED_TOUCHES = 300
 """Safe touches, and as many dangerous ones, to which a score is fitted; fits to 1200 found no more."""
 PROVISIONAL = 200, 100
 """Safe and dangerous touches of a provisional threshold: 4 s of one core; 100 of each fit its score."""
+_HIGHEST = 0.5  # score of a touch from which a threshold for few missed ones need not know it
 _LOWER = 0.95  # probability that a provisional threshold is no higher than that of the wanted rate
 THRESHOLDS = "thresholds.json"
 """File beside the weights of a pretrained model: thresholds for touches, by the hash of what decides them."""
@@ -535,12 +537,17 @@ def _on_touches_of(
     danger = labels[:, TOUCH.names.index(LABEL)]
     safe, others = labels[~danger], labels[danger]
     chosen = np.concatenate([safe[:count], others[:tests], safe[count:][:apart], others[tests:][:apart]])
+    dangerous = np.arange(2 * fitted) >= fitted
     with Steps({"choosing the threshold of the alarm": 4.0 if quick else 20.0}) as steps:
         # More threads than free cores take many times as long.
-        decisions = decide_touches(
-            learner, device, live, chosen, seed, lambda done: steps.report(done / len(chosen)), quick
-        )
-    score = decisions.fit(np.arange(len(chosen))[-2 * fitted :], np.arange(2 * fitted) >= fitted)
+        decide = partial(decide_touches, learner, device, live)
+        report = lambda done: steps.report(done / len(chosen))  # noqa: E731
+        if missed is None:
+            decisions = decide(chosen, seed, report, (None, -1.0) if quick else None)
+            score = decisions.fit(np.arange(len(chosen))[-2 * fitted :], dangerous)
+        else:
+            score = decide(chosen[-2 * fitted :], seed).fit(np.arange(2 * fitted), dangerous)
+            decisions = decide(chosen[: -2 * fitted], seed + 1, report, (score, _HIGHEST))
     tested = slice(count, count + tests)
     scores = decisions.scores(score)
     safe_scores, others_scores = scores[:count], scores[tested]
@@ -549,7 +556,7 @@ def _on_touches_of(
     else:
         which = counted(decisions.peak[tested].numpy(), decisions.sensed[tested].numpy())
         others_scores = others_scores[which]
-        threshold = threshold_for_misses(others_scores.numpy(), missed)
+        threshold = min(_HIGHEST, threshold_for_misses(others_scores.numpy(), missed))
     point = OperatingPoint(threshold, target, count, 0, seed, len(others_scores), 0, live.rate, score)
     raised, found = (int(point.alarm(part).sum()) for part in (safe_scores, others_scores))
     return replace(point, raised=raised, found=found, provisional=quick)

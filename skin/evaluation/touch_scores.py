@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from math import ceil
 from typing import NamedTuple
 
@@ -80,7 +81,7 @@ def decide_touches(
     labels: np.ndarray,
     seed: int,
     report: Callable[[int], None] | None = None,
-    about_peak: bool = False,
+    enough: tuple[DangerScore | None, float] | None = None,
 ) -> TouchDecisions:
     """Return the decisions of the live view about touches.
 
@@ -91,35 +92,39 @@ def decide_touches(
         labels: (B, 4), bool, of the touches.
         seed: of the touches and their devices.
         report: called with the number of touches that are done.
-        about_peak: only the decisions about the first peak of each touch, a third of all. No score is then
-            higher than that of all decisions, and most are equal.
+        enough: a score, and the level above which it need not be known: of a touch that the decisions about
+            its first peak, a third of all, bring above it, the others are left out. No score is then higher
+            than that of all decisions.
     """
     device = device.replace(padded=False, stream=False)
     parts = list[tuple[Tensor, ...]]()
     weigh = geometry.footprints if device.model.smooth else AbstractBody.footprints
     footprints = torch.from_numpy(weigh(device.body, device.sensors)).float()
-    danger = device.sampler.labels[LABEL]
+    danger, row = device.sampler.labels[LABEL], live.decisions(_round_rate(device, live))
     for first in range(0, len(labels), 50):
         batch, draw = labels[first : first + 50], generator(Stream.ALARM, seed, 2, first)
         movie = device.sampler.sample(len(batch), draw, batch)
         readings, valid, contact = _decision_windows(device, movie, live, draw)
-        if about_peak:
-            largest = readings.amax(dim=(2, 3)) * contact
-            after = torch.arange(contact.shape[1]) - largest.argmax(dim=1, keepdim=True)
-            contact = contact & (after >= _ABOUT_PEAK[0]) & (after <= _ABOUT_PEAK[1])
-        probabilities = torch.zeros(contact.shape)
-        probabilities[contact] = _classify_windows(
-            learner, device, live, readings[contact], valid[contact.nonzero()[:, 0]]
-        )
+        classify = partial(_classify, learner, device, live, readings, valid)
+        judged, largest, probabilities = contact, readings.amax(dim=(2, 3)), torch.zeros(contact.shape)
+        if enough is not None:
+            after = torch.arange(contact.shape[1]) - (largest * contact).argmax(dim=1, keepdim=True)
+            judged = contact & (after >= _ABOUT_PEAK[0]) & (after <= _ABOUT_PEAK[1])
+        probabilities[judged] = classify(judged)
         peak = danger.measure(movie, device.body) / danger.above
         means = (movie.frames.flatten(1) @ footprints.T)[movie.index] * movie.scale[:, :, None]
         felt = means.amax(dim=1).where(valid, 0.0).amax(dim=1)  # Pa, the largest over a valid sensor
         sensed = peak * felt / movie.parameters["pressure"].clamp(1.0)
-        parts.append((probabilities, readings.amax(dim=(2, 3)), contact, peak, sensed))
+        found = TouchDecisions(row, probabilities, largest, judged, peak, sensed)
+        if enough is not None:
+            others = contact & ~judged & (found.scores(enough[0]) <= enough[1])[:, None]
+            probabilities[others] = classify(others)
+            found = found._replace(contact=judged | others)
+        parts.append(found[1:])
         if report is not None:
             report(first + len(batch))
     joined = [torch.cat(part) for part in zip(*parts, strict=True)]
-    return TouchDecisions(live.decisions(_round_rate(device, live)), *joined)
+    return TouchDecisions(row, *joined)
 
 
 def _round_rate(device: Simulated, live: LiveConditions) -> float:
@@ -181,13 +186,15 @@ def _draw_decisions(shape: torch.Size, first: int, step: float, draw: np.random.
     return torch.from_numpy(ends)
 
 
-def _classify_windows(
-    learner: Predictor, device: Simulated, live: LiveConditions, readings: Tensor, valid: Tensor
+def _classify(
+    learner: Predictor, device: Simulated, live: LiveConditions, windows: Tensor, valid: Tensor, which: Tensor
 ) -> Tensor:
-    """Return the probability of ``dangerous`` of windows (W, T, S) with valid sensors (W, S), (W,)."""
+    """Return the probability of ``dangerous``, (W,), of windows (B, J, T, S) where ``which`` (B, J) holds."""
     positions = torch.from_numpy(device.sensors.positions).float()
+    readings, valid = windows[which], valid[which.nonzero()[:, 0], None].expand(-1, windows.shape[2], -1)
     parts = [
         learner.probabilities(Touches(*part, positions, None, device.model_rate))[:, live.column]
-        for part in zip(readings.split(500), valid[:, None].expand_as(readings).split(500), strict=True)
+        for part in zip(readings.split(500), valid.split(500), strict=True)
+        if len(readings)
     ]
     return torch.cat(parts).nan_to_num(1.0) if parts else torch.zeros(0)

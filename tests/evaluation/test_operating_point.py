@@ -3,6 +3,7 @@
 import json
 import math
 from dataclasses import astuple, replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -347,16 +348,16 @@ class Onset(Largest):
         return torch.sigmoid(change)[:, None].expand(-1, 4)
 
 
-def test_no_score_of_a_part_of_the_decisions_is_higher(drawn):
+def test_no_score_of_a_part_of_the_decisions_is_higher_and_the_alarms_are_the_same(drawn):
     labels = balanced(64, generator(Stream.TEST, 8))
-    every, part = (
-        touch_scores.decide_touches(Largest(), drawn, watching(100.0), labels, 9, about_peak=part).scores(
-            None
-        )
-        for part in (False, True)
-    )
-    assert (part <= every).all()
-    assert float((part == every).float().mean()) > 0.5
+    decide = partial(touch_scores.decide_touches, Onset(), drawn, watching(100.0), labels, 9)
+    every, part = (decide(enough=enough).scores(None) for enough in (None, (None, -1.0)))
+    level = float(every.median())
+    enough = decide(enough=(None, level)).scores(None)
+    assert (part <= enough).all()
+    assert (enough <= every).all()
+    assert ((enough > level) == (every > level)).all()
+    assert (part < enough).any()
 
 
 def test_one_decision_raises_more_alarms_than_two_and_a_slow_device_needs_one(drawn):

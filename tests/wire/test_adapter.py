@@ -28,7 +28,7 @@ OTHERS = {
     "struct": Adapter(kind="binary", struct={"counter": "u1", "f": "(3,)<i2"}, head="aa 55"),
     "index": Adapter(kind="text", rows=0, index=0),
 }
-ALL = {name: read_adapter(name) for name in SHIPPED} | OTHERS
+ALL = {name: read_adapter(name) for name in SHIPPED} | OTHERS | {"protocol": Adapter()}
 
 
 @pytest.mark.parametrize("name", SHIPPED)

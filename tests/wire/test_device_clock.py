@@ -124,9 +124,3 @@ def test_a_header_that_was_damaged_once_costs_frames_until_the_next():
     assert len(play(decoder, lambda t: t, 9, begin=6, header=encode_header(FIRST))) == 900
     assert decoder.error() is None
     assert decoder.header == FIRST
-
-
-def test_a_rate_that_the_firmware_measures_may_vary():
-    decoder = Decoder(4)
-    play(decoder, lambda t: t, 3, header=encode_header(Header(n=4, rate=99.4)))
-    assert len(play(decoder, lambda t: t, 3, begin=3, header=encode_header(Header(n=4, rate=101.2)))) == 300

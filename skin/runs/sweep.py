@@ -126,8 +126,8 @@ class SweepCallback(Callback):
 
     The parent exists before the first job, and with it database and experiment: jobs that start at once must
     not race to make them. Hydra does not call ``on_multirun_end`` when a job has failed, so the parent is
-    closed at exit. A parent that has no children by then, because each job was finished before or refused, is
-    deleted. A job that is refused is noted in the tag ``refused_<number>`` of the parent.
+    closed at exit, as FAILED. A parent that has no children by then, because each job was finished before or
+    refused, is deleted.
 
     Only Hydra's own sweeper has a list of jobs. Others choose each by the objectives of those before it.
 
@@ -141,7 +141,6 @@ class SweepCallback(Callback):
         self._store: Store | None = None
         self._held = ExitStack()  # the lock of the parent
         self._jobs: list[int] = []  # numbers of the jobs of this shard; empty: unknown
-        self._open: set[int] = set()  # those that have not ended
         self._swept: list[str] = []
 
     def __getstate__(self) -> dict[str, Any]:
@@ -208,8 +207,7 @@ class SweepCallback(Callback):
         names = [_identify_job(config, job) if divided else str(job) for job in jobs]
         chosen = (shard or Shard(1, 1)).part(names) if self._runs is None else self._runs
         self._jobs = [number for number, name in enumerate(names) if name in chosen]
-        self._open = {*self._jobs}
-        os.environ[LEFT_OUT] = " ".join(str(n) for n in range(len(names)) if n not in self._open)
+        os.environ[LEFT_OUT] = " ".join(str(n) for n in range(len(names)) if n not in self._jobs)
         if jobs and not self._jobs:
             if self._runs is None:
                 print(f"shard {config.shard} has no job: the sweep has only {len(set(names))}")
@@ -228,23 +226,18 @@ class SweepCallback(Callback):
         print(
             f"{label}: {value if failed else 'done'}", file=sys.stderr if failed else sys.stdout, flush=True
         )
-        if not failed or isinstance(value, InputError):
-            self._open.discard(number)
-        if failed and isinstance(value, InputError):
-            self._store.client.set_tag(self._parent, f"refused_{number}", f"{label}: {value}"[:500])
 
     def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
         """Close the parent run: no job has failed."""
         self._close(ended=True)
 
     def _close(self, ended: bool = False) -> None:
-        """End the parent run, once: FINISHED if each job ended or was refused; delete it without children."""
+        """End the parent run, once: FINISHED if no job failed; delete it without children."""
         store, self._store = self._store, None
         # Errors of the database were reported before; the next start closes the run.
         with suppress(Exception), self._held:
             if store is not None:
-                complete = ended or (self._jobs and not self._open)
-                store.end(self._parent, "FINISHED" if complete else "FAILED")
+                store.end(self._parent, "FINISHED" if ended else "FAILED")
                 if not store.find(**{"mlflow.parentRunId": self._parent}):
                     store.client.delete_run(self._parent)
 

@@ -392,17 +392,16 @@ def _text(data: bytes) -> Iterator[Adapter]:
     lines = [
         re.sub(rb"\x1b\[[0-9;]*[A-Za-z]|\0", b"", line).strip(b"\r\n ") for line in data.split(mark)[1:-1]
     ]
-    yield from _lines([line for line in lines if line and not line.startswith(b"#")], data, {})
+    yield from _lines([line for line in lines if line and not line.startswith(b"#")], {})
 
 
-def _lines(lines: Sequence[bytes], data: bytes, ending: dict[str, Any]) -> Iterator[Adapter]:
+def _lines(lines: Sequence[bytes], ending: dict[str, Any]) -> Iterator[Adapter]:
     yield Adapter(kind="json", **ending)
     for label in (":", "="):
         yield from (Adapter(kind="text", label=label, decimal=sign, **ending) for sign in (".", ","))
     words = [word for line in lines for word in re.split(rb"[;\t ]+", line)]
-    grouped = [word for word in words if re.fullmatch(rb"[-+]?\d{1,3}(,\d{3})+", word)]
     if (
-        grouped
+        any(re.fullmatch(rb"[-+]?\d{1,3}(,\d{3})+", word) for word in words)
         and len(words) >= 2 * len(lines)
         and any(word.isdigit() and int(word) < 1000 for word in words)
     ):
@@ -421,7 +420,7 @@ def _lines(lines: Sequence[bytes], data: bytes, ending: dict[str, Any]) -> Itera
         names = (*order[begin:], *order[:begin])
         yield Adapter(kind="text", pattern=pattern, names=names, rows=0, counter=None, **ending)
     yield from (replace(adapter, **ending) for adapter in _patterns(lines))
-    yield from (replace(read_adapter("anyskin"), **ending),)
+    yield replace(read_adapter("anyskin"), **ending)
     yield from (
         Adapter(kind="text", number=rf"-?\d+\.\d{{{decimals}}}", **ending) for decimals in range(1, 7)
     )
@@ -434,11 +433,10 @@ def _patterns(lines: Sequence[bytes]) -> Iterator[Adapter]:
         alike = [line for line in lines if tuple(b" ".join(t.split()) for t in _NUMBER.split(line)) == shape]
         if len(alike) < _FRAMES or len(shape) < 2:
             continue
-        tokens = [_NUMBER.findall(line) for line in alike]
         literals = [
             Counter(column).most_common(1)[0][0] for column in zip(*map(_NUMBER.split, alike), strict=True)
         ]
-        columns = list(zip(*tokens, strict=True))
+        columns = list(zip(*map(_NUMBER.findall, alike), strict=True))
         if INVALID & {word.lower() for text in literals for word in re.findall(rb"[A-Za-z/]+", text)}:
             continue  # the text is a value that is missing
         index = next(
@@ -464,21 +462,13 @@ def _patterns(lines: Sequence[bytes]) -> Iterator[Adapter]:
             name = "row" if position == index else word if word and not word[0].isdigit() else f"f{position}"
             name = name if name not in (*used, "values", "value", "name") else f"f{position}"
             used.add(name)
-            attached = position != index and index is not None
-            parts.append(
-                rf"{_WORD}?"
-                if attached
-                else rf"(?P<{name}>\d+)"
-                if position == index
-                else rf"(?P<{name}>{_WORD})"
-            )
+            others = rf"(?P<{name}>{_WORD})" if index is None else rf"{_WORD}?"
+            parts.append(rf"(?P<{name}>\d+)" if position == index else others)
         if first < len(columns) - 1 or index is not None:
             parts += [_literal(literals[first]), "(?P<values>.*?)"]
         pattern = "".join(parts) + _literal(literals[-1])
-        if index is None:
-            yield Adapter(kind="text", pattern=pattern)
-        else:
-            yield Adapter(kind="text", pattern=pattern, rows=0, index="row", counter=None)
+        rows: dict[str, Any] = {} if index is None else {"rows": 0, "index": "row", "counter": None}
+        yield Adapter(kind="text", pattern=pattern, **rows)
 
 
 def _literal(text: bytes) -> str:
@@ -497,4 +487,4 @@ def _endless(data: bytes, longest: int = 512) -> Iterator[Adapter]:
     words = Counter(re.findall(rb"[^\d\s.,;+-]+", data))
     for word, count in words.most_common(2):
         if count >= _FRAMES and word.isascii():
-            yield from _lines(data.split(word)[1:-1], data, {"end": word.decode()})
+            yield from _lines(data.split(word)[1:-1], {"end": word.decode()})

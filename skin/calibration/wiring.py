@@ -387,20 +387,18 @@ def wired_bench(
         each = bench.each if places is bench.gauge else per_newton(device.model, device.body, places)
         found += _explain(turn, responses, each)
     straight = found[0] if "as_given" in allowed else None
-    least = min(entry.residual.sum() for entry in found)
-    best = sorted(
-        (entry for entry in found if entry.residual.sum() <= least + _CLEARLY), key=lambda entry: entry.parts
-    )
+    limit = min(entry.residual.sum() for entry in found) + _CLEARLY
+    best = sorted((entry for entry in found if entry.residual.sum() <= limit), key=lambda entry: entry.parts)
     most = _MOST * responses.responding.sum()
     clear = [entry for entry in best if entry.parts and entry.sure and len(entry.unexplained) <= most]
-    if straight is not None:  # which a turn must improve where two exchanged channels would not
+    if straight is not None:  # a turn must improve more channels than an exchange of two does
         clear = [
             entry
             for entry in clear
             if {*entry.unexplained} <= {*straight.unexplained}
             and (entry.turn == "as_given" or (straight.residual > entry.residual + _BETTER).sum() >= _FEWEST)
         ]
-        if not len(straight.unexplained) and (straight in best or not clear):
+        if not len(straight.unexplained) and (straight.residual.sum() <= limit or not clear):
             return bench
     raise InputError(_refusal(straight, best[0], clear, confirmed, responses.responding))
 

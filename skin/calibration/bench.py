@@ -2,7 +2,7 @@
 
 import json
 import logging
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -47,14 +47,12 @@ def load_table(path: str | Path, what: str) -> tuple[pa.Table, dict[str, Any]]:
         InputError: no such file, another ending, unreadable, or no rows.
     """
     path = Path(path).expanduser()
-    if not path.is_dir():
-        path = tabular(path, f"a {what}")
+    path = path if path.is_dir() else tabular(path, f"a {what}")
     if not path.exists():
         raise InputError(f"no {what} {path}")
     try:
         if path.is_dir():
-            about, parts = read_parts(path)
-            table = _join(path, parts)
+            about, table = _join(path)
         elif path.suffix == ".parquet":
             with pa.parquet.ParquetFile(path) as file:
                 size = 16.0 * file.metadata.num_rows * file.metadata.num_columns
@@ -62,9 +60,8 @@ def load_table(path: str | Path, what: str) -> tuple[pa.Table, dict[str, Any]]:
                 table = file.read()
             about = json.loads((table.schema.metadata or {}).get(_KEY, b"{}"))
         else:
-            lines = path.read_bytes().removeprefix(b"\xef\xbb\xbf").splitlines()
-            rows = b"".join(line + b"\n" for line in lines if not line.startswith(b"#"))
-            table = pa.csv.read_csv(pa.py_buffer(rows))
+            frame = pd.read_csv(path, comment="#", index_col=False, encoding="utf-8-sig", low_memory=False)
+            table = pa.Table.from_pandas(frame, preserve_index=False)
             sidecar = path.with_name(path.name + ".json")
             about = json.loads(sidecar.read_text(encoding="utf-8")) if sidecar.is_file() else {}
         if not isinstance(about, dict):
@@ -78,15 +75,17 @@ def load_table(path: str | Path, what: str) -> tuple[pa.Table, dict[str, Any]]:
     return table.rename_columns([name.strip() for name in table.column_names]), about
 
 
-def _join(folder: Path, parts: Mapping[Path, pa.Table | None]) -> pa.Table:
-    """Return the frames in all intact files of a session of skin record."""
+def _join(folder: Path) -> tuple[dict[str, Any], pa.Table]:
+    """Return the metadata of a session of skin record, and the frames in all of its intact files."""
+    about, parts = read_parts(folder)
     if damaged := [path.name for path, part in parts.items() if part is None]:
         _log.warning("%s: damaged files are left out: %s", folder, ", ".join(damaged))
     intact = [part for part in parts.values() if part is not None]
     if not intact:
         raise ValueError("it has no frames: record some")
     table = pa.concat_tables(intact).sort_by("time")
-    return table.select([name for name in table.column_names if name in _OTHER or name.startswith("raw_")])
+    names = [name for name in table.column_names if name in _OTHER or name.startswith("raw_")]
+    return about, table.select(names)
 
 
 def numbers(table: pa.Table, name: str, where: str) -> np.ndarray:
@@ -425,7 +424,6 @@ def write_bench_session(session: BenchSession, path: str | Path) -> Path:
 
 _LEAD, _TAIL = 0.2, 1.0  # s around a press that are not idle
 _FEWEST = 50  # idle frames
-_SUDDEN = 2  # frames that a release may take
 
 
 def true_readings(gauge: Gauge, each: np.ndarray, time: np.ndarray) -> np.ndarray:
@@ -461,11 +459,10 @@ class BenchData:
     @cached_property
     def idle(self) -> np.ndarray:
         """Frames without a press, (T,), bool."""
-        time, busy = self.session.time, np.zeros(len(self.session.time), dtype=bool)
-        ends = np.append(self.gauge.first[1:], len(self.gauge.time)) - 1
-        for start, end in zip(self.gauge.time[self.gauge.first], self.gauge.time[ends], strict=True):
-            busy |= (time >= start - _LEAD) & (time <= end + _TAIL)
-        return ~busy
+        first, time = self.gauge.first, self.session.time
+        ends = self.gauge.time[np.append(first[1:], len(self.gauge.time)) - 1]
+        begun = np.searchsorted(self.gauge.time[first] - _LEAD, time, side="right")
+        return (begun == 0) | (time > ends[begun - 1] + _TAIL)
 
     def frames_of(self, presses: Collection[int]) -> np.ndarray:
         """Frames of some presses, (T,), bool."""
@@ -482,19 +479,15 @@ class BenchData:
         """Frames at the largest force of their press so far, (T,), bool."""
         return (self.applied[0] > 0) & (self.applied[0] >= 0.995 * self.peaks)
 
-    @cached_property
-    def releases(self) -> list[slice]:
-        """Frames from each sudden release to the next press, one slice per such release."""
-        force, press = self.applied
-        releases = []
-        for number in range(len(self.gauge)):
-            mine = np.flatnonzero(press == number)
-            loaded = mine[force[mine] > 0.02 * force[mine].max(initial=0)]
-            if not len(loaded) or force[max(loaded[-1] - _SUDDEN, 0)] < 0.2 * force[mine].max():
-                continue
-            later = np.flatnonzero((press > number) & (force > 0))
-            releases.append(slice(loaded[-1] + _SUDDEN, later[0] if len(later) else len(force)))
-        return releases
+
+def check_channels(device: Simulated, session: BenchSession) -> None:
+    """Raise InputError unless a session has a channel for each sensor of the layout."""
+    channels, sensors = session.raw.shape[1], len(device.sensors)
+    if channels != sensors:
+        raise InputError(
+            f"the session has {channels} channels, the layout {sensors} sensors: give the layout it was "
+            "recorded with, as in layout=file layout.path=FILE.csv"
+        )
 
 
 def build_bench_data(device: Simulated, session: BenchSession, gauge: Gauge | None) -> BenchData:
@@ -506,12 +499,7 @@ def build_bench_data(device: Simulated, session: BenchSession, gauge: Gauge | No
     rows = gauge or session.gauge
     if rows is None:
         raise InputError("no force in the session: add presses=gauge.csv with time, force, x_m and y_m")
-    channels, sensors = session.raw.shape[1], len(device.sensors)
-    if channels != sensors:
-        raise InputError(
-            f"the session has {channels} channels, the layout {sensors} sensors: give the layout it was "
-            "recorded with, as in layout=file layout.path=FILE.csv"
-        )
+    check_channels(device, session)
     model = device.simulator(device.body, device.sensors)
     bench = BenchData(session, rows, per_newton(model, device.body, rows))
     if not bench.loading.any():

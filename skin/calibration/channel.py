@@ -50,9 +50,9 @@ class Channel:
         middle: logarithms of a true reading, N, and of the value that it has.
         span: logarithms of the least and largest true reading that were seen, N.
         error: standard error of the logarithm of the gain, of the noise alone.
-        clip: largest value; None: it was not reached.
+        clip: largest value; NaN: it was not reached.
         time_constant: of a first-order lag, s.
-        hysteresis: mean gap between unloading and loading, fraction of the peak; None: not observed.
+        hysteresis: mean gap between unloading and loading, fraction of the peak; NaN: not observed.
     """
 
     slopes: np.ndarray = field(default_factory=lambda: np.ones(1))
@@ -60,9 +60,9 @@ class Channel:
     middle: tuple[float, float] = (0.0, 0.0)
     span: tuple[float, float] = (0.0, 0.0)
     error: float = np.inf
-    clip: float | None = None
+    clip: float = np.nan
     time_constant: float = 0.0
-    hysteresis: float | None = None
+    hysteresis: float = np.nan
 
     @property
     def kind(self) -> str:
@@ -323,9 +323,9 @@ def _describe(
         (middle, float(solution[0])),
         (float(seen.min(initial=0.0)) + middle, float(seen.max(initial=0.0)) + middle),
         float(errors[0]) if below.sum() >= _BELOW else np.inf,
-        limit if above.sum() >= _FEWEST else None,
+        limit if above.sum() >= _FEWEST else np.nan,
         float(np.interp(solution[2], np.arange(_LAGS), loads.lags)) * (solution[2] >= 1),
-        float(bend) if falling.sum() >= _FEWEST else None,
+        float(bend) if falling.sum() >= _FEWEST else np.nan,
     )
 
 

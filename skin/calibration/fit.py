@@ -9,8 +9,6 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import torch
-from rich.console import Console
-from rich.table import Table
 from scipy.stats import theilslopes
 
 from skin.calibration.bench import BenchData, BenchSession
@@ -18,7 +16,6 @@ from skin.calibration.channel import Channel, Loads, describe_channels, fit_chan
 from skin.calibration.wiring import (
     MAD,
     QUIET,
-    Rest,
     check_usable,
     collect_responses,
     find_polarity,
@@ -64,13 +61,12 @@ def fit_calibration(bench: BenchData, presses: Collection[int] | None = None) ->
             f"channel {few[0]} has {counts[few[0]]} idle frames: do not touch the skin for some seconds"
         )
     rests = measure_rests(bench.session, bench.idle)
-    polarity = find_polarity(responses, bench.each)
-    offset, drift = (np.array([getattr(rest, name) for rest in rests]) for name in ("offset", "drift"))
+    polarity, (offset, drift) = find_polarity(responses, bench.each), rests[["offset", "drift"]].to_numpy().T
     changes = polarity * (raw - offset - drift * bench.session.time[:, None])
     driven = bench.true[bench.frames_of(used)].max(axis=0, initial=0.0)
     loads, channels = Loads(bench, used), dict[int, Channel]()
     for number in np.flatnonzero(usable & (driven >= _PRESSED * driven.max())).tolist():
-        noise = math.hypot(rests[number].noise, rests[number].step / math.sqrt(12))
+        noise = math.hypot(rests["noise"][number], rests["quantum"][number] / math.sqrt(12))
         channel = fit_channel(loads, bench.each[:, number], changes[:, number], noise)
         channels |= {} if channel is None else {number: channel}
     if not any(channel.known for channel in channels.values()):
@@ -83,19 +79,13 @@ def fit_calibration(bench: BenchData, presses: Collection[int] | None = None) ->
 
 def _find_broken(session: BenchSession, pressed: np.ndarray, responding: np.ndarray) -> dict[str, list[int]]:
     """Return the broken channels by kind: those that never change, or are silent though ``pressed``, N."""
-    broken: dict[str, list[int]] = {kind: [] for kind in BROKEN}
-    largest = float(np.nanmax(session.raw, initial=-np.inf))
+    largest, table = float(np.nanmax(session.raw, initial=-np.inf)), pd.DataFrame(session.raw)
     limit = min(2**session.bits - 1 if session.bits else np.inf, _LIMIT * largest)
     silent = (pressed >= _PRESSED * pressed.max()) & ~responding
-    for number, values in enumerate(session.raw.T):
-        present = values[np.isfinite(values)]
-        still = not len(present) or np.ptp(present) == 0
-        level = float(present[0]) if still and len(present) else 0.0
-        if level != 0:
-            broken["saturated" if level >= limit > 0 else "stuck"].append(number)
-        elif still or silent[number]:
-            broken["dead"].append(number)
-    return broken
+    still, level = table.nunique().to_numpy() < 2, table.bfill().iloc[0].fillna(0.0).to_numpy()
+    fixed, full = still & (level != 0), (level >= limit) & (limit > 0)
+    kinds = {"dead": ~fixed & (still | silent), "stuck": fixed & ~full, "saturated": fixed & full}
+    return {kind: np.flatnonzero(kinds[kind]).tolist() for kind in BROKEN}
 
 
 def _curved_noise(bench: BenchData, curves: Curves, number: int, change: np.ndarray) -> float:
@@ -111,11 +101,10 @@ def _curved_noise(bench: BenchData, curves: Curves, number: int, change: np.ndar
 
 def _curves(channels: Mapping[int, Channel], sensors: int) -> Curves | None:
     """Return the curves of all channels, in the session's unit; None: all are linear."""
-    bent = {n: channel for n, channel in channels.items() if channel.kind != "linear" and channel.known}
+    bent = {n: channel for n, channel in channels.items() if channel.kind != "linear"}
     if not bent:
         return None
-    at = math.exp(float(np.median([channel.middle[1] for channel in bent.values()])))
-    exponent = np.ones(sensors)
+    at, exponent = math.exp(float(np.median([one.middle[1] for one in bent.values()]))), np.ones(sensors)
     for number, channel in bent.items():
         exponent[number] = channel.slopes[0] if channel.kind == "power" else 1.0
     tables = {n: channel.table(at) for n, channel in bent.items() if channel.kind == "table"}
@@ -124,30 +113,24 @@ def _curves(channels: Mapping[int, Channel], sensors: int) -> Curves | None:
 
 def _describe(
     bench: BenchData,
-    rests: Sequence[Rest],
+    rests: pd.DataFrame,
     polarity: np.ndarray,
     channels: Mapping[int, Channel],
     changes: np.ndarray,
     broken: Mapping[str, list[int]],
 ) -> Calibration:
     """Return the calibration that follows from the rest and the response of every channel."""
-    curves, known = _curves(channels, len(rests)), {n: one for n, one in channels.items() if one.known}
-    at = 1.0 if curves is None else float(curves.at[0])
-    values = {
-        name: np.array([getattr(rest, name) for rest in rests]) for name in ("offset", "noise", "drift")
-    }
-    values |= {"drift": polarity * values["drift"], "quantum": np.array([rest.step for rest in rests])}
-    names = ("clip", "gain", "hysteresis", "time_constant", *(() if curves is None else ("exponent",)))
-    values |= {name: np.full(len(rests), np.nan) for name in names}
-    for number, channel in channels.items():
-        values["clip"][number] = np.nan if channel.clip is None else channel.clip
-    for number, channel in known.items():
-        values["gain"][number], values["time_constant"][number] = channel.gain(at), channel.time_constant
-        values["hysteresis"][number] = np.nan if channel.hysteresis is None else channel.hysteresis
-        if curves is not None:
-            values["exponent"][number] = curves.exponent[number]
-            if channel.kind != "linear":
-                values["noise"][number] = _curved_noise(bench, curves, number, changes[:, number])
+    known = {n: one for n, one in channels.items() if one.known}
+    curves = _curves(known, len(rests))
+    at, values = 1.0 if curves is None else float(curves.at[0]), rests.assign(drift=polarity * rests["drift"])
+    values["clip"] = pd.Series({n: one.clip for n, one in channels.items()})
+    values["gain"] = pd.Series({n: one.gain(at) for n, one in known.items()})
+    for name in ("hysteresis", "time_constant"):
+        values[name] = pd.Series({n: getattr(one, name) for n, one in known.items()})
+    if curves is not None:
+        values["exponent"] = pd.Series(curves.exponent)[list(known)]
+        for n in (n for n, one in known.items() if one.kind != "linear"):
+            values.loc[n, "noise"] = _curved_noise(bench, curves, n, changes[:, n])
     metadata = {"presses": len(bench.gauge), "frames": len(bench.session.time)}
     calibration = convert_to_newton(bench.session, values, polarity, broken, metadata)
     scale, (low, high) = calibration.scale, calibration.ranges["gain"]
@@ -162,7 +145,7 @@ def _describe(
 
 def convert_to_newton(
     session: BenchSession,
-    values: Mapping[str, np.ndarray],
+    values: pd.DataFrame,
     polarity: np.ndarray,
     broken: Mapping[str, Sequence[int]],
     metadata: Mapping[str, Any],
@@ -171,7 +154,8 @@ def convert_to_newton(
 
     Args:
         session: of the channels.
-        values: quantity -> (S,), in the session's unit, gain per N, offset of the raw values; NaN if unknown.
+        values: columns of quantities (S,), in the session's unit, gain per N, offset of the raw values; NaN
+            if unknown.
         polarity: (S,), 1 or -1.
         broken: kind -> numbers of channels.
         metadata: origin of the calibration.
@@ -182,7 +166,7 @@ def convert_to_newton(
     if session.unit != "N":
         scale, zero = 1 / float(np.nanmedian(values["gain"])), float(np.median(values["offset"][alive]))
     sensors, ranges = dict[str, list[float | None]](), {"dead": [0.0, float((~alive).sum())]}
-    for name, column in {**values, "offset": polarity * (values["offset"] - zero)}.items():
+    for name, column in values.assign(offset=polarity * (values["offset"] - zero)).items():
         converted = column * (1.0 if name in ("hysteresis", "time_constant", "exponent") else scale)
         # No negative 0.
         sensors[name] = [float(f"{value:.6g}") + 0.0 if np.isfinite(value) else None for value in converted]
@@ -201,24 +185,22 @@ class HeldOutErrors:
     """Errors on presses that were not used for the calibration.
 
     Attributes:
-        simulated: RMSE of the simulated true readings (gain 1, no offset), N.
-        tared: RMSE with each sensor's offset added, N.
-        calibrated: RMSE of the calibrated simulation, N.
+        rmse: N, of the ``simulated`` true readings (gain 1, no offset), of these ``tared``, with the offset
+            of each sensor, and of the ``calibrated`` simulation.
         held_out: numbers of these presses.
         force: ratio of estimated force to the gauge's, median over the loading of each held-out press, (n,);
             empty if no sensor could be used.
     """
 
-    simulated: float
-    tared: float
-    calibrated: float
+    rmse: dict[str, float]
     held_out: Sequence[int]
     force: np.ndarray
 
     @property
     def helps(self) -> bool:
         """Whether the calibrated simulation has a smaller error than taring alone."""
-        return self.calibrated < 0.99 * min(self.simulated, self.tared)  # less is chance
+        # Less than a hundredth is chance.
+        return self.rmse["calibrated"] < 0.99 * min(self.rmse["simulated"], self.rmse["tared"])
 
 
 def evaluate_held_out(bench: BenchData, fraction: float) -> HeldOutErrors:
@@ -243,19 +225,10 @@ def evaluate_held_out(bench: BenchData, fraction: float) -> HeldOutErrors:
     responding = answers > _RESPONDING * answers.max(axis=1, keepdims=True)
     alive = ~calibration.values()["dead"] & np.isfinite(bench.session.raw)
     counted = bench.frames_of(held)[:, None] & responding & alive
-    measured, true = calibration.newtons(bench.session.raw), bench.true
-
-    def rmse(guess: np.ndarray) -> float:
-        return float(np.sqrt(np.mean((guess[counted] - measured[counted]) ** 2)))
-
-    offset = calibration.values()["offset"]
-    return HeldOutErrors(
-        rmse(true),
-        rmse(true + offset),
-        rmse(predict_session(bench, calibration)),
-        held,
-        _estimate_forces(bench, held, calibration),
-    )
+    measured, tared = calibration.newtons(bench.session.raw), bench.true + calibration.values()["offset"]
+    sides = {"simulated": bench.true, "tared": tared, "calibrated": predict_session(bench, calibration)}
+    rmse = {name: float(np.sqrt(np.mean((side - measured)[counted] ** 2))) for name, side in sides.items()}
+    return HeldOutErrors(rmse, held, _estimate_forces(bench, held, calibration))
 
 
 def predict_session(bench: BenchData, calibration: Calibration) -> np.ndarray:
@@ -420,21 +393,20 @@ def fit_presses(bench: BenchData, fraction: float, clip: float | None) -> tuple[
     if clip is not None:
         check_force(calibration, clip)
     outcome = evaluate_held_out(bench, fraction)
-    rmse = {name: round(getattr(outcome, name), 6) for name in ("simulated", "tared", "calibrated")}
+    rmse = {name: round(value, 6) for name, value in outcome.rmse.items()}
     metadata = {**calibration.about, "held_out": list(outcome.held_out), "rmse": rmse}
     return replace(calibration, about=metadata), outcome
 
 
 def print_calibration(calibration: Calibration, outcome: HeldOutErrors) -> None:
     """Print the constants of working sensors, the broken, inverse and weak ones, and held-out errors."""
-    table = Table("", "median", "least", "largest", "", box=None, pad_edge=False)
-    for name in QUANTITIES:
-        values = [value for value in calibration.sensors.get(name, []) if value is not None]
-        if values and name in calibration.ranges:
-            low, high = calibration.ranges[name]
-            middle = f"{np.median(values):.4g}"
-            table.add_row(name, middle, f"{low:.4g}", f"{high:.4g}", _UNITS.get(name, "N"))
-    Console().print(table)
+    rows = {
+        name: [np.median(calibration.known(name)), *calibration.ranges[name], _UNITS.get(name, "N")]
+        for name in QUANTITIES
+        if name in calibration.ranges
+    }
+    table = pd.DataFrame.from_dict(rows, orient="index", columns=["median", "least", "largest", ""])
+    print(table.to_string(float_format="{:.4g}".format))
     for line in calibration.about.get("responses", []):
         print(line)
     gains = {n: gain for n, gain in enumerate(calibration.sensors["gain"]) if gain is not None}
@@ -450,10 +422,8 @@ def print_calibration(calibration: Calibration, outcome: HeldOutErrors) -> None:
     for words, numbers, note in groups:
         if numbers:
             print(f"{words}: sensors {', '.join(map(str, numbers))}{note}")
-    print(
-        f"RMSE on {len(outcome.held_out)} held-out presses: simulated {outcome.simulated:.4f} N, with tare "
-        f"{outcome.tared:.4f} N, calibrated {outcome.calibrated:.4f} N"
-    )
+    errors = ", ".join(f"{name} {value:.4f} N" for name, value in outcome.rmse.items())
+    print(f"RMSE on {len(outcome.held_out)} held-out presses: {errors}")
     if len(outcome.force):
         off = np.abs(outcome.force - 1)
         print(f"force of these presses from readings: off by {np.median(off):.1%}, at most {off.max():.1%}")

@@ -16,7 +16,14 @@ import torch
 from pydantic import PositiveFloat
 
 from skin.body.base import AbstractBody, Sensors
-from skin.calibration.bench import BenchSession, Gauge, per_newton, true_readings, write_bench_session
+from skin.calibration.bench import (
+    BenchSession,
+    Gauge,
+    check_channels,
+    per_newton,
+    true_readings,
+    write_bench_session,
+)
 from skin.calibration.fit import convert_to_newton
 from skin.calibration.wiring import MAD, find_quantum, list_numbers, measure_rests
 from skin.core.settings import configured
@@ -214,12 +221,7 @@ def fit_known_load(device: Simulated, session: BenchSession, load: KnownLoad) ->
     Raises:
         InputError: another number of channels, no placement, or sensors without one.
     """
-    channels, sensors = session.raw.shape[1], len(device.sensors)
-    if channels != sensors:
-        raise InputError(
-            f"the session has {channels} channels, the layout {sensors} sensors: give the layout it was "
-            "recorded with, as in layout=file layout.path=FILE.csv"
-        )
+    check_channels(device, session)
     placements = find_placements(session)
     if not len(placements.change):
         touched = f" ({placements.unsteady} changed while they lay, or were touched)"
@@ -308,17 +310,16 @@ def _build(
     rests = measure_rests(
         replace(session, time=session.time - session.time[placements.idle].mean()), placements.idle
     )
-    offset, noise, steps = np.array([(rest.offset, rest.noise, rest.step) for rest in rests]).T
     absolute = np.where(np.isfinite(gains), gains * signs, np.nan)
     typical = float(np.nanmedian(absolute))
-    quiet = float(np.median(np.maximum(noise, steps / math.sqrt(12)))) / typical
+    quiet = float(np.median(np.maximum(rests["noise"], rests["quantum"] / math.sqrt(12)))) / typical
     if quiet < usual / _QUIETER:
         raise InputError(
             f"weight={load.weight:g} (kg) would mean a noise of {quiet:.2g} N, device.noise is {usual:g}: "
             "give the load in this unit, or device.noise= if the sensors are so quiet"
         )
     metadata = {"placements": len(placements.change), "weight": load.weight, "base": load.base}
-    values = {"offset": offset, "noise": noise, "quantum": steps, "gain": absolute}
+    values = rests.drop(columns="drift").assign(gain=absolute)
     calibration = convert_to_newton(session, values, signs, {"dead": dead}, metadata)
     return LoadResult(calibration, counts, differ, never)
 

@@ -7,7 +7,7 @@ it would be if the positions of the presses were mirrored or turned, or the chan
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -33,8 +33,7 @@ _INVERSE = 4.5  # factor on the residual of a channel whose polarity is not that
 _STRONGER = 20.0  # response over its prediction, relative to the strongest: above, the channel is a wrong one
 
 
-@dataclass(frozen=True)
-class Rest:
+class Rest(NamedTuple):
     """Statistics of an untouched channel, in the session's unit.
 
     Attributes:
@@ -42,29 +41,27 @@ class Rest:
         drift: per s; 0 if its 95 % confidence interval contains 0.
         noise: 1.4826 times the median absolute deviation; with steps of similar size, the standard
             deviation without outliers.
-        step: of the converter; 0: continuous.
+        quantum: step of the converter; 0: continuous.
     """
 
-    offset: float = 0.0
-    drift: float = 0.0
-    noise: float = 0.0
-    step: float = 0.0
+    offset: float
+    drift: float
+    noise: float
+    quantum: float
 
 
-def measure_rests(session: BenchSession, idle: np.ndarray) -> list[Rest]:
-    """Return the rest of every channel in idle frames, (T,) bool; one that never changes has no noise."""
+def measure_rests(session: BenchSession, idle: np.ndarray) -> pd.DataFrame:
+    """Return the :class:`Rest` of each channel, (S, 4), of idle frames, (T,); still ones have no noise."""
     rests = []
     for values in session.raw.T:
         present = np.isfinite(values)
-        quiet = values[present & idle]
+        quiet, quantum = values[present & idle], find_quantum(values[present])
         if len(quiet) < QUIET or np.ptp(quiet) == 0:
             spare = quiet if len(quiet) else values[present]
-            rests.append(
-                Rest(float(np.median(spare)) if len(spare) else 0.0, step=find_quantum(values[present]))
-            )
-            continue
-        rests.append(measure_rest(session.time[present & idle], quiet, find_quantum(values[present])))
-    return rests
+            rests.append(Rest(float(np.median(spare)) if len(spare) else 0.0, 0.0, 0.0, quantum))
+        else:
+            rests.append(measure_rest(session.time[present & idle], quiet, quantum))
+    return pd.DataFrame(rests)
 
 
 def find_quantum(values: np.ndarray) -> float:
@@ -133,27 +130,11 @@ class Responses:
     responding: np.ndarray
 
 
-@dataclass(frozen=True)
-class Match:
-    """How well every channel is explained by the prediction for every sensor.
-
-    Attributes:
-        residual: (channels, sensors), fraction of a channel's energy that the prediction does not explain
-            with any gain and limit, without that of the noise: 0 to 1.
-        sign: (channels, sensors), 1 or -1: whether the channel rises or falls with force.
-        expected: (sensors,), largest prediction, as a fraction of the largest of all.
-    """
-
-    residual: np.ndarray
-    sign: np.ndarray
-    expected: np.ndarray
-
-
 def collect_responses(bench: BenchData) -> Responses:
     """Return the responses of all channels of a session, which do not depend on places or layout."""
     raw, (force, press) = bench.session.raw, bench.applied
     idle = np.flatnonzero(bench.idle)
-    rows, forces, numbers, counts, rests = [], [], [], [], []
+    steps, rests = [], []
     resting = find_medians(raw[idle])
     for number in range(len(bench.gauge)):
         frames = np.flatnonzero((press == number) & bench.loading)
@@ -164,21 +145,20 @@ def collect_responses(bench: BenchData) -> Responses:
         level = np.where(np.isfinite(level), level, resting)
         rests.append(level)
         for step in np.array_split(frames, min(_STEPS, len(frames))):
-            rows.append(find_medians(raw[step]) - level)
-            forces.append(np.median(force[step]))  # as the readings: a part may hold two levels
-            numbers.append(number)
-            counts.append(len(step))
-    measured = np.nan_to_num(np.array(rows))
-    noise, step = np.array([(rest.noise, rest.step) for rest in measure_rests(bench.session, bench.idle)]).T
+            # Of the force as of the readings: a part may hold two levels.
+            steps.append((find_medians(raw[step]) - level, np.median(force[step]), number, len(step)))
+    rows, forces, numbers, counts = map(np.array, zip(*steps, strict=True))
+    measured = np.nan_to_num(rows)
+    noise, step = measure_rests(bench.session, bench.idle)[["noise", "quantum"]].to_numpy().T
     error = noise * _MEDIAN * math.sqrt(1 / float(np.median(counts)) + 1 / _BEFORE)
     if len(rests) > 2:  # slow noise, which no mean reduces
         error = np.maximum(error, MAD * np.nan_to_num(find_medians(np.abs(np.diff(rests, axis=0)))))
     floor = np.maximum(np.maximum(_SURE * error, _VISIBLE * noise), _STEP * step)
     responding = np.abs(measured).max(axis=0) > floor
-    return Responses(measured, np.array(forces), np.array(numbers), error, responding)
+    return Responses(measured, forces, numbers, error, responding)
 
 
-def match_channels(responses: Responses, per_newton: np.ndarray) -> Match:
+def match_channels(responses: Responses, per_newton: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Compare every channel with the prediction for every sensor.
 
     A channel reads gain times the prediction up to a limit. Both are free, and the gain may be negative. But
@@ -187,6 +167,12 @@ def match_channels(responses: Responses, per_newton: np.ndarray) -> Match:
     Args:
         responses: of the session.
         per_newton: (P, S), true readings per N of every press.
+
+    Returns:
+        residual: (channels, sensors), fraction of a channel's energy that the prediction does not explain
+            with any gain and limit, without that of the noise: 0 to 1.
+        sign: (channels, sensors), 1 or -1: whether the channel rises or falls with force.
+        expected: (sensors,), largest prediction, as a fraction of the largest of all.
     """
     prediction = responses.force[:, None] * per_newton[responses.press]  # N, (F, S)
     largest = np.abs(prediction).max(axis=0)
@@ -211,7 +197,7 @@ def match_channels(responses: Responses, per_newton: np.ndarray) -> Match:
     nearest = sign[np.arange(len(sign)), residual.argmin(axis=1)][responses.responding]
     maximum = -1.0 if nearest.sum() < 0 else 1.0
     residual = np.where(sign == maximum, residual, np.minimum(_INVERSE * residual, 1.0))
-    return Match(residual, sign, expected)
+    return residual, sign, expected
 
 
 def find_polarity(responses: Responses, per_newton: np.ndarray) -> np.ndarray:
@@ -219,7 +205,7 @@ def find_polarity(responses: Responses, per_newton: np.ndarray) -> np.ndarray:
 
     A channel that does not respond has the polarity of most others.
     """
-    signs = np.diagonal(match_channels(responses, per_newton).sign)
+    signs = np.diagonal(match_channels(responses, per_newton)[1])
     maximum = -1.0 if signs[responses.responding].sum() < 0 else 1.0
     return np.where(responses.responding, signs, maximum)
 
@@ -256,7 +242,8 @@ TURNS: dict[Turn, tuple[np.ndarray, str]] = {
 sheet, x right and y down; and its words."""
 _FITS = 0.45  # residual: sensors misplaced by 5 mm leave 0.25, another sensor 0.6 and more
 _WELL = 0.15  # residual: a channel that is called exchanged has to fit its new place at least as well
-_CLEARER = 2.0, 0.1  # another explanation leaves less than half of the residual, less 0.1 of a channel's
+_NO_FIT = 0.5  # residual of a channel that fits no better
+_CLEARLY, _BETTER = 0.3, 0.2  # less residual of all channels, and of one, that another explanation leaves
 _MOST = 0.25  # fraction of the responding channels that an explanation may leave, and of unusable sensors
 _PRESSED = 0.2  # of the largest prediction: a sensor with less was not pressed, so it identifies no channel
 _LISTED = 12  # channels in a message
@@ -330,7 +317,7 @@ class _Explanation:
     Attributes:
         turn: of the positions.
         sensors: (S,), sensor of every channel.
-        residual: (S,), of every channel at its sensor, 0 to 1; 0 where it does not respond.
+        residual: (S,), of every channel at its sensor, up to 0.5, of no fit; 0 where it does not respond.
         sure: whether every channel away from its own sensor fits well, and nowhere else about as well.
     """
 
@@ -353,23 +340,6 @@ class _Explanation:
     def parts(self) -> int:
         """How much the explanation supposes."""
         return (self.turn != "as_given") + len(self.moved)
-
-    def leaves_more(self, rival: "_Explanation") -> bool:
-        """Return whether another explanation leaves clearly less."""
-        factor, minimum = _CLEARER
-        differs = (self.sensors != rival.sensors) | (self.turn != rival.turn)
-        clearly = self.residual[differs].sum() > factor * rival.residual[differs].sum() + minimum
-        return bool(len(self.unexplained) > len(rival.unexplained) or clearly)
-
-    def improves(self, straight: "_Explanation | None", responding: np.ndarray) -> bool:
-        """Return whether it may be named in place of the layout as it is, where that is possible."""
-        if not (self.parts and self.sure and len(self.unexplained) <= _MOST * responding.sum()):
-            return False
-        if straight is None:
-            return True
-        better = straight.residual > _CLEARER[0] * self.residual + _CLEARER[1]
-        kept = not len(np.setdiff1d(self.unexplained, straight.unexplained))
-        return kept and (self.turn == "as_given" or int(better.sum()) >= _FEWEST)
 
     def words(self, confirmed: Confirmed) -> str:
         """Return the explanation in words, with the settings that confirm it."""
@@ -415,40 +385,42 @@ def wired_bench(
     responses, found = collect_responses(bench), list[_Explanation]()
     for turn, places in allowed.items():
         each = bench.each if places is bench.gauge else per_newton(device.model, device.body, places)
-        found += _explain(match_channels(responses, each), responses.responding, turn)
+        found += _explain(turn, responses, each)
     straight = found[0] if "as_given" in allowed else None
-    least = min(found, key=lambda entry: (len(entry.unexplained), entry.residual.sum()))
-    best = sorted((one for one in found if not one.leaves_more(least)), key=lambda entry: entry.parts)
-    clear = [entry for entry in best if entry.improves(straight, responses.responding)]
-    if straight and not len(straight.unexplained) and (straight in best or not clear):
-        return bench
+    limit = min(entry.residual.sum() for entry in found) + _CLEARLY
+    best = sorted((entry for entry in found if entry.residual.sum() <= limit), key=lambda entry: entry.parts)
+    most = _MOST * responses.responding.sum()
+    clear = [entry for entry in best if entry.parts and entry.sure and len(entry.unexplained) <= most]
+    if straight is not None:  # a turn must improve more channels than an exchange of two does
+        clear = [
+            entry
+            for entry in clear
+            if {*entry.unexplained} <= {*straight.unexplained}
+            and (entry.turn == "as_given" or (straight.residual > entry.residual + _BETTER).sum() >= _FEWEST)
+        ]
+        if not len(straight.unexplained) and (straight.residual.sum() <= limit or not clear):
+            return bench
     raise InputError(_refusal(straight, best[0], clear, confirmed, responses.responding))
 
 
-def _explain(match: Match, responding: np.ndarray, turn: Turn) -> list[_Explanation]:
+def _explain(turn: Turn, responses: Responses, per_newton: np.ndarray) -> list[_Explanation]:
     """Return the explanation that leaves channels at their sensors, and the one that permutes them best."""
+    (residual, _, expected), responding = match_channels(responses, per_newton), responses.responding
     channels = np.arange(len(responding))
-    cost = np.where(responding[:, None], match.residual, 0.5)
-    # Among equal places a channel stays at its own.
+    # A channel that fits nowhere, or is silent, stays at its own sensor where that is free.
+    cost = np.where(responding[:, None] & (residual <= _FITS), residual, _NO_FIT)
     _, sensors = linear_sum_assignment(cost - 1e-6 * np.eye(len(cost)))
-    settled = responding & (cost[channels, sensors] <= _FITS)
-    # Unsettled channels stay at their own sensors, where these are free.
-    free = np.setdiff1d(channels, sensors[settled])
-    stay = np.intersect1d(free, channels[~settled])
-    sensors[stay] = stay
-    sensors[~settled & ~np.isin(channels, stay)] = np.setdiff1d(free, stay)
     straight, permuted = (
         np.where(responding, cost[channels, position], 0.0) for position in (channels, sensors)
     )
-    factor, minimum = _CLEARER
-    moved = settled & (sensors != channels)
-    cost[channels, sensors] = 1.0
-    sure = (cost.min(axis=1) > factor * permuted + minimum) & (permuted <= _WELL)
-    sure &= match.expected[sensors] >= _PRESSED
+    moved, settled = sensors != channels, cost[channels, sensors] < _NO_FIT
+    cost[channels, sensors] = _NO_FIT
+    sure = (cost.min(axis=1) > permuted + _BETTER) & (permuted <= _WELL)
+    sure &= expected[sensors] >= _PRESSED
     # Of two silent channels, nothing says which is where.
-    known = bool(sure[moved].all()) and int((~settled & (sensors != channels)).sum()) <= 1
+    known = bool(sure[moved & settled].all()) and (moved & ~settled).sum() <= 1
     found = [_Explanation(turn, channels, straight), _Explanation(turn, sensors, permuted, known)]
-    return found if len(found[1].moved) else found[:1]
+    return found if moved.any() else found[:1]
 
 
 def _refusal(
@@ -462,9 +434,7 @@ def _refusal(
     order, wrong = np.array(confirmed.order(len(responding))), np.flatnonzero(responding)
     trouble = "the places of some presses are outside the sheet"
     if straight is not None:
-        wrong = np.flatnonzero(
-            (straight.residual > _CLEARER[0] * best.residual + _CLEARER[1]) | (straight.residual > _FITS)
-        )
+        wrong = np.flatnonzero(straight.residual > np.minimum(best.residual + _BETTER, _FITS))
         listed = list_numbers(np.sort(order[wrong]))
         trouble = f"channel {listed} responds, but not to the presses near its sensor"
         if len(wrong) > 1:

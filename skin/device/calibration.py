@@ -249,11 +249,8 @@ class Calibration:
         A sensor that was never driven to its limit thus clips like the others: channels share a converter.
         """
         values = np.array([np.nan if value is None else value for value in self.sensors.get(name, [None])])
-        values = np.broadcast_to(values, (len(self),))
-        spare = QUANTITIES[name]
-        if np.isfinite(values).any():
-            spare = float(np.nanmedian(values))
-        return np.where(np.isnan(values), spare, values)
+        spare = float(np.nanmedian(values)) if np.isfinite(values).any() else QUANTITIES[name]
+        return np.where(np.isnan(values), spare, np.broadcast_to(values, (len(self),)))
 
     def values(self) -> dict[str, np.ndarray]:
         """Return every quantity, (S,), with ``dead`` and the constant ``level`` of broken sensors, N."""
@@ -269,11 +266,12 @@ class Calibration:
 
         Quantities without a range keep their values. Broken sensors are drawn as well.
         """
-        converted = {name: np.broadcast_to(self.known(name), shape).copy() for name in QUANTITIES}
-        for name in QUANTITIES:
-            low, high = self.ranges.get(name, (0.0, 0.0))
-            drawn = generator.uniform(low, high, shape)
-            converted[name] = drawn if name in self.ranges else converted[name]
+        ranges = {name: self.ranges.get(name, (0.0, 0.0)) for name in QUANTITIES}
+        drawn = {name: generator.uniform(low, high, shape) for name, (low, high) in ranges.items()}
+        converted = {
+            name: drawn[name] if name in self.ranges else np.broadcast_to(self.known(name), shape).copy()
+            for name in QUANTITIES
+        }
         fewest, maximum = self.ranges.get("dead", (0, 0))
         count = generator.integers(int(fewest), int(maximum), (*shape[:-1], 1), endpoint=True)
         rank = generator.random(shape).argsort(axis=-1).argsort(axis=-1)

@@ -188,15 +188,14 @@ def check_rate(measured: float, rate: float, setting: str | None = None) -> None
     Raises:
         InputError: the device is slower by more than 5 %.
     """
-    if _SLOWER * measured >= rate:
-        return
-    slow = f"the device sends {measured:.3g} frames a second, the model needs {rate:g}: "
-    if setting is not None:
-        raise InputError(f"{slow}raise {setting}, or lower touch.rate, as in {setting}={rate:g}")
-    raise InputError(
-        f"{slow}let the firmware send faster, or train a model at the device's rate, as in "
-        f"touch.rate={measured:.2g}"
-    )
+    if _SLOWER * measured < rate:
+        remedy = f"raise {setting}, or lower touch.rate, as in {setting}={rate:g}"
+        if setting is None:
+            remedy = "let the firmware send faster, or train a model at the device's rate, as in "
+            remedy += f"touch.rate={measured:.2g}"
+        raise InputError(
+            f"the device sends {measured:.3g} frames a second, the model needs {rate:g}: {remedy}"
+        )
 
 
 class Window:

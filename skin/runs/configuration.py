@@ -13,8 +13,9 @@ import subprocess
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
-from functools import cache
+from functools import cache, reduce
 from math import isnan
+from operator import getitem
 from pathlib import Path
 from typing import Any, cast
 from urllib.parse import urlsplit
@@ -457,9 +458,7 @@ def recompose(stored: Config, overrides: Sequence[str]) -> Config:
     for key in keys:
         if key not in _SKIN:
             # Unresolved, so that a device refers to the simulator of this run.
-            parent, _, name = key.rpartition(".")
-            source = OmegaConf.select(fresh, parent) if parent else fresh
-            OmegaConf.update(whole, key, _raw(source)[name], merge=False)
+            OmegaConf.update(whole, key, reduce(getitem, key.split("."), _raw(fresh)), merge=False)
     whole.tracking = fresh.tracking
     leaves = iterate_leaves({group: _raw(whole)[group] for group in _FIXED if group in whole})
     changed = [name for path, value in leaves if OmegaConf.select(run, name := ".".join(path)) != value]

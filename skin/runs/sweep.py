@@ -16,8 +16,6 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.utils import JobReturn, JobStatus
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
 
 from skin.core.messages import PARENT, to_input_error
 from skin.errors import InputError
@@ -124,12 +122,12 @@ def _words(config: DictConfig) -> list[str]:
 
 
 class SweepCallback(Callback):
-    """Hydra's callback of every command: opens and closes the parent run, shows the progress.
+    """Hydra's callback of every command: opens and closes the parent run, prints how each job ended.
 
     The parent exists before the first job, and with it database and experiment: jobs that start at once must
     not race to make them. Hydra does not call ``on_multirun_end`` when a job has failed, so the parent is
-    closed at exit. A parent that has no children by then, because each job was finished before or refused, is
-    deleted. A job that is refused is noted in the tag ``refused_<number>`` of the parent.
+    closed at exit, as FAILED. A parent that has no children by then, because each job was finished before or
+    refused, is deleted.
 
     Only Hydra's own sweeper has a list of jobs. Others choose each by the objectives of those before it.
 
@@ -141,15 +139,13 @@ class SweepCallback(Callback):
     def __init__(self, parent: bool = True, runs: Collection[str] | None = None) -> None:
         self._wanted, self._runs = parent, runs
         self._store: Store | None = None
-        self._held = ExitStack()  # the lock of the parent, and the bar
+        self._held = ExitStack()  # the lock of the parent
         self._jobs: list[int] = []  # numbers of the jobs of this shard; empty: unknown
-        self._open: set[int] = set()  # those that have not ended
         self._swept: list[str] = []
-        self._bar: Progress | None = None
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what jobs in other processes need: they print how they ended."""
-        return vars(self) | {"_held": None, "_bar": None}
+        return vars(self) | {"_held": None}
 
     def on_run_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Refuse to divide a single job."""
@@ -199,17 +195,10 @@ class SweepCallback(Callback):
         self._held.enter_context(self._store.hold(self._parent))
         atexit.register(self._close)
         os.environ[PARENT] = self._parent
-        parallel = config.hydra.launcher.get("n_jobs") or 1  # of joblib's launcher
-        basic = config.hydra.launcher._target_.endswith(".BasicLauncher")
-        if parallel != 1:
+        if (parallel := config.hydra.launcher.get("n_jobs") or 1) != 1:  # of joblib's launcher
             # Two jobs with two threads each are several times slower than two with one.
             threads = max(1, cpu_count() // effective_n_jobs(parallel))
             os.environ.setdefault("OMP_NUM_THREADS", str(threads))
-        elif basic and (console := Console(stderr=True)).is_terminal:
-            columns = "{task.description}", BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
-            bar = Progress(*columns, console=console, transient=True, redirect_stdout=sys.stdout.isatty())
-            self._bar = self._held.enter_context(bar)
-            self._task = self._bar.add_task(name, total=len(self._jobs) or None)
 
     def _choose(self, config: DictConfig, jobs: Sequence[Mapping[str, str]]) -> None:
         """Choose the jobs of this shard, and tell the others that they have nothing to do."""
@@ -218,8 +207,7 @@ class SweepCallback(Callback):
         names = [_identify_job(config, job) if divided else str(job) for job in jobs]
         chosen = (shard or Shard(1, 1)).part(names) if self._runs is None else self._runs
         self._jobs = [number for number, name in enumerate(names) if name in chosen]
-        self._open = {*self._jobs}
-        os.environ[LEFT_OUT] = " ".join(str(n) for n in range(len(names)) if n not in self._open)
+        os.environ[LEFT_OUT] = " ".join(str(n) for n in range(len(names)) if n not in self._jobs)
         if jobs and not self._jobs:
             if self._runs is None:
                 print(f"shard {config.shard} has no job: the sweep has only {len(set(names))}")
@@ -231,8 +219,6 @@ class SweepCallback(Callback):
         if self._store is None or str(config.hydra.job.num) in os.environ.get(LEFT_OUT, "").split():
             return
         number, value = config.hydra.job.num, job_return._return_value
-        if self._bar:
-            self._bar.advance(self._task)
         count = f"{self._jobs.index(number) + 1}/{len(self._jobs)}" if self._jobs else f"{number + 1}"
         job = _parse_choices(_words(config))
         label = f"[{count}] {' '.join(f'{key}={job[key]}' for key in self._swept or job)}"
@@ -240,23 +226,18 @@ class SweepCallback(Callback):
         print(
             f"{label}: {value if failed else 'done'}", file=sys.stderr if failed else sys.stdout, flush=True
         )
-        if not failed or isinstance(value, InputError):
-            self._open.discard(number)
-        if failed and isinstance(value, InputError):
-            self._store.client.set_tag(self._parent, f"refused_{number}", f"{label}: {value}"[:500])
 
     def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
         """Close the parent run: no job has failed."""
         self._close(ended=True)
 
     def _close(self, ended: bool = False) -> None:
-        """End the parent run, once: FINISHED if each job ended or was refused; delete it without children."""
+        """End the parent run, once: FINISHED if no job failed; delete it without children."""
         store, self._store = self._store, None
         # Errors of the database were reported before; the next start closes the run.
         with suppress(Exception), self._held:
             if store is not None:
-                complete = ended or (self._jobs and not self._open)
-                store.end(self._parent, "FINISHED" if complete else "FAILED")
+                store.end(self._parent, "FINISHED" if ended else "FAILED")
                 if not store.find(**{"mlflow.parentRunId": self._parent}):
                     store.client.delete_run(self._parent)
 

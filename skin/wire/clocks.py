@@ -61,12 +61,11 @@ class FrameClock:
         self._count, self._arrival_period = 0, 0.0
         self._arrivals = deque[tuple[float, int]]()
         self._latest = -inf
-        self._after: After = ""
         self.restart("")
 
     def restart(self, after: After = "reconnect") -> None:
         """Begin another connection; unit, modulus and rate are kept."""
-        self.cut(after)
+        self._after: After = after  # why the next frame starts a new segment
         self.trusted = True
         self._first: tuple[float, float] | None = None
         self._arrivals.clear()
@@ -78,10 +77,6 @@ class FrameClock:
         """Take the unit of the first frames, s per tick, unless it is known; ``fixed``: the user set it."""
         if not self.witness:
             self.unit, self._fixed = unit, fixed
-
-    def cut(self, after: After) -> None:
-        """Start a new segment with the next frame; ``after`` is the reason."""
-        self._after = after
 
     def _compare_anew(self) -> None:
         """Forget the relation of both clocks: another segment has begun."""
@@ -113,7 +108,7 @@ class FrameClock:
         if ticks is None or not clocked:
             ticks = self._estimate(now, ahead, rate) / self.unit
         elif self._correct_unit(ticks, now, ahead, rate):
-            self.cut("reset")
+            self._after = "reset"
         self._last = seq, ticks
         if self._after or last is None:
             return self._begin(ticks, now)
@@ -128,7 +123,7 @@ class FrameClock:
         if known:
             ahead = self._count_ahead(last[0], seq, elapsed, clocked)  # type: ignore[arg-type]
         if not ahead or elapsed < 0:
-            self.cut("reset")
+            self._after = "reset"
             return self._begin(ticks, now)
         self._period = 0.9 * self._period + 0.1 * elapsed / ahead if self._period else elapsed / ahead
         t = (ticks + self._wrapped) * self.unit
@@ -174,7 +169,7 @@ class FrameClock:
             self._doubtful_since = now
         if self._doubtful_since is not None and now - self._doubtful_since >= caught_up:
             self.trusted = False
-            self.cut("reset")
+            self._after = "reset"
 
     def _begin(self, ticks: float, now: float) -> FramePosition:
         after, self._after, self._wrapped, self._t = self._after, "", 0.0, ticks * self.unit

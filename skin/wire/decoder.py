@@ -140,8 +140,7 @@ class Decoder:
     ) -> None:
         self.sensors, self.adapter = sensors, adapter or Adapter()
         self.stats, self.announcements = Stats(), deque[Announcement](maxlen=64)
-        self._compared_at: float | None = None
-        self._good = self._bad = 0
+        self._compared: tuple[float, int, int] | None = None  # s, good and bad frames until then
         self._latest_bad = FrameError("")
         self._changed_at = inf  # s, when another header came on an open connection
         self._clock = self.stats.timing = FrameClock(modulus=self.adapter.modulus)
@@ -191,13 +190,13 @@ class Decoder:
             return []
         assert self.frame_format is not None
         pieces, self._buffer = self.frame_format.split(self._buffer)
-        good, bad = self.stats.frames, self.stats.bad_frames
+        self._compared = self._compared or (now, self.stats.frames, self.stats.bad_frames)
         frames = [frame for piece in pieces if (frame := self._frame(piece, now))]
         if frames and self._clocked:
             self._clock.judge(now, (self.header and self.header.speed) or 1.0)
         if len(self._buffer) > _LONGEST:
             self._buffer, self._overlong = b"", True
-        self._compare(now, self.stats.frames - good, self.stats.bad_frames - bad)
+        self._compare(now, *self._compared)
         return frames
 
     def error(self, patience: float = 2.0) -> InputError | None:
@@ -311,20 +310,19 @@ class Decoder:
             over = at_limit if over is None else at_limit | over
         return Frame(raw.seq, t, t_host, values, valid, segment, lost, after, over, self._polarity)
 
-    def _compare(self, now: float, good: int, bad: int, span: float = 2.0, few: int = 3) -> None:
+    def _compare(
+        self, now: float, since: float, good: int, bad: int, span: float = 2.0, few: int = 3
+    ) -> None:
         """Compare the good frames received by ``now``, s, with the bad ones, over ``span`` s at a time.
 
         Up to ``few`` bad frames are too few for a conclusion.
         """
-        self._compared_at = now if self._compared_at is None else self._compared_at
-        self._good += good
-        self._bad += bad
-        if now - self._compared_at < span:
+        if now - since < span:
             return
-        latest, frames = self._latest_bad, self._bad + self._good
-        maximum = self._bad > max(self._good, few)
-        self.stats.bad_fraction = (self._bad, frames, latest.reason, latest.found) if maximum else None
-        self._compared_at, self._good, self._bad = now, 0, 0
+        latest, good, bad = self._latest_bad, self.stats.frames - good, self.stats.bad_frames - bad
+        most = bad > max(good, few)
+        self.stats.bad_fraction = (bad, bad + good, latest.reason, latest.found) if most else None
+        self._compared = now, self.stats.frames, self.stats.bad_frames
 
 
 def kind_of_line(line: bytes, longest: int = 40) -> str:

@@ -330,12 +330,12 @@ def resolve(selected: Sequence[Field], names: Sequence[str], count: int) -> list
     """
     positions = list[int]()
     for field in selected:
-        if isinstance(field, int):
-            hits = [field] if 0 <= field < count else []
-        else:
-            hits = [
-                position for position, name in enumerate(names) if name == field or fnmatchcase(name, field)
-            ]
+        numbered = names if isinstance(field, str) else range(count)
+        hits = [
+            position
+            for position, name in enumerate(numbered)
+            if name == field or (isinstance(name, str) and fnmatchcase(name, str(field)))
+        ]
         if not hits:
             listed = f"their names are {', '.join(dict.fromkeys(names))}" if names else "they have no names"
             sent = f"the board sends {count} fields, 0 to {count - 1}"

@@ -218,10 +218,9 @@ class StructReader:
         rows = np.frombuffer(piece, self.record, self.repeat, self.offset)
         names = self.record.names or ()
         row = np.concatenate([self._numbers(name, rows[name]) for name in names], axis=1).ravel()
-        finite = np.isfinite(row)
-        if whole := bool(finite.all()):
-            return Line(row, "none", whole)  # type: ignore[arg-type]
-        return Line(np.where(finite, row, np.nan), "none", whole)  # type: ignore[arg-type]
+        whole = bool(np.isfinite(row).all())
+        row = row if whole else np.where(np.isfinite(row), row, np.nan)
+        return Line(row, "none", whole)  # type: ignore[arg-type]
 
     def _numbers(self, name: str, column: np.ndarray) -> np.ndarray:
         """Return the numbers (R, N) of a field of all repetitions."""
@@ -265,9 +264,7 @@ def learn_keys(read: Callable[[bytes], Mapping[str, Any]], lines: Sequence[bytes
     A name that less than a quarter of the lines have is left out.
     """
     seen = Counter(keys for line in lines if (keys := _keys(read, line)))
-    counts = Counter[str]()
-    for keys, count in seen.items():
-        counts.update(dict.fromkeys(keys, count))
+    counts = Counter(key for keys in seen.elements() for key in keys)
     common = [key for key, count in counts.items() if 4 * count >= seen.total()]
     first = max(seen, key=lambda keys: (len(keys), seen[keys]), default=())
     if set(common) <= set(first) and all(

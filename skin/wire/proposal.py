@@ -91,17 +91,14 @@ def propose(pieces: Pieces, seconds: float | None = None, margin: float = 0.25) 
     if not readings:
         raise InputError(f"no adapter reads what the board sends: {_sample(data, reasons)}")
     best = readings[0]
+    count = min(len(reading.values) for reading in readings)  # of frames that all have at the end
     others = [
-        other for other in readings[1:] if other.score < best.score + margin and not _alike(other, best)
+        other
+        for other in readings[1:]
+        if other.score < best.score + margin
+        and not np.array_equal(other.values[-count:], best.values[-count:], equal_nan=True)
     ]
     return [best, *others[:1]]
-
-
-def _alike(other: Proposal, best: Proposal) -> bool:
-    """Return whether two readings are the same values."""
-    count = min(len(other.values), len(best.values))
-    shape = other.values[-count:].shape == best.values[-count:].shape
-    return shape and bool(np.allclose(other.values[-count:], best.values[-count:], equal_nan=True))
 
 
 def _refuse_pauses(
@@ -151,8 +148,6 @@ def _read(adapter: Adapter, pieces: Pieces, data: bytes) -> Proposal:
     if adapter.kind == "protocol" and stats.check == "none" and decoder.header is None:
         raise FrameError("structure")
     values = np.array([np.where(frame.valid, frame.values, np.nan) for frame in frames])
-    if not stats.timing.trusted:
-        raise _ImplausibleError("a field that rises is no clock in s, ms or us")
     score += bad / len(frames) + _judge_values(values, decoder.frame_format)
     passed = frames[-1].t_host - frames[0].t_host
     rate = f" at {(len(frames) - 1) / passed:.3g} Hz" if passed > 0 else ""
@@ -201,7 +196,6 @@ def _errors(values: np.ndarray, period: float, longest: float = 0.0205) -> list[
 
     Nothing touches a skin for one frame of 20 ms; the largest counts of converters may be meant, though.
     """
-    values = values[:, np.isfinite(values).any(axis=0)]
     steps = np.diff(values, axis=0)
     far = 50 * np.maximum(_typical_step(values, 1), _resolution(values))
     back = np.abs(steps[:-1] + steps[1:]) < far / 5
@@ -255,8 +249,6 @@ def _settle(adapter: Adapter, data: bytes) -> tuple[Adapter, list[str], float]:
             kind.count("#") > 1 or re.fullmatch(r"[^#]*[^\W\d_]{2}[^#]*", kind) for kind in between
         )
         ignore, kinds = None, []
-    elif len(others) - sum(kinds_count for _, kinds_count in kinds) > (1 - SAME) * len(lines):
-        raise FrameError("structure")
     table = np.array([line.fields for line in lines])
     roles, left_out = _roles(table, names, text) if adapter.rows is None else ({"counter": None}, {})
     left_out |= dict.fromkeys(text, "is text")
@@ -306,10 +298,6 @@ def _text_columns(lines: Sequence[Line]) -> list[int]:
         numbers = {tuple(_NUMBER.findall(word)) for word in words}
         if position in columns and len(numbers - {()}) > 1 and not all(map(_UNIT.fullmatch, words)):
             raise FrameError("number")  # with a text beside it
-        column = [line.strange.get(position) for line in lines]
-        changes = sum(before != word for before, word in pairwise(column))
-        if 2 * changes > len(column) and not all(map(_UNIT.fullmatch, words)):
-            raise FrameError("rows")  # it names the line
     return columns
 
 
@@ -320,7 +308,7 @@ def _ignored(others: Sequence[bytes], frames: Sequence[bytes]) -> tuple[str | No
         _ImplausibleError: such lines name what follows them.
     """
     kinds = Counter(kind_of_line(line) for line in others)
-    kept, parts = list[tuple[str, int]](), list[str]()
+    kept = list[tuple[str, int]]()
     for kind, count in kinds.most_common(8):
         start, words = kind.partition("#")[0], split_words(kind.lower().encode())
         # Words for values are none of another kind: known ones, and those of several sensors.
@@ -337,8 +325,8 @@ def _ignored(others: Sequence[bytes], frames: Sequence[bytes]) -> tuple[str | No
                 "line per frame, or give them as device.adapter.ignore"
             )
         kept.append((kind, count))
-        parts.append(re.escape(start) + ".*")
-    return "|".join(dict.fromkeys(parts)) or None, kept
+    starts = dict.fromkeys(re.escape(kind.partition("#")[0]) + ".*" for kind, _ in kept)
+    return "|".join(starts) or None, kept
 
 
 def _roles(
@@ -346,27 +334,23 @@ def _roles(
 ) -> tuple[dict[str, Any], dict[int, str]]:
     """Return the settings of counter and time of fields (L, C), and why other fields are no sensors."""
     free = [position for position in range(table.shape[1]) if position not in text]
-    roles, left_out = dict[str, Any](counter=None, time=None), dict[int, str]()
+    roles = dict[str, Any](counter=None, time=None)
     many = len(table) > 30  # of a few lines, only the first two fields may look like a clock
     for role, behaves in (("counter", partial(counts, wraps=many)), ("time", runs)):
-        rising = [
-            position for position in free if (position < 2 or many or names) and behaves(table[:, position])
-        ]
-        if rising and len(free) > 1:
-            roles[role] = rising[0]
-            free.remove(rising[0])
+        seen = free if many or names else [position for position in free if position < 2]
+        rising = next((position for position in seen if behaves(table[:, position])), None)
+        if rising is not None and len(free) > 1:
+            roles[role] = rising
+            free.remove(rising)
     counter = roles["counter"]
     if counter is not None and np.count_nonzero(np.diff(table[:, counter]) < 0) > 1:
         roles["modulus"] = int(table[:, counter].max()) + 1
-    if any(cycles(table[:, position]) for position in free):
-        raise FrameError("rows")
-    named = dict.fromkeys(free, "") | {position: names[position] for position in free if names}
-    aside = {
+    named = {position: names[position] if names else "" for position in free}
+    aside = [
         position
         for position in free
-        if {*map(_ASIDE.fullmatch, (last_part(named[position]), named[position]))} != {None}
-    }
-    left_out |= dict.fromkeys(aside, "is no force, by its name")
+        if _ASIDE.fullmatch(named[position]) or _ASIDE.fullmatch(last_part(named[position]))
+    ]
     moving = [position for position in free if np.ptp(table[:, position]) > 0 and position not in aside]
     low, high = (table[:, moving].min(), table[:, moving].max()) if moving else (0, 0)
     outside = [
@@ -376,6 +360,7 @@ def _roles(
     ]
     pair = outside == [free[0], free[-1]] and np.count_nonzero(table[0, outside] <= low) == 1
     guides = [position for position in outside if pair or _GUIDE.fullmatch(last_part(named[position]))]
+    left_out = dict.fromkeys(aside, "is no force, by its name")
     left_out |= {position: f"is always {table[0, position]:g}, a guide of a plotter" for position in guides}
     rest = [position for position in free if position not in left_out]
     for position in (rest[-1], rest[0]) if len(rest) > 2 else ():
@@ -383,14 +368,13 @@ def _roles(
         # What varies as the others do: quiet sensors at rest are near their mean, too.
         near = [total - column for total in _sums(inner, table, counter) if np.ptp(column) > 0]
         if any(np.mean(np.abs(error) < 0.51) > SAME and error.std() < 0.3 * column.std() for error in near):
-            left_out[position] = "is a sum or mean of the others"
+            left_out[position] = "is a sum of the others"
             break
     return roles, left_out
 
 
 def _sums(inner: np.ndarray, table: np.ndarray, counter: int | None) -> Iterator[np.ndarray]:
-    """Yield what firmware sends to check fields (L, C), or beside them: sums, parities and means."""
-    yield inner.mean(axis=1)
+    """Yield what firmware sends to check fields (L, C): sums and parities."""
     parts = [inner] if counter is None else [inner, np.column_stack([table[:, counter], inner])]
     for part in parts if not (table[:, [0]] % 1).any() else ():
         whole = np.nan_to_num(part).astype(np.int64)
@@ -408,17 +392,16 @@ def _text(data: bytes) -> Iterator[Adapter]:
     lines = [
         re.sub(rb"\x1b\[[0-9;]*[A-Za-z]|\0", b"", line).strip(b"\r\n ") for line in data.split(mark)[1:-1]
     ]
-    yield from _lines([line for line in lines if line and not line.startswith(b"#")], data, {})
+    yield from _lines([line for line in lines if line and not line.startswith(b"#")], {})
 
 
-def _lines(lines: Sequence[bytes], data: bytes, ending: dict[str, Any]) -> Iterator[Adapter]:
+def _lines(lines: Sequence[bytes], ending: dict[str, Any]) -> Iterator[Adapter]:
     yield Adapter(kind="json", **ending)
     for label in (":", "="):
         yield from (Adapter(kind="text", label=label, decimal=sign, **ending) for sign in (".", ","))
     words = [word for line in lines for word in re.split(rb"[;\t ]+", line)]
-    grouped = [word for word in words if re.fullmatch(rb"[-+]?\d{1,3}(,\d{3})+", word)]
     if (
-        grouped
+        any(re.fullmatch(rb"[-+]?\d{1,3}(,\d{3})+", word) for word in words)
         and len(words) >= 2 * len(lines)
         and any(word.isdigit() and int(word) < 1000 for word in words)
     ):
@@ -437,7 +420,7 @@ def _lines(lines: Sequence[bytes], data: bytes, ending: dict[str, Any]) -> Itera
         names = (*order[begin:], *order[:begin])
         yield Adapter(kind="text", pattern=pattern, names=names, rows=0, counter=None, **ending)
     yield from (replace(adapter, **ending) for adapter in _patterns(lines))
-    yield from (replace(read_adapter("anyskin"), **ending),)
+    yield replace(read_adapter("anyskin"), **ending)
     yield from (
         Adapter(kind="text", number=rf"-?\d+\.\d{{{decimals}}}", **ending) for decimals in range(1, 7)
     )
@@ -450,11 +433,10 @@ def _patterns(lines: Sequence[bytes]) -> Iterator[Adapter]:
         alike = [line for line in lines if tuple(b" ".join(t.split()) for t in _NUMBER.split(line)) == shape]
         if len(alike) < _FRAMES or len(shape) < 2:
             continue
-        tokens = [_NUMBER.findall(line) for line in alike]
         literals = [
             Counter(column).most_common(1)[0][0] for column in zip(*map(_NUMBER.split, alike), strict=True)
         ]
-        columns = list(zip(*tokens, strict=True))
+        columns = list(zip(*map(_NUMBER.findall, alike), strict=True))
         if INVALID & {word.lower() for text in literals for word in re.findall(rb"[A-Za-z/]+", text)}:
             continue  # the text is a value that is missing
         index = next(
@@ -480,21 +462,13 @@ def _patterns(lines: Sequence[bytes]) -> Iterator[Adapter]:
             name = "row" if position == index else word if word and not word[0].isdigit() else f"f{position}"
             name = name if name not in (*used, "values", "value", "name") else f"f{position}"
             used.add(name)
-            attached = position != index and index is not None
-            parts.append(
-                rf"{_WORD}?"
-                if attached
-                else rf"(?P<{name}>\d+)"
-                if position == index
-                else rf"(?P<{name}>{_WORD})"
-            )
+            others = rf"(?P<{name}>{_WORD})" if index is None else rf"{_WORD}?"
+            parts.append(rf"(?P<{name}>\d+)" if position == index else others)
         if first < len(columns) - 1 or index is not None:
             parts += [_literal(literals[first]), "(?P<values>.*?)"]
         pattern = "".join(parts) + _literal(literals[-1])
-        if index is None:
-            yield Adapter(kind="text", pattern=pattern)
-        else:
-            yield Adapter(kind="text", pattern=pattern, rows=0, index="row", counter=None)
+        rows: dict[str, Any] = {} if index is None else {"rows": 0, "index": "row", "counter": None}
+        yield Adapter(kind="text", pattern=pattern, **rows)
 
 
 def _literal(text: bytes) -> str:
@@ -513,4 +487,4 @@ def _endless(data: bytes, longest: int = 512) -> Iterator[Adapter]:
     words = Counter(re.findall(rb"[^\d\s.,;+-]+", data))
     for word, count in words.most_common(2):
         if count >= _FRAMES and word.isascii():
-            yield from _lines(data.split(word)[1:-1], data, {"end": word.decode()})
+            yield from _lines(data.split(word)[1:-1], {"end": word.decode()})

@@ -14,6 +14,7 @@ An emulated skin announces its next gesture in a comment of the text protocol th
 
 import binascii
 import json
+import re
 import struct
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -247,6 +248,7 @@ _MAGIC = 0xA5
 _COMMENT = ord("#")
 _HEAD = struct.Struct("<BBHIH")
 _TAIL = struct.Struct("<H")
+_BLOCKS = re.compile(rb"[^\0]{254}|[^\0]{0,253}\0")  # of COBS: bytes up to a zero, at most 254
 _NUMBER: dict[Kind, int] = {"u16": 1, "i16": 2, "f32": 3}
 _TYPE: dict[int, np.dtype] = {1: np.dtype("<u2"), 2: np.dtype("<i2"), 3: np.dtype("<f4")}
 
@@ -313,17 +315,10 @@ def encode_comment(text: bytes) -> bytes:
 
 def stuff(data: bytes) -> bytes:
     """Return ``data`` encoded with COBS: without zeros, each replaced by the distance to the next."""
-    out = bytearray()
-    blocks = data.split(b"\0")
-    for position, block in enumerate(blocks):
-        while len(block) >= 254:
-            out += b"\xff" + block[:254]
-            block = block[254:]
-            if not block and position == len(blocks) - 1:
-                return bytes(out)
-        out.append(len(block) + 1)
-        out += block
-    return bytes(out)
+    blocks = _BLOCKS.findall(data + b"\0")
+    if len(blocks) > 1 and blocks[-1] == b"\0" and blocks[-2][-1]:
+        blocks.pop()  # the zero behind a full block at the end is not sent
+    return b"".join(b"\xff" + block if block[-1] else bytes((len(block),)) + block[:-1] for block in blocks)
 
 
 def unstuff(data: bytes) -> bytes:

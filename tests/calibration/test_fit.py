@@ -1,5 +1,7 @@
 """Emulated devices with hidden constants: are these found, and the report's press with them?"""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -8,6 +10,7 @@ from skin.body.base import Sheet
 from skin.body.layout import Grid
 from skin.calibration.bench import BenchData, Gauge, build_bench_data, per_newton
 from skin.calibration.fit import (
+    check_gauge,
     estimate_force,
     evaluate_held_out,
     fit_calibration,
@@ -89,7 +92,7 @@ def test_held_out_presses_are_simulated_down_to_the_noise(known):
     outcome = evaluate_held_out(found, 0.25)
     assert len(outcome.held_out) == 3
     assert outcome.helps
-    assert outcome.calibrated < 0.07 < 0.3 < min(outcome.simulated, outcome.tared)
+    assert outcome.rmse["calibrated"] < 0.07 < 0.3 < min(outcome.rmse["simulated"], outcome.rmse["tared"])
     np.testing.assert_allclose(outcome.force, 1, atol=0.05)
 
 
@@ -176,3 +179,40 @@ def test_what_cannot_be_calibrated_is_refused():
     silent.session.raw[:] = 0.05 * np.random.default_rng(0).standard_normal(silent.session.raw.shape)
     with pytest.raises(InputError, match=r"no channel responds to a press|strongest"):
         fit_calibration(silent)
+
+
+def drifted(bench: BenchData, gain: float = 0.0, zero: float = 0.0) -> BenchData:
+    """Return a session whose gauge changes linearly, by shares of its sensitivity and of the peak."""
+    gauge = bench.gauge
+    time = (gauge.time - gauge.time[0]) / np.ptp(gauge.time)
+    force = gauge.force * (1 + gain * time) + zero * gauge.force.max() * time
+    return BenchData(bench.session, replace(gauge, force=force), bench.each)
+
+
+@pytest.mark.parametrize("hidden", [{}, SLOW, {"exponent": 0.5}, {"position_error": 0.002}])
+def test_a_steady_gauge_is_accepted(hidden):
+    check_gauge(session_of(device(**hidden)))
+
+
+@pytest.mark.parametrize("hidden", [{}, SLOW])
+@pytest.mark.parametrize(
+    ("drift", "named"),
+    [
+        ({"gain": 0.3}, r"sensitivity .* \+[23]\d%"),
+        ({"gain": -0.3}, "sensitivity .* -3"),
+        ({"zero": 0.3}, "zero"),
+    ],
+)
+def test_a_gauge_that_drifts_by_30_percent_is_refused(hidden, drift, named):
+    with pytest.raises(InputError, match=f"{named}.*record again"):
+        check_gauge(drifted(session_of(device(**hidden)), **drift))
+
+
+def test_where_each_sensor_is_pressed_once_only_the_zero_can_be_seen():
+    skin, randomness = device(), np.random.default_rng(0)
+    rows = PROTOCOL.gauge(PROTOCOL.positions(skin, randomness)[:6])
+    session = emulate_session(skin, rows, PROTOCOL, randomness)
+    bench = replace(session_of(skin), session=session, gauge=rows, each=session_of(skin).each[:6])
+    check_gauge(drifted(bench, gain=0.3))
+    with pytest.raises(InputError, match="the zero of the gauge"):
+        check_gauge(drifted(bench, zero=0.3))

@@ -8,7 +8,7 @@ import pytest
 
 from skin.body.base import Sheet
 from skin.body.layout import File, Grid
-from skin.calibration.bench import BenchData, BenchSession, Gauge
+from skin.calibration.bench import BenchSession, Gauge
 from skin.calibration.fit import fit_calibration
 from skin.calibration.known_loads import Protocol, emulate_session
 from skin.calibration.wiring import (
@@ -24,11 +24,8 @@ from skin.device.simulated import Simulated
 from skin.errors import InputError
 from skin.mechanics.simulator.fem import PlatesAndBeams
 from skin.mechanics.simulator.solid import Solid
+from tests.calibration.test_fit import LAYERS
 
-LAYERS = [
-    {"material": "Dragon Skin 10 Medium", "thickness": 0.010},
-    {"material": "EcoFlex 00-30", "thickness": 0.005},
-]
 GEL = [{"material": "EcoFlex 00-30", "thickness": 0.015}]
 EIGHT = "x_m,y_m\n.020,.018\n.075,.022\n.130,.016\n.045,.052\n.101,.049\n.022,.083\n.078,.080\n.131,.086\n"
 PROTOCOL = Protocol(idle=5.0)
@@ -88,8 +85,13 @@ def refused(skin, session, **confirmed) -> str:
     return str(caught.value)
 
 
-def gains(bench: BenchData) -> np.ndarray:
-    return fit_calibration(bench).values()["gain"]
+def check_confirmed(skin, session, dead=(), **confirmed) -> Calibration:
+    """Check the gains and the dead channels of a session; return its calibration."""
+    calibration = fit_calibration(wired_bench(skin, session, None, Confirmed(**confirmed)))
+    assert calibration.broken["dead"] == list(dead)
+    alive = np.setdiff1d(np.arange(len(calibration)), dead)
+    np.testing.assert_allclose(calibration.values()["gain"][alive], skin.constants.gain[alive], rtol=0.02)
+    return calibration
 
 
 @pytest.mark.parametrize("turn", TURNS)
@@ -107,24 +109,19 @@ def test_turns_come_back_and_compose(turn):
 
 @pytest.mark.parametrize("name", SKINS)
 def test_a_session_that_fits_passes(skins, name):
-    skin, session = skins(name)
-    np.testing.assert_allclose(
-        gains(wired_bench(skin, session, None, Confirmed())), skin.constants.gain, rtol=0.02
-    )
+    check_confirmed(*skins(name))
 
 
-@pytest.mark.parametrize("dead", [(), (0,)])
-@pytest.mark.parametrize(("name", "turn"), list(zip(SKINS * 2, list(TURNS)[1:7], strict=True)))
+@pytest.mark.parametrize(
+    ("name", "turn", "dead"), list(zip(SKINS * 2, list(TURNS)[1:7], [(), (0,)] * 3, strict=True))
+)
 def test_turned_places_are_named_and_right_once_confirmed(skins, name, turn, dead):
     skin, session = skins(name)
     session = changed(replace(session, gauge=in_frame(session.gauge, turn, skin.size)), dead=dead)
     said = refused(skin, session)
     assert f"the session fits if the places of the presses are {TURNS[turn][1]}; to confirm" in said
     assert f"add calibrate.places={turn}" in said.split(". ")[0]
-    calibration = fit_calibration(wired_bench(skin, session, None, Confirmed(places=turn)))
-    assert calibration.broken["dead"] == list(dead)
-    alive = np.setdiff1d(np.arange(len(calibration)), dead)
-    np.testing.assert_allclose(calibration.values()["gain"][alive], skin.constants.gain[alive], rtol=0.02)
+    check_confirmed(skin, session, dead, places=turn)
 
 
 def test_places_that_no_turn_brings_onto_the_sheet_are_refused_with_one(skins):
@@ -133,8 +130,9 @@ def test_places_that_no_turn_brings_onto_the_sheet_are_refused_with_one(skins):
     assert "is outside the sheet" in refused(skin, replace(session, gauge=gauge))
 
 
-@pytest.mark.parametrize("name", SKINS)
-@pytest.mark.parametrize("dead", [(), (3,), (1,)])
+@pytest.mark.parametrize(
+    ("name", "dead"), [("fem", ()), ("long", ()), ("irregular", ()), ("fem", (3,)), ("irregular", (1,))]
+)
 def test_exchanged_channels_are_named_and_right_once_confirmed(skins, name, dead):
     skin, session = skins(name)
     order = exchanged(len(skin.sensors), 1, 6)
@@ -143,10 +141,7 @@ def test_exchanged_channels_are_named_and_right_once_confirmed(skins, name, dead
     said = refused(skin, session)
     assert "channels 1 and 6 are exchanged" in said
     assert said.endswith(f"add '{setting}'")
-    calibration = fit_calibration(wired_bench(skin, session, None, Confirmed(channels=order)))
-    assert calibration.broken["dead"] == [order.index(channel) for channel in dead]
-    alive = np.flatnonzero(~calibration.values()["dead"])
-    np.testing.assert_allclose(calibration.values()["gain"][alive], skin.constants.gain[alive], rtol=0.02)
+    check_confirmed(skin, session, [order.index(channel) for channel in dead], channels=order)
 
 
 @pytest.mark.parametrize("name", SKINS)
@@ -156,8 +151,7 @@ def test_any_order_of_the_channels_is_found(skins, name):
     said = refused(skin, changed(session, order))
     channels = np.argsort(order).tolist()
     assert f"'calibrate.channels=[{','.join(map(str, channels))}]'" in said
-    found = gains(wired_bench(skin, changed(session, order), None, Confirmed(channels=channels)))
-    np.testing.assert_allclose(found, skin.constants.gain, rtol=0.02)
+    check_confirmed(skin, changed(session, order), channels=channels)
 
 
 def test_axes_and_channels_may_both_be_wrong(skins):
@@ -168,9 +162,8 @@ def test_axes_and_channels_may_both_be_wrong(skins):
     )
     said = refused(skin, session)
     assert "add calibrate.places=mirror_y 'calibrate.channels=[4,1,2,3,0,5,6,7]'" in said
-    bench = wired_bench(skin, session, None, Confirmed(places="mirror_y", channels=order))
-    np.testing.assert_allclose(gains(bench), skin.constants.gain, rtol=0.02)
-    assert fit_calibration(bench).polarity == [1, 1, -1, 1, 1, 1, 1, 1]
+    calibration = check_confirmed(skin, session, places="mirror_y", channels=order)
+    assert calibration.polarity == [1, 1, -1, 1, 1, 1, 1, 1]
 
 
 def test_a_confirmation_that_is_wrong_is_refused_with_the_right_one(skins):
@@ -186,9 +179,8 @@ def test_a_confirmation_that_is_wrong_is_refused_with_the_right_one(skins):
 def test_inverse_channels_are_found_and_need_no_confirmation(skins, inverse):
     skin, session = skins("irregular")
     session = changed(session, inverse=inverse)
-    calibration = fit_calibration(wired_bench(skin, session, None, Confirmed()))
+    calibration = check_confirmed(skin, session)
     assert [n for n, sign in enumerate(calibration.polarity) if sign < 0] == inverse
-    np.testing.assert_allclose(calibration.values()["gain"], skin.constants.gain, rtol=0.02)
     true = np.nan_to_num(calibration.corrected(session.raw))
     np.testing.assert_allclose(true.max(axis=0), 10 / skin.constants.gain, rtol=0.1)
     assert true.min() > -1

@@ -94,20 +94,6 @@ def test_living_sensors_at_their_limit_are_saturated():
     assert said[0, 2, living] == pytest.approx(10.0, abs=1.0)
 
 
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        *[("noise", value) for value in (-1, [0.2, 0.1], [-0.1, 0.1], [0.1], "much")],
-        ("clip", 0),
-        *[("dead", value) for value in (-1, 2.5, [3], [4, 2], [0, 1.5], "two")],
-        *[("table", value) for value in ([[0, 1], [0, 0]], [[0, 1]], "x")],
-    ],
-)
-def test_bad_settings_are_refused(name, value):
-    with pytest.raises(InputError, match=rf"device.{name}=.* (must |has too )"):
-        Imperfection(**{name: value})
-
-
 def test_the_default_device_is_what_it_was():
     """Written down again: clip the force, add noise and offset; the order of the draws is part of it."""
     true = 8 * torch.randn(40, 30, 25, generator=torch.Generator().manual_seed(0)).abs()

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from skin.core.files import ROOT
-from skin.device.conversion import build_recording, convert_files, read_by_function
+from skin.device.conversion import convert_files, read_by_function
 from skin.device.files import read_recording, write_recording
 from skin.device.formats import read_format
 from skin.device.readers import GESTURES, VARIANTS, cost, eflesh, epi
@@ -113,13 +113,6 @@ def test_an_altered_file_is_refused(corpus, tmp_path, change, message):
         cost(tmp_path / "none.csv")
 
 
-def test_a_missing_value_is_an_invalid_reading(corpus, tmp_path):
-    path = tmp_path / "CoST.csv"
-    path.write_text("\n".join(changed(9, 10, "")(corpus.read_text().splitlines())))
-    valid = cost(path).touches.valid
-    assert (~valid).any(dim=(0, 1)).nonzero().flatten().tolist() == [6]
-
-
 def test_epi_has_a_touch_in_each_row(tmp_path):
     values = np.arange(11 * 1200).reshape(11, 12, 100)
     lines = "\n".join(",".join(map(str, row.ravel())) for row in values)
@@ -219,8 +212,3 @@ def test_a_function_of_ones_own_reads_what_it_likes(tmp_path, monkeypatch):
     ):
         with pytest.raises(InputError, match=message):
             read_by_function(reader, tmp_path / "x.npy", options)
-
-
-def test_labels_of_nothing_are_refused():
-    with pytest.raises(InputError, match=r"labels.press is unknown in all touches"):
-        build_recording(np.zeros((2, 3, 4), np.float32), 10.0, labels={"press": [None, None]})

@@ -115,12 +115,6 @@ def test_more_than_memory_is_refused_before_it_is_read(folder, monkeypatch):
         device.touches("train")
 
 
-def test_a_folder_that_is_no_data_set_is_refused(tmp_path):
-    for path in (tmp_path, tmp_path / "none"):
-        with pytest.raises(InputError, match=r"is no data set, because it has no manifest.json"):
-            Recorded(BODY, LAYOUT, str(path))
-
-
 def test_a_converted_recording_brings_its_sensors(simulated, tmp_path):
     """Body and layout have no effect on it, nor on the device that restores a run."""
     foreign = replace(simulated, metadata={"positions": "unknown", "groups": {}})

@@ -168,14 +168,6 @@ def test_help_and_mistakes_wait_for_no_heavy_import(argument, said, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("argument", ["seed=x", "model.typo=1"])
-def test_a_mistake_ends_with_code_2_and_says_which(argument, run, tmp_path):
-    done = run(tmp_path, "train", argument)
-    assert done.returncode == 2, done.stderr
-    assert argument.removeprefix("model.").partition("=")[0] in done.stderr
-    assert not list(tmp_path.iterdir())
-
-
 @pytest.mark.parametrize(("verb", "minimum"), [("listen", 1), ("emulate", 7), ("evaluate", 11)])
 def test_a_verb_composes_only_what_it_needs(verb, minimum):
     with initialize_config_dir(str(CONF), version_base="1.3"):

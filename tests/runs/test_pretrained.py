@@ -88,26 +88,27 @@ def test_the_weights_reproduce_the_card_on_400_touches(name, tmp_path):
 
 
 @pytest.fixture
-def copied(tmp_path, monkeypatch):
-    """Return the folder of a copy in the current folder, which comes before the one of the package."""
-    folder = tmp_path / MODELS / "copy"
-    shutil.copytree(ROOT / MODELS / "default_skin", folder)
+def model(tmp_path, monkeypatch):
+    """Return the folder of a copy of a model, with few bytes of weights, in the current folder."""
     monkeypatch.chdir(tmp_path)
-    assert find_pretrained("copy").info.artifact_uri == folder.as_uri()
+    folder = tmp_path / MODELS / "mine"
+    shutil.copytree(ROOT / MODELS / "default_skin", folder)
+    (folder / "weights.pt").write_bytes(b"weights")
+    (folder / SUMS).write_text(checksums(folder, "weights.pt"))
     return folder
 
 
 @pytest.mark.parametrize("name", ["weights.pt", CONFIG, RECORD, CARD])
-def test_an_altered_or_missing_file_is_refused_by_name(name, copied):
-    content = bytearray((copied / name).read_bytes())
+def test_an_altered_or_missing_file_is_refused_by_name(name, model):
+    content = bytearray((model / name).read_bytes())
     position = content.index(b"0") if name == RECORD else len(content) // 2
     content[position] = ord("1") if content[position] != ord("1") else ord("2")
-    (copied / name).write_bytes(content)
-    with pytest.raises(InputError, match=rf"^{name} in .*copy differs from {SUMS}: "):
-        find_pretrained("copy")
-    (copied / name).unlink()
+    (model / name).write_bytes(content)
+    with pytest.raises(InputError, match=rf"^{name} in .*mine differs from {SUMS}: "):
+        find_pretrained("mine")
+    (model / name).unlink()
     with pytest.raises(InputError, match=name):
-        find_pretrained("copy")
+        find_pretrained("mine")
 
 
 @pytest.mark.parametrize(
@@ -118,13 +119,13 @@ def test_an_altered_or_missing_file_is_refused_by_name(name, copied):
             "", "[]", "{}", '{"format": 1}', '{"format": 1, "tags": {"learned": 3}}')),
     ],
 )  # fmt: skip
-def test_another_record_and_a_folder_without_hashes_are_refused(text, reason, copied):
-    (copied / SUMS).unlink()
+def test_another_record_and_a_folder_without_hashes_are_refused(text, reason, model):
+    (model / SUMS).unlink()
     with pytest.raises(InputError, match=SUMS):
-        find_pretrained("copy")
-    (copied / RECORD).write_text(text)
+        find_pretrained("mine")
+    (model / RECORD).write_text(text)
     with pytest.raises(InputError, match=reason):
-        find_pretrained("copy")
+        find_pretrained("mine")
 
 
 @pytest.mark.parametrize("name", ["", "latest", "25aa", "../models/default_skin", "Default", ".hidden"])
@@ -133,31 +134,20 @@ def test_what_selects_a_run_or_a_path_is_no_name(name):
     assert find_pretrained(name) is None
 
 
-def test_a_model_is_given_by_its_folder(copied, tmp_path, monkeypatch):
+def test_a_model_is_given_by_its_folder(model, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path / MODELS)
-    for name in ("./copy", str(copied)):
-        assert find_pretrained(name).info.artifact_uri == copied.as_uri()
-    (copied / CONFIG).write_text("")
+    for name in ("./mine", str(model)):
+        assert find_pretrained(name).info.artifact_uri == model.as_uri()
+    (model / CONFIG).write_text("")
     with pytest.raises(InputError, match="differs from SHA256SUMS"):
-        find_pretrained("./copy")
+        find_pretrained("./mine")
 
 
 @pytest.mark.skipif(shutil.which("sha256sum") is None, reason="needs sha256sum")
-def test_sha256sum_reads_the_hashes(copied):
+def test_sha256sum_reads_the_hashes(model):
     command = ["sha256sum", "--check", "--strict", SUMS]
-    done = subprocess.run(command, cwd=copied, capture_output=True, text=True, check=True)
+    done = subprocess.run(command, cwd=model, capture_output=True, text=True, check=True)
     assert done.stdout.count(": OK") == 4
-
-
-@pytest.fixture
-def model(tmp_path, monkeypatch):
-    """Return the folder of a copy of a model, with few bytes of weights."""
-    monkeypatch.chdir(tmp_path)
-    folder = tmp_path / MODELS / "mine"
-    shutil.copytree(ROOT / MODELS / "default_skin", folder)
-    (folder / "weights.pt").write_bytes(b"weights")
-    (folder / SUMS).write_text(checksums(folder, "weights.pt"))
-    return folder
 
 
 @pytest.mark.parametrize("name", [RECORD, CONFIG, CARD, SUMS, "weights.pt"])

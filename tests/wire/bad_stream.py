@@ -82,7 +82,7 @@ def damage(piece, rng):
     return bytes(data)
 
 
-def fuzz(count, spoken, sensors, seed, make=Decoder):
+def fuzz(count, spoken, sensors, seed):
     """Feed a decoder with ``count`` frames, damaged and invalid ones, and noise, in chunks of any size.
 
     Returns:
@@ -104,7 +104,7 @@ def fuzz(count, spoken, sensors, seed, make=Decoder):
         elif kind == "noise":
             intact = noise(rng, sensors, end)
         data += intact
-    decoder, position, recovered, wrong = make(sensors), 0, set(), 0
+    decoder, position, recovered, wrong = Decoder(sensors), 0, set(), 0
     while position < len(data):
         following = position + rng.randint(0, rng.choice((0, 1, 3, 20, 130, 500, 3000)))
         for found in decoder.feed(bytes(data[position:following]), 0.002 * count * position / len(data)):

@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from skin.core.files import CONF
 from skin.errors import InputError
 from skin.wire.adapter import Adapter, read_adapter
-from skin.wire.clocks import FrameClock
 from skin.wire.decoder import Decoder
 from skin.wire.proposal import propose
 from skin.wire.reader import Port, WireFeed
@@ -28,7 +27,7 @@ OTHERS = {
     "struct": Adapter(kind="binary", struct={"counter": "u1", "f": "(3,)<i2"}, head="aa 55"),
     "index": Adapter(kind="text", rows=0, index=0),
 }
-ALL = {name: read_adapter(name) for name in SHIPPED} | OTHERS
+ALL = {name: read_adapter(name) for name in SHIPPED} | OTHERS | {"protocol": Adapter()}
 
 
 @pytest.mark.parametrize("name", SHIPPED)
@@ -79,51 +78,6 @@ def test_lines_that_do_not_match_are_shown_with_the_field_that_failed():
     error = str(decoder.error())
     assert all(f"'12,13,{n}mm,14' (field '{n}mm' is not a number)" in error for n in (57, 58, 59))
     assert "adapter=auto" in error
-
-
-@pytest.mark.parametrize(("frames", "rate", "witness"), [(200, None, "host"), (20, 100.0, "rate")])
-def test_the_unit_of_a_clock_follows_from_the_host_or_the_header(frames, rate, witness):
-    clock = FrameClock()
-    placed = [clock.place(n, 10 * n, n / 100, rate=rate) for n in range(frames)]
-    assert [position.after for position in placed].count("reset") == 1
-    assert (clock.unit, clock.witness) == (1e-3, witness)
-    assert np.diff([position.t for position in placed[-5:]]) == pytest.approx(0.01)
-
-
-@pytest.mark.parametrize(("fixed", "arrival", "rate"), [(True, 0.01, None), (False, 10.0, 100.0)])
-def test_where_the_unit_contradicts_the_hosts_clock_that_rules(fixed, arrival, rate):
-    """The user set the unit; or the header says 100 Hz, but the host sees 0.1 Hz of the same clock."""
-    clock, stopped = FrameClock(1e-6, fixed), []
-    for n in range(400):
-        clock.place(n, 10 * n, arrival * n, rate=rate)
-        clock.judge(arrival * n)
-        stopped.append(clock.trusted)
-    assert not fixed or clock.unit == 1e-6
-    assert stopped[0]
-    assert not stopped[-1]
-
-
-@pytest.mark.parametrize("modulus", [16, 37, 100, 256, 1000, 4096])
-@pytest.mark.parametrize("clocked", [True, False])
-def test_a_counter_wraps_at_any_modulus_and_losses_are_counted(modulus, clocked):
-    clock = FrameClock()
-    sent = [n for n in range(5 * modulus) if n % 91 != 17]
-    placed = [clock.place(n % modulus, 10_000 * n if clocked else None, n / 100) for n in sent]
-    resets = sum(position.after == "reset" for position in placed)
-    if clocked:
-        lost = sum(position.lost for position in placed)
-        assert (resets, lost) == (0, sent[-1] + 1 - sent[0] - len(sent))
-    else:
-        assert resets <= 1 + (modulus == 37)
-    assert clock.modulus == modulus
-
-
-def test_a_restart_is_no_wrap():
-    clock = FrameClock()
-    for n in range(300):
-        clock.place(n, 10_000.0 * n, n / 100)
-    assert clock.place(0, 10_000.0 * 400, 4.0).after == "reset"  # the counter after a pause
-    assert clock.place(1, 0.0, 4.1).after == "reset"  # the clock
 
 
 def cut(data, cuts):

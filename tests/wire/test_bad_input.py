@@ -1,8 +1,6 @@
 """What a person meets at a real pseudo-terminal, beyond tests/port/test_open_skin.py."""
 
 import os
-import subprocess
-import sys
 from threading import Thread
 from time import monotonic, sleep
 
@@ -22,26 +20,6 @@ from skin.wire.tare import Tare
 
 PATIENT = 300.0  # s: machines are busy at times
 SHEET = Sheet((0.16, 0.16), (32, 32), [{"material": "EcoFlex 00-30", "thickness": 0.005}])
-
-
-@pytest.mark.parametrize("verb", ["listen", "record"])
-@pytest.mark.slow("a process for each command")
-def test_a_port_in_use_ends_a_command_with_code_2(plug, tmp_path, verb):
-    out = {"listen": [], "record": ["out=s"]}[verb]
-    with open_skin(plug.port):
-        done = subprocess.run(
-            [sys.executable, "-m", "skin", verb, f"device.port={plug.port}", *out],
-            cwd=tmp_path,
-            capture_output=True,
-            text=True,
-            timeout=PATIENT,
-            check=False,
-        )
-    assert done.returncode == 2
-    assert (
-        done.stderr == f"{plug.port} is in use: close the serial monitor or any other program that reads it\n"
-    )
-    assert not list(tmp_path.glob("s*"))
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,6 @@ import torch
 
 from skin.body.base import Sheet
 from skin.body.layout import Grid
-from skin.core.settings import configured
 from skin.device.resampling import resample
 from skin.device.simulated import Simulated
 from skin.errors import InputError
@@ -56,11 +55,6 @@ def test_counts_are_those_of_a_converter():
     assert Converter(None, 10.0)(np.array([0.25])).tolist() == [0.25]
 
 
-def test_no_fault_changes_nothing():
-    data = bytes(range(256))
-    assert Faults().damaged(data, np.random.default_rng(0)) == data
-
-
 def test_bits_and_bytes_at_their_rates():
     data, draw = bytes(100_000), np.random.default_rng(1)
     arrived = Faults(flipped_bits=0.01, lost_bytes=0.1).damaged(data, draw)
@@ -76,19 +70,6 @@ def test_a_rate_is_per_minute_and_a_list_is_moments():
     assert happened == pytest.approx(600, abs=5 * np.sqrt(600))
     listed = Faults(reset=[1.5, 3]).happen("reset", 100, 300, 100.0, draw)
     assert np.flatnonzero(listed).tolist() == [50, 200]
-
-
-@pytest.mark.parametrize(
-    ("given", "reason"),
-    [
-        ({"flip": 1}, "faults has no setting flip"),
-        ({"flipped_bits": 2}, "flipped_bits"),
-        ({"reset": -1}, "reset"),
-    ],
-)
-def test_what_cannot_be_is_refused(given, reason):
-    with pytest.raises(InputError, match=reason):
-        configured(Faults, given, "faults")
 
 
 def test_a_channel_that_is_not_there():

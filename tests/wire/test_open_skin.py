@@ -7,7 +7,7 @@ import signal
 import socket
 import subprocess
 import sys
-from itertools import islice
+from itertools import count, islice
 from threading import Event
 from time import monotonic, sleep
 
@@ -220,18 +220,6 @@ def test_a_forbidden_port_is_refused(monkeypatch):
         open_skin("/dev/ttyACM0")
 
 
-@pytest.mark.parametrize(
-    ("setting", "named"),
-    [
-        ({"baudrate": 0}, "baudrate"),
-        ({"backoff": (2, 1)}, "backoff"),
-    ],
-)
-def test_a_setting_that_cannot_be_used_is_refused(plug, setting, named):
-    with pytest.raises(InputError, match=f"device.{named}"):
-        open_skin(plug.port, **setting)
-
-
 def test_channels_that_mean_nothing_are_masked_and_named():
     rng = np.random.default_rng(0)
     values = rng.integers(400, 600, (800, 6))
@@ -288,3 +276,69 @@ def test_ctrl_c_ends_a_read_that_waits(plug):
         sleep(0.2)
         process.send_signal(signal.SIGINT)
         assert b"KeyboardInterrupt" in process.communicate(timeout=PATIENT)[1]
+
+
+HASTY = {"reconnect": True, "silence": 0.3, "backoff": (0.01, 0.04)}
+LINK = "socket://127.0.0.1:1"
+
+
+def polled(pieces, silence, step=0.1):
+    """Poll a feed every ``step`` s; return its frames and when it was found silent."""
+    feed, times = WireFeed(lambda: Sent(*pieces, end=False, pause=0), Decoder(4), None, silence), count()
+    frames = []
+    for _ in range(len(pieces) + 20):
+        now = step * next(times)
+        try:
+            frames += feed.poll(lambda now=now: now)
+        except TimeoutError:
+            return frames, now
+    return frames, np.inf
+
+
+@pytest.mark.parametrize(
+    ("pieces", "silence", "found"),
+    [
+        ([lines(*range(3))], 0.5, 0.5),  # from the last byte on
+        ([], 0.5, 0.5),  # from the opening on
+        ([lines(0, 1, 2), b"", b"", b"", lines(3), b"", b"", b""], 0.5, 0.9),
+        ([piece for n in range(12) for piece in (lines(n), b"", b"", b"")], 0.5, np.inf),  # seldom
+        ([lines(*range(3))], np.inf, np.inf),
+    ],
+)
+def test_silence_counts_from_the_last_byte(pieces, silence, found):
+    frames, when = polled(pieces, silence)
+    last = max((n for n, piece in enumerate(pieces) if piece), default=0)
+    assert when == pytest.approx(found if len(pieces) < 40 else 0.1 * last + silence)
+    assert len(frames) == sum(piece.count(b"\n") for piece in pieces)
+
+
+@pytest.mark.parametrize(
+    ("address", "settings", "silence"),
+    [
+        (LINK, {}, 0.3),
+        (LINK, {"silence": 0}, np.inf),
+        (LINK, {"silence": None}, np.inf),
+        (LINK, {"reconnect": False}, np.inf),
+        ("/dev/ttyACM0", {}, np.inf),  # the system tells of a serial port that is gone
+    ],
+)
+def test_silence_is_borne_where_that_is_asked_for(address, settings, silence):
+    with open_skin(address, LAYOUT, opener=lambda: Sent(end=False), **HASTY | settings) as skin:
+        assert skin._feed._silence == silence
+
+
+def test_a_peer_that_accepts_and_never_sends_is_tried_less_and_less_often():
+    """Iterating does not give up although the timeout passes: the skin comes back again and again."""
+    streams, times = [Sent(end=False) for _ in range(5)] + [Sent(lines(*range(4)), end=False)], []
+
+    def opener():
+        times.append(monotonic())
+        return streams[len(times) - 1]
+
+    settings = HASTY | {"silence": 0.02, "backoff": (0.01, 10.0), "timeout": 0.1}
+    with open_skin(LINK, LAYOUT, opener=opener, **settings) as skin:
+        assert [frame.seq for frame in islice(skin, 4)] == [0, 1, 2, 3]
+        assert skin.stats.reconnects == 5
+    assert all(stream.closed for stream in streams)
+    # 0.02 s of silence, and 0.01, 0.02 ... 0.16 s between two attempts
+    assert times[-1] - times[-2] >= 0.17

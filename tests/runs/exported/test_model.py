@@ -1,12 +1,21 @@
-"""Files that are not what an exported model must be."""
+"""An exported network is for one skin, which its file describes; other and damaged files are refused."""
 
 import json
+import os
+import re
+from pathlib import Path
+from time import monotonic
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
+from skin.core import safe_loading as checksum
 from skin.errors import InputError
-from skin.runs.model import KEY, ModelMetadata, OnnxModel
+from skin.runs.configuration import settings_of
+from skin.runs.model import KEY, ModelMetadata, OnnxModel, check_overrides, describe_skin
+from tests.damage import DAMAGED_FILES, damaged, mutated, opened
 
 onnx = pytest.importorskip("onnx")
 pytest.importorskip("onnxruntime")
@@ -21,17 +30,6 @@ def test_it_describes_itself(exported):
     entry = {one.key: one.value for one in onnx.load(path).metadata_props}[KEY]
     assert json.loads(entry)["schema"] == 1
     assert json.loads(entry)["sensors"] == 6
-
-
-def test_one_window_has_one_number_per_label(exported):
-    of, path = exported
-    touches = of.device.touches("test")[:1]
-    window = touches.readings[0].numpy(), touches.valid[0].numpy()
-    np.testing.assert_allclose(
-        OnnxModel(path).probabilities(*(part[None] for part in window))[0],
-        of.learner.probabilities(touches)[0].numpy(),
-        atol=1e-5,
-    )
 
 
 def changed(path, folder, change):
@@ -69,3 +67,153 @@ def test_other_files_are_refused(tmp_path):
         OnnxModel(tmp_path / "text.onnx")
     with pytest.raises(InputError, match="was not written by skin export"):
         ModelMetadata.parse({}, "x.onnx")
+
+
+SIZES = ("simulator=naive", "layout=grid", "layout.rows=2", "layout.columns=3")
+
+
+@pytest.mark.parametrize(
+    "override",
+    ["layout=file", "body.size=[0.2,0.16]", "touch.rate=50", "evaluation.profile=mild", "simulator=solid",
+     "seed=3", "model=mlp", "data.gestures=7", "profile=mild", "experiment=gru"],
+)  # fmt: skip
+def test_what_the_file_fixes_is_refused(override):
+    with pytest.raises(InputError, match=f"^{re.escape(override)} has no effect on skin.onnx, a network for"):
+        check_overrides("skin.onnx", ["run=skin.onnx", override])
+
+
+def test_what_belongs_to_the_command_is_accepted():
+    words = ["device=serial", "device.port=x", "live.touch=0.5", "web=true", "seconds=3"]
+    check_overrides("skin.onnx", ["run=skin.onnx", *words, "tracking.threads=1", "hydra.searchpath=[x]"])
+
+
+def test_a_skin_is_described_unless_its_sensors_are_those_of_a_recording(untrained, configured):
+    settings = settings_of(configured(*SIZES))
+    of = untrained("representation=readings", "model=mlp", "fusion=early")
+    described = describe_skin(settings, of.positions)
+    assert described == {name: settings[name] for name in described}
+    assert set(described) == {"body", "layout", "simulator", "touch", "evaluation"}
+    assert describe_skin(settings, np.zeros((4, 3))) is None
+
+
+ABOUT = ModelMetadata(
+    "abc", "title", "1", ["a", "b"], "binary", None, False, 10.0, 3, [(0.0, 0.0, 0.0)] * 4, (0.1, 0.1),
+    10.0, 0.5, 0.3, False, 3.0,
+)  # fmt: skip
+WINDOW = np.ones((1, 3, 4), np.float32), np.ones((1, 3, 4), bool)
+
+
+def model(nodes="", constants="", domains=""):
+    """Return a model of a sum of the readings, with further operators before it, and a seal to fill."""
+    weights = ", ".join(f"{0.01 * number:.2f}" for number in range(24))
+    made = onnx.parser.parse_model(
+        f"""
+        <ir_version: 10, opset_import: ["": 20{domains}]>
+        graph (float[batch,3,4] readings, bool[batch,3,4] valid) => (float[batch,2] probabilities)
+        <int64[2] flat = {{-1, 12}}, float[12,2] weights = {{{weights}}}{constants}> {{
+            {nodes}
+            rows = Reshape(readings, flat)
+            sums = MatMul(rows, weights)
+            probabilities = Sigmoid(sums)
+        }}"""
+    )
+    onnx.helper.set_model_props(made, {checksum.KEY: checksum.BLANK, KEY: ABOUT.text()})
+    return made
+
+
+def write(made, path: Path) -> Path:
+    path.write_bytes(made.SerializeToString())
+    checksum.seal(path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    return write(model(), tmp_path_factory.mktemp("onnx") / "skin.onnx")
+
+
+def test_a_sealed_file_is_used(written):
+    assert OnnxModel(written).probabilities(*WINDOW).shape == (1, 2)
+
+
+@DAMAGED_FILES
+@given(data=st.data())
+def test_damage_never_passes_for_a_network(written, data):
+    path = written.with_name("damaged.onnx")
+    path.write_bytes(data.draw(damaged(written.read_bytes())))
+    known = opened(lambda: OnnxModel(path))
+    if known is not None:
+        np.testing.assert_array_equal(known.probabilities(*WINDOW), OnnxModel(written).probabilities(*WINDOW))
+
+
+@DAMAGED_FILES
+@given(data=st.data())
+def test_every_description_works_or_is_refused(written, data):
+    text = json.dumps(data.draw(mutated(json.loads(ABOUT.text()))))
+    opened(lambda: ModelMetadata.parse({KEY: text}, "skin.onnx"))
+
+
+BODY = "<body = loop (int64 round, bool go) => (bool going) { going = Identity(go) }>"
+LOOP = (f"x = Loop {BODY} (count, yes)", f", int64 count = {{{1 << 60}}}, bool yes = {{1}}")
+JOINED = "joined0 = Identity(weights)\n" + "".join(
+    f"joined{number + 1} = Concat<axis = 0>(joined{number}, joined{number})\n" for number in range(60)
+)
+DEPENDENT = """largest = ReduceMax<keepdims = 0>(readings)
+    limit = Cast<to = 7>(largest)
+    numbers = Range(start, limit, step)"""
+
+
+def huge(size):
+    return model("huge = ConstantOfShape(size)", f", int64[1] size = {{{size}}}")
+
+
+def outside():
+    """Return a model with weights in another file."""
+    made = model()
+    weights = made.graph.initializer[1]
+    weights.ClearField("float_data")
+    weights.data_location = onnx.TensorProto.EXTERNAL
+    weights.external_data.add(key="location", value="../../../../dev/zero")
+    return made
+
+
+@pytest.mark.parametrize(
+    ("made", "reason"),
+    [
+        (lambda: model(*LOOP), "it uses the operator Loop"),
+        (lambda: model(f"{JOINED} probability = ReduceMax(joined60)"), "ONNX Runtime cannot load"),
+        (lambda: huge(1 << 33), "ONNX Runtime cannot load"),
+        (lambda: huge(1 << 60), "ONNX Runtime cannot load"),
+        (outside, "it refers to other files"),
+        (lambda: model(DEPENDENT, ", int64 start = {0}, int64 step = {1}"),
+         "the size of what Range returns depends on readings"),
+        (lambda: model("x = mine.Foreign(readings)", domains=', "mine": 1'), "operator mine Foreign"),
+        (lambda: model("x = Relu(missing)"), "ONNX Runtime cannot load"),
+    ],
+)  # fmt: skip
+def test_a_hostile_file_is_refused_soon(tmp_path, made, reason):
+    path, start = write(made(), tmp_path / "skin.onnx"), monotonic()
+    with pytest.raises(InputError, match=reason):
+        OnnxModel(path)
+    assert monotonic() - start < 20
+
+
+def test_what_is_no_file_is_refused(tmp_path):
+    os.mkfifo(tmp_path / "pipe.onnx")
+    for path in (tmp_path / "pipe.onnx", Path("/dev/zero"), tmp_path):
+        with pytest.raises(InputError, match="it is not a regular file"):
+            OnnxModel(path)
+
+
+def test_outputs_that_are_no_probabilities_are_refused(tmp_path):
+    made = model()
+    made.graph.initializer[1].float_data[0] = float("nan")
+    with pytest.raises(InputError, match="does not give probabilities"):
+        OnnxModel(write(made, tmp_path / "skin.onnx"))
+
+
+def test_a_description_of_an_earlier_version_has_no_limits_and_no_guarantees():
+    stored = json.loads(ABOUT.text())
+    text = json.dumps({name: value for name, value in stored.items() if name not in ("limits", "guarantees")})
+    read = ModelMetadata.parse({KEY: text}, "skin.onnx")
+    assert (read.limits, read.guarantees, read.run) == (None, None, ABOUT.run)

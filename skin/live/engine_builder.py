@@ -322,6 +322,7 @@ class LiveSetup:
             # Frames that waited meanwhile would delay the verdicts about those of now.
             with suppress(SkinTimeout, SkinDisconnected):
                 self.port.skin.read(10**6, 0.0)  # more than any queue holds
+            self.port.skin.stats.dropped = 0  # nor are those lost that it could not hold
         nominal = engine_settings(model, DebounceSettings(above=usual), danger=danger)
         patience = replace(live.patience, above=usual if given is None else given)
         engine = engine_settings(model, patience, live.touch, live.drift, danger, promise)

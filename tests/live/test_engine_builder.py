@@ -168,7 +168,9 @@ def test_no_frame_that_waited_while_the_threshold_was_chosen_is_judged(model, sk
     with ExitStack() as opened:
         setup = watch_exported(str(model), {"port": skin}, print, opened)
         sleep(1.5)
+        setup.port.skin.stats.dropped = 12635  # by a queue that nobody read meanwhile
         (frame,) = setup.watch(LIVE, print)[0].skin.read(1)
+        assert setup.port.skin.stats.dropped == 0
         assert monotonic() - frame.t_host < 0.5
 
 

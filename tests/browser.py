@@ -1,12 +1,22 @@
-"""A real browser, driven over HTTP as the W3C's WebDriver has it: no package is needed for that."""
+"""A real browser, driven over HTTP as the W3C's WebDriver has it: no package is needed for that.
+
+Beside ``skin live demo=true`` on an idle machine, this records the animation of the README:
+
+    python -m tests.browser http://127.0.0.1:8765 docs/results/live.gif
+"""
 
 import json
 import re
 import shutil
 import subprocess
+import sys
 import urllib.request
 from base64 import b64decode
+from io import BytesIO
+from time import monotonic, sleep
 from typing import Any
+
+from PIL import Image
 
 _OPTIONS = ("--headless=new", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage")
 _PATIENCE = 180  # s
@@ -69,3 +79,20 @@ class Browser:
         self._process.wait(30)
         if self._process.stdout is not None:
             self._process.stdout.close()
+
+
+def record(address: str, path: str, frames: int = 26, interval: float = 0.3) -> None:
+    """Write what a page shows as GIF below 1 MB, a frame each ``interval`` s; octrees keep rare colours."""
+    browser, shots, begin = Browser(*(installed() or sys.exit("needs Chromium"))), [], monotonic() + 5
+    browser.open(address)
+    for number in range(frames):
+        sleep(max(0.0, begin + number * interval - monotonic()))
+        shot = Image.open(BytesIO(browser.picture())).convert("RGB")
+        shot = shot.resize((shot.width * 3 // 4, shot.height * 3 // 4))
+        shots.append(shot.quantize(128, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE))
+    browser.close()
+    shots[0].save(path, save_all=True, append_images=shots[1:], duration=round(1e3 * interval), loop=0)
+
+
+if __name__ == "__main__":
+    record(*sys.argv[1:3])

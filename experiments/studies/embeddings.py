@@ -381,17 +381,28 @@ def spaces(frame: pd.DataFrame, names: Sequence[str]) -> Figure:
     for panels, row in zip(axes, frame.itertuples(), strict=True):
         plane = np.reshape(row.plane, (-1, 2))
         drawn = [(plane, classes) for classes in np.reshape(row.classes, (len(plane), -1)).T]
-        drawn.append((np.reshape(row.mixed, (-1, 2)), np.asarray(row.layouts)))
+        drawn.append((np.reshape(row.mixed, (-1, 2)), 2 + np.asarray(row.layouts, int)))  # in other colours
         for axis, (points, classes) in zip(panels, drawn, strict=False):
             for number in np.unique(classes):
                 colour, mark = COLOURS[number % len(COLOURS)], MARKS[number % len(MARKS)]
-                chosen = points[classes == number]
-                axis.scatter(*chosen.T, s=7, color=colour, marker=mark, alpha=0.6, linewidths=0)
+                name = ("the label does not hold", "the label holds", f"layout {number - 1}")[min(number, 2)]
+                axis.scatter(
+                    *points[classes == number].T,
+                    s=7,
+                    color=colour,
+                    marker=mark,
+                    alpha=0.6,
+                    linewidths=0,
+                    label=name,
+                )
             axis.set(xticks=[], yticks=[])
         panels[0].set_ylabel(_title((row.attribute, row.name)), fontsize=8)
     for axis, name in zip(axes[0], [*names, "layout"], strict=False):
         axis.set_title(name)
-    figure.supxlabel("square: the label holds, circle: it does not; each layout has a mark", fontsize=8)
+    marks = {group.get_label(): group for axis in axes.flat for group in axis.collections}
+    figure.legend(
+        marks.values(), marks, loc="outside lower center", ncols=len(marks), fontsize=8, markerscale=2
+    )
     return figure
 
 

@@ -318,15 +318,16 @@ def _strips(study: Study, trials: pd.DataFrame) -> Figure:
     lines = variants if shared else [", ".join(filter(None, key)) for key, _ in groups]
     height = 0.1 * max(len(conditions), 3) if shared else 0.3
     figure = Figure(figsize=(8, 1.2 + height * len(lines)), layout="constrained")
-    across = f"{_label(metric)}: each run, mean and 95 % interval"
-    axis = figure.add_subplot(ylim=(len(lines) - 0.5, -0.5), xlabel=across)
+    axis = figure.add_subplot(
+        ylim=(len(lines) - 0.5, -0.5), xlabel=f"{_label(metric)}: each run, mean and 95 % interval"
+    )
     for number, ((variant, condition), group) in enumerate(groups):
         if values(group, metric).empty:
             continue
         style = conditions.index(condition) if shared else 0
         apart = 0.8 * ((style + 0.5) / len(conditions) - 0.5) if shared else 0.0
         height = (variants.index(variant) if shared else number) + apart
-        colour, marker = COLOURS[style % len(COLOURS)], "osD^v<>pP*"[style % 10]
+        colour, marker = COLOURS[style % len(COLOURS)], MARKS[style % len(MARKS)]
         mean, _, margin, _ = estimate(group, metric)
         figures = (1 if metric in UNITS else 100) * group[metric].dropna()
         axis.plot(figures, [height] * len(figures), marker, color=colour, alpha=0.35, ms=4)

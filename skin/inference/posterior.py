@@ -129,12 +129,12 @@ class Region:
     Attributes:
         cells: (C, 2), x and y of their centres, m.
         width: (2,), of a cell, m.
-        fraction: probability that they hold.
+        probabilities: (C,), that each holds the position.
     """
 
     cells: np.ndarray
     width: np.ndarray
-    fraction: float
+    probabilities: np.ndarray
 
     @property
     def area(self) -> float:
@@ -199,11 +199,10 @@ class ContactEstimate:
         order = np.argsort(-mass, axis=None, kind="stable")
         total = np.cumsum(mass.ravel()[order])
         # The last cell is included if the probability is nearer to ``fraction`` with it than without.
-        count = max(1, int(np.argmin(np.abs(total - fraction))) + 1)
-        chosen = np.unravel_index(order[:count], mass.shape)
+        chosen = np.unravel_index(order[: np.argmin(np.abs(total - fraction)) + 1], mass.shape)
         middles = [(line[1:] + line[:-1]) / 2 for line in edges]
         cells = np.stack([middles[axis][chosen[axis]] for axis in (0, 1)], axis=1)
-        return Region(cells, (high - low) / steps, float(total[count - 1]))
+        return Region(cells, (high - low) / steps, mass[chosen])
 
 
 def _overlap(edges: np.ndarray, centre: np.ndarray, width: np.ndarray) -> np.ndarray:

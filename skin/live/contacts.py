@@ -91,10 +91,11 @@ def _contact(contact: "ContactEstimate", probability: float = 0.9, cell: float =
         "peak": round(contact.peak),
         "peak_interval": [round(limit) for limit in contact.peak_interval],
         "region": {
-            "share": round(region.fraction, 4),
+            "share": round(float(region.probabilities.sum()), 4),
             "origin": origin.round(6).tolist(),
             "cell": region.width.round(6).tolist(),
             "cells": ((region.cells - origin) / region.width).round().astype(int).tolist(),
+            "probabilities": region.probabilities.round(5).tolist(),
         },
     }
 
@@ -105,8 +106,10 @@ def contact_text_lines(message: dict[str, Any]) -> list[str]:
     if state == "unknown":
         return [f"contacts unknown: {message['reason']}"]
     if state == "not a fingertip":
-        head = f"{state} (fit {message['fit']:.2g}, a larger contact {100 * message['large']:.0f} %)"
-        return [head, *(f"best: {_words(contact)}" for contact in message["contacts"])]
+        return [
+            f"{state} (fit {message['fit']:.2g}, a larger contact {100 * message['large']:.0f} %)",
+            *(f"best: {_words(contact)}" for contact in message["contacts"]),
+        ]
     head = f"{number or 'no'} contact{'s' * (number > 1)} ({100 * message['probability']:.0f} %)"
     return [head, *map(_words, message["contacts"])]
 

@@ -321,6 +321,7 @@ class LiveSetup:
         if conditions is not None and self.port is not None:
             # Of the frames that waited, the latest give the baseline; others would delay verdicts about now.
             self.port.skin.skip(self.port.tare.seconds + 0.2)
+            self.port.skin.stats.dropped = 0  # nor are those lost that the queue could not hold
         nominal = engine_settings(model, DebounceSettings(above=usual), danger=danger)
         patience = replace(live.patience, above=usual if given is None else given)
         engine = engine_settings(model, patience, live.touch, live.drift, danger, promise)

@@ -465,7 +465,11 @@ class LiveLoop:
         stats, enough = self._skin.stats, self._enough * self._engine.rate
         slow = f" (short taps read low below {enough:g} Hz)" * (0 < stats.rate_hz < 0.95 * enough)
         counts = stats.list_counts(
-            bad_frames="bad", lost="lost", dropped="dropped", resets="restarts", reconnects="reconnected"
+            bad_frames="bad",
+            lost="lost",
+            dropped="not read in time",
+            resets="restarts",
+            reconnects="reconnected",
         )
         faulty = [
             f"sensor {number} {state}" for number, state in enumerate(self._skin.channels) if state != "ok"

@@ -10,11 +10,14 @@ from torch import Tensor
 
 from skin.core.files import whole
 
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
-"""Okabe and Ito's palette, which colour-blind readers can distinguish."""
+COLOURS = (
+    *("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000"),
+    *("#999999", "#882255", "#332288"),
+)
+"""Okabe and Ito's palette, which colour-blind readers can distinguish, and three of Tol's, for ten lines."""
 
 MARKS = ("o", "s", "^", "D", "v", "P", "X")
-"""Markers of lines, so that they differ without colour."""
+"""Markers of lines, so that they differ without colour; with :data:`COLOURS`, no pair of 70 comes twice."""
 
 
 def save_figure(figure: Figure, path: Path) -> Path:

@@ -239,9 +239,11 @@ def record_session(
                     done = segmenter.add(frame)
                     if done is not None and not done.broken and done.number not in log.done:
                         log.write((done, conversion))
-                        words = f": {label_text(done.labels)}" if done.labels else ""
-                        words += f" ({done.lost} frames lost)" * bool(done.lost)
-                        notify(f"{len(log.done)} of {number or 'any'} gestures{words}")
+                        words = (
+                            f"{len(log.done)} of {number} gestures" if number else f"gesture {len(log.done)}"
+                        )
+                        words += f": {label_text(done.labels)}" if done.labels else ""
+                        notify(words + f" ({done.lost} frames lost)" * bool(done.lost))
                     elif segmenter.gesture is None and len(log.frames) >= _MOST:
                         log.write()
                     _add(log, frame)

@@ -468,11 +468,11 @@ def _with_unit(
         return replace(roles, summary="; ".join(words))
     steps = np.diff(table[:, roles.time])
     step = float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
-    name, source = names[roles.time].rpartition(".")[2] if names else "", "the adapter"
+    name, source = names[roles.time].rpartition(".")[2] if names else "", "as the adapter says"
     if unit is None:
-        unit, source = next((u for u in _NAMED_UNITS if _NAMED_UNITS[u].fullmatch(name)), None), "its name"
+        unit, source = next((u for u in _NAMED_UNITS if _NAMED_UNITS[u].fullmatch(name)), None), "by its name"
     if unit is None:
-        source = f"its steps of {step:.4g}"
+        source = f"as it rises by {step:.4g} per frame"
         unit = min(UNITS, key=lambda unit: abs(np.log10((step * UNITS[unit] or usual) / usual)))
-    words.append(f"field {roles.time} is the time in {unit}, by {source}")
+    words.append(f"field {roles.time} is the time in {unit}, {source}")
     return replace(roles, unit=UNITS[unit], summary="; ".join(words))

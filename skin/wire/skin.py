@@ -22,6 +22,7 @@ from skin.device.resampling import Frame, check_rate
 from skin.errors import InputError
 from skin.wire.channels import RawRange, UnitConversion, check_sensitivity, fails_in_contact, unit_conversion
 from skin.wire.decoder import Decoder, Stats
+from skin.wire.formats import runs
 from skin.wire.protocol import Announcement, Header
 from skin.wire.reader import (
     ByteStream,
@@ -512,10 +513,11 @@ class PortMonitor:
             text = state if fraction == 1 else f"{state}, invalid in {1 - fraction:.0%}"
             if fraction == 0 and state == "ok":
                 text = "no value"
+            elif runs(row):
+                text = "a clock or counter, no sensor: skin listen adapter=auto describes such a board"
             elif _fails_under_touch(~valid[:, channel], touched):
                 text += ", more often in contact than at rest: beyond its range?"
-            numbers = f"{channel:7d}{row.min():10.5g}{middle:10.5g}{row.max():10.5g}{noise:10.3g}"
-            lines.append(f"{numbers}  {text}")
+            lines.append(f"{channel:7d}{row.min():10.5g}{middle:10.5g}{row.max():10.5g}{noise:10.3g}  {text}")
         if _fails_under_touch(np.array([frame.lost > 0 for frame in self._frames]), touched):
             lines.append(
                 "more frames are unreadable or lost in contact than at rest: values beyond the range?"
@@ -532,5 +534,6 @@ class PortMonitor:
 
 def _fails_under_touch(failed: np.ndarray, touched: np.ndarray) -> bool:
     """Return whether frames (F,) fail more often while the skin is touched, (F,)."""
-    counts = (int(part.sum()) for part in (failed & touched, touched, failed & ~touched, ~touched))
-    return fails_in_contact(*counts)
+    return fails_in_contact(
+        *(int(part.sum()) for part in (failed & touched, touched, failed & ~touched, ~touched))
+    )

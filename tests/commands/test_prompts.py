@@ -130,7 +130,7 @@ def test_ctrl_c_at_a_prompt_keeps_what_there_is(person_at, address, tmp_path):
 def test_free_recording_asks_for_nothing_and_goes_on_after_a_kill(person_at, address, tmp_path):
     command = ["record.py", *SKIN, "out=f", f"device.port={address}", "record.free=true"]
     with person_at(tmp_path, *command) as person:
-        person.until("2 of any gestures")
+        person.until("gesture 2")
         person.process.kill()
     done = len(read_session(tmp_path / "f").gestures)
     assert done >= 2

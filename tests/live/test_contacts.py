@@ -127,6 +127,7 @@ def test_the_message_says_where_and_how_hard(posterior, felt):
     low, high = contact["peak_interval"]
     assert low < contact["peak"] < high
     region = contact["region"]
+    assert region["share"] == pytest.approx(sum(region["probabilities"]), abs=1e-3)
     assert region["share"] == pytest.approx(0.9, abs=0.08)
     assert min(region["cell"]) > 0.001
     positions = np.array(region["origin"]) + np.array(region["cells"]) * region["cell"]

@@ -169,7 +169,9 @@ def test_frames_that_waited_while_the_threshold_was_chosen_give_the_baseline_alo
     with ExitStack() as opened:
         setup = watch_exported(str(model), {"port": skin}, print, opened)
         sleep(3.0)
+        setup.port.skin.stats.dropped = 12635  # by a queue that nobody read meanwhile
         source, begun = setup.watch(LIVE, print)[0], monotonic()
+        assert source.skin.stats.dropped == 0
         while source.tare.conversion is None:
             (frame,) = source.skin.read(1)
             source.tare.add(frame)

@@ -17,7 +17,9 @@ from rich.console import Console
 
 from skin.device.resampling import Frame
 from skin.errors import InputError
+from skin.inference.candidates import FingertipPrior
 from skin.live import loop, web
+from skin.live.contacts import unknown_contacts
 from skin.live.loop import Display
 from skin.live.verdict import Note, Verdict, contact_text, verdict_message
 from skin.live.view import screen, show_in_terminal
@@ -371,33 +373,50 @@ def test_the_page_draws_what_it_is_sent(browser):
         shows(browser, "document.documentElement.scrollHeight <= innerHeight", True)
     for said in ("DANGEROUS", "80 %", "90 %", "about the last 3 s", "99.9 Hz", "/dev/skin"):
         assert said in text
-    # Half of the scale: between teal and yellow, and not the darkness of no force.
+    # A disc at half of the scale: between teal and yellow, and not the darkness of no force.
     assert min(colour[:2]) > 60
 
 
-def test_the_picture_shows_each_reading_and_no_edge_between_or_outside(browser):
-    """Of an invalid sensor it shows what lies around: a dark hole would hide the press."""
-    subject = display()
-    with web.serve_page(subject, 0) as address:
+def test_the_map_draws_the_mean_pressure_of_the_posterior(browser):
+    """Far fewer sensors than fingers leave a wide region: the pressure is spread over it."""
+    samples = np.random.default_rng(0).normal([0.08, 0.06], [0.003, 0.008], (20_000, 2))
+    weights, x, y = np.histogram2d(*samples.T, bins=(20, 40), range=((0.06, 0.1), (0.02, 0.1)), density=False)
+    cells, share = np.argwhere(weights), 1.0
+    region = {"origin": [x[0] + 0.001, y[0] + 0.001], "cell": [0.002, 0.002], "cells": cells.tolist()}
+    region |= {"share": share, "probabilities": (weights[tuple(cells.T)] / weights.sum()).tolist()}
+    contact = {"force": 5.0, "radius": 0.008, "radius_deviation": 0.002, "region": region}
+    with web.serve_page(display(), 0) as address:
         browser.open(address)
         shows(browser, "Boolean(skin)", True)
+        drawn = browser.run(f"return [...expected({json.dumps([contact])}, 80, 60, 0.002)]")
+    drawn = np.reshape(drawn, (60, 80))
+    assert drawn.sum() * 0.002**2 == pytest.approx(5.0, rel=0.01)
+    radii = 0.008 + 0.002 * np.sqrt(3) * np.random.default_rng(1).uniform(-1, 1, len(samples))  # as the prior
+    peak = FingertipPrior().peak(radii) * 5.0
+    for row, column in ((30, 40), (30, 43), (36, 40), (40, 42)):
+        away = np.linalg.norm(samples - [(column + 0.5) * 0.002, (row + 0.5) * 0.002], axis=1)
+        mean = np.mean(peak / (1 + np.exp((away - radii) / 0.0015)))
+        assert drawn[row, column] == pytest.approx(mean, rel=0.1)
 
-        def image(values, valid):
-            dots = browser.run(f"return [...picture({values}, {json.dumps(valid)})]")
-            return np.array(dots).reshape(64, 64)
 
-        values = [0.0, 4.0, 1.0, 3.0, 2.0]
-        whole = image(values, [True] * 5)
-        for (x, y, _), value in zip(PLACES, values, strict=True):
-            row, column = int(64 * y / SIZE[1]), int(64 * x / SIZE[0])
-            assert whole[row, column] == pytest.approx(255 * value / 4, abs=8)
-        assert whole[32, 20] == pytest.approx(np.mean(whole[[31, 33, 32, 32], [20, 20, 19, 21]]), abs=2)
-        # Half a picture from dark to bright is 8 a pixel.
-        assert max(np.abs(np.diff(whole, axis=axis)).max() for axis in (0, 1)) <= 8
-        one = image([0.0, 0.0, 1.0, 0.0, 0.0], [False, False, True, False, False])
-        assert (one.min(), one.max()) == (63, 63)
-        assert image([1, 1, 4, 1, 0], [True, True, True, True, False])[32, 32] > 60
-        assert image([0.0] * 5, [False] * 5).max() == 0
+@pytest.mark.parametrize("state", ["contacts", "not a fingertip", "unknown"])
+def test_pressure_is_drawn_where_contacts_explain_the_readings(browser, state):
+    region = {"share": 1.0, "origin": [0.08, 0.09], "cell": [0.002, 0.002], "cells": [[0, 0]]}
+    contact = {"force": 20.0, "force_deviation": 1.0, "radius": 0.01, "radius_deviation": 0.001}
+    contact |= dict.fromkeys(("x", "y"), 0.08) | dict.fromkeys(("x_deviation", "y_deviation"), 0.001)
+    contact |= {"peak_interval": [4e4, 9e4], "region": region | {"probabilities": [1.0]}}
+    subject = display()
+    subject.contacts._latest = {
+        **unknown_contacts("being prepared"), "state": state, "number": 1, "probability": 1.0, "fit": 0.0,
+        "large": 1.0, "device_time": 1.0, "contacts": [contact] * (state != "unknown"),
+    }, np.inf  # fmt: skip
+    subject.add(frame([0, 0, 2.0, 0, 0]))
+    with web.serve_page(subject, 0) as address, repeated(subject, replace(PRESSED, dangerous=False)):
+        browser.open(address)
+        shows(browser, "pictures >= 3", True)
+        colour = browser.run(AT.format(0.078 / SIZE[0], 0.083 / SIZE[1]))
+    # Yellow is near the limit of dangerous; the dark of the skin says that nothing is known to press there.
+    assert (min(colour[:2]) > 90) == (state == "contacts")
 
 
 ANNOUNCED = "pictures > 0 && [...document.querySelectorAll('[role=alert]')].map(one => one.textContent)"

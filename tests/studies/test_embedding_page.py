@@ -80,3 +80,7 @@ def test_the_figure_has_a_panel_per_label_and_layout(three):
     assert len(figure.axes) == 2 * 3
     assert figure.axes[2].get_title() == "layout"
     assert [len(group.get_offsets()) for group in figure.axes[0].collections] == [10, 10]
+    texts = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert texts == ["the label does not hold", "the label holds", "layout 1", "layout 2"]
+    colours = {tuple(handle.get_facecolor()[0]) for handle in figure.legends[0].legend_handles}
+    assert len(colours) == 4

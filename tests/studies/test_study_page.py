@@ -160,6 +160,12 @@ def test_several_variants_under_several_conditions_have_a_line_each_and_a_legend
     assert [text.get_text() for text in drawn.legends[0].get_texts()] == ["no condition", "rough"]
 
 
+def test_conditions_are_distinguished_by_colour():
+    found = [trial(name, "0", 0.9, condition=f"device {n}") for name in ("a", "b") for n in range(9)]
+    (axis,) = study_figure(STUDY, pd.DataFrame(found)).axes
+    assert len({drawn[0].get_color() for drawn in axis.containers}) == 9
+
+
 def test_tables_of_several_runs_become_one(tmp_path):
     pages = [Page("", {}, pd.DataFrame([{"course": "hold, 1 s", "alarms": n}])) for n in range(2)]
     rows = [trial("a", str(n), None, run=f"run{n}", page=page) for n, page in enumerate([*pages, Page("")])]

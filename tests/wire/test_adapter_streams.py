@@ -232,6 +232,8 @@ def test_a_proposed_adapter_reads_what_was_sent(name):
     pieces = sent(name)
     proposal = propose(pieces)[0]
     assert proposal.sensors == rows.shape[1]
+    if name == "milliseconds":
+        assert "field 0 is the time in ms, as it rises by 20 per frame" in proposal.summary
     # What a person pastes is what is read.
     import yaml
 

@@ -359,6 +359,17 @@ def test_a_channel_that_never_sends_a_number_is_not_ok():
     assert rows[1].endswith("  no value")
 
 
+def test_a_clock_that_nothing_describes_is_not_ok():
+    noise = np.random.default_rng(0).integers(0, 9, (100, 2))
+    data = b"".join(line([9 * n + 5000, *noise[n], 700 + n // 40]) for n in range(100))
+    with opened(data, layout=4) as skin:
+        monitor = PortMonitor(skin)
+        monitor._frames.extend(skin.read(99, timeout=20))
+        rows = monitor.summary().splitlines()[-4:]
+    assert "  a clock or counter, no sensor: skin listen adapter=auto" in rows[0]
+    assert all(row.endswith("  ok") for row in rows[1:])
+
+
 def test_channels_and_frames_that_fail_under_a_press_are_named():
     """A word in place of a value costs that value; letters in a line that has no other field, the line."""
     data = b""

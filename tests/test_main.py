@@ -35,8 +35,9 @@ def test_a_verb_shows_its_own_groups_and_settings(verb, capsys):
     assert f"skin {verb}" in text
     trained = ("adapt", "compare", "evaluate", "export", "live", "train")
     assert ("fusion" in text) == (verb in trained)
-    assert ("[serial]" in text) == (verb in ("check", "listen", "record"))
-    assert ("[simulated]" in text) == (verb not in ("check", "listen", "record"))
+    at_port = ("check", "listen", "record", "setup")
+    assert ("[serial]" in text) == (verb in at_port)
+    assert ("[simulated]" in text) == (verb not in at_port)
     assert "hydra" not in text
 
 

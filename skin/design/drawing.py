@@ -1,6 +1,6 @@
 """Tables and pictures of the expected posterior of a skin, and of placements."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +14,7 @@ from rich.console import Console
 from rich.table import Table
 
 from skin.body.base import AbstractBody, Sensors
+from skin.body.layout import tile_centres
 from skin.design.expected import Findings, Step
 from skin.plot.figures import COLOURS, MARKS, save_figure
 
@@ -27,6 +28,46 @@ _WIDE = ("raised\nmm", "radius\nmm", "reach\nmm", "local precision\nmm")  # no r
 def print_expected(findings: Sequence[Findings]) -> None:
     """Print a line per force; the reach is the receptive radius."""
     _print([_cells(finding) for finding in findings])
+
+
+_LONGER = 20  # cells of the map along its longer side: it fits on a screen
+
+
+def print_blind_places(
+    body: AbstractBody,
+    sensors: Sensors,
+    forces: Sequence[float],
+    count_unfelt: Callable[[np.ndarray], np.ndarray],
+) -> None:
+    """Print a map of the force from which a fingertip is felt, and where a medium force is not.
+
+    Args:
+        body: the skin.
+        sensors: in it.
+        forces: to choose from, N.
+        count_unfelt: from places (N, 2), m, to the number of the forces that no sensor feels there, (N,).
+    """
+    size, positions = np.array(body.size), sensors.positions[:, :2]
+    shape = np.maximum(1, np.round(_LONGER * size[::-1] / size.max())).astype(int)  # rows, columns
+    places = tile_centres(*shape) * size
+    nearest = np.linalg.norm(places[:, None] - positions, axis=2).argsort(axis=1)[:, :4]
+    low, high = positions[nearest].min(axis=1), positions[nearest].max(axis=1)
+    inside = ((low[:, None] <= positions) & (positions <= high[:, None])).all(axis=2).sum(axis=1)
+    between = ((low < places) & (places < high)).all(axis=1) & (inside == 4)
+    groups = np.unique(np.sort(nearest[between], axis=1), axis=0)
+    unfelt = count_unfelt(np.concatenate([places, positions[groups].mean(axis=1)]))
+    texts = np.array([*(f"{force:g}" for force in sorted(forces)), "##"], dtype="U6")
+    cells = texts[unfelt[: len(places)]].reshape(shape)
+    numbers = [f"s{number}" for number in range(len(positions))]
+    cells[tuple(np.minimum(positions[:, ::-1] / size[::-1] * shape, shape - 1).astype(int).T)] = numbers
+    print(
+        f"\nLeast of {', '.join(texts[:-1])} N from which a fingertip is felt (##: none; s0, ...: sensors):",
+        *("".join(f"{text:>3}" for text in row) for row in cells),
+        sep="\n",
+    )
+    blind = [", ".join(map(str, group)) for group in groups[unfelt[len(places) :] > len(forces) // 2]]
+    if blind:
+        print(f"A fingertip of {texts[len(forces) // 2]} N is not felt between sensors {'; '.join(blind)}.")
 
 
 def draw_expected(body: AbstractBody, sensors: Sensors, maps: Mapping[float, np.ndarray], path: Path) -> Path:
@@ -54,9 +95,12 @@ def draw_expected(body: AbstractBody, sensors: Sensors, maps: Mapping[float, np.
         )
         axis.set(title=f"{force:g} N", xlabel="x, mm", ylabel="y, mm")
         axis.label_outer()
-    steps = (1, 2, 5) if highest > 5 * lowest else range(1, 10)
     figure.colorbar(
-        picture, ax=axes, label="expected error of the place, mm", format="%g", ticks=LogLocator(subs=steps)
+        picture,
+        ax=axes,
+        label="expected error of the place, mm",
+        format="%g",
+        ticks=LogLocator(subs=(1, 2, 5) if highest > 5 * lowest else range(1, 10)),
     ).minorticks_off()
     return save_figure(figure, path)
 
@@ -176,12 +220,15 @@ def placement(
         )
         marks.append(Patch(color=_SHADE, label="keep-out zone"))
     marks += axis.plot(*(1e3 * sites.T), ".", color=_SHADE, markersize=2, label=f"{len(sites)} sites")
-    named = f"configured layout, {len(before)}"
     marks += axis.plot(
-        *(1e3 * before.T), "s", color=COLOURS[1], markersize=9, markerfacecolor="none", label=named
+        *(1e3 * before.T),
+        "s",
+        color=COLOURS[1],
+        markersize=9,
+        markerfacecolor="none",
+        label=f"configured layout, {len(before)}",
     )
-    placed = f"placed, {len(chosen)}"
-    marks += axis.plot(*(1e3 * chosen.T), "o", color=COLOURS[0], markersize=6, label=placed)
+    marks += axis.plot(*(1e3 * chosen.T), "o", color=COLOURS[0], markersize=6, label=f"placed, {len(chosen)}")
     axis.set(xlabel="x, mm", ylabel="y, mm", xlim=extent[:2], ylim=extent[2:], aspect="equal", title=title)
     axis.legend(handles=marks, loc="upper left", bbox_to_anchor=(1.01, 1), frameon=False)
     return figure

@@ -2,7 +2,7 @@
 
 import math
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -83,14 +83,8 @@ def sensitivity(simulator: AbstractSimulator, fingertip: Fingertip, touches: Ten
         touches: (B, 4).
     """
     simulator.double()
-    parts = list(_parts(simulator, fingertip, touches.double()))
-    return Sensitivity(*(torch.cat(columns) for columns in zip(*parts, strict=True)))
-
-
-def _parts(
-    simulator: AbstractSimulator, fingertip: Fingertip, touches: Tensor
-) -> Iterator[tuple[Tensor, Tensor]]:
-    for part in touches.split(_AT_ONCE):
+    parts = list[tuple[Tensor, Tensor]]()
+    for part in touches.double().split(_AT_ONCE):
         slopes = []
         for axis in range(len(PARAMETERS)):
             along = torch.zeros_like(part)
@@ -98,7 +92,8 @@ def _parts(
             # Touches do not influence each other, so one direction serves all of them.
             pair = torch.func.jvp(lambda touch: simulator.press(fingertip(touch)).readings, (part,), (along,))
             slopes.append(pair[1])
-        yield pair[0], torch.stack(slopes, dim=-1)
+        parts.append((pair[0], torch.stack(slopes, dim=-1)))
+    return Sensitivity(*(torch.cat(columns) for columns in zip(*parts, strict=True)))
 
 
 def local_covariance(sensitivity: Sensitivity, noise: Noise, priors: Tensor) -> Tensor:
@@ -241,12 +236,18 @@ class ExpectedPosterior:
         Raises:
             InputError: a skin that cannot be built, or a margin that leaves no position.
         """
-        from skin.design.drawing import draw_expected, print_expected
+        from skin.design.drawing import draw_expected, print_blind_places, print_expected
 
         simulator = skin.simulator(skin.body, skin.sensors)
         trials = self.trials(simulator, skin.body)
         findings = self.find(simulator, skin.body, trials)
         print_expected(findings)
+        print_blind_places(
+            skin.body,
+            skin.sensors,
+            self.forces,
+            lambda places: self.count_unfelt(simulator, skin.body, places),
+        )
         settings = {name + _UNITS.get(name, ""): value for name, value in asdict(self).items()}
         content = {
             "sensors": len(skin.sensors),
@@ -301,6 +302,14 @@ class ExpectedPosterior:
             _findings(force, trial, area, self._local_precision(responses.of_force(force), force, body))
             for force, trial in trials.items()
         ]
+
+    def count_unfelt(
+        self, simulator: AbstractSimulator, body: AbstractBody, places: np.ndarray
+    ) -> np.ndarray:
+        """Return how many of the forces raise no sensor, (N,), at places (N, 2), m, by a medium fingertip."""
+        discs = np.column_stack([places, np.full(len(places), sum(self.radii) / 2)])
+        largest = torch.from_numpy(disc_readings(simulator, body, discs, self.rim).max(axis=1))
+        return np.sum([~self._noise.exceeds(force * largest).numpy() for force in self.forces], axis=0)
 
     def _local_precision(self, responses: Sensitivity, force: float, body: AbstractBody) -> float:
         """Return the median local precision of the position, m."""
@@ -399,13 +408,6 @@ class Step:
     pitch: float
     findings: list[Findings]
 
-    def lines(self) -> Iterator[dict[str, float]]:
-        """Yield one line of a table per force."""
-        rows, columns = self.grid
-        for finding in self.findings:
-            case = {"thickness_m": self.thickness, "rows": rows, "columns": columns, "pitch_m": self.pitch}
-            yield case | asdict(finding)
-
 
 @checked("design")
 @dataclass(frozen=True, kw_only=True)
@@ -441,8 +443,18 @@ class Sweep(ExpectedPosterior):
         shown = track(cases, "solving", console=Console(stderr=True), disable=not sys.stderr.isatty())
         steps = [self.step(skin, *case) for case in shown]
         print_sweep(steps)
-        table = pd.DataFrame([line for step in steps for line in step.lines()])
-        path = write(table.to_csv(index=False, na_rep="nan"), folder / "design_sweep.csv")
+        table = pd.DataFrame(
+            {
+                "thickness_m": step.thickness,
+                "rows": step.grid[0],
+                "columns": step.grid[1],
+                "pitch_m": step.pitch,
+                **asdict(finding),
+            }
+            for step in steps
+            for finding in step.findings
+        ).to_csv(index=False, na_rep="nan")
+        path = write(table, folder / "design_sweep.csv")
         print(path, draw_sweep(steps, folder / "design_sweep.png"), sep="\n")
 
     def step(self, skin: SkinModel, thickness: float, grid: tuple[int, int]) -> Step:

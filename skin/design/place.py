@@ -132,7 +132,12 @@ class Place:
         device = device.replace(touch=replace(device.sampler.settings, over_sensors=False))
         forbidden = keep_out(self.keep_out, device.size)
         problem = PlacementProblem.of(device, forbidden, self.count, self.keep, self.distance, self.raster)
-        noise = self._noise(device)
+        noise = _median(device.constants.noise) if self.noise is None else self.noise
+        if noise == 0:
+            raise InputError(
+                "placement needs sensors with noise, got device.noise=0: set design.noise=0.05, or another "
+                "standard deviation in N"
+            )
         clip = _median(device.constants.clip)
         covariance, frames = reading_covariance(device, problem.sensors, self.touches, self.seed, clip)
         with Console(stderr=True).status("placing sensors"):
@@ -140,18 +145,16 @@ class Place:
         settings: dict[str, Any] = {"sites": problem.sites, "touches": self.touches, "frames": frames}
         settings |= {"noise_N": noise, "clip_N": clip, "distance_m": self.distance}
         content = settings | outcome | {"seconds": round(time.perf_counter() - started, 1)}
-        Console().print(_table(content))
-        paths = self._write(problem, chosen, content, forbidden, folder)
-        print("\n".join(map(str, paths)))
-
-    def _noise(self, device: Simulated) -> float:
-        noise = _median(device.constants.noise) if self.noise is None else self.noise
-        if noise == 0:
-            raise InputError(
-                "placement needs sensors with noise, got device.noise=0: set design.noise=0.05, or another "
-                "standard deviation in N"
-            )
-        return noise
+        table = Table(
+            "layout",
+            "sensors",
+            "information, nats",
+            title=f"{content['sites']} sites, {content['touches']} touches, {content['seconds']:g} s",
+        )
+        for name, layout in {"placed": content, **content["layouts"]}.items():
+            table.add_row(name.replace("_", " "), str(layout["sensors"]), f"{layout['information_nats']:.1f}")
+        Console().print(table)
+        self._write(problem, chosen, content, forbidden, folder)
 
     def _write(
         self,
@@ -160,7 +163,7 @@ class Place:
         content: Mapping[str, Any],
         forbidden: np.ndarray | None,
         folder: Path,
-    ) -> list[Path]:
+    ) -> None:
         positions = problem.sensors.positions[:, :2]
         figure = placement(
             positions[chosen],
@@ -170,11 +173,12 @@ class Place:
             forbidden,
             f"{content['information_nats']:.1f} nats",
         )
-        return [
+        print(
             write(_csv(problem.sensors, chosen), folder / "placement.csv"),
             write(json_text(content), folder / "placement.json"),
             save_figure(figure, folder / "placement.png"),
-        ]
+            sep="\n",
+        )
 
 
 def _median(constants: Tensor) -> float:
@@ -189,16 +193,3 @@ def _csv(sensors: Sensors, rows: np.ndarray) -> str:
         names, columns = [*names, "normal_x", "normal_y", "normal_z"], [*columns, sensors.normals[rows]]
     lines = (",".join(f"{value:.6f}" for value in row) for row in np.hstack(columns))
     return "\n".join([",".join(names), *lines]) + "\n"
-
-
-def _table(content: Mapping[str, Any]) -> Table:
-    """Return the table of the placement and of other layouts."""
-    made = Table(
-        "layout",
-        "sensors",
-        "information, nats",
-        title=f"{content['sites']} sites, {content['touches']} touches, {content['seconds']:g} s",
-    )
-    for name, layout in {"placed": content, **content["layouts"]}.items():
-        made.add_row(name.replace("_", " "), str(layout["sensors"]), f"{layout['information_nats']:.1f}")
-    return made

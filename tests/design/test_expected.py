@@ -7,6 +7,7 @@ import pytest
 
 from skin.body.base import Sheet
 from skin.body.layout import Grid
+from skin.design.drawing import print_blind_places
 from skin.design.expected import ExpectedPosterior
 from skin.errors import InputError
 from skin.inference.candidates import FingertipPrior, disc_readings
@@ -95,6 +96,26 @@ def test_the_posterior_says_how_far_it_errs_and_the_map_shows_where():
     near = shown[row, column]
     high = near > np.median(near)
     assert rms(errors[high]) > 1.2 * rms(errors[~high])
+
+
+def test_a_map_shows_from_which_force_a_touch_is_felt(capsys):
+    sensors, forces = Grid(2, 3, depth=0.0195).sensors(BODY), (20.0, 0.1, 5.0)
+    expected = design(forces=forces)
+    places = np.array([[0.04, 0.04], [0.02, 0.02]])  # in the middle between four sensors, and above one
+    readings = disc_readings(solid(), BODY, np.column_stack([places, [0.008, 0.008]]), expected.rim).max(1)
+    unfelt = expected.count_unfelt(solid(), BODY, places)
+    assert unfelt.tolist() == [sum(force * reading <= 0.15 for force in forces) for reading in readings]
+    assert unfelt.tolist() == [3, 1]
+    print_blind_places(BODY, sensors, forces, lambda where: expected.count_unfelt(solid(), BODY, where))
+    *rows, named = capsys.readouterr().out.splitlines()[2:]
+    cells = [row.split() for row in rows]
+    assert {len(row) for row in cells} == {20}
+    assert [[row[3], row[10], row[16]] for row in cells if "s0" in row or "s3" in row] == [
+        ["s0", "s1", "s2"],
+        ["s3", "s4", "s5"],
+    ]
+    assert {text for row in cells for text in row if text[0] != "s"} == {"5", "20", "##"}
+    assert named == "A fingertip of 5 N is not felt between sensors 0, 1, 3, 4; 1, 2, 4, 5."
 
 
 def test_the_map_has_no_value_where_no_touch_is():

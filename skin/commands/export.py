@@ -3,12 +3,14 @@
     skin export run=latest out=skin.onnx
     skin export run=any_skin body=arm layout.path=sensors.csv
     skin live run=skin.onnx device=serial device.port=/dev/ttyACM0
+    skin export run=features format=c out=model.h
     skin export run=latest format=folder name=my_skin licence=MIT
     skin export run=any_skin format=thresholds export.rates=[100]
 
 The ONNX file holds a network, from readings to probabilities, and is compared with the run on simulated or
-recorded touches first. The folder holds any run: run=my_skin then selects it wherever a run is accepted.
-format=thresholds adds those of a skin to the folder of a pretrained model, where skin live finds them.
+recorded touches first. The C file holds trees or rules, for a board. The folder holds any run: run=my_skin
+then selects it wherever a run is accepted. format=thresholds adds those of a skin to the folder of a
+pretrained model, where skin live finds them.
 """
 
 import sys
@@ -35,7 +37,6 @@ if TYPE_CHECKING:
     from skin.runs.run import FinishedRun
 
 _THRESHOLDS = "choosing the thresholds of the alarm for touches"
-_USUAL = 100.0  # Hz
 # Expected seconds of each step, for the fraction that is done.
 _STEPS = {
     "loading the run and the threshold of its alarm": 25.0,
@@ -50,7 +51,7 @@ _STEPS = {
 def main(
     config: Config,
     run: str,
-    format: Literal["onnx", "folder", "thresholds"],
+    format: Literal["onnx", "c", "folder", "thresholds"],
     out: str | None,
     name: str | None,
     licence: str | None,
@@ -71,16 +72,28 @@ def main(
     else:
         check_settings(_export_file, export, "export")
         with Steps(_STEPS) as steps:
-            if format == "thresholds":
-                _ship_thresholds(run, config, export["touch"], export["rates"])
+            if format == "onnx":
+                _export_file(run, config, _path(out, ".onnx"), steps, **export)
+            elif format == "c":
+                _export_header(run, config, _path(out, ".h"), export["touch"], export["rates"])
             else:
-                _export_file(run, config, out, steps, **export)
+                from skin.evaluation.alarm import ship_thresholds
+
+                _, _, model, conditions = _load(run, config, export["touch"], export["rates"], alarm=False)
+                ship_thresholds(model.alarm, conditions, print)
+
+
+def _path(out: str | None, suffix: str) -> Path | None:
+    """Return the path that the user gives, of a file with the suffix; None: of ``results``."""
+    if out is not None and Path(out).suffix != suffix:
+        raise InputError(f"out={out} must end in {suffix}: as in out=skin{suffix}")
+    return None if out is None else Path(out).expanduser()
 
 
 def _export_file(
     name: str,
     config: Config,
-    out: str | None,
+    path: Path | None,
     steps: Steps,
     touch: PositiveFloat | None,
     touches: Annotated[int, Ge(1)],
@@ -91,17 +104,13 @@ def _export_file(
     Args:
         name: of the run.
         config: of the command.
-        out: path of the file; None: in ``results``.
+        path: of the file; None: in ``results``.
         steps: to be shown.
         touch: contact threshold, N above the baseline; None: as in the run.
         touches: number of touches on which the file is compared with the run.
         rates: of devices, Hz, for each of which the threshold of the alarm is chosen; None: that of the run's
             device, 100 Hz if it has many.
     """
-    path = None if out is None else Path(out).expanduser()
-    if path is not None and path.suffix != ".onnx":
-        raise InputError(f"out={out} must end in .onnx: as in out=skin.onnx")
-
     from skin.runs.build import equation10_warning
     from skin.runs.model import describe_skin
 
@@ -122,21 +131,30 @@ def _export_file(
         described = replace(described, **_choose_thresholds(model.alarm, conditions))
     path = path or results(None) / f"{run.title.split()[0]}_{run.identity[:8]}.onnx"
     steps.begin("simulating touches to compare")
-    if (device := model.device.reference) is None:
-        compared = model.device.touches("test")[:touches]
-    else:  # a tenth of the gestures is the validation split
-        compared = device.replace(gestures=10 * max(10, touches)).touches("validation")[:touches]
+    compared = (
+        device.fresh_touches(touches)
+        if (device := model.device.reference)
+        else model.device.touches("test")[:touches]
+    )
     steps.begin("writing the file and comparing it")
     difference = write_model(module, described, compared, path)
     print(f"{path}: differs from the run by {difference:.1g} at most on {len(compared)} touches")
 
 
-def _ship_thresholds(name: str, config: Config, touch: float | None, rates: Sequence[float] | None) -> None:
-    """Add the thresholds of the alarm for a skin to those of a pretrained model; see :func:`_export_file`."""
-    from skin.evaluation.alarm import ship_thresholds
+def _export_header(
+    name: str,
+    config: Config,
+    path: Path | None,
+    touch: float | None,
+    rates: Sequence[float] | None,
+) -> None:
+    """Write trees or rules for a board, of 100 Hz unless a rate is given; see :func:`_export_file`."""
+    from skin.live.engine import DebounceSettings
+    from skin.robot.board import write_header
 
-    _, _, model, conditions = _load(name, config, touch, rates, alarm=False)
-    ship_thresholds(model.alarm, conditions, print)
+    path, usual = path or results(None) / f"{name}.h", DebounceSettings()
+    model, conditions = _load(name, config, touch, rates or [100.0])[2:]
+    print(write_header(model, conditions, usual.label, usual.calm, path, print))
 
 
 def _load(
@@ -152,7 +170,7 @@ def _load(
     used = run.configured(overrides())
     model = load_model(run, used, touch=touch, one_skin=True, alarm=alarm)
     rate = used.device.get("rate") or model.rate
-    rates = rates or [rate if isinstance(rate, int | float) else _USUAL]
+    rates = rates or [rate if isinstance(rate, int | float) else 100.0]  # Hz
     patience = DebounceSettings().alarm
     return run, used, model, [model.live_conditions(rate, patience, False) for rate in rates if model.alarms]
 
@@ -162,15 +180,22 @@ def _choose_thresholds(source: "AlarmSource", conditions: "Sequence[LiveConditio
     from skin.evaluation.alarm import choose_alarm_threshold
 
     points = {f"{live.rate:g}": choose_alarm_threshold(source, live, say=print) for live in conditions}
-    hiding = [at.warning() for at in points.values() if at and at.useless]
-    sys.stderr.writelines(f"{text}: skin live refuses the file at this rate\n" for text in hiding)
-    thresholds = {rate: 1.0 if at.useless else at.threshold for rate, at in points.items() if at}
-    scores = {rate: astuple(at.score) for rate, at in points.items() if at and at.score}
-    promises = {
-        rate: {
-            name: value for name, value in vars(at.guarantee).items() if name not in ("lapsed", "verified")
+    sys.stderr.writelines(
+        f"{at.warning()}: skin live refuses the file at this rate\n"
+        for at in points.values()
+        if at and at.useless
+    )
+    return {
+        "thresholds": {rate: 1.0 if at.useless else at.threshold for rate, at in points.items() if at},
+        "scores": {rate: astuple(at.score) for rate, at in points.items() if at and at.score} or None,
+        "guarantees": {
+            rate: {
+                name: value
+                for name, value in vars(at.guarantee).items()
+                if name not in ("lapsed", "verified")
+            }
+            for rate, at in points.items()
+            if at and at.guarantee
         }
-        for rate, at in points.items()
-        if at and at.guarantee
+        or None,
     }
-    return {"thresholds": thresholds, "scores": scores or None, "guarantees": promises or None}

@@ -34,7 +34,7 @@ help:  ## list the targets
 $(READY): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip
-	$(BIN)/python -m pip install --constraint constraints.txt --editable ".[dev,parallel,embeddings,docs,export,data,server,mujoco]"
+	$(BIN)/python -m pip install --constraint constraints.txt --editable ".[dev,parallel,embeddings,docs,export,data,server,mujoco,robot]"
 	touch $@
 
 install: $(READY)  ## create .venv; run by the other targets if needed

@@ -339,10 +339,10 @@ def build_recording(
     for name, values in (groups or {}).items():
         numbers = [float(lists[name].index(text)) for text in values]
         parameters[GROUP + name] = torch.tensor(numbers, dtype=torch.float32)
-    word = positions if isinstance(positions, str) else "stated"
-    if positions is None or isinstance(positions, Sensors):
-        word = "layout"
-    metadata: dict[str, Any] = {"about": about, "positions": word, "groups": lists}
+    placed: dict[str, Any] = {"positions": positions if isinstance(positions, str) else "stated"}
+    if isinstance(positions, Sensors):
+        placed = {"positions": "layout", "directions": positions.normals.tolist()}
+    metadata = {"about": about, **placed, "groups": lists}
     task, known = _binary(labels) if labels else (TOUCH, None)
     if kinds is not None:
         present, numbers_of_kinds = _number(kinds, names)
@@ -417,20 +417,21 @@ def _position(
     return sensors, (width, height)
 
 
-def read_by_function(reader: str, path: Path, options: Mapping[str, Any]) -> Recording:
+def read_by_function(reader: str, path: Path, options: Mapping[str, Any], *skin: Any) -> Recording:
     """Return the recording that a function makes of files.
 
     Args:
         reader: its name, ``package.function``, given by the person at the command line.
         path: of the files.
         options: further arguments.
+        skin: sensors, and extent of the skin, m, where the configuration gives them.
 
     Raises:
         InputError: no such function, options that it does not take, or another result than a recording.
     """
     function = import_target(reader, "reader")
     check_settings(function, options, "options")
-    recording = function(path, **options)
+    recording = function(path, *skin, **options)
     if not isinstance(recording, Recording):
         raise InputError(f"reader={reader} must return a Recording, got {type(recording).__name__}")
     return recording

@@ -69,7 +69,7 @@ def _description(
 
 def describe_recording(recording: Recording, first: int = 0) -> dict[str, Any]:
     """Return everything that a file contains beside its rows; ``first`` is the number of the first touch."""
-    touches = recording.touches
+    touches, geometry = recording.touches, recording.touches.geometry
     return {
         "format": FORMAT,
         "units": UNITS,
@@ -86,7 +86,9 @@ def describe_recording(recording: Recording, first: int = 0) -> dict[str, Any]:
         "displacement": recording.displacement is not None,
         "saturated": touches.saturated is not None,
         "parameters": list(recording.parameters),
-        "metadata": recording.metadata,
+        "metadata": recording.metadata
+        # The normals of the sensors, which a recording has no tensor for.
+        | ({} if geometry is None or geometry.ndim > 2 else {"directions": geometry[:, 3:6].tolist()}),
         # Only with contacts, so that a file without them is what earlier versions write and read.
         **({} if touches.contacts is None else {"contacts": touches.contacts.shape[2]}),
     }
@@ -137,7 +139,7 @@ def write_recording(recording: Recording, path: str | Path, first: int = 0) -> P
     """
     path = tabular(path, "a recording")
     about = describe_recording(recording, first)
-    table = _table(recording, about)
+    table = tabulate(recording, about)
     with whole(path) as partial:
         if path.suffix == ".csv":
             pa.csv.write_csv(table, partial)
@@ -150,7 +152,8 @@ def write_recording(recording: Recording, path: str | Path, first: int = 0) -> P
     return path
 
 
-def _table(recording: Recording, about: dict[str, Any]) -> pa.Table:
+def tabulate(recording: Recording, about: dict[str, Any]) -> pa.Table:
+    """Return the rows of a recording, which :func:`describe_recording` describes."""
     touches, moves = recording.touches, recording.displacement
     batch, time, _ = touches.readings.shape
 
@@ -173,11 +176,12 @@ def _table(recording: Recording, about: dict[str, Any]) -> pa.Table:
         of_frames(touches.saturated),
         np.ma.masked_invalid(of_frames(touches.contacts)),
     )
-    arrays = (column for part in parts for column in part.T)
     return pa.table(
         {
             name: pa.array(np.ma.getdata(array), kind, mask=np.ma.getmaskarray(array), safe=False)
-            for (name, kind), array in zip(column_types(about).items(), arrays, strict=True)
+            for (name, kind), array in zip(
+                column_types(about).items(), (column for part in parts for column in part.T), strict=True
+            )
         }
     )
 
@@ -201,20 +205,19 @@ def read_recording(path: str | Path, complete: bool = True) -> Recording:
     path = tabular(path, "a recording")
     if path.suffix == ".csv":
         raise InputError(f"{path} is a table without layout and rate: give {path.with_suffix('.parquet')}")
-    with _refused(path):
+    with refused(path):
         check_content(path.read_bytes())
         about, task = _describe(path)
         if not complete:
             about |= {"force": False, "displacement": False, "parameters": []}
         columns = column_types(about)
         with pa.parquet.ParquetFile(path, page_checksum_verification=True) as file:
-            rows, touches = file.metadata.num_rows, f"{about['gestures']} touches of {about['frames']} frames"
-            if about["gestures"] * about["frames"] != rows:
-                raise ValueError(f"it has {rows} rows, not {touches}: is it cut off?")
-            needed = 16.0 * rows * len(columns)
-            require_memory(needed, f"{path}, {rows} rows,", "give a recording of fewer gestures")
+            rows = file.metadata.num_rows
+            require_memory(
+                16.0 * rows * len(columns), f"{path}, {rows} rows,", "give a recording of fewer gestures"
+            )
             table = file.read(columns=list(columns)).cast(pa.schema(columns.items()))
-        return _recording(table, about, task)
+        return from_table(table, about, task)
 
 
 def read_description(path: Path) -> dict[str, Any]:
@@ -223,12 +226,12 @@ def read_description(path: Path) -> dict[str, Any]:
     Raises:
         InputError: as of :func:`read_recording`; the rows are not read.
     """
-    with _refused(path):
+    with refused(path):
         return _describe(path)[0]
 
 
 @contextmanager
-def _refused(path: Path) -> Iterator[None]:
+def refused(path: Path) -> Iterator[None]:
     """Turn errors of a file that cannot be read as a recording into an InputError."""
     if not path.is_file():
         raise InputError(f"no recording {path}: skin generate n=1000 out={path} makes one")
@@ -249,17 +252,36 @@ def _describe(path: Path) -> tuple[dict[str, Any], Task]:
     if stored.get(b"skin_sha256", digest) != digest:  # older files have none
         raise ValueError("its units, layout and rate are not those that were written")
     about = json.loads(stored[b"skin"])
+    return about, check_description(about, path)
+
+
+def check_description(about: dict[str, Any], path: Path) -> Task:
+    """Check what :func:`describe_recording` returned; return its task.
+
+    Raises:
+        ValueError: it is of another version, or has other units.
+        InputError: an entry is missing or invalid.
+    """
     if isinstance(about, dict) and about.get("format") != FORMAT:
         raise ValueError(f"it has format {about.get('format')}, this version reads format {FORMAT}")
     check_settings(_description, about, f"{path}: description", whole=True)
     check_settings(Task, about["task"], f"{path}: task", whole=True)
     if about["units"] != UNITS:
         raise ValueError(f"it has the units {about['units']}, needed are {UNITS}: convert it before")
-    return about, Task(**about["task"] | {"names": tuple(about["task"]["names"])})
+    return Task(**about["task"] | {"names": tuple(about["task"]["names"])})
 
 
-def _recording(table: pa.Table, about: dict[str, Any], task: Task) -> Recording:
-    shape, sensors = (about["gestures"], about["frames"], -1), len(about["positions"])
+def from_table(table: pa.Table, about: dict[str, Any], task: Task) -> Recording:
+    """Return the recording of rows of :func:`tabulate`, with their description and its task.
+
+    Raises:
+        ValueError: rows that are not whole touches.
+    """
+    batch, time, sensors = about["gestures"], about["frames"], len(about["positions"])
+    if table.num_rows != batch * time:
+        raise ValueError(
+            f"it has {table.num_rows} rows, not {batch} touches of {time} frames: is it cut off?"
+        )
     for name, expected in zip(("simulation", "frame"), _rows(about), strict=True):
         if len(wrong := np.flatnonzero(table[name].to_numpy() != expected)):
             raise ValueError(
@@ -269,7 +291,7 @@ def _recording(table: pa.Table, about: dict[str, Any], task: Task) -> Recording:
 
     def numbers(names: Sequence[str], unknown: float = 0.0) -> Tensor:
         columns = [table[name].cast(pa.float32()).fill_null(unknown).to_numpy() for name in names]
-        return torch.from_numpy(np.stack(columns, axis=-1)).view(shape)
+        return torch.from_numpy(np.stack(columns, axis=-1)).view(batch, time, -1)
 
     def of_sensors(name: str) -> Tensor:
         return numbers(numbered(name, sensors))
@@ -278,7 +300,7 @@ def _recording(table: pa.Table, about: dict[str, Any], task: Task) -> Recording:
     contacts = _contact_names(about)
     touches = Touches(
         of_sensors("reading"),
-        torch.from_numpy(valid).view(shape),
+        torch.from_numpy(valid).view(batch, time, -1),
         torch.tensor(about["positions"], dtype=torch.float32),
         numbers(task.names, nan)[:, 0].clone() if about["labelled"] else None,
         about["rate"],

@@ -22,7 +22,7 @@ from skin.device.touches import Recording, Touches
 from skin.errors import InputError
 from skin.mechanics.geometry import sensor_geometry
 from skin.mechanics.simulator.base import AbstractSimulator
-from skin.robot.mujoco_skin import MujocoSurface, Press, Pressing, load_mujoco
+from skin.robot.mujoco_skin import MujocoSurface, Press, Pressing, load_package
 from skin.touch.fingertips import read_touch
 from skin.touch.labels import TOUCH, report_labels
 from skin.touch.movie import Movie, measure_gestures
@@ -56,16 +56,15 @@ def draw_object(kind: Kind, random: np.ndarray, side: float) -> tuple[str, np.nd
         return _geom("box", [x, y, 0.1 * side]), np.array([x, y]), 4 * x * y
     scale = side * (0.7 + 0.4 * first)
     palm, finger = scale * np.array([0.3, 0.24, 0.06]), scale * np.array([0.05, 0.12])
-    fingers = [
+    geoms = _geom("box", palm, y=-0.17 * scale) + "".join(
         _geom("capsule", finger, "0 1 0", x * scale, 0.24 * scale) for x in (-0.225, -0.075, 0.075, 0.225)
-    ]
-    geoms = _geom("box", palm, y=-0.17 * scale) + "".join(fingers)
+    )
     return geoms, scale * np.array([0.3, 0.41]), 0.35 * scale**2
 
 
 def _geom(kind: str, size: Any, axis: str = "0 0 1", x: float = 0.0, y: float = 0.0) -> str:
-    height = size[0] if kind == "capsule" else size[-1]
-    return f'<geom type="{kind}" size="{" ".join(map(str, size))}" pos="{x} {y} {height}" zaxis="{axis}"/>'
+    place = f"{x} {y} {size[0] if kind == 'capsule' else size[-1]}"
+    return f'<geom type="{kind}" size="{" ".join(map(str, size))}" pos="{place}" zaxis="{axis}"/>'
 
 
 # A controller presses an object: its position follows a target.
@@ -142,7 +141,7 @@ class Mujoco(ImperfectionSettings, AbstractDevice):
     randomise: bool = False
 
     def __post_init__(self) -> None:
-        load_mujoco()
+        load_package("mujoco", "mujoco")
         if not self.body.flat:
             raise InputError("device=mujoco presses flat skins: set body=sheet")
         self.size, self.sensors = self.body.size, self.layout.sensors(self.body)
@@ -168,8 +167,12 @@ class Mujoco(ImperfectionSettings, AbstractDevice):
             rows = slice(None) if split in ("test", None) else split_rows(split, count, self.data_seed)
             drawn = self._draw(count, generator(stream, *key))
             true = self._simulate({name: values[rows] for name, values in drawn.items()})
-            source = generator(Stream.CONSTANTS, self.seed)
-            constants = draw_constants(self.imperfection, len(self.sensors), true.touches.rate, source)
+            constants = draw_constants(
+                self.imperfection,
+                len(self.sensors),
+                true.touches.rate,
+                generator(Stream.CONSTANTS, self.seed),
+            )
             self._kept[split] = with_imperfections(
                 true,
                 self.imperfection,
@@ -200,22 +203,35 @@ class Mujoco(ImperfectionSettings, AbstractDevice):
             "force": np.exp(random.uniform(least, most, count)) * area,
             "friction": random.uniform(*self.friction, count),
         }
-        motion = random.random((count, 4))
-        return drawn | draw_motion(labels[:, 1], drawn, self.settings, self.size, motion)
+        return drawn | draw_motion(labels[:, 1], drawn, self.settings, self.size, random.random((count, 4)))
 
     def _simulate(self, drawn: Draws) -> Recording:
         """Return the true readings of touches, with labels."""
-        model, settings, count = self.simulator(self.body, self.sensors), self.settings, len(drawn["force"])
-        pressing = Pressing(model, self.body)
-        touches = ({name: values[row] for name, values in drawn.items()} for row in range(count))
-        pressures, readings, travels = zip(*(self._press(touch, pressing) for touch in touches), strict=True)
+        pressing, settings, count = (
+            Pressing(self.simulator(self.body, self.sensors), self.body),
+            self.settings,
+            len(drawn["force"]),
+        )
+        pressures, readings, travels = zip(
+            *(
+                self._press({name: values[row] for name, values in drawn.items()}, pressing)
+                for row in range(count)
+            ),
+            strict=True,
+        )
         frames, window = torch.cat(pressures), settings.frames.window
         index, scale = torch.arange(len(frames)).view(count, window), torch.ones(count, window)
         force = frames.sum((1, 2))[index] * float(np.prod(self.body.cell))
-        judged = self.sensors if settings.over_sensors else cover_surface(self.body, self.sensors.footprint)
-        footprints = torch.from_numpy(self.body.footprints(judged)).float()
+        footprints = self.body.footprints(
+            self.sensors if settings.over_sensors else cover_surface(self.body, self.sensors.footprint)
+        )
         measures = measure_gestures(
-            frames, index, scale, footprints, self.body.cell, settings.thresholds.contact
+            frames,
+            index,
+            scale,
+            torch.from_numpy(footprints).float(),
+            self.body.cell,
+            settings.thresholds.contact,
         )
         # On coarse cells the centre of pressure of a light contact jumps; the object does not.
         parameters = {
@@ -229,41 +245,50 @@ class Mujoco(ImperfectionSettings, AbstractDevice):
         limits = report_labels(settings.thresholds, settings.rate) | dict(settings.labels)
         labels = [label.measure(movie, self.body) > label.above for label in limits.values()]
         true = torch.stack(readings)
-        felt = Touches(
-            true,
-            torch.ones_like(true, dtype=torch.bool),
-            torch.from_numpy(self.sensors.positions).float(),
-            torch.stack(labels, dim=1).float(),
-            float(settings.rate),
-            geometry=sensor_geometry(self.body, self.sensors, model),
+        return Recording(
+            Touches(
+                true,
+                torch.ones_like(true, dtype=torch.bool),
+                torch.from_numpy(self.sensors.positions).float(),
+                torch.stack(labels, dim=1).float(),
+                float(settings.rate),
+                geometry=sensor_geometry(self.body, self.sensors, pressing.simulator),
+            ),
+            self.task,
+            self.size,
+            self.sensors.footprint,
+            force,
+            parameters=parameters,
         )
-        return Recording(felt, self.task, self.size, self.sensors.footprint, force, None, parameters)
 
     def _press(self, touch: Draws, pressing: Pressing) -> tuple[Tensor, Tensor, float]:
         """Return pressure (T, H, W), Pa, and true readings (T, S), N, of a touch in the middles of frames.
 
         The third result is the largest distance of the object's target from that of the first frame, m.
         """
-        mujoco, window, rate = load_mujoco(), self.settings.frames.window, self.settings.rate
-        world = press_world(str(touch["geoms"]), float(touch["angle"]), float(touch["friction"]), self.body)
-        model = mujoco.MjModel.from_xml_string(world)
+        mujoco, window, rate = (
+            load_package("mujoco", "mujoco"),
+            self.settings.frames.window,
+            self.settings.rate,
+        )
+        model = mujoco.MjModel.from_xml_string(
+            press_world(str(touch["geoms"]), float(touch["angle"]), float(touch["friction"]), self.body)
+        )
         surface, data = MujocoSurface(model, "skin", self.body), mujoco.MjData(model)
         begin, end = (float(frame) / rate for frame in touch["onset"] + np.array([0, touch["duration"]]))
         times = np.arange(begin - 2 * _APPROACH, end - 0.5 / rate, _STEP)
         targets = self._targets(touch, times + _LAG, begin, end)
         data.qpos[:] = targets[0]
-        presses, numbers = list[Press](), list[int]()
+        pressed = list[tuple[Press, int]]()
         frames = int(touch["onset"]) + np.arange(int(touch["duration"]))
         middles = np.searchsorted(times, (frames + 0.5) / rate)
         for frame, part in zip(frames, np.split(targets, middles[:-1]), strict=True):
             for target in part:
                 data.ctrl[:] = target
                 mujoco.mj_step(model, data)
-            found = surface.presses(data)
-            presses += found
-            numbers += [int(frame)] * len(found)
+            pressed += [(press, int(frame)) for press in surface.presses(data)]
         way = targets[middles - 1, :2]
-        return *pressing.frames(presses, numbers, window), float(np.linalg.norm(way - way[0], axis=1).max())
+        return *pressing.frames(pressed, window), float(np.linalg.norm(way - way[0], axis=1).max())
 
     def _targets(self, touch: Draws, times: np.ndarray, begin: float, end: float) -> np.ndarray:
         """Return the target position of an object at some times, (N, 3), m: in the model, z up."""

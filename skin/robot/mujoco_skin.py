@@ -9,6 +9,7 @@ import warnings
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from functools import cached_property
+from importlib import import_module
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -60,8 +61,10 @@ class Pressing:
         self.simulator, self._body = simulator, body
         self.compliance = surface_compliance(simulator, body)
         if not simulator.feels_shear:
-            name = option_name(simulator)
-            warnings.warn(f"simulator={name} has normal forces only: friction is left out", stacklevel=3)
+            warnings.warn(
+                f"simulator={option_name(simulator)} has normal forces only: friction is left out",
+                stacklevel=3,
+            )
 
     def pressures(self, presses: Sequence[Press]) -> Tensor:
         """Return the pressure of each press alone, (P, H, W), Pa; its sum is the force into the skin."""
@@ -73,23 +76,22 @@ class Pressing:
             compliance = self.compliance[near[:, None], near]
             start = _sink(gaps[:, near], totals * float(compliance.diagonal().mean()))
             gap, total, begin = (torch.from_numpy(values) for values in (gaps[:, near], totals, start))
-            solved = solve_contact(compliance, gap, total, begin, iterations=1000)
-            pressure[:, near] = solved.pressure
+            pressure[:, near] = solve_contact(compliance, gap, total, begin, iterations=1000).pressure
         return pressure.unflatten(1, self._body.shape)
 
     @torch.no_grad()
-    def frames(self, presses: Sequence[Press], numbers: Sequence[int], count: int) -> tuple[Tensor, Tensor]:
+    def frames(self, presses: Sequence[tuple[Press, int]], count: int) -> tuple[Tensor, Tensor]:
         """Return the pressure (F, H, W), Pa, and the readings (F, S), N, of frames; presses add up.
 
         Friction is a shear in proportion to the pressure, if the simulator feels it.
 
         Args:
-            presses: P of them.
-            numbers: (P,), the frame of each.
+            presses: each with its frame.
             count: F, number of frames.
         """
-        pressures, index = self.pressures(presses), torch.tensor(numbers, dtype=torch.long)
-        forces = torch.from_numpy(np.array([press.force for press in presses]).reshape(-1, 3))
+        pressures = self.pressures([press for press, _ in presses])
+        index = torch.tensor([frame for _, frame in presses], dtype=torch.long)
+        forces = torch.from_numpy(np.array([press.force for press, _ in presses]).reshape(-1, 3))
         shear = forces[:, :2] / forces[:, 2:] if self.simulator.feels_shear else None
         readings = self.simulator(pressures, shear).readings
         total, read = (values.new_zeros(count, *values.shape[1:]) for values in (pressures, readings))
@@ -114,17 +116,16 @@ def _sink(gap: np.ndarray, total: np.ndarray) -> np.ndarray:
 # The skin in MuJoCo.
 
 
-def load_mujoco() -> Any:
-    """Return the package ``mujoco``.
+def load_package(name: str, extra: str) -> Any:
+    """Return a package that comes with an extra of this one.
 
     Raises:
         InputError: it is not installed.
     """
     try:
-        import mujoco
+        return import_module(name)
     except ModuleNotFoundError as error:
-        raise InputError("MuJoCo is not installed: pip install 'tactile-skin[mujoco]'") from error
-    return mujoco
+        raise InputError(f"{error.name} is not installed: pip install 'tactile-skin[{extra}]'") from error
 
 
 class MujocoSurface:
@@ -144,7 +145,7 @@ class MujocoSurface:
     """
 
     def __init__(self, model: Any, site: str, body: AbstractBody) -> None:
-        self._mujoco, self._model, self._body = load_mujoco(), model, body
+        self._mujoco, self._model, self._body = load_package("mujoco", "mujoco"), model, body
         try:
             self._site = model.site(site).id
         except KeyError as error:
@@ -200,10 +201,9 @@ class MujocoSurface:
             cell = int(((contact.pos[row] - points) ** 2).sum(1).argmin())
             off = self._frames[cell] @ axes.T @ (contact.pos[row] - points[cell]) * [1, 1, 0]
             frame = self._body.frame(self._cells[cell] + off) @ self._axes.T @ axes.T
-            force = frame @ contact.frame[row].reshape(3, 3).T @ wrench[:3]
-            force *= mine[row] @ [-1, 1]  # it acts on the second geom
-            beside = np.abs(off[:2]) > np.array(self._body.cell) / 2 + _ROUNDING
-            if force[2] > 0 and not beside.any():
+            # It acts on the second geom.
+            force = mine[row] @ [-1, 1] * (frame @ contact.frame[row].reshape(3, 3).T @ wrench[:3])
+            if force[2] > 0 and (np.abs(off[:2]) <= np.array(self._body.cell) / 2 + _ROUNDING).all():
                 touches[contact.geom[row].sum() - self.geom].append((cell, force))
         return [self._press(data, points, axes, *touch) for touch in touches.items()]
 
@@ -319,8 +319,8 @@ class MujocoSkin:
         Args:
             data: ``mujoco.MjData`` after ``mj_step`` or ``mj_forward``.
         """
-        presses = self.surface.presses(data)
-        return self._pressing.frames(presses, [0] * len(presses), 1)[1][0].double().numpy()
+        presses = [(press, 0) for press in self.surface.presses(data)]
+        return self._pressing.frames(presses, 1)[1][0].double().numpy()
 
     def contacts(self, data: Any) -> FrameEstimate:
         """Return where and how hard the skin is touched, as its readings tell; ``data`` as in ``read``."""

@@ -90,7 +90,7 @@ def test_a_curved_body_and_unknown_objects_are_refused(configured):
 
 def test_without_the_package_one_sentence_says_what_to_install(configured, monkeypatch):
     monkeypatch.setitem(sys.modules, "mujoco", None)
-    with pytest.raises(InputError, match="MuJoCo is not installed: pip install"):
+    with pytest.raises(InputError, match="mujoco is not installed: pip install"):
         build_device(configured(*SMALL))
 
 

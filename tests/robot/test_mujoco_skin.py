@@ -164,5 +164,5 @@ def test_a_skin_larger_than_its_geom_is_noted(world):
 
 def test_without_the_package_one_sentence_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "mujoco", None)
-    with pytest.raises(InputError, match=r"^MuJoCo is not installed: pip install 'tactile-skin\[mujoco\]'$"):
+    with pytest.raises(InputError, match=r"^mujoco is not installed: pip install 'tactile-skin\[mujoco\]'$"):
         MujocoSkin(None, "skin", BODY, Grid(5, 5))

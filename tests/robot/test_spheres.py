@@ -39,7 +39,7 @@ def test_spheres_are_found_as_well_as_in_the_study_of_contacts():
         data.xfrc_applied[2, 2] = -force
         mujoco.mj_step(model, data, 300)
         presses = MujocoSurface(model, "skin", BODY).presses(data)
-        readings = pressing.frames(presses, [0], 1)[1][0].double().numpy()
+        readings = pressing.frames([(press, 0) for press in presses], 1)[1][0].double().numpy()
         if readings.max() > 0.15:  # a sensor responds in a frame
             estimate = posterior.estimate(readings + random.normal(0, 0.05 / 10**0.5, len(readings)))
             contact = estimate.contacts[0]

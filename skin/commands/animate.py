@@ -36,6 +36,5 @@ def main(
         scene = read_scene(device, index or 0)
     else:
         scene = simulate_scene(device.simulation, labels, shape, config.seed, view == "skin3d")
-    path = Path(out).expanduser()
-    path = (still if path.suffix == ".png" else write_animation)(scene, str(view), path)
+    path = (still if out.endswith(".png") else write_animation)(scene, str(view), Path(out).expanduser())
     print(f"{path}: {scene.title}, {len(scene.readings)} frames at {scene.rate:g} Hz")

@@ -67,8 +67,9 @@ def main(
         rows = None if presses is None else bench.read_gauge(presses, *shape, calibrate["delay"], units)
         clip = device.imperfection.clip if units.force_scale is None else None
         with Console(stderr=True).status("fitting"):
-            wired = wired_bench(device, recorded, rows, confirmed)
-            calibration, errors = fit_presses(wired, calibrate["held_out"], clip)
+            calibration, errors = fit_presses(
+                wired_bench(device, recorded, rows, confirmed), calibrate["held_out"], clip
+            )
         print_calibration(calibration, errors)
         if not errors.helps:
             print(

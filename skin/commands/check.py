@@ -43,6 +43,5 @@ def main(config: Config, weight: float | None, base: float | None, seconds: Anno
         raise InputError(f"{config.device['port']}: {error}") from error
     rest = conversion.zero if conversion.rest is None else conversion.raw(conversion.rest)
     setup = describe_setup(device.wire, skin.header, conversion, device.sensors.positions, device.size)
-    date = datetime.now(UTC).isoformat(timespec="seconds")
-    path = store_check(Check(setup, date, ratios, rest.tolist()))
+    path = store_check(Check(setup, datetime.now(UTC).isoformat(timespec="seconds"), ratios, rest.tolist()))
     print(f"{path}: the scale agrees, times {', '.join(f'{ratio:.3g}' for ratio in ratios.values())}")

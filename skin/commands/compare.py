@@ -40,15 +40,20 @@ def main(
 
     quiet()
     device = build_device(config).simulated("a session is compared with a simulation")
-    calibrated = f" with {device.calibration}." if device.calibration else ", not calibrated."
-    description = f"Session {session}, simulated by {type(device.model).__name__}{calibrated}"
     comparison = compare_session(device, session, presses, compare)
     agreement = [] if run is None else compare_predictions(run, config, comparison, device)
     if compare["miss_rate"] is not None and (run is None or comparison.bench is None):
         raise InputError("compare.miss_rate needs presses of known force, and run= whose alarm they test")
     if run is not None and comparison.bench is not None:
         agreement += _test_alarm(run, config, comparison.bench, device, compare)
-    page, picture = publish_comparison(comparison, agreement, description, compare["shown"], results(out))
+    calibrated = f" with {device.calibration}." if device.calibration else ", not calibrated."
+    page, picture = publish_comparison(
+        comparison,
+        agreement,
+        f"Session {session}, simulated by {type(device.model).__name__}{calibrated}",
+        compare["shown"],
+        results(out),
+    )
     print(page.read_text(encoding="utf-8"), page, picture, sep="\n")
 
 
@@ -80,5 +85,9 @@ def _test_alarm(
     assert point is not None
     patience = replace(patience, above=point.announced(notify))
     alarms = partial(raises_alarm, engine_settings(model, patience, danger=point.score))
-    judged = judge_presses(device, bench, compare["scale"], model.rate, alarms)
-    return [f"- {point.sentence()}", *describe_presses(*judged, compare["miss_rate"])]
+    return [
+        f"- {point.sentence()}",
+        *describe_presses(
+            *judge_presses(device, bench, compare["scale"], model.rate, alarms), compare["miss_rate"]
+        ),
+    ]

@@ -32,6 +32,5 @@ def main(config: Config, n: int, out: str | None) -> None:
     from skin.runs.build import build_device
     from skin.runs.generation import generate_data_set, generate_file
 
-    device = build_device(config)
     generate = generate_file if path.suffix else generate_data_set
-    print(f"{path}: {generate(device, settings_of(config), path)}")
+    print(f"{path}: {generate(build_device(config), settings_of(config), path)}")

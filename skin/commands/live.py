@@ -57,8 +57,15 @@ def main(
     words = [*(word for word in _DEMO if _group(word) not in replaced), *words]
     skin = [word for word in words if _group(word) in {"touch", *_SKIN}]
     words = [word for word in words if _group(word) != "touch"]
-    emulated = _emulated_skin(run, config, skin)
-    show(run, config, words, settings, web or "web" not in given, seconds, emulated)
+    show(
+        run,
+        config,
+        words,
+        settings,
+        web or "web" not in given,
+        seconds,
+        emulated=_emulated_skin(run, config, skin),
+    )
 
 
 def _group(word: str) -> str:
@@ -84,8 +91,9 @@ def _emulated_skin(run: str, config: Config, overrides: Sequence[str]) -> Iterat
     from skin.runs.run import find_run
     from skin.wire.emulator import Emulator, EmulatorSettings, Faults, open_port
 
-    emulated = find_run(config.tracking, run, config.trust).configured(["device=simulated", *overrides])
-    device = build_device(emulated).simulated("a skin is emulated")
+    device = build_device(
+        find_run(config.tracking, run, config.trust).configured(["device=simulated", *overrides])
+    ).simulated("a skin is emulated")
     port = open_port("tcp:0", None)
     # At rest until the view has its baseline.
     emulator = Emulator(device, port, EmulatorSettings(idle=10.0), Faults())

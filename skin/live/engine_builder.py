@@ -242,6 +242,7 @@ class LiveSettings:
         drift: N in ten minutes that the baseline may follow without touch.
         verdicts: where JSON lines go, ``stdout``, in place of the terminal view; None: nowhere.
         log: file to which alarms are appended; None: no log.
+        record: new MCAP file for readings, verdicts and contacts; None: they are not recorded.
         contacts: whether a process of its own estimates contacts.
         selftest: whether simulated dangerous touches must raise the alarm at the start.
         patience: settings of debouncing.
@@ -253,6 +254,7 @@ class LiveSettings:
     drift: Annotated[float, Ge(0)]
     verdicts: Literal["stdout"] | None
     log: str | None
+    record: str | None
     contacts: bool
     selftest: bool
     patience: DebounceSettings

@@ -121,6 +121,7 @@ class Display:
         line: text with rate, lost frames and latency.
         closed: event, set at the end.
         observers: called whenever the skin is assessed, and with each event of the operator.
+        recent: the latest frames in newtons, for who takes them; by default none is kept.
     """
 
     title: str
@@ -141,6 +142,7 @@ class Display:
         self.closed = Event()
         self.notes: tuple[Note, ...] = ()
         self.observers: list[Observer] = []
+        self.recent: deque[NewtonFrame] = deque(maxlen=0)
         self.line = ""
         self._lock, self._number, self._contact = RLock(), 0, False
         self.place(self.positions)
@@ -166,6 +168,7 @@ class Display:
         """Add a frame in newtons."""
         with self._lock:
             self._number += 1
+            self.recent.append(readings)
             self._frames.append((readings.newtons, readings.saturated))
             self._valid = readings.usable
             self._peak = np.maximum(self._peak, readings.newtons)

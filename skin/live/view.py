@@ -4,13 +4,14 @@ import gc
 import signal
 import sys
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence, Set
+from collections.abc import Callable, Iterable, Iterator, Sequence, Set
 from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from functools import partial
 from math import inf
 from pathlib import Path
-from threading import Condition, Thread
-from time import monotonic
+from queue import Empty, SimpleQueue
+from threading import Lock, Thread
+from time import monotonic, time
 from typing import IO, Any
 
 import numpy as np
@@ -36,57 +37,67 @@ from skin.wire.segmentation import typed_lines
 
 _say = Console(stderr=True, highlight=False).print
 
-# JSON lines, for other programs and as a log.
+# Events for other programs and as a log: JSON lines, or another form.
 
 
 HEARTBEAT = 0.4
 """s without a line from which the state is repeated: 0.5 s at most, as :func:`watch_age` looks each 0.1 s."""
 
 
-class LineQueue:
-    """Writes numbered JSON lines in a thread of its own, flushed one by one: a slow reader delays no verdict.
+Form = Callable[[Any, Iterable[dict[str, Any]]], object]
+"""Writes messages to an open file until they end."""
+
+
+def write_json(file: IO[str], messages: Iterable[dict[str, Any]]) -> None:
+    """Write a JSON line for each message, flushed one by one."""
+    for message in messages:
+        file.write(json_line(message) + "\n")
+        file.flush()
+
+
+class MessageQueue:
+    """Writes numbered messages in a thread of its own: a slow reader delays no verdict.
 
     Args:
         file: open for writing.
         failed: called with the error when the file cannot be written any more, as its reader is gone.
-        waiting: lines for a slow reader; then the oldest is dropped.
-        ending: s in which a slow reader may take the last lines.
+        form: writes them.
+        waiting: messages for a slow reader; then the oldest is dropped.
+        ending: s in which a slow reader may take the last messages.
     """
 
     def __init__(
-        self, file: IO[str], failed: Callable[[Exception], object], waiting: int = 256, ending: float = 1.0
+        self,
+        file: IO[Any],
+        failed: Callable[[Exception], object],
+        form: Form = write_json,
+        waiting: int = 256,
+        ending: float = 1.0,
     ) -> None:
-        self._file, self._failed, self._ending = file, failed, ending
-        self._changed, self._over, self._number = Condition(), False, 0
-        self._waiting: deque[str] = deque(maxlen=waiting)
+        self._file, self._failed, self._form, self._most, self._ending = file, failed, form, waiting, ending
+        self._waiting, self._adding, self._number = SimpleQueue[dict[str, Any] | None](), Lock(), 0
         self._thread = Thread(target=self._run, name="skin-lines", daemon=True)
 
-    def __enter__(self) -> "LineQueue":
+    def __enter__(self) -> "MessageQueue":
         self._thread.start()
         return self
 
     def __exit__(self, *error: object) -> None:
-        """Write the lines that wait, and end."""
-        with self._changed:
-            self._over = True
-            self._changed.notify()
+        """Write the messages that wait, and end."""
+        self._waiting.put(None)
         self._thread.join(self._ending)
 
     def add(self, message: dict[str, Any]) -> None:
-        """Add a line with its number, from 1 up; return at once."""
-        with self._changed:
+        """Add a message with its number, from 1 up; return at once."""
+        with self._adding, suppress(Empty):
             self._number += 1
-            self._waiting.append(json_line({"number": self._number, **message}) + "\n")
-            self._changed.notify()
+            self._waiting.put({"number": self._number, **message})
+            if self._waiting.qsize() > self._most:
+                self._waiting.get_nowait()
 
     def _run(self) -> None:
         try:
-            while self._waiting or not self._over:
-                with self._changed:
-                    self._changed.wait_for(lambda: self._waiting or self._over)
-                    line = self._waiting.popleft() if self._waiting else ""
-                self._file.write(line)
-                self._file.flush()
+            self._form(self._file, iter(self._waiting.get, None))
         except (OSError, ValueError) as error:
             self._failed(error)
 
@@ -100,16 +111,21 @@ sensors have no valid reading), and of the baseline."""
 
 
 @contextmanager
-def write_lines(
-    display: Display, file: IO[str], failed: Callable[[Exception], object], wanted: Set[str]
+def write_events(
+    display: Display,
+    file: IO[Any],
+    failed: Callable[[Exception], object],
+    wanted: Set[str],
+    form: Form = write_json,
 ) -> Iterator[None]:
-    """Write a line to a file for each event while the block runs.
+    """Write a message to a file for each event while the block runs.
 
     Args:
         display: gives the verdicts; watched by :func:`watch_age`.
         file: open for writing.
         failed: called with the error when the file cannot be written any more; the live view continues.
         wanted: names of the events, of :data:`VERDICTS` and :data:`CHANGES`.
+        form: of the file.
     """
     written = monotonic()
     latest, states = display.assess(written), (True, False, False)
@@ -130,10 +146,10 @@ def write_lines(
         chosen = [event for event in events if event in wanted]
         for event in chosen:
             written, described = now, display.describe(latest, now)
-            lines.add({"event": event, **verdict_message(latest, *described, now)})
+            queue.add({"event": event, **verdict_message(latest, *described, now)})
         return bool(chosen)
 
-    with LineQueue(file, failed) as lines:
+    with MessageQueue(file, failed, form) as queue:
         write(monotonic(), "started")
         display.observers.append(observe)
         try:
@@ -143,22 +159,34 @@ def write_lines(
 
 
 @contextmanager
-def log_alarms(display: Display, path: Path) -> Iterator[None]:
-    """Append the lines of :data:`CHANGES` to a file while the block runs.
+def write_file(
+    display: Display,
+    path: Path,
+    mode: str = "a",
+    wanted: Set[str] = CHANGES,
+    form: Form = write_json,
+    override: str = "live.log=FILE.jsonl",
+) -> Iterator[None]:
+    """Write events to a file while the block runs; by default, append JSON lines of :data:`CHANGES`.
 
     If it becomes unwritable, a message says so once.
+
+    Args:
+        display, wanted, form: as of :func:`write_events`.
+        path: of the file.
+        mode: in which it is opened.
+        override: setting that selects another file, for the message.
 
     Raises:
         InputError: the file cannot be written.
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        file = path.open("a", encoding="utf-8")
+        file = path.open(mode, encoding=None if "b" in mode else "utf-8")
     except OSError as error:
-        raise unwritable(path, error, "live.log=FILE.jsonl") from error
-    warn = partial(print, "the alarm log ends here:", file=sys.stderr)
+        raise unwritable(path, error, override) from error
     try:
-        with write_lines(display, file, warn, CHANGES):
+        with write_events(display, file, partial(print, f"{path} ends here:", file=sys.stderr), wanted, form):
             yield
     finally:
         with suppress(OSError):  # of a full disk, which the message has reported
@@ -178,9 +206,13 @@ def show_in_terminal(display: Display, console: Console) -> Iterator[None]:
         # In the background the program reads no keys; it must not be stopped.
         signal.signal(signal.SIGTTIN, signal.SIG_IGN)
     Thread(target=_read_keys, args=(display,), name="skin-keys", daemon=True).start()
-    render = lambda: screen(display, monotonic())  # noqa: E731
-    live = Live(get_renderable=render, console=console, refresh_per_second=8, transient=True)
-    lines = write_lines(display, console.file, display.close, CHANGES | {"change"})
+    live = Live(
+        get_renderable=lambda: screen(display, monotonic()),
+        console=console,
+        refresh_per_second=8,
+        transient=True,
+    )
+    lines = write_events(display, console.file, display.close, CHANGES | {"change"})
     with live if console.is_terminal else lines:
         yield
 
@@ -196,8 +228,12 @@ def _read_keys(display: Display) -> None:
 def screen(display: Display, now: float) -> RenderableType:
     """Return the verdict and the contacts at ``now``, s, with the status of the stream below."""
     state, title = display.state(now), f"{display.title} on {display.port}"
-    shown = Group(_verdict(state), Text(), Text("\n".join(contact_text_lines(state.contacts))))
-    panel = Panel(shown, title=title, border_style="bold red" if state.alarm else "dim", expand=False)
+    panel = Panel(
+        Group(_verdict(state), Text(), Text("\n".join(contact_text_lines(state.contacts)))),
+        title=title,
+        border_style="bold red" if state.alarm else "dim",
+        expand=False,
+    )
     return Group(panel, Text(state.line or " ", style="dim"), Text(_KEYS, style="dim"))
 
 
@@ -206,8 +242,9 @@ def _verdict(state: DisplayState) -> RenderableType:
     verdict, alarm = state.verdict, Text("DANGEROUS", "bold white on red")
     if verdict is None or not verdict.touched:
         shown = "unknown" if verdict is None else verdict.state
-        text = ": ".join(filter(None, (shown, state.reason)))
-        trouble = Text(text, style="dim" if shown == "no touch" else "yellow")
+        trouble = Text(
+            ": ".join(filter(None, (shown, state.reason))), "dim" if shown == "no touch" else "yellow"
+        )
         return Group(alarm, Text(), trouble) if state.alarm else trouble
     strongest, limited = int(state.peak.argmax()), int(state.saturated.sum())
     notes = (
@@ -219,8 +256,12 @@ def _verdict(state: DisplayState) -> RenderableType:
         "frames are missing" * verdict.gap,
     )
     words = "\n".join(f"{word:10} {100 * probability:3.0f} %" for word, probability in verdict.words())
-    head = alarm if state.alarm else Text("touch", "bold")
-    return Group(head, Text(), Text(words), Text("\n".join(filter(None, notes)), "yellow"))
+    return Group(
+        alarm if state.alarm else Text("touch", "bold"),
+        Text(),
+        Text(words),
+        Text("\n".join(filter(None, notes)), "yellow"),
+    )
 
 
 # The whole view.
@@ -332,17 +373,36 @@ def _open_views(display: Display, setup: LiveSetup, live: LiveSettings, opened: 
     display.place(model.positions)
     try:
         if live.contacts:
-            whole = lambda: setup.port is not None and setup.port.raw_range.whole  # noqa: E731
-            display.contacts.start(setup.mechanics(), whole)
+            display.contacts.start(
+                setup.mechanics(), lambda: setup.port is not None and setup.port.raw_range.whole
+            )
     except InputError as error:
         display.contacts.explain(str(error))
         _say(f"no contacts: {error}")
     if live.log is not None:
-        opened.enter_context(log_alarms(display, Path(live.log).expanduser()))
+        opened.enter_context(write_file(display, Path(live.log).expanduser()))
+    if live.record is not None:
+        from skin.robot.recordings import LIVE, live_messages, load_package, write_messages
+
+        display.recent = deque(maxlen=display.kept)
+        package, epoch = load_package("mcap.writer", "robot"), time() - monotonic()
+        layout = {"unit": "N", "positions": model.positions.tolist(), "size": model.size}
+        opened.enter_context(
+            write_file(
+                display,
+                Path(live.record).expanduser(),
+                "xb",
+                VERDICTS | CHANGES,
+                lambda file, verdicts: write_messages(
+                    package, layout, LIVE, file, live_messages(verdicts, display.recent, epoch)
+                ),
+                "live.record=FILE.mcap",
+            )
+        )
     if live.verdicts is not None:
         # A file of its own, and never closed: lines that a reader did not take would fail once more.
         stdout = open(sys.stdout.fileno(), "w", closefd=False)  # noqa: SIM115
-        opened.enter_context(write_lines(display, stdout, display.close, VERDICTS))
+        opened.enter_context(write_events(display, stdout, display.close, VERDICTS))
 
 
 def adopt_final(final: FinalThreshold | None, engine: Engine, display: Display) -> None:

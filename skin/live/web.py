@@ -44,10 +44,15 @@ def serve_page(display: Display, port: int) -> Iterator[str]:
         listening = socket.create_server((_HOST, port))
     except (OSError, OverflowError) as error:
         raise InputError(f"no page on port {port}: {error}; give live.web_port=0, or another") from error
-    settings = uvicorn.Config(
-        _application(display), log_config=None, access_log=False, lifespan="off", timeout_graceful_shutdown=1
+    server = uvicorn.Server(
+        uvicorn.Config(
+            _application(display),
+            log_config=None,
+            access_log=False,
+            lifespan="off",
+            timeout_graceful_shutdown=1,
+        )
     )
-    server = uvicorn.Server(settings)
     thread = Thread(target=server.run, kwargs={"sockets": [listening]}, name="skin-page", daemon=True)
     thread.start()
     try:
@@ -98,22 +103,23 @@ def _application(display: Display) -> Starlette:
         refused = display.request_tare(monotonic(), force=order == "force")
         return JSONResponse({"reason": refused}, status_code=409) if refused else Response(status_code=204)
 
-    # Other host names are refused, so that pages of other sites cannot read the skin.
-    local = Middleware(TrustedHostMiddleware, allowed_hosts=[_HOST, "localhost"])
-
     async def info(request: Request) -> Response:
         if not len(display.positions):
             return Response(status_code=503)  # the page asks again
         named = {name: getattr(display, name) for name in ("title", "port", "top", "window", "size")}
         return JSONResponse(named | {"positions": display.positions.tolist()})
 
-    routes = [
-        Route("/", FileResponse(_PAGE, media_type="text/html", headers={"Cache-Control": "no-store"})),
-        Route("/skin.json", info),
-        Route("/pictures", pictures),
-        Route("/tare", tare, methods=["POST"]),
-    ]
-    return Starlette(routes=routes, middleware=[local])
+    # Other host names are refused, so that pages of other sites cannot read the skin.
+    local = Middleware(TrustedHostMiddleware, allowed_hosts=[_HOST, "localhost"])
+    return Starlette(
+        routes=[
+            Route("/", FileResponse(_PAGE, media_type="text/html", headers={"Cache-Control": "no-store"})),
+            Route("/skin.json", info),
+            Route("/pictures", pictures),
+            Route("/tare", tare, methods=["POST"]),
+        ],
+        middleware=[local],
+    )
 
 
 async def _events(display: Display) -> AsyncIterator[str]:

@@ -19,7 +19,7 @@ from skin.core.files import ROOT
 from skin.errors import InputError
 from skin.live.loop import Display, watch_age
 from skin.live.verdict import Verdict
-from skin.live.view import HEARTBEAT, VERDICTS, LineQueue, log_alarms, write_lines
+from skin.live.view import HEARTBEAT, VERDICTS, MessageQueue, write_events, write_file
 
 PATIENCE = 60  # s
 
@@ -48,7 +48,7 @@ def piped(shown):
         os.fdopen(reading, "rb") as lines,
         os.fdopen(writing, "w", buffering=1) as file,
         watch_age(shown),
-        write_lines(shown, file, shown.close, VERDICTS),
+        write_events(shown, file, shown.close, VERDICTS),
     ):
         yield lines
 
@@ -152,7 +152,7 @@ def test_what_waits_is_written_before_the_end():
     shown = display()
     reading, writing = os.pipe()
     with os.fdopen(reading, "rb") as lines:
-        with os.fdopen(writing, "w", buffering=1) as file, write_lines(shown, file, shown.close, VERDICTS):
+        with os.fdopen(writing, "w", buffering=1) as file, write_events(shown, file, shown.close, VERDICTS):
             for _ in range(20):
                 shown.set_verdict(verdict(), monotonic())
         assert [json.loads(line)["number"] for line in lines] == [*range(1, 21)]
@@ -161,7 +161,7 @@ def test_what_waits_is_written_before_the_end():
 def test_each_change_is_a_line_with_its_time(tmp_path):
     shown, path = display(0.0), tmp_path / "logs" / "alarms.jsonl"
     before = datetime.now(UTC)
-    with log_alarms(shown, path):
+    with write_file(shown, path):
         shown.set_verdict(None, monotonic(), "filling the window: 20 %")
         for dangerous in (False, True, True):
             shown.set_verdict(logged(dangerous), monotonic())
@@ -182,7 +182,7 @@ def test_each_change_is_a_line_with_its_time(tmp_path):
     times = [datetime.fromisoformat(one["time"]) for one in found]
     slack = timedelta(milliseconds=2)
     assert all(before - slack <= time <= datetime.now(UTC) + slack for time in times)
-    with log_alarms(shown, path):
+    with write_file(shown, path):
         pass
     assert len(path.read_text().splitlines()) == len(found) + 2  # appended
 
@@ -191,7 +191,7 @@ def test_a_folder_that_cannot_be_written_is_refused(tmp_path):
     (tmp_path / "file").write_text("")
     with (
         pytest.raises(InputError, match=r"live\.log=FILE"),
-        log_alarms(display(0.0), tmp_path / "file" / "log"),
+        write_file(display(0.0), tmp_path / "file" / "log"),
     ):
         pass
 
@@ -202,7 +202,7 @@ def test_a_full_disk_ends_the_log_and_not_the_view():
             raise OSError("No space left on device")
 
     errors = []
-    with LineQueue(Full(), errors.append) as lines:
+    with MessageQueue(Full(), errors.append) as lines:
         for _ in range(3):
             lines.add({"event": "alarm"})
     assert [str(error) for error in errors] == ["No space left on device"]
@@ -212,9 +212,9 @@ def test_a_full_disk_ends_the_log_and_not_the_view():
 def test_a_full_disk_does_not_hide_how_the_view_ends(capsys):
     """Closing the file raised an error of its own: SIGTERM ended with code 2."""
     shown = display(0.0)
-    with pytest.raises(SystemExit, match="143"), log_alarms(shown, Path("/dev/full")):
+    with pytest.raises(SystemExit, match="143"), write_file(shown, Path("/dev/full")):
         raise SystemExit(143)
-    assert capsys.readouterr().err == "the alarm log ends here: [Errno 28] No space left on device\n"
+    assert capsys.readouterr().err == "/dev/full ends here: [Errno 28] No space left on device\n"
 
 
 def test_the_log_is_valid_json_whatever_a_verdict_holds(tmp_path):
@@ -222,7 +222,7 @@ def test_the_log_is_valid_json_whatever_a_verdict_holds(tmp_path):
     broken = Verdict(
         float("inf"), monotonic(), {"a": float("nan")}, True, {"a": True}, True, False, (), 1e300
     )
-    with log_alarms(shown, path):
+    with write_file(shown, path):
         shown.set_verdict(broken, monotonic())
     messages = [json.loads(line, parse_constant=pytest.fail) for line in path.read_text().splitlines()]
     assert {message.get("device_time") for message in messages} == {None}
@@ -233,12 +233,12 @@ import sys
 import numpy as np
 from skin.live.loop import Display, watch_age
 from skin.live.verdict import Verdict
-from skin.live.view import VERDICTS, write_lines
+from skin.live.view import VERDICTS, write_events
 from time import monotonic
 
 assert sys.argv[-1] == "live.verdicts=stdout"
 shown = Display("run", "port", np.zeros((4, 3)), (0.1, 0.1), 4.0)
-with watch_age(shown), write_lines(shown, sys.stdout, shown.close, VERDICTS):
+with watch_age(shown), write_events(shown, sys.stdout, shown.close, VERDICTS):
     shown.closed.wait(1)
     for _ in range(40):
         chances = {"big": 0.3, "dangerous": 1.0}

@@ -306,7 +306,8 @@ class TorchModel(Model):
             device.task,
             example.readings.shape[1],
             example.rate,
-            self.sites.numpy(),
+            # What a process gets is moved to shared memory: a view would then read freed memory.
+            self.sites.numpy().copy(),
             device.size,
             threshold,
             alarm,

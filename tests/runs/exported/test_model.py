@@ -32,6 +32,14 @@ def test_it_describes_itself(exported):
     assert json.loads(entry)["sensors"] == 6
 
 
+def test_positions_stay_where_a_process_gets_the_tensors_of_a_run(exported):
+    of, _ = exported
+    assert not np.shares_memory(of.positions, of.sites.numpy())
+    before = of.positions.tolist()
+    of.sites.share_memory_()  # as where the final threshold of a live view is chosen
+    assert of.positions.tolist() == before
+
+
 def changed(path, folder, change):
     """Return a copy of a model with a changed description."""
     model = onnx.load(path)

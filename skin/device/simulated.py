@@ -1,11 +1,13 @@
 """A simulated skin: sampled gestures, a simulator, and device imperfections."""
 
+import logging
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from itertools import count
-from typing import Annotated, Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import torch
@@ -113,37 +115,63 @@ def describe(device: "Simulated", recording: Recording, split: Split | None, epo
     }
 
 
-# Labels that the shape of a touch gives away.
+# The class balance of a data set: shape, area, force and position per class, and leakage of labels by shape.
 
 
-def check_label_leakage(device: AbstractDevice, recording: Recording | None = None) -> None:
-    """Warn if the shape alone predicts a label of the gestures that a simulated device is trained on.
+if TYPE_CHECKING:
+    import pandas as pd
 
-    A label leaks if its balanced accuracy is above ``touch.leak`` by more than two standard errors; the
-    margin keeps small data sets from warnings by chance.
+_log = logging.getLogger(__name__)
+
+
+def report_balance(device: AbstractDevice, recording: Recording | None = None, shown: bool = True) -> None:
+    """Log the class balance of the gestures that a simulated device is trained on, and check its labels.
 
     Args:
         device: the device; nothing is done unless it is simulated.
         recording: its gestures; None: its training budget.
+        shown: whether to log the balance.
     """
     if device.simulation is None:
         return
-    sampler, told = device.simulation.sampler, list[str]()
+    sampler = device.simulation.sampler
     recording = only_touches(recording or device.recording(None, complete=False))
-    shape, labels = recording.parameters["shape"].int().numpy(), recording.touches.known_labels.numpy() > 0.5
+    balance = class_balance(recording, sampler)
+    if shown:
+        _log.info(balance_text(balance))
+    check_label_leakage(balance, sampler.leak)
+
+
+def class_balance(recording: Recording, sampler: AbstractSampler) -> "pd.DataFrame":
+    """Return a table with two rows per label, the class and its opposite, without those that do not occur.
+
+    Args:
+        recording: simulated touches.
+        sampler: that drew them; the parameter ``shape`` is an index into its shapes.
+
+    Returns:
+        accuracy of the label from the shape alone and its standard error (:func:`accuracy_from_shape`); the
+        fraction of each shape, %; means of area, %, and of the first position, mm; the median force, N; and
+        the fractions of paths with other labels and of bodies that do not fit, of all that were drawn, %.
+    """
+    import pandas as pd  # not needed by skin live
+
+    touches = pd.DataFrame({name: values.double().numpy() for name, values in recording.parameters.items()})
+    shapes, rows = [Path(name).stem for name in sampler.shapes.names], dict[str, dict[str, float]]()
+    labels = recording.touches.known_labels.numpy() > 0.5
     for name, holds in zip(recording.task.names, labels.T, strict=True):
-        accuracy, error = accuracy_from_shape(shape, holds)
-        if name in sampler.labels and accuracy - 2 * error > sampler.leak:
-            told.append(f"{name} ({accuracy:.0%})")
-    if told:
-        warnings.warn(
-            f"the shape alone predicts {' and '.join(told)} of these gestures, more than "
-            f"touch.leak={sampler.leak:g} allows: a model may learn the shape instead of the label; give "
-            "touch.shapes of one kind, raise touch.stretch, or give touch.leak=0.5, which fits every shape "
-            "to the sheet",
-            RuntimeWarning,
-            stacklevel=3,
-        )
+        if name not in sampler.labels:
+            continue
+        scores = accuracy_from_shape(touches["shape"].to_numpy(int), holds)
+        for title, part in ((name, touches[holds]), (sampler.labels[name].opposite, touches[~holds])):
+            if count := len(part):
+                rows[title] = dict(zip(("accuracy", "error"), scores, strict=True)) if title == name else {}
+                rows[title] |= {shape: 100 * (part["shape"] == n).mean() for n, shape in enumerate(shapes)}
+                rows[title] |= {"area %": 100 * part["area"].mean(), "force N": part["force"].median()}
+                rows[title] |= {"x mm": 1e3 * part["x"].mean(), "y mm": 1e3 * part["y"].mean()}
+                rows[title]["paths"] = 100 * (1 - count / part["draws"].sum())
+                rows[title]["bodies"] = 100 * (1 - count / (count + part["misfits"].sum()))
+    return pd.DataFrame.from_dict(rows, orient="index")
 
 
 def accuracy_from_shape(shape: np.ndarray, holds: np.ndarray) -> tuple[float, float]:
@@ -162,10 +190,44 @@ def accuracy_from_shape(shape: np.ndarray, holds: np.ndarray) -> tuple[float, fl
     totals = counts.sum(axis=1, keepdims=True)
     if totals.min() < 2:
         return 0.5, 0.0
-    others, against = (counts - 1) / (totals - 1), (counts / totals)[::-1]
-    right = np.where(np.isclose(others, against), 0.5, others > against)
-    rates = (counts * right).sum(axis=1) / totals[:, 0]
-    return float(rates.mean()), float(np.sqrt((rates * (1 - rates) / totals[:, 0]).sum()) / 2)
+    rates = []
+    for side in (0, 1):
+        others = (counts[side] - 1) / (totals[side] - 1)
+        against = counts[1 - side] / totals[1 - side]
+        right = np.where(np.isclose(others, against), 0.5, others > against)
+        rates.append(float((counts[side] * right).sum() / totals[side, 0]))
+    error = (
+        np.sqrt(sum(rate * (1 - rate) / total for rate, total in zip(rates, totals[:, 0], strict=True))) / 2
+    )
+    return sum(rates) / 2, float(error)
+
+
+def balance_text(balance: "pd.DataFrame") -> str:
+    """Return a class balance as lines."""
+    formats = dict.fromkeys(("accuracy", "error"), "{:.2f}".format)
+    table = balance.to_string(formatters=formats, float_format="{:.0f}".format, na_rep="", line_width=None)
+    return (
+        "balance: shapes are in % of a class, paths and bodies in % rejected; accuracy: balanced accuracy of "
+        f"the label from the shape alone\n{table}"
+    )
+
+
+def check_label_leakage(balance: "pd.DataFrame", leak: float) -> None:
+    """Warn if the shape alone predicts a label.
+
+    A label leaks if its balanced accuracy is above ``leak`` by more than two standard errors; the margin
+    keeps small data sets from warnings by chance.
+    """
+    scores = balance["accuracy"][balance["accuracy"] - 2 * balance["error"] > leak]
+    if len(scores):
+        named = " and ".join(f"{name} ({score:.0%})" for name, score in scores.items())
+        warnings.warn(
+            f"the shape alone predicts {named} of these gestures, more than touch.leak={leak:g} allows: a "
+            "model may learn the shape instead of the label; give touch.shapes of one kind, raise "
+            "touch.stretch, or give touch.leak=0.5, which fits every shape to the sheet",
+            RuntimeWarning,
+            stacklevel=3,
+        )
 
 
 # Summary of a data set in one line: forces, strains, clipped readings, accepted draws.

@@ -15,7 +15,7 @@ from skin.body.base import require_memory
 from skin.core.files import MANIFEST
 from skin.device.base import AbstractDevice, in_threads
 from skin.device.files import DataSet, Manifest, describe_recording, write_recording
-from skin.device.simulated import check_label_leakage, summary_line
+from skin.device.simulated import report_balance, summary_line
 from skin.device.touches import Part
 from skin.errors import InputError
 from skin.runs.configuration import iterate_leaves, settings_hash, source_tags
@@ -58,11 +58,11 @@ def generate_data_set(device: AbstractDevice, settings: Mapping[str, Any], folde
 
 
 def _begin(device: AbstractDevice, parts: list[Part], source: dict[str, Any], folder: Path) -> None:
-    """Draw the first shard, check its labels, and write the manifest."""
+    """Draw the first shard, check the balance of its touches, and write the manifest."""
     if folder.exists() and (not folder.is_dir() or any(folder.glob("[!.]*"))):
         raise InputError(f"{folder} exists and has no {MANIFEST}: add out= with a new or an empty folder")
     drawn = [parts[0].make()]
-    check_label_leakage(device, drawn[0])
+    report_balance(device, drawn[0])
     source |= {name: tag for name, tag in source_tags().items() if name.startswith("source_")}
     counts, seed = [part.count for part in parts], source["config"].get("seed")
     Manifest.of(describe_recording(drawn[0]), counts, seed=seed, **source).write(folder)
@@ -124,7 +124,7 @@ def generate_file(device: AbstractDevice, settings: Mapping[str, Any], path: Pat
         needed = 40.0 * count * simulation.window * len(simulation.sensors)
         require_memory(needed, f"n={count} in one file", "add out=FOLDER for a data set, which needs less")
     recording = device.recording()
-    check_label_leakage(device, recording)
+    report_balance(device, recording)
     metadata = recording.metadata | {"config_hash": settings_hash(settings), "config": settings}
     write_recording(replace(recording, metadata=metadata), path)
     # The metadata of a file may have any content.

@@ -28,7 +28,7 @@ from skin.core.files import results
 from skin.core.messages import PARENT, quiet
 from skin.core.progress import Steps
 from skin.core.settings import option_name
-from skin.device.simulated import check_label_leakage
+from skin.device.simulated import report_balance
 from skin.errors import InputError
 from skin.evaluation.alarm import AlarmSource, choose_alarm_threshold, threshold_device
 from skin.evaluation.metrics import OUTCOMES, compute_metrics
@@ -104,7 +104,7 @@ def train(config: Config) -> float:
     source = replace(source, device=device if settings.profile is None else threshold_device(source))
     learner.check(data)
     _objective(tracking.objective, _score(data.task, *[data.example.known_labels] * 2))  # refuses other names
-    check_label_leakage(device)
+    report_balance(device, shown=PARENT not in os.environ)
     name = name_run(identity, relevant_overrides(config.learner))
     store = Store.open(tracking)
     with store.hold(identity["fingerprint"]):

@@ -1,6 +1,6 @@
-"""A simulated device: seeds, splits, what each setting changes, and whether a shape tells a label."""
+"""A simulated device: seeds, splits, and what each setting changes."""
 
-from dataclasses import fields, replace
+from dataclasses import fields
 
 import numpy as np
 import pytest
@@ -11,12 +11,11 @@ from skin.body.layout import Grid, Scattered
 from skin.body.sheet import Sheet
 from skin.core.rng import Stream, generator
 from skin.device.imperfection import ImperfectionSettings
-from skin.device.simulated import Simulated, accuracy_from_shape, check_label_leakage
+from skin.device.simulated import Simulated
 from skin.device.touches import concatenate
 from skin.errors import InputError
 from skin.mechanics.simulator.fem import PlatesAndBeams
 from skin.mechanics.simulator.naive import Naive
-from skin.runs.build import build_device
 from skin.touch.sampler import balanced
 from tests.touch.movie_labels import movie_labels
 
@@ -165,10 +164,15 @@ def test_the_summary_counts(plain):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
+        ({"gestures": 9}, r"device.gestures=9 must be greater than or equal to 10"),
+        ({"test_gestures": 0}, r"device.test_gestures=0 must be greater than or equal to 1"),
+        ({"position_error": -0.1}, r"position_error"),
+        ({"rate": 0}, r"device.rate"),
         (
             {"rate": 9.0},
             r"sends 9 frames a second, the model needs 10: raise device.rate, or lower",
         ),
+        ({"dead": 25}, r"device.dead"),
         ({"seed": -1}, r"from 0 up"),
         ({"touch": {"shapes": ["potato"]}}, r"no shape potato"),
         ({"touch": {"shear": 0.5}}, r"got simulator=naive: set simulator=solid, or touch.shear=0"),
@@ -256,24 +260,3 @@ def test_the_true_footprints_differ_and_the_reported_ones_do_not():
     assert 0.05 < np.log(factors).std() < 0.15
     fractions = [skin.geometry[:, GEOMETRY.index("share")] for skin in (exact, wrong)]
     torch.testing.assert_close(*fractions)
-
-
-def test_the_accuracy_is_the_overlap_of_two_distributions():
-    """Shares 0.7 / 0.3 against 0.4 / 0.6: the best guess is right in (0.7 + 0.6) / 2."""
-    shape = np.repeat([0, 1, 0, 1], [700, 300, 400, 600])
-    assert accuracy_from_shape(shape, np.arange(2000) < 1000)[0] == pytest.approx(0.65)
-    shape = np.arange(400) % 4
-    assert accuracy_from_shape(shape, shape < 2) == (1.0, 0.0)
-    accuracy, error = accuracy_from_shape(shape, np.random.default_rng(0).random(400) < 0.5)
-    assert accuracy < 0.5 + 2 * error
-    assert 0.02 < error < 0.03
-
-
-def test_a_shape_that_tells_a_label_is_warned_of(configured, recwarn):
-    device = build_device(configured("simulator=naive", "data.gestures=160", "layout=grid"))
-    recording = device.recording(None, complete=False)
-    check_label_leakage(device, recording)
-    assert not recwarn.list
-    bars = recording.parameters | {"shape": recording.touches.labels[:, 0] * 3}
-    with pytest.warns(RuntimeWarning, match=r"the shape alone predicts big \(100%\).*touch.leak=0.6"):
-        check_label_leakage(device, replace(recording, parameters=bars))

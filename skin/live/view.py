@@ -333,7 +333,7 @@ def _open_views(display: Display, setup: LiveSetup, live: LiveSettings, opened: 
     try:
         if live.contacts:
             whole = lambda: setup.port is not None and setup.port.raw_range.whole  # noqa: E731
-            display.contacts.start(setup.mechanics(), whole)
+            display.contacts.start(setup.mechanics(thickness=live.thickness), whole)
     except InputError as error:
         display.contacts.explain(str(error))
         _say(f"no contacts: {error}")

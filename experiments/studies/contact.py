@@ -8,9 +8,10 @@ left out.
 
 import time
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import cache
-from itertools import product
+from itertools import compress, product
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -27,11 +28,15 @@ from skin.body.base import AbstractBody, Layer, Sensors
 from skin.body.layout import Listed
 from skin.body.material import Material
 from skin.body.sheet import Sheet
+from skin.core.settings import RISING
 from skin.device.simulated import Simulated
 from skin.errors import InputError
 from skin.inference.candidates import FingertipPrior, disc_readings
+from skin.inference.likelihood import Observation
+from skin.inference.mechanics import Mechanics
 from skin.inference.noise import Noise
 from skin.inference.posterior import FrameEstimate, Posterior
+from skin.inference.watch import Thickness
 from skin.mechanics.simulator.base import AbstractSimulator
 from skin.mechanics.simulator.solid import Solid
 from skin.touch.gestures import GestureSettings, draw_bodies
@@ -55,7 +60,11 @@ class Contact:
         apart: least distance between contacts, m.
         exactly: whether neighbours are that far apart.
         gain, clip, position: of the device, as :class:`skin.inference.noise.Noise` has them.
-        actual: layers of the skin that is touched, where the posterior has others.
+        actual: layers of the skin that is touched, where the posterior has others; its sensors are as far
+            above the base.
+        thickness: range that the posterior learns from.
+        counted: touches of a stream that count, from one up to another one, where the posterior learns. Each
+            stream begins with the described thickness.
         grid: whether to compare with the posterior on a grid (:func:`grid_errors`).
         seed: of the touches, with the name of the condition.
     """
@@ -70,6 +79,8 @@ class Contact:
     clip: float = float("inf")
     position: float = 0.0
     actual: Sequence[Any] = ()
+    thickness: Annotated[tuple[float, float], RISING] = (1.0, 1.0)
+    counted: Annotated[tuple[int, int], RISING] = (19, 50)
     grid: bool = False
     seed: Annotated[int, Ge(0)] = 0
 
@@ -80,13 +91,14 @@ class Contact:
         assert isinstance(body, Sheet)
         prior, noise = (
             FingertipPrior(force=self.force),
-            Noise(0.05, 10, self.gain, self.clip, 0, self.position),
+            Noise(0.05, 10, self.gain, self.clip, 0, self.position, self.thickness),
         )
         rng = np.random.default_rng([self.seed, *subject.condition.encode()])
         count, exact = self.touches if self.number == 1 else self.touches // 4, None
         shift = np.pad(noise.position * rng.standard_normal((len(sensors), 2)), ((0, 0), (0, 1)))
         if self.number:
             touched = Sheet(body.size, body.cells, self.actual) if self.actual else body  # type: ignore[arg-type]
+            shift[:, 2] = touched.thickness - body.thickness
             exact = ExactSkin(touched, Sensors(sensors.positions + shift, sensors.footprint), prior)
             contacts = self._draw_contacts(body, prior, 3 * count, rng)
             flat = contacts.reshape(-1, 4)
@@ -99,12 +111,21 @@ class Contact:
         gains, scatter = 1 + noise.gain * rng.standard_normal(true.shape[1]), np.sqrt(noise.floor)
         readings = gains * true[chosen] + scatter * rng.standard_normal((len(chosen), len(sensors)))
         posterior = Posterior(device.model, noise, body, prior)
+        described = Thickness(Mechanics(device.simulator, body, sensors, noise), posterior)
+        candidates, works = posterior.candidates, np.ones(len(sensors), dtype=bool)
+        first, length = self.counted if self.thickness != (1, 1) else (0, len(readings))
         estimates, seconds = list[Any](), list[float]()
-        for values in readings:
+        for number, values in enumerate(readings):
+            if number % length == 0:
+                learned = copy(described)
+                posterior.assume(candidates, noise)
             start = time.process_time()
             estimates.append(posterior.estimate(values))
             seconds.append(time.process_time() - start)
-        figures = summarise_estimates(estimates, contacts[chosen], prior)
+            if estimates[-1].fingertip and estimates[-1].number == 1:
+                learned.add(Observation.of(values, works, ~works, posterior.noise))
+        counted = np.arange(len(readings)) % length >= first
+        figures = summarise_estimates([*compress(estimates, counted)], contacts[chosen][counted], prior)
         if exact and self.grid:
             figures |= grid_errors(exact, body, noise, prior, readings, contacts[chosen, 0])
         times = 1e3 * np.quantile(seconds, [0.5, 0.99])

@@ -1,7 +1,9 @@
 """Readings of fingertips on a skin, for every position and radius: sampled once, then interpolated."""
 
+from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, reduce
 from itertools import product
 from typing import NamedTuple
 
@@ -154,7 +156,19 @@ class CandidateReadings:
         self._patch = self.size / self._counts
         self._coefficients = self._fit(simulator, body, prior)
         self.boxes = self._first_boxes()
+        self._tabulate()
+
+    def _tabulate(self) -> None:
         self.readings, self.slopes = (np.ascontiguousarray(part) for part in self.at(self.boxes.centre))
+
+    @staticmethod
+    def mixed(parts: "Sequence[CandidateReadings]", weights: np.ndarray) -> "CandidateReadings":
+        """Return the weighted sum of the readings of skins of one size; weights (N,), float32."""
+        mixed = copy(parts[0])
+        weighted = (weight * part._coefficients for weight, part in zip(weights, parts, strict=True))
+        mixed._coefficients = reduce(np.add, weighted)
+        mixed._tabulate()
+        return mixed
 
     def _fit(self, simulator: AbstractSimulator, body: AbstractBody, prior: FingertipPrior) -> np.ndarray:
         """Return coefficients (patches, K, S), float32."""

@@ -1,9 +1,9 @@
 """One contact: boxes of positions and radii, refined where the probability is."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.special import log_ndtr
@@ -59,7 +59,7 @@ class _Leaves(NamedTuple):
         boxes: N of them.
         readings: (N, S), N/N.
         slopes: (N, 3, S), their derivatives by position and radius, N/N/m.
-        spread: (N, S), variance from gains and positions per square newton, or None.
+        spread: (N, S), variance from gains, thickness and positions per square newton.
         forces: of the boxes.
         evidence: (N,), log of the probability in a box.
     """
@@ -67,33 +67,30 @@ class _Leaves(NamedTuple):
     boxes: Boxes
     readings: np.ndarray
     slopes: np.ndarray
-    spread: np.ndarray | None
+    spread: np.ndarray
     forces: Forces
     evidence: np.ndarray
 
     def rows(self, rows: np.ndarray) -> "_Leaves":
         """Return some of the boxes."""
-        spread = None if self.spread is None else self.spread[rows]
-        boxes, forces = (type(part)(*(values[rows] for values in part)) for part in (self.boxes, self.forces))
-        arrays = self.readings[rows], self.slopes[rows], spread
-        return _Leaves(boxes, *arrays, forces, self.evidence[rows])  # type: ignore[arg-type]
+        return _each(lambda values: values[rows], self)
 
     @staticmethod
     def join(parts: "Sequence[_Leaves]") -> "_Leaves":
         """Return the boxes of all parts."""
-        boxes, forces = (
-            type(same[0])(*map(np.concatenate, zip(*same, strict=True)))
-            for same in ([part.boxes for part in parts], [part.forces for part in parts])
-        )
-        spread = None if parts[0].spread is None else np.concatenate([part.spread for part in parts])  # type: ignore[misc]
-        readings, slopes, evidence = (
-            np.concatenate([getattr(part, name) for part in parts])
-            for name in ("readings", "slopes", "evidence")
-        )
-        return _Leaves(boxes, readings, slopes, spread, forces, evidence)  # type: ignore[arg-type]
+        return _each(lambda *values: np.concatenate(values), *parts)
 
 
-def blur_first(candidates: CandidateReadings, noise: Noise) -> tuple[np.ndarray | None, np.ndarray]:
+def _each(change: Callable[..., np.ndarray], *parts: Any) -> Any:
+    """Return nested tuples of what a change makes of each of their arrays."""
+    changed = (
+        change(*same) if isinstance(same[0], np.ndarray) else _each(change, *same)
+        for same in zip(*parts, strict=True)
+    )
+    return type(parts[0])(*changed)
+
+
+def blur_first(candidates: CandidateReadings, noise: Noise) -> tuple[np.ndarray, np.ndarray]:
     """Return the relative variance of the first boxes, without and with their width; common to all frames."""
     spread = relative_variance(noise, candidates.readings, candidates.slopes)
     return spread, _blurred(candidates.boxes, candidates.slopes, spread)
@@ -103,7 +100,7 @@ def one_contact(
     candidates: CandidateReadings,
     prior: FingertipPrior,
     frame: Observation,
-    first: tuple[np.ndarray | None, np.ndarray] | None = None,
+    first: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> Cloud:
     """Return the posterior of one contact.
 
@@ -151,14 +148,14 @@ def _judge(
     return _Leaves(boxes, readings, slopes, spread, forces, evidence + np.log(boxes.width.prod(1)))
 
 
-def _blurred(boxes: Boxes, slopes: np.ndarray, spread: np.ndarray | None) -> np.ndarray:
+def _blurred(boxes: Boxes, slopes: np.ndarray, spread: np.ndarray) -> np.ndarray:
     """Return the variance (N, S) per square newton averaged over a box, which the box then represents."""
     scaled = slopes * (boxes.width * math.sqrt(1 / 12)).astype(np.float32)[..., None]
     scaled *= scaled
     blurred = scaled[:, 0]
     blurred += scaled[:, 1]
     blurred += scaled[:, 2]
-    return blurred if spread is None else blurred + spread
+    return blurred + spread
 
 
 def _probable(evidence: np.ndarray, others: list[np.ndarray]) -> np.ndarray:
@@ -181,7 +178,7 @@ def _expand(
     """
     readings, spread = leaves.readings, leaves.spread
     force = np.exp(leaves.forces.mode)[:, None]
-    variance = np.float32(frame.noise.floor) + (0 if spread is None else force * force * spread)
+    variance = np.float32(frame.noise.floor) + force * force * spread
     weight = np.broadcast_to(frame.counts / variance, readings.shape)
     pull = weight * (frame.readings - force * readings)
     if len(frame.clipped):
@@ -251,7 +248,7 @@ def _weigh(
     total = weight.sum()
     weight /= total
     middle = np.exp(fit.mode)[:, None]
-    variance = frame.noise.floor + (0 if spread is None else middle * middle * spread)
+    variance = frame.noise.floor + middle * middle * spread
     misfit = ((frame.readings - middle * readings) ** 2 / variance) @ frame.counts
     extent = float(np.prod(candidates.size) * candidates.span)
     evidence = float(top + math.log(total) - math.log(extent))

@@ -119,7 +119,7 @@ class Search:
 
     def variance(self, frame: Observation, predicted: np.ndarray, columns: np.ndarray) -> np.ndarray:
         """Return the variance (M, S), N^2, of readings as of :meth:`predict`."""
-        variance = frame.noise.floor + (frame.noise.gain * predicted) ** 2
+        variance = frame.noise.floor + (frame.noise.relative * predicted) ** 2
         if frame.noise.position:
             for axis in (0, 1):
                 variance = variance + (frame.noise.position * columns[:, axis::4].sum(1)) ** 2

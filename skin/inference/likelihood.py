@@ -67,15 +67,10 @@ class Observation:
         return log_ndtr((predicted - np.float32(self.noise.clip)) / deviation).sum(-1)
 
 
-def relative_variance(noise: Noise, readings: np.ndarray, slopes: np.ndarray) -> np.ndarray | None:
-    """Return the variance from gains and positions of sensors (N, S), per square newton of force, or None."""
-    spread = None
-    if noise.gain:
-        spread = (np.float32(noise.gain) * readings) ** 2
-    if noise.position:
-        moved = np.float32(noise.position**2) * (slopes[:, 0] ** 2 + slopes[:, 1] ** 2)
-        spread = moved if spread is None else spread + moved
-    return spread
+def relative_variance(noise: Noise, readings: np.ndarray, slopes: np.ndarray) -> np.ndarray:
+    """Return the variance (N, S) from gains, thickness and positions, per square newton of force."""
+    moved = slopes[:, 0] ** 2 + slopes[:, 1] ** 2
+    return np.float32(noise.relative**2) * readings**2 + np.float32(noise.position**2) * moved
 
 
 class Forces(NamedTuple):
@@ -102,7 +97,7 @@ def fit_force(
         spread: (N, S), further variance per square newton.
     """
     floor, values = np.float32(frame.noise.floor), frame.readings
-    plain = frame.counts / (floor + (np.float32(frame.noise.gain) * values) ** 2)
+    plain = frame.counts / (floor + (np.float32(frame.noise.relative) * values) ** 2)
     squares = readings * readings
     mode = _mode(prior, readings @ (plain * values), squares @ plain, None).mode
     forces = refit_force(frame, prior, readings, spread, mode)
@@ -116,15 +111,12 @@ def refit_force(
     frame: Observation,
     prior: FingertipPrior,
     readings: np.ndarray,
-    spread: np.ndarray | None,
+    spread: np.ndarray,
     mode: np.ndarray,
 ) -> Forces:
     """Return the force of candidates from that of a similar likelihood, (N,), its logarithm."""
-    variance = np.float32(frame.noise.floor)
-    if spread is not None:
-        force = np.exp(mode)[:, None]
-        variance = force * force * spread + variance
-    weight = readings / variance
+    force = np.exp(mode)[:, None]
+    weight = readings / (force * force * spread + np.float32(frame.noise.floor))
     along = weight @ (frame.counts * frame.readings)
     weight *= readings
     return _mode(prior, along, weight @ frame.counts, mode)
@@ -161,42 +153,23 @@ def _push(mode: np.ndarray, along: np.ndarray, square: np.ndarray) -> tuple[np.n
 
 
 def integrate_force(
-    frame: Observation, prior: FingertipPrior, readings: np.ndarray, spread: np.ndarray | None, fit: Forces
+    frame: Observation, prior: FingertipPrior, readings: np.ndarray, spread: np.ndarray, fit: Forces
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return forces (N, J), N, and the log weight of each, whose sum is the integral over the prior.
 
     Args:
         frame, prior, readings: as of :func:`fit_force`.
-        spread: (N, S), further variance per square newton; None: none.
+        spread: (N, S), further variance per square newton.
         fit: where the forces are.
     """
     nodes, weights = _NODES[bool(len(frame.clipped))]
     deviation = 1 / np.sqrt(fit.curvature)
     logarithm = fit.mode[:, None] + nodes.astype(np.float32) * deviation[:, None]
     force = np.exp(logarithm)
-    if spread is None:
-        likelihood = _quadratic(frame, readings, force)
-    else:
-        predicted, further = (
-            force[..., None] * readings[:, None],
-            (force * force)[..., None] * spread[:, None],
-        )
-        likelihood = frame.likelihood(predicted, further)
+    further = (force * force)[..., None] * spread[:, None]
+    likelihood = frame.likelihood(force[..., None] * readings[:, None], further)
     factor = np.log(weights / math.sqrt(2 * math.pi)) + nodes**2 / 2 + np.log(deviation)[:, None]
     return force, likelihood + _density(prior, logarithm) + factor
-
-
-def _quadratic(frame: Observation, readings: np.ndarray, force: np.ndarray) -> np.ndarray:
-    """Return the log likelihood of forces (N, J) where the variance does not depend on them."""
-    floor = frame.noise.floor
-    precise = readings.astype(float)
-    values, counts = frame.readings.astype(float), frame.counts.astype(float)
-    along, square = precise @ (counts * values), (precise * precise) @ counts
-    misfit = values @ values - force * (2 * along[:, None] - force * square[:, None])
-    fit = -0.5 * (misfit / floor + counts.sum() * math.log(2 * math.pi * floor))
-    if len(frame.clipped):
-        fit += frame.clipping(force[..., None] * precise[:, None, frame.clipped], np.asarray(floor))
-    return fit
 
 
 def fit_residual(

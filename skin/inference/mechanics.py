@@ -1,7 +1,7 @@
 """What contacts on a watched skin are estimated with; it can be sent to a process. torch is not imported."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,6 +11,7 @@ from skin.errors import InputError
 if TYPE_CHECKING:
     from skin.body.base import AbstractBody, Sensors
     from skin.device.simulated import Simulated
+    from skin.inference.candidates import CandidateReadings, FingertipPrior
     from skin.inference.noise import Noise
     from skin.inference.posterior import Posterior
     from skin.mechanics.simulator.base import AbstractSimulator
@@ -37,7 +38,12 @@ class Mechanics:
 
     @classmethod
     def of(
-        cls, device: "Simulated | None", calibrated: bool, gain: float = 0.02, placed: float = 0.001
+        cls,
+        device: "Simulated | None",
+        calibrated: bool,
+        gain: float = 0.02,
+        placed: float = 0.001,
+        thickness: tuple[float, float] = (1.0, 1.0),
     ) -> "Mechanics":
         """Return the mechanics of a run's skin.
 
@@ -47,6 +53,7 @@ class Mechanics:
                 training do.
             gain: standard deviation of the gains of a calibrated device.
             placed: m, standard deviation of the positions of sensors, as made by hand.
+            thickness: range, relative to the described one (:class:`skin.inference.noise.Noise`).
 
         Raises:
             InputError: there are no mechanics, or readings of contacts do not add up.
@@ -62,8 +69,17 @@ class Mechanics:
         noise = max(float(np.mean(settings.noise)), QUIET)
         gain = gain if calibrated else float(np.mean(settings.gain_spread))
         offset = 0.0 if settings.tare else settings.offset
-        nominal = Noise(noise, gain=gain, offset=offset, position=placed)
+        nominal = Noise(noise, gain=gain, offset=offset, position=placed, thickness=thickness)
         return cls(device.simulator, device.body, device.sensors, nominal)
+
+    def thicker(self, factor: float, prior: "FingertipPrior") -> "CandidateReadings":
+        """Return the readings of a skin whose layers are thicker, and whose sensors deeper, by a factor."""
+        from skin.inference.candidates import CandidateReadings
+
+        layers = tuple(replace(layer, thickness=factor * layer.thickness) for layer in self.body.layers)
+        body = replace(self.body, layers=layers)
+        sensors = replace(self.sensors, positions=self.sensors.positions * [1, 1, factor])
+        return CandidateReadings(self.simulator(body, sensors), body, prior)
 
     def posterior(self) -> "Posterior":
         """Return the estimator, for a skin that is watched all the time and therefore idle most of it.

@@ -274,16 +274,19 @@ class Posterior:
                 "readings of simulator.reading=equation10 do not add up, so that only one contact can be "
                 "estimated: give contacts=1, or set simulator.reading=interface or simulator=solid"
             )
-        self.noise, self.prior = noise, prior or FingertipPrior()
+        self.prior = prior or FingertipPrior()
         possible = np.flatnonzero(self.prior.numbers[: contacts + 1])
         self._maximum = int(possible[-1])
-        self.candidates = CandidateReadings(simulator, body, self.prior)
-        self._first = blur_first(self.candidates, noise)
-        self._search = Search(self.candidates, self.prior)
+        self.assume(CandidateReadings(simulator, body, self.prior), noise)
         self._large = LargeContacts(self.candidates, noise) if self.prior.large else None
         with np.errstate(divide="ignore"):
             self._numbers = np.log(np.array(self.prior.numbers[: self._maximum + 1]))
         self._peak = self.prior.peak
+
+    def assume(self, candidates: CandidateReadings, noise: Noise) -> None:
+        """Take the readings of fingertips, and the noise of readings, to be these."""
+        self.candidates, self.noise = candidates, noise
+        self._first, self._search = blur_first(candidates, noise), Search(candidates, self.prior)
 
     def estimate(
         self, readings: np.ndarray, valid: np.ndarray | None = None, saturated: np.ndarray | None = None
@@ -344,10 +347,10 @@ class Posterior:
         number = int(logs.argmax())
         total = float(logs.max() + np.log(np.exp(logs - logs.max()).sum()))
         probabilities = np.exp(logs - total)
-        misfit = {0: frame.misfit_empty(), 1: single.misfit}.get(number)
-        if misfit is None:
-            misfit = mixtures[number].misfit
-        fit = float(gammaincc(max(frame.counts.sum(), 1) / 2, misfit / 2))
+        misfits = {0: frame.misfit_empty(), 1: single.misfit} | {
+            n: each.misfit for n, each in mixtures.items()
+        }
+        fit = float(gammaincc(max(frame.counts.sum(), 1) / 2, misfits[number] / 2))
         if number in mixtures:
             mixtures[number] = self._search.walk(frame, mixtures[number])
         contacts = self._contacts(number, single, mixtures)
@@ -409,9 +412,7 @@ class Posterior:
             return (
                 self._summary(boxes.centre, boxes.width, single.force, single.weight, single.mode[0, 2:]),
             )
-        if number not in mixtures:
-            raise AssertionError("a number of contacts that was not refined is not the most probable")
-        mixture = mixtures[number]
+        mixture = mixtures[number]  # the most probable number is one that was refined
         weight = mixture.weight[:, None]
         parts = list[ContactEstimate]()
         modes = self._search.contacts(mixture.mode[None])[0]

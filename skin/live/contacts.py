@@ -31,7 +31,9 @@ if TYPE_CHECKING:
 
 def unknown_contacts(reason: str) -> dict[str, Any]:
     """Return the message that nothing is known of contacts, with the reason."""
-    empty = dict.fromkeys(("device_time", "number", "probability", "probabilities", "fit", "large"))
+    empty = dict.fromkeys(
+        ("device_time", "number", "probability", "probabilities", "fit", "large", "thickness")
+    )
     return {"state": "unknown", "reason": reason, **empty, "contacts": [], "changed": []}
 
 
@@ -50,6 +52,7 @@ def contact_message(estimate: "FrameEstimate", time: float, noise_fit: float = 1
         "fit": round(estimate.fit, 6),
         "large": round(estimate.large, 6),
         "changed": [],
+        "thickness": None,
     }
     if not (estimate.fingertip or none):
         # The strongest of the fingertips that fit best: a reader must find where a hard touch is.
@@ -102,16 +105,19 @@ def _contact(contact: "ContactEstimate", probability: float = 0.9, cell: float =
 
 def contact_text_lines(message: dict[str, Any]) -> list[str]:
     """Return what is known of contacts in words, a line for each."""
-    state, number = message["state"], message["number"]
+    state, number, contacts = message["state"], message["number"], [*map(_words, message["contacts"])]
     if state == "unknown":
         return [f"contacts unknown: {message['reason']}"]
+    head = (
+        f"{number or 'no'} contact{'s' * ((number or 0) > 1)} ({100 * (message['probability'] or 0):.0f} %)"
+    )
     if state == "not a fingertip":
-        return [
-            f"{state} (fit {message['fit']:.2g}, a larger contact {100 * message['large']:.0f} %)",
-            *(f"best: {_words(contact)}" for contact in message["contacts"]),
-        ]
-    head = f"{number or 'no'} contact{'s' * (number > 1)} ({100 * message['probability']:.0f} %)"
-    return [head, *map(_words, message["contacts"])]
+        head = f"{state} (fit {message['fit']:.2g}, a larger contact {100 * message['large']:.0f} %)"
+        contacts = [f"best: {words}" for words in contacts]
+    if message["thickness"]:
+        fits, described = (1e3 * thickness for thickness in message["thickness"])
+        contacts.append(f"readings fit {fits:.3g} mm better than the described {described:.3g} mm")
+    return [head, *contacts]
 
 
 def _words(contact: dict[str, Any]) -> str:
@@ -214,24 +220,28 @@ def serve(mechanics: Mechanics, pipe: Connection) -> None:
     """Prepare the mechanics, then answer readings with messages until the pipe is closed."""
     import torch
 
-    from skin.inference.watch import Watch
+    from skin.inference.likelihood import Observation
+    from skin.inference.watch import Thickness, Watch
 
     if hasattr(os, "nice"):
         os.nice(5)  # below what shows verdicts
     os.dup2(2, 1)  # what a library prints is no JSON line
     torch.set_num_threads(1)
     posterior, tare = mechanics.posterior(), -1
+    thickness = Thickness(mechanics, posterior)
     with threadpool_limits(1), suppress(EOFError, OSError):  # the command has ended
         while True:
             readings = pipe.recv()
             if readings.tare != tare:
                 watch, tare = Watch(posterior.candidates, posterior.prior, mechanics.noise), readings.tare
             try:
-                message = estimate_contacts(posterior, mechanics.noise, readings)
+                message = estimate_contacts(posterior, thickness.noise, readings)
                 watch.look(readings.values, readings.valid & ~readings.saturated, posterior.noise)
+                moment = readings.values, readings.valid, readings.saturated, posterior.noise
+                thickness.look(Observation.of(*moment), message["number"])
             except (ArithmeticError, ValueError, AssertionError, InputError) as error:
                 message = unknown_contacts(f"the estimate failed: {error}")
-            pipe.send(message | {"changed": [*watch.changed]})
+            pipe.send(message | {"changed": [*watch.changed], "thickness": thickness.doubt})
 
 
 class LiveContacts:

@@ -246,6 +246,7 @@ class LiveSettings:
         contacts: whether a process of its own estimates contacts.
         selftest: whether simulated dangerous touches must raise the alarm at the start.
         patience: settings of debouncing.
+        thickness: range of the thickness of the skin, relative to the described one, for contacts.
     """
 
     web_port: Annotated[int, Ge(0), Le(65535)]
@@ -258,6 +259,7 @@ class LiveSettings:
     contacts: bool
     selftest: bool
     patience: DebounceSettings
+    thickness: tuple[Annotated[float, Gt(0), Le(1)], Annotated[float, Ge(1)]] = (1.0, 1.0)
 
     @classmethod
     def of(cls, live: Mapping[str, Any]) -> "LiveSettings":
@@ -289,7 +291,7 @@ class LiveSetup:
     name: str
     port: Source | None
     begin: Callable[[], Source]
-    mechanics: Callable[[], Mechanics]
+    mechanics: Callable[..., Mechanics]
 
     def watch(
         self, live: LiveSettings, say: Callable[[str], None]

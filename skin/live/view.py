@@ -374,7 +374,8 @@ def _open_views(display: Display, setup: LiveSetup, live: LiveSettings, opened: 
     try:
         if live.contacts:
             display.contacts.start(
-                setup.mechanics(), lambda: setup.port is not None and setup.port.raw_range.whole
+                setup.mechanics(thickness=live.thickness),
+                lambda: setup.port is not None and setup.port.raw_range.whole,
             )
     except InputError as error:
         display.contacts.explain(str(error))

@@ -385,6 +385,8 @@ def test_errors_are_one_sentence():
     body, sensors = SMALL, sensors_of(SMALL, None, 3)
     with pytest.raises(skin.InputError, match="a standard deviation above 0 N"):
         Noise(0.0)
+    with pytest.raises(skin.InputError, match=r"the described one and includes it.*thickness=\[1.1,1.3\]"):
+        Noise(0.05, thickness=(1.1, 1.3))
     with pytest.raises(skin.InputError, match="needs the mechanics of a skin"):
         Posterior(None, NOISE, body)
     with pytest.raises(skin.InputError, match="1 to 3 contacts"):

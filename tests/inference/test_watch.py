@@ -4,6 +4,7 @@
 """
 
 import os
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -14,8 +15,10 @@ from skin.body.base import Sheet
 from skin.body.layout import Grid
 from skin.inference.candidates import CandidateReadings, FingertipPrior, disc_readings
 from skin.inference.likelihood import Observation
+from skin.inference.mechanics import Mechanics
 from skin.inference.noise import Noise
-from skin.inference.watch import THRESHOLD, Prediction, RankTests, Watch
+from skin.inference.posterior import Posterior
+from skin.inference.watch import THRESHOLD, Prediction, RankTests, Thickness, Watch
 from skin.mechanics.simulator.solid import Solid
 
 BODY = Sheet((0.16, 0.16), (16, 16), [{"material": "EcoFlex 00-30", "thickness": 0.03}])
@@ -168,3 +171,34 @@ def test_faults_are_found_within_sixty_touches(fault, near):
     )
     # A gain, or a sensor that is dead, is felt only where it is touched.
     assert len(found) >= 0.5 * count or not (near or fault == "offset")
+
+
+@pytest.mark.parametrize("true", [0.8, 1.0, 1.2])
+def test_touches_tell_the_thickness_and_each_counts_once(true):
+    noise, none = Noise(0.05, 10, thickness=(0.75, 1.3)), np.zeros(9, bool)
+    body = Sheet((0.09, 0.09), (9, 9), BODY.layers)
+    mechanics = Mechanics(coarse, body, Grid(3, 3, (0.01, 0.01), depth=0.0295).sensors(body), noise)
+    prior, rng = FingertipPrior(large=0), np.random.default_rng(0)
+    posterior = Posterior(coarse(body, mechanics.sensors), noise, body, prior, contacts=1)
+    learned, described = Thickness(mechanics, posterior), posterior.candidates
+    discs = np.column_stack([rng.uniform(0.02, 0.07, (30, 2)), rng.uniform(*prior.radii, 30)])
+    readings = 10 * mechanics.thicker(true, prior).at(discs)[0] + 0.016 * rng.standard_normal((30, 9))
+    for touch in readings[:19]:
+        for part, number in ((0.5, 1), (1, 1), (2, None), (0.0, 0), (0.0, 0)):
+            learned.look(Observation.of(part * touch, ~none, none, noise), number)
+    assert (learned.touches, learned.doubt) == (19, None)  # too few to say so
+    for touch in readings[19:]:
+        learned.add(Observation.of(touch, ~none, none, noise))
+    assert learned.factor == pytest.approx(true, abs=0.05)
+    assert learned.noise.relative < 0.05 < noise.relative
+    assert (learned.doubt is None) == (true == 1)
+    assert posterior.noise is learned.noise
+    error = posterior.candidates.at(discs)[0] - mechanics.thicker(true, prior).at(discs)[0]
+    assert np.abs(error).max() < 0.25 * np.abs(described.at(discs)[0]).max()
+    known = Thickness(replace(mechanics, noise=DEVICE), posterior)  # without a range
+    known.add(Observation.of(touch, ~none, none, noise))
+    assert (known.touches, posterior.noise) == (0, learned.noise)
+
+
+def coarse(body, sensors):
+    return Solid(body, sensors, divisions=4, refinement=1)

@@ -133,6 +133,8 @@ def test_the_message_says_where_and_how_hard(posterior, felt):
     positions = np.array(region["origin"]) + np.array(region["cells"]) * region["cell"]
     assert (np.abs(positions - TRUTH[0, :2]) <= np.array(region["cell"])).all(axis=1).any()
     head, line = contact_text_lines(message)
+    *_, doubt = contact_text_lines(message | {"thickness": (0.0241, 0.03)})
+    assert doubt == "readings fit 24.1 mm better than the described 30 mm"
     assert head.startswith("1 contact (")
     assert " N, " in line
     assert line.endswith(" kPa")

@@ -136,11 +136,13 @@ class AbstractSimulator(nn.Module, ABC):
             )
 
     def refuse_tilted(self, sensors: Sensors) -> None:
-        """Raise InputError for a tilted sensor if this simulator does not support it."""
-        if not self.feels_shear and sensors.tilted.any():
+        """Raise InputError for a tilted sensor, or one of three axes, if this simulator has none."""
+        along = (sensors.measured[:, :2] != 0).any(axis=1)
+        if not self.feels_shear and along.any():
             raise InputError(
-                f"sensor {int(sensors.tilted.argmax()) + 1} is tilted, but simulator={self._name} has normal "
-                "forces only: set simulator=solid, or give normals (0, 0, 1)"
+                f"sensor {int(along.argmax()) + 1} is tilted or measures along the surface, but "
+                f"simulator={self._name} has normal forces only: set simulator=solid, or layout.tilt=0 "
+                "layout.axes=normal, or directions (0, 0, 1)"
             )
 
     def motion(self, pressure: Tensor, shear: Tensor | None = None) -> Tensor:

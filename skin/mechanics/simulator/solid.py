@@ -265,9 +265,9 @@ _BODIES = WeakValueDictionary[tuple[str, int], Elastic]()
 class Solid(AbstractSimulator):
     """Layers of nearly incompressible elastic solid on a rigid base.
 
-    A sensor reads the normal force n . sigma . n on its footprint. A tilted sensor therefore responds to
-    shear, and each sensor responds to its neighbourhood. The model is linear: strains must be small (see the
-    summary of each data set).
+    A sensor reads the force d . sigma . n on its footprint along its direction d, by default n. One that is
+    tilted or has three axes responds to shear, and each sensor responds to its neighbourhood. The model is
+    linear: strains must be small (see the summary of each data set).
 
     Readings under a disc of 5 mm radius and more on the default sheet have an error of up to 2 %, those under
     uniform pressure of 0.2 %; ``make physics`` and tests/mechanics/simulator/test_solid.py check other cases.
@@ -277,7 +277,7 @@ class Solid(AbstractSimulator):
 
     Args:
         body: sheet or arm.
-        sensors: positions and normals of the sensors.
+        sensors: positions, normals and directions of the sensors.
         divisions: rows of elements in each layer.
         refinement: elements along each side of a cell.
         poisson: name of a material -> nu that replaces a value >= 0.5.
@@ -471,6 +471,7 @@ class Solid(AbstractSimulator):
         about = {
             "positions": sensors.positions.tolist(),
             "normals": sensors.normals.tolist(),
+            "directions": sensors.measured.tolist(),
             "footprint": sensors.footprint,
         }
         key = self._key(self._parts, about)

@@ -50,6 +50,7 @@ class AbstractSimulator(nn.Module, ABC):
     Attributes:
         feels_shear: whether readings depend on tangential forces too.
         mechanical: whether readings depend on the thickness and stiffness of the layers.
+        axes: sensors of a site: 3 if they measure along the surface too.
         smooth: whether the loads of movies are moments of the pressure (:mod:`skin.touch.splines`) instead of
             mean pressures of cells.
     """
@@ -57,6 +58,7 @@ class AbstractSimulator(nn.Module, ABC):
     feels_shear: ClassVar[bool] = False
     mechanical: ClassVar[bool] = True
     smooth: ClassVar[bool] = False
+    axes = 1
 
     @abstractmethod
     def forward(self, pressure: Tensor, shear: Tensor | None = None) -> Response:

@@ -315,7 +315,7 @@ class Solid(AbstractSimulator):
         self.register_buffer("transfer", torch.from_numpy(rows.transpose(0, 2, 1).copy()).float())
         for name, count in zip(("spread_x", "spread_y"), body.cells, strict=True):
             self.register_buffer(name, torch.from_numpy(splines.of_cells(count).copy()).float())
-        self._sensors = len(sensors)
+        self._sensors, self.axes = len(sensors), sensors.axes
 
     def forward(self, pressure: Tensor, shear: Tensor | None = None) -> Response:
         """Return the response to pressure (..., H, W), Pa, and shear (..., 2), with D_s and D_t."""
@@ -351,9 +351,8 @@ class Solid(AbstractSimulator):
 
     def motion(self, pressure: Tensor, shear: Tensor | None = None) -> Tensor:
         """Return the displacement of each sensor along x, along y and into the skin, (..., S, 3), m."""
-        count = self._sensors
-        loads = self.loads(pressure)
-        inwards, _, x, y = self._rows(loads, shear, slice(count, 5 * count)).chunk(4, dim=-1)
+        rows = slice(self._sensors, 5 * self._sensors)
+        inwards, _, x, y = self._rows(self.loads(pressure), shear, rows).chunk(4, dim=-1)
         return torch.stack([x, y, inwards], dim=-1)
 
     def compliance(self) -> Tensor:

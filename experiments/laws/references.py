@@ -4,9 +4,9 @@ A half-space: point solutions of Boussinesq (across the surface) and Cerruti (al
 Contact Mechanics (1985), sections 3.2 and 3.6. x and y lie on the surface, z points into the body, stress is
 positive in tension.
 
-Layers: under a pressure p cos(k x) every quantity is a wave of the same length times a function of depth,
-which obeys four ordinary differential equations (Vlasov's method of initial functions). A pressure on a
-rectangle within smooth walls is a sum of such waves.
+Layers: under a load cos(k x) every quantity is a wave of the same length times a function of depth, which
+obeys four ordinary differential equations (Vlasov's method of initial functions), and two for motions across
+the wave. A pressure on a rectangle within smooth walls is a sum of such waves.
 """
 
 import math
@@ -132,16 +132,16 @@ def bonded_layer(number: float, slab: Slab) -> float:
 
 
 class Discs:
-    """Forces on squares at a depth of endless layers under discs of even pressure, by Hankel integrals.
+    """Forces on squares at a depth of endless layers under discs of even load, by Hankel integrals.
 
-    The stress of a disc is tabulated over its radius and the distance, and joined by cubic splines.
+    Stresses of a disc are tabulated over its radius and the distance, and joined by cubic splines.
 
     Args:
         slabs: from the surface down.
-        depth: of the squares, m; where pressure waves shorter than 1 / 40 of it have died away.
+        depth: of the squares, m; where waves shorter than 1 / 40 of it have died away.
         radii: least and largest radius of a disc, m.
         reach: largest distance of a square's middle, m.
-        edges: what is added to the radius, m; the pressure is the mean of such discs.
+        edges: what is added to the radius, m; the load is the mean of such discs.
     """
 
     def __init__(
@@ -155,105 +155,137 @@ class Discs:
         knots, weight = np.polynomial.legendre.leggauss(1200)
         longest = 40 / depth
         number, weight = (knots + 1) / 2 * longest, weight / 2 * longest
-        stress = -waves(number, slabs, depth)[:, 1] * weight
+        states = waves(number, slabs, depth)[:, 3:]
+        (down, along), (sunk, dragged), across = -states[:, 0, :2].T, states[:, 1, :2].T, states[:, 2, 2]
         # Waves from the surface fade over a depth, so that a twelfth of it is a fine step.
         step = min(depth / 12, 5e-4)
         radius = np.linspace(*radii, max(5, math.ceil((radii[1] - radii[0]) / step)))
         away = np.linspace(0, 1.1 * reach, math.ceil(1.1 * reach / step))
         discs = (radius[:, None] + np.array(edges)).clip(min=0)
-        strength = stress * np.mean([part * j1(number * part) for part in discs.T[..., None]], axis=0)
-        self._stress = RectBivariateSpline(radius, away, strength @ j0(np.outer(number, away)))
+        strength = weight * np.mean([part * j1(number * part) for part in discs.T[..., None]], axis=0)
+        phase = np.outer(number, away).clip(1e-9)
+        even, once = j0(phase), j1(phase)
+        twice = 2 * once / phase - even
+        terms = [(down, even), (sunk, once), (-along, once)]
+        terms += [((dragged + across) / 2, even), ((across - dragged) / 2, twice)]
+        self._stresses = [
+            RectBivariateSpline(radius, away, (strength * wave) @ function) for wave, function in terms
+        ]
 
     def forces(self, discs: np.ndarray, squares: np.ndarray, side: float) -> np.ndarray:
-        """Return the forces (N, S), N, of discs under 1 Pa.
+        """Return the forces (N, S) into the layers, N, of discs under a pressure of 1 Pa.
 
         Args:
             discs: (N, 3), x, y and radius, m.
             squares: (S, 2), their middles, m.
             side: of the squares, m.
         """
+        return self._integrate(discs, squares, side, 1)[..., 0]
+
+    def tractions(self, discs: np.ndarray, squares: np.ndarray, side: float) -> np.ndarray:
+        """Return the forces (N, S, 3, 3) along x, along y and inwards, N, of discs under 1 Pa along each.
+
+        Args:
+            discs, squares, side: as of :meth:`forces`.
+        """
+        down, pushed_x, pushed_y, sunk_x, sunk_y, even, cos, sin = np.moveaxis(
+            self._integrate(discs, squares, side, 5), 2, 0
+        )
+        forces = [[even + cos, sin, pushed_x], [sin, even - cos, pushed_y], [sunk_x, sunk_y, down]]
+        return np.moveaxis(np.array(forces), (0, 1), (2, 3))
+
+    def _integrate(self, discs: np.ndarray, squares: np.ndarray, side: float, count: int) -> np.ndarray:
+        """Return integrals over squares of the first tables, times the cosine and sine of their angle."""
         points, weights = np.polynomial.legendre.leggauss(6)
-        total = np.zeros((len(discs), len(squares)))
-        radius = np.broadcast_to(discs[:, 2:], total.shape)
+        total = np.zeros((len(discs), len(squares), 1 if count == 1 else 8))
+        radius = np.broadcast_to(discs[:, 2:], total.shape[:2])
         for (x, along), (y, across) in product(zip(points, weights, strict=True), repeat=2):
             shift = squares + np.array([x, y]) * side / 2 - discs[:, None, :2]
-            total += (
-                along * across * side**2 / 4 * self._stress.ev(radius, np.hypot(*np.moveaxis(shift, 2, 0)))
-            )
+            away = np.hypot(*np.moveaxis(shift, 2, 0))
+            tables = [table.ev(radius, away) for table in self._stresses[:count]]
+            if count > 1:
+                cos, sin = np.moveaxis(shift / away.clip(1e-12)[..., None], 2, 0)
+                down, pushed, sunk, even, twice = tables
+                turned = pushed * cos, pushed * sin, sunk * cos, sunk * sin, even
+                tables = [down, *turned, twice * (cos**2 - sin**2), twice * 2 * cos * sin]
+            total += along * across * side**2 / 4 * np.stack(tables, axis=-1)
         return total
 
 
 def waves(number: np.ndarray, slabs: Sequence[Slab], depth: float) -> np.ndarray:
-    """Return how waves of pressure of 1 Pa move and stress a depth: (n, 2), m/Pa and Pa/Pa.
+    """Return how waves of 1 Pa move and stress a depth, (n, 6, 3), m/Pa and Pa/Pa.
 
-    The first is the motion into the skin, the second sigma_zz, both in phase with the pressure. In each slab
-    two waves fade downwards and two upwards.
+    Rows are the motions along the wave, into the skin and across, then sigma_zz and the shears along and
+    across. Columns are the loads: pressure, and shear along and across. Motions along and shears along are a
+    quarter of a wave before the others. In each slab three waves fade downwards and three upwards.
 
     Args:
         number: k, (n,), 1/m, above 0.
         slabs: from the surface down; the last is bonded to a rigid base.
         depth: m; at an interface it may belong to either layer.
     """
-    unknowns = 4 * len(slabs)
+    unknowns = 6 * len(slabs)
     system = np.zeros((len(number), unknowns, unknowns))
     scale = slabs[0].shear * number[:, None, None]
     row, last = 0, len(slabs) - 1
     for index, slab in enumerate(slabs):
-        columns = slice(4 * index, 4 * index + 4)
+        columns = slice(6 * index, 6 * index + 6)
         top, bottom = (_basis(number, slab, at, scale) for at in (0.0, slab.thickness))
         if index == 0:
-            system[:, 0:2, columns] = top[:, 2:]
-            row = 2
+            system[:, 0:3, columns] = top[:, 3:]
+            row = 3
         else:
-            system[:, row : row + 4, columns] = -top
-            row += 4
+            system[:, row : row + 6, columns] = -top
+            row += 6
         if index < last:
-            system[:, row : row + 4, columns] = bottom
+            system[:, row : row + 6, columns] = bottom
         else:
-            system[:, row : row + 2, columns] = bottom[:, :2]
-    right = np.zeros((len(number), unknowns, 1))
-    right[:, 0] = -1 / scale[:, 0]
+            system[:, row : row + 3, columns] = bottom[:, :3]
+    right = np.zeros((len(number), unknowns, 3))
+    right[:, :3] = np.diag([-1, 1, 1]) / scale
     amounts = np.linalg.solve(system, right)
     above = 0.0
     for index, slab in enumerate(slabs):
         if depth <= above + slab.thickness or index == last:
-            state = _basis(number, slab, depth - above, scale) @ amounts[:, 4 * index : 4 * index + 4]
-            return np.column_stack([state[:, 1, 0], state[:, 2, 0] * scale[:, 0, 0]])
+            state = _basis(number, slab, depth - above, scale) @ amounts[:, 6 * index : 6 * index + 6]
+            return state * np.concatenate([np.ones((len(number), 3, 1)), np.tile(scale, (1, 3, 1))], axis=1)
         above += slab.thickness
     raise AssertionError
 
 
 def _basis(number: np.ndarray, slab: Slab, at: float, scale: np.ndarray) -> np.ndarray:
-    """Return the states (n, 4, 4) of four solutions at a depth within a slab.
+    """Return the states (n, 6, 6) of six solutions at a depth within a slab.
 
-    A state holds the motions along the wave and down, then sigma_zz and the shear over ``scale`` (n, 1, 1),
-    Pa/m. Solutions fade from the face where they begin, so that no exponential overflows.
+    A state holds the rows of :func:`waves`, stresses over ``scale`` (n, 1, 1), Pa/m. Solutions fade from the
+    face where they begin, so that no exponential overflows.
     """
     matrix = _matrix(slab)
     down, up = number * at, number * (slab.thickness - at)
     states = []
     for sign, way in ((-1.0, down), (1.0, up)):
-        shifted = matrix - sign * np.eye(4)
-        # matrix has the eigenvalues 1 and -1 twice each; this is the invariant plane of ``sign``.
-        plane = np.linalg.svd((matrix + sign * np.eye(4)) @ (matrix + sign * np.eye(4)))[0][:, :2]
+        shifted = matrix - sign * np.eye(6)
+        # matrix has the eigenvalues 1 and -1 three times each; this is the invariant space of ``sign``.
+        plane = np.linalg.svd((matrix + sign * np.eye(6)) @ (matrix + sign * np.eye(6)))[0][:, :3]
         grown = plane - sign * way[:, None, None] * (shifted @ plane)
         states.append(np.exp(-way)[:, None, None] * grown)
     basis = np.concatenate(states, axis=2)
-    units = np.ones((len(number), 4, 1))
-    units[:, 2:] = slab.shear * number[:, None, None] / scale
+    units = np.ones((len(number), 6, 1))
+    units[:, 3:] = slab.shear * number[:, None, None] / scale
     return basis * units
 
 
 def _matrix(slab: Slab) -> np.ndarray:
-    """Return d/d(kz) of (motion along, motion down, sigma_zz / Gk, shear / Gk) under a wave, (4, 4)."""
+    """Return d/d(kz) of motions along, down and across, sigma_zz / Gk and shears / Gk of a wave, (6, 6)."""
     ratio = 2 * slab.poisson / (1 - 2 * slab.poisson)  # lambda / G
     whole = ratio + 2
     return np.array(
         [
-            [0, -1, 0, 1],
-            [ratio / whole, 0, 1 / whole, 0],
-            [0, 0, 0, 1],
-            [whole - ratio**2 / whole, 0, -ratio / whole, 0],
+            [0, -1, 0, 0, 1, 0],
+            [ratio / whole, 0, 0, 1 / whole, 0, 0],
+            [0, 0, 0, 0, 0, 1],
+            [0, 0, 0, 0, 1, 0],
+            [whole - ratio**2 / whole, 0, 0, -ratio / whole, 0, 0],
+            [0, 0, 1, 0, 0, 0],
         ]
     )
 

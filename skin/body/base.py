@@ -42,17 +42,31 @@ class Sensors:
         positions: (S, 3), m: x to the right and y downwards from the body's upper left corner, z the depth
             below the surface. The order of the sensors is the order of the readings everywhere.
         footprint: extent (x, y) of the sensitive area of one sensor, m.
-        normals: (S, 3), unit vectors n, in the local frame (x, y, into the skin), of the stress that each
-            sensor measures: it reads n . sigma . n. One (3,) holds for all; by default they face the surface.
+        normals: (S, 3), unit vectors n, in the local frame (x, y, into the skin), across the footprint of
+            each sensor. One (3,) holds for all; by default they face the surface.
+        directions: (S, 3), unit vectors d in the same frame: a sensor reads d . sigma . n, the force along d
+            that what is above its footprint exerts on it; None: d is n. A site of three axes is three
+            sensors, one after the other: two along its plane, and one inwards.
     """
 
     positions: np.ndarray
     footprint: tuple[float, float]
     normals: np.ndarray = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
+    directions: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         normals = np.broadcast_to(np.asarray(self.normals, dtype=float), self.positions.shape)
         object.__setattr__(self, "normals", normals.copy())
+
+    @property
+    def axes(self) -> int:
+        """Sensors of a site: 3 if they measure along its plane too, else 1."""
+        return 1 if self.directions is None else 3
+
+    @property
+    def measured(self) -> np.ndarray:
+        """Directions of the forces that the sensors read, (S, 3), unit vectors."""
+        return self.normals if self.directions is None else self.directions
 
     @property
     def tilted(self) -> np.ndarray:
@@ -61,6 +75,14 @@ class Sensors:
 
     def __len__(self) -> int:
         return len(self.positions)
+
+
+def plane_axes(normals: np.ndarray) -> np.ndarray:
+    """Return the chart's x and y turned the shortest way into planes across normals (S, 3), (S, 2, 3)."""
+    x, y, z = (normals * np.where(normals[:, 2:] < 0, -1, 1)).T
+    along_x = np.stack([1 - x * x / (1 + z), -x * y / (1 + z), -x], axis=-1)
+    along_y = np.stack([-x * y / (1 + z), 1 - y * y / (1 + z), -y], axis=-1)
+    return np.stack([along_x, along_y], axis=1) + 0.0  # -0.0 would give other keys of stored operators
 
 
 # Check that arrays fit into memory before they are allocated.

@@ -9,13 +9,13 @@ from collections.abc import Sequence
 from io import StringIO
 from itertools import islice
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 from annotated_types import Ge, Lt
 from pydantic import NonNegativeInt, PositiveFloat, PositiveInt
 
-from skin.body.base import MOST, AbstractBody, Sensors
+from skin.body.base import MOST, AbstractBody, Sensors, plane_axes
 from skin.core.files import candidates
 from skin.core.safe_loading import read_file
 from skin.core.settings import checked
@@ -57,6 +57,12 @@ Footprint = tuple[PositiveFloat, PositiveFloat]
 """Extent (x, y) of the sensitive area of a sensor, m."""
 
 
+Axes = Literal["normal", "three"]
+"""What each site measures: the force inwards, or forces along x, along y and inwards."""
+
+_UNIT = 1e-3  # of a length of 1: files have few digits
+
+
 class AbstractLayout(ABC):
     """Places sensors in a body."""
 
@@ -71,39 +77,71 @@ class AbstractLayout(ABC):
 
 def place_sensors(
     body: AbstractBody,
-    x: np.ndarray,
-    y: np.ndarray,
-    depth: np.ndarray | float | None,
+    centres: np.ndarray,
+    depth: np.ndarray | list[float] | float | None,
     footprint: Footprint,
     normals: np.ndarray | None = None,
+    axes: Axes = "normal",
+    directions: np.ndarray | None = None,
 ) -> Sensors:
-    """Return sensors at x and y, each (S,), m.
+    """Return sensors at x and y (S, 2), m; three at each position if ``axes`` is ``three``.
 
     Args:
         body: the body.
-        x, y: (S,), m.
+        centres: (S, 2), x and y, m.
         depth: of all sensors or of each (S,), m; None: ``body.sensor_depth``.
         footprint: extent (x, y) of the sensitive area, m.
-        normals: (S, 3), unit vectors; None: those of the surface.
+        normals: (S, 3), of any length; None: those of the surface.
+        axes: of each site.
+        directions: (S, 3), which each measures; None: the normals, or those of ``axes``.
 
     Raises:
-        InputError: a depth that is not a number, a sensor outside the body, or two sensors with the same x
-            and y, because images and graphs are flat.
+        InputError: a sensor outside the body, two sensors with the same x and
+            y, because images and graphs are flat, or directions that are not those of three axes.
     """
-    depths = np.asarray(body.sensor_depth if depth is None else depth)
-    if depths.dtype.kind not in "if":
-        raise InputError(f"layout.depth must be a length in m or null, got {depth!r}: as in 0.004")
-    positions = np.column_stack([x, y, np.broadcast_to(depths, x.shape)])
+    depths = np.broadcast_to(body.sensor_depth if depth is None else depth, len(centres))
+    positions = np.column_stack([centres, depths])
     _check_inside(body, positions)
-    # Two sensors less than a micrometre apart in the plane are at one position.
-    first, second, distance = _closest(positions, (1.0, 1.0))
+    facing = np.broadcast_to([0.0, 0.0, 1.0] if normals is None else normals, positions.shape)
+    facing = facing / np.linalg.norm(facing, axis=1, keepdims=True)
+    if axes == "three":
+        directions = np.concatenate([plane_axes(facing), facing[:, None]], axis=1).reshape(-1, 3)
+        positions, facing = positions.repeat(3, axis=0), facing.repeat(3, axis=0)
+    sensors = Sensors(positions, (float(footprint[0]), float(footprint[1])), facing, directions)
+    if directions is not None:
+        _check_axes(sensors, directions)
+    # Two sites less than a micrometre apart in the plane are at one position.
+    first, second, distance = _closest(sensors, (1.0, 1.0))
     if distance < 1e-6:
         raise InputError(
-            f"sensors {first + 1} and {second + 1} are at one position, x = {x[first]:g} m, "
-            f"y = {y[first]:g} m: move one or remove it from the layout"
+            f"sensors {first + 1} and {second + 1} are at one position, x = {positions[first, 0]:g} m, "
+            f"y = {positions[first, 1]:g} m: move one or remove it from the layout"
         )
-    extent = float(footprint[0]), float(footprint[1])
-    return Sensors(positions, extent) if normals is None else Sensors(positions, extent, normals)
+    return sensors
+
+
+def _check_axes(sensors: Sensors, directions: np.ndarray) -> None:
+    lengths, sites = np.linalg.norm(directions, axis=1), len(sensors) // 3
+    if (wrong := np.abs(lengths - 1) > _UNIT).any():
+        raise InputError(
+            f"the direction of sensor {wrong.argmax() + 1} has length {lengths[wrong][0]:.3g}, but must be a "
+            "unit vector, such as 1,0,0 along x, 0,1,0 along y or 0,0,1 inwards"
+        )
+    frames, where = (part[: 3 * sites].reshape(-1, 3, 3) for part in (directions, sensors.positions))
+    turned = [
+        frames @ frames.transpose(0, 2, 1) - np.eye(3),
+        frames[:, 2:] - sensors.normals[: 3 * sites : 3, None],
+    ]
+    if (
+        len(sensors) != 3 * sites
+        or (where != where[:, :1]).any()
+        or max(np.abs(part).max() for part in turned) > _UNIT
+    ):
+        raise InputError(
+            "a site of three axes has three rows, one after the other, at one position: two directions along "
+            "its plane and one inwards, at right angles, such as 1,0,0, then 0,1,0, then 0,0,1; got "
+            f"{len(sensors)} rows with {directions[:3].tolist()} first"
+        )
 
 
 def _check_inside(body: AbstractBody, positions: np.ndarray, rounding: float = 1e-9) -> None:
@@ -122,8 +160,9 @@ def _check_inside(body: AbstractBody, positions: np.ndarray, rounding: float = 1
         )
 
 
-def _closest(positions: np.ndarray, unit: Footprint) -> tuple[int, int, float]:
-    """Return the two sensors that are closest along their farther axis, and how far, in units (x, y)."""
+def _closest(sensors: Sensors, unit: Footprint) -> tuple[int, int, float]:
+    """Return sensors of the two closest sites along their farther axis, and how far, in units (x, y)."""
+    positions = sensors.positions[:: sensors.axes]
     if len(positions) < 2:
         return 0, 0, math.inf
     # Not all pairs, which would take gigabytes for the most sensors that a file may have.
@@ -132,7 +171,7 @@ def _closest(positions: np.ndarray, unit: Footprint) -> tuple[int, int, float]:
     distance, nearest = cKDTree(positions[:, :2] / unit).query(positions[:, :2] / unit, k=2, p=math.inf)
     first = int(distance[:, 1].argmin())
     second = next(int(index) for index in nearest[first] if index != first)
-    return first, second, float(distance[first, 1])
+    return first * sensors.axes, second * sensors.axes, float(distance[first, 1])
 
 
 # Sensors whose positions are settings: those of a layout that was built in Python.
@@ -146,9 +185,10 @@ class Listed(AbstractLayout):
         positions: of S sensors, (x, y, z) each, m: from the upper left corner, z the depth.
         footprint: extent (x, y) of the sensitive area of a sensor, m.
         normals: of the sensors, unit vectors (x, y, into the skin); None: those of the surface.
+        directions: which each measures, unit vectors; None: the normals.
 
     Raises:
-        InputError: two sensors at one position.
+        InputError: two sensors at one position, or directions that are not those of three axes.
     """
 
     def __init__(
@@ -156,14 +196,17 @@ class Listed(AbstractLayout):
         positions: Sequence[tuple[float, float, float]],
         footprint: Footprint = (0.01, 0.01),
         normals: Sequence[tuple[float, float, float]] | None = None,
+        directions: Sequence[tuple[float, float, float]] | None = None,
     ) -> None:
         self.positions, self.footprint = np.array(positions, dtype=float), footprint
-        self.normals = None if normals is None else np.array(normals, dtype=float)
+        self.normals, self.directions = (
+            None if vectors is None else np.array(vectors, dtype=float) for vectors in (normals, directions)
+        )
 
     def sensors(self, body: AbstractBody) -> Sensors:
         """Return the sensors in their order."""
-        x, y, depth = self.positions.T
-        return place_sensors(body, x, y, depth, self.footprint, self.normals)
+        centres, depth = self.positions[:, :2], self.positions[:, 2]
+        return place_sensors(body, centres, depth, self.footprint, self.normals, directions=self.directions)
 
 
 # Sensors on a regular grid.
@@ -181,6 +224,8 @@ class Grid(AbstractLayout):
             turn, so that neighbours respond to different directions of shear. Only ``simulator=solid``
             supports it.
         depth: of all sensors, m; None: ``body.sensor_depth``.
+        axes: ``three``: each site measures along x, along y and inwards, as three sensors one after the
+            other. Only ``simulator=solid`` supports it.
 
     Raises:
         InputError: no row or column, or a tilt outside 0 to pi / 2.
@@ -193,15 +238,16 @@ class Grid(AbstractLayout):
         footprint: Footprint = (0.01, 0.01),
         tilt: Tilt = 0.0,
         depth: float | None = None,
+        axes: Axes = "normal",
     ) -> None:
         self.centres = tile_centres(rows, columns)
         self.normals = rosette(rows, columns, tilt)
-        self.footprint, self.depth = footprint, depth
+        self.footprint, self.depth, self.axes = footprint, depth, axes
 
     def sensors(self, body: AbstractBody) -> Sensors:
         """Return the sensors row by row, from the upper left rightwards and down."""
-        x, y = (self.centres * np.array(body.size)).T
-        return place_sensors(body, x, y, self.depth, self.footprint, self.normals)
+        centres = self.centres * np.array(body.size)
+        return place_sensors(body, centres, self.depth, self.footprint, self.normals, self.axes)
 
 
 # Sensors in staggered rows.
@@ -219,6 +265,7 @@ class Hexagonal(AbstractLayout):
         columns: number of columns (along x).
         footprint: extent (x, y) of the sensitive area of a sensor, m.
         depth: of all sensors, m; None: ``body.sensor_depth``.
+        axes: of each site, as in ``layout=grid``.
 
     Raises:
         InputError: no row or column.
@@ -230,17 +277,17 @@ class Hexagonal(AbstractLayout):
         columns: PositiveInt = 5,
         footprint: Footprint = (0.01, 0.01),
         depth: float | None = None,
+        axes: Axes = "normal",
     ) -> None:
         self.centres = tile_centres(rows, columns)
-        odd = np.repeat(np.arange(rows) % 2, columns)
         # A quarter of a pitch to either side keeps the rows within the surface.
-        self.centres[:, 0] += (0.5 * odd - 0.25) / columns
-        self.footprint, self.depth = footprint, depth
+        self.centres[:, 0] += (0.5 * np.repeat(np.arange(rows) % 2, columns) - 0.25) / columns
+        self.footprint, self.depth, self.axes = footprint, depth, axes
 
     def sensors(self, body: AbstractBody) -> Sensors:
         """Return the sensors row by row, from the upper left rightwards and down."""
-        x, y = (self.centres * np.array(body.size)).T
-        return place_sensors(body, x, y, self.depth, self.footprint)
+        centres = self.centres * np.array(body.size)
+        return place_sensors(body, centres, self.depth, self.footprint, axes=self.axes)
 
 
 # Sensors scattered at random around a grid.
@@ -259,6 +306,7 @@ class Scattered(AbstractLayout):
         tilt: angle between the normals of each sensor and of the surface, rad, as in ``layout=grid``.
         normals: (S, 3), direction of each sensor; None: from ``tilt``.
         depth: of all sensors or of each (S,), m; None: ``body.sensor_depth``.
+        axes: of each site, as in ``layout=grid``.
 
     Raises:
         InputError: no row or column, a jitter at which two sensors could meet, or a tilt outside 0 to pi / 2.
@@ -272,20 +320,21 @@ class Scattered(AbstractLayout):
         seed: NonNegativeInt = 0,
         footprint: Footprint = (0.01, 0.01),
         tilt: Tilt = 0.0,
-        depth: float | np.ndarray | None = None,
+        depth: float | list[float] | None = None,
         normals: np.ndarray | None = None,
+        axes: Axes = "normal",
     ) -> None:
         self.centres = tile_centres(rows, columns)
         self.normals = rosette(rows, columns, tilt) if normals is None else normals
         self.pitch = np.array([1 / columns, 1 / rows])
         self.jitter, self.seed = jitter, seed
-        self.footprint, self.depth = footprint, depth
+        self.footprint, self.depth, self.axes = footprint, depth, axes
 
     def sensors(self, body: AbstractBody) -> Sensors:
         """Return the sensors row by row, from the upper left rightwards and down, to the micrometre."""
         moves = np.random.default_rng(self.seed).uniform(-self.jitter, self.jitter, self.centres.shape)
-        x, y = np.round((self.centres + moves * self.pitch) * body.size, 6).T
-        return place_sensors(body, x, y, self.depth, self.footprint, self.normals)
+        centres = np.round((self.centres + moves * self.pitch) * body.size, 6)
+        return place_sensors(body, centres, self.depth, self.footprint, self.normals, self.axes)
 
 
 # Sensors at random positions.
@@ -303,6 +352,7 @@ class Random(AbstractLayout):
         seed: of the positions.
         footprint: extent (x, y) of the sensitive area of a sensor, m.
         depth: of all sensors, m; None: ``body.sensor_depth``.
+        axes: of each site, as in ``layout=grid``.
 
     Raises:
         InputError: no sensor, or more of them than fit.
@@ -314,9 +364,10 @@ class Random(AbstractLayout):
         seed: NonNegativeInt = 0,
         footprint: Footprint = (0.01, 0.01),
         depth: float | None = None,
+        axes: Axes = "normal",
     ) -> None:
         self.count, self.seed = count, seed
-        self.footprint, self.depth = footprint, depth
+        self.footprint, self.depth, self.axes = footprint, depth, axes
 
     def sensors(self, body: AbstractBody) -> Sensors:
         """Return the sensors from the top down, to the micrometre."""
@@ -327,8 +378,8 @@ class Random(AbstractLayout):
             if (np.abs(positions - candidate) >= extent).any(axis=1).all():
                 positions = np.vstack([positions, candidate])
             if len(positions) == self.count:
-                x, y = positions[np.argsort(positions[:, 1], kind="stable")].T
-                return place_sensors(body, x, y, self.depth, self.footprint)
+                centres = positions[np.argsort(positions[:, 1], kind="stable")]
+                return place_sensors(body, centres, self.depth, self.footprint, axes=self.axes)
         width, height = self.footprint
         raise InputError(
             f"{self.count} sensors of {width:g} x {height:g} m do not fit at random on {body.size[0]:g} x "
@@ -341,10 +392,11 @@ class Random(AbstractLayout):
 
 _NEED = (
     "a layout has the columns x_m, y_m and optionally depth_m, in metres from the upper left corner, and "
-    "normal_x, normal_y, normal_z, which way a sensor faces"
+    "normal_x, normal_y, normal_z, which way a sensor faces, and direction_x, direction_y, direction_z, what "
+    "it measures"
 )
-_FACING = ("normal_x", "normal_y", "normal_z")
-_COLUMNS = ("x_m", "y_m", "depth_m", *_FACING, "sensor")
+_FACING, _ALONG = (tuple(f"{name}_{axis}" for axis in "xyz") for name in ("normal", "direction"))
+_COLUMNS = ("x_m", "y_m", "depth_m", *_FACING, *_ALONG, "sensor")
 _SHOWN = 80  # characters of the file, in a message
 
 
@@ -354,9 +406,10 @@ class File(AbstractLayout):
 
     The rows are in the order of the readings, which is the order of the hardware's channels, unless a column
     ``sensor`` numbers them. ``normal_x``, ``normal_y`` and ``normal_z``, of any length, are the direction of
-    a sensor in the local frame (x, y, into the skin); the default is the surface normal. Only
-    ``simulator=solid`` supports tilted sensors. Other columns are ignored. A warning names two sensors whose
-    footprints overlap.
+    a sensor in the local frame (x, y, into the skin); the default is the surface normal. ``direction_x``,
+    ``direction_y`` and ``direction_z`` are the unit vector of the force that it measures: a site of three
+    axes has three rows, with directions along x, along y and inwards. Only ``simulator=solid`` supports
+    these and tilted sensors. Other columns are ignored. A warning names two sensors whose footprints overlap.
 
     Args:
         path: of the file; a relative path is searched in the current folder, then beside the package.
@@ -365,7 +418,7 @@ class File(AbstractLayout):
 
     Raises:
         InputError: a missing or empty file, more than 10 000 sensors, a missing column, a cell that is not a
-            number, or a normal of length 0, with its line.
+            number, or a normal of length 0, with its line; directions that are not those of three axes.
     """
 
     def __init__(
@@ -377,9 +430,14 @@ class File(AbstractLayout):
 
     def sensors(self, body: AbstractBody) -> Sensors:
         """Return the sensors in the order of their numbers or, without any, of the file."""
-        x, y, depth = self.columns["x_m"], self.columns["y_m"], self.columns.get("depth_m", self.depth)
-        sensors = place_sensors(body, x, y, depth, self.footprint, self._normals())
-        first, second, distance = _closest(sensors.positions, sensors.footprint)
+        depth = self.columns.get("depth_m", self.depth)
+        centres = np.column_stack([self.columns["x_m"], self.columns["y_m"]])
+        normals, directions = (
+            np.column_stack([self.columns[name] for name in names]) if names[0] in self.columns else None
+            for names in (_FACING, _ALONG)
+        )
+        sensors = place_sensors(body, centres, depth, self.footprint, normals, directions=directions)
+        first, second, distance = _closest(sensors, sensors.footprint)
         if distance < 1 - 1e-6:
             warnings.warn(
                 f"{self.path.name}: the footprints of sensors {first + 1} and {second + 1} overlap: correct "
@@ -388,13 +446,6 @@ class File(AbstractLayout):
                 stacklevel=2,
             )
         return sensors
-
-    def _normals(self) -> np.ndarray | None:
-        """Return the unit vectors of the file, (S, 3), if it has any."""
-        if _FACING[0] not in self.columns:
-            return None
-        vectors = np.column_stack([self.columns[name] for name in _FACING])
-        return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
 
 
 def _find(name: str | Path) -> Path:
@@ -413,7 +464,7 @@ def _read(path: Path) -> dict[str, np.ndarray]:
         text = content.decode("utf-16" if content[:2] in (BOM_UTF16_LE, BOM_UTF16_BE) else "utf-8-sig")
         reader = csv.DictReader(StringIO(text, newline=""), skipinitialspace=True)
         reader.fieldnames = names = [" ".join(name.split()) for name in reader.fieldnames or []]
-        needed = {"x_m", "y_m"} | (set(_FACING) if set(_FACING) & set(names) else set())
+        needed = {"x_m", "y_m"}.union(*(group for group in (_FACING, _ALONG) if set(group) & set(names)))
         if missing := needed - set(names):
             if any(";" in name for name in names):
                 raise ValueError("semicolons between its columns: save it with commas, and 0.04 for 0,04")

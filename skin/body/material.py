@@ -119,10 +119,6 @@ def _material(
     return Material(name, young, poisson, relaxation)
 
 
-def _known() -> str:
-    return "known materials: " + ", ".join(material.name for material in MATERIALS)
-
-
 def _missing(name: str, young: float | None, poisson: float | None) -> str:
     need = " and ".join(key for key, value in (("young (Pa)", young), ("poisson", poisson)) if value is None)
     advice = (
@@ -131,4 +127,5 @@ def _missing(name: str, young: float | None, poisson: float | None) -> str:
     )
     if _key(name) == "ecoflexgel":
         return f"EcoFlex Gel has no constants of its own: the report's measurement was unreliable; {advice}"
-    return f"unknown material {name}: {_known()}; or {advice}"
+    known = ", ".join(material.name for material in MATERIALS)
+    return f"unknown material {name}: known materials: {known}; or {advice}"

@@ -174,7 +174,7 @@ def candidate_sites(
             f"{body.size[1]:g} m: shrink the zones of design.keep_out, or lower design.raster or "
             "layout.footprint"
         )
-    return place_sensors(body, x[columns], y[rows], depth, footprint)
+    return place_sensors(body, np.column_stack([x[columns], y[rows]]), depth, footprint)
 
 
 def keep_out(zones: Zones | str | None, size: tuple[float, float]) -> np.ndarray | None:
@@ -304,6 +304,11 @@ class PlacementProblem:
             InputError: numbers that do not fit the layout or the sites.
         """
         body, old = device.body, device.sensors
+        if old.axes > 1:
+            raise InputError(
+                "design=place chooses sensors of one axis, got a layout of three: place them with "
+                "layout.axes=normal, then give each position three directions in the file"
+            )
         count = len(old) if count is None else count
         staying = _find_staying(keep, len(old), count)
         depths, numbers = np.unique(old.positions[:, 2], return_counts=True)

@@ -51,7 +51,7 @@ def misplace(
         footprint_error: standard deviation of the logarithm of the factor on the sides of all footprints.
     """
     drawn = generator(Stream.POSITION, seed)
-    moves = drawn.standard_normal((len(sensors), 2))
+    moves = drawn.standard_normal((len(sensors) // sensors.axes, 2)).repeat(sensors.axes, axis=0)
     positions = sensors.positions.copy()
     positions[:, :2] = np.clip(positions[:, :2] + error * moves, 0, size)
     if not footprint_error:

@@ -140,7 +140,8 @@ def scattered_devices(device: Simulated, count: int) -> Iterator[Simulated]:
     Raises:
         InputError: the sensors cannot form a grid.
     """
-    sensors = len(device.sensors)
+    axes = device.sensors.axes
+    sensors = len(device.sensors) // axes
     rows = max(number for number in range(1, int(sensors**0.5) + 1) if sensors % number == 0)
     if sensors // rows > 3 * rows:
         raise InputError(f"{sensors} sensors cannot form a grid, so there are no other layouts of them")
@@ -150,8 +151,9 @@ def scattered_devices(device: Simulated, count: int) -> Iterator[Simulated]:
             sensors // rows,
             seed=101 + number,  # none of data/layouts
             footprint=device.sensors.footprint,
-            depth=device.sensors.positions[:, 2],
-            normals=device.sensors.normals,
+            depth=device.sensors.positions[::axes, 2].tolist(),
+            normals=device.sensors.normals[::axes],
+            axes="three" if axes > 1 else "normal",
         )
         yield device.replace(layout=layout)
 

@@ -1,5 +1,6 @@
 """Readings of fingertips on a skin, for every position and radius: sampled once, then interpolated."""
 
+import math
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass
@@ -12,7 +13,7 @@ import torch
 
 from skin.body.base import AbstractBody
 from skin.errors import InputError
-from skin.mechanics.geometry import fingertip_readings
+from skin.mechanics.geometry import Fingertip
 from skin.mechanics.simulator.base import AbstractSimulator
 
 
@@ -31,6 +32,9 @@ class FingertipPrior:
         numbers: probabilities of 0, 1, 2 and 3 fingertips. By default a skin is idle or touched by one
             fingertip more often than by several.
         large: probability of a contact that is larger, such as a hand.
+        friction: largest tangential force as a fraction of the force; fractions up to it are equally likely,
+            in any direction, and a normal distribution of the same variance stands for them. None: 0.8 for
+            sensors of three axes, else 0.
 
     Raises:
         InputError: a number that has no meaning.
@@ -42,6 +46,7 @@ class FingertipPrior:
     rim: float = 0.0015
     numbers: tuple[float, float, float, float] = (0.3, 0.4, 0.15, 0.05)
     large: float = 0.1
+    friction: float | None = None
 
     def __post_init__(self) -> None:
         if min(self.numbers) < 0 or not any(self.numbers[1:]) or not self.large >= 0:
@@ -49,6 +54,8 @@ class FingertipPrior:
                 "a prior of fingertips needs probabilities of 0 or more, and one above 0 of a contact, got "
                 f"numbers={list(self.numbers)} and large={self.large:g}"
             )
+        if not (self.friction is None or 0 <= self.friction < math.inf):
+            raise InputError(f"a prior of fingertips needs friction of 0 or more, got {self.friction:g}")
         if not (self.force > 0 and self.spread > 0 and self.rim > 0 and 0 < self.radii[0] < self.radii[1]):
             raise InputError(
                 "a prior of fingertips needs force, spread and rim above 0 and two rising radii, got "
@@ -69,21 +76,33 @@ class FingertipPrior:
 
 
 def disc_readings(
-    simulator: AbstractSimulator, body: AbstractBody, discs: np.ndarray, rim: float
+    simulator: AbstractSimulator, body: AbstractBody, discs: np.ndarray, rim: float, friction: float = 0.0
 ) -> np.ndarray:
     """Return the readings (N, S), N/N, of discs (N, 3) of 1 N: x, y and radius, m.
 
     The only part of inference that calls the mechanics.
+
+    Args:
+        simulator, body: of the skin.
+        discs: (N, 3), m.
+        rim: of the discs, m.
+        friction: if it is above 0, readings (N, 3 S) follow each other: those of the force into the skin,
+            and what a tangential force of ``friction`` N along x, then along y, adds.
     """
     touches = torch.from_numpy(np.column_stack([discs, np.ones(len(discs))])).float()
     touches = touches.to(next(simulator.buffers()).device)
+    fingertip = Fingertip(body, rim, simulator.smooth)
+    sides = (friction * torch.eye(2, device=touches.device))[: 2 if friction else 0]
+    # Small results that are kept between large ones would hold the memory of these: up to 1 GB.
+    readings = np.empty((len(discs), 0))
     with torch.no_grad():
-        sensors = fingertip_readings(simulator, body, touches[:1], rim).shape[1]
-        # Small results that are kept between large ones would hold the memory of these: up to 1 GB.
-        readings = np.empty((len(discs), sensors))
         for first in range(0, len(discs), _AT_ONCE):
-            part = slice(first, first + _AT_ONCE)
-            readings[part] = fingertip_readings(simulator, body, touches[part], rim).cpu().numpy()
+            loads = fingertip(touches[first : first + _AT_ONCE])
+            plain = simulator.press(loads).readings
+            further = [simulator.press(loads, side).readings - plain for side in sides]
+            every = torch.cat([plain, *further], dim=1).cpu().numpy()
+            readings = readings if first else np.empty((len(discs), every.shape[1]))
+            readings[first : first + _AT_ONCE] = every
     return readings
 
 
@@ -140,9 +159,12 @@ class CandidateReadings:
     Attributes:
         radii, span: least and largest radius, and their difference, m.
         size: of the body, (2,), m.
+        sensors: S, their number.
+        friction: standard deviation of the tangential force along x and along y per newton; 0: without.
         boxes: the first boxes, which cover the surface and the radii.
-        readings: (N, S), N/N, in their centres, float32.
-        slopes: (N, 3, S), their derivatives, N/N/m, float32.
+        readings: (N, L S), N/N, in their centres, float32: of the force into the skin (L = 1), followed with
+            friction (L = 3) by those of a tangential force of a standard deviation along x and along y.
+        slopes: (N, 3, L S), their derivatives, N/N/m, float32.
     """
 
     def __init__(
@@ -150,6 +172,8 @@ class CandidateReadings:
     ) -> None:
         self.radii, self.size = prior.radii, np.array(body.size)
         self.span = prior.radii[1] - prior.radii[0]
+        largest = 0.8 * (simulator.axes > 1) if prior.friction is None else prior.friction
+        self.friction = largest / math.sqrt(6)  # of a uniform fraction in a uniform direction
         # An even number, so that two by two of them make a first box.
         self._per_box = max(1, round(coarse / _PATCH))
         self._counts = self._per_box * np.ceil(self.size / coarse - 1e-9).astype(int)
@@ -160,6 +184,7 @@ class CandidateReadings:
 
     def _tabulate(self) -> None:
         self.readings, self.slopes = (np.ascontiguousarray(part) for part in self.at(self.boxes.centre))
+        self.sensors = self.readings.shape[1] // (3 if self.friction else 1)
 
     @staticmethod
     def mixed(parts: "Sequence[CandidateReadings]", weights: np.ndarray) -> "CandidateReadings":
@@ -171,12 +196,12 @@ class CandidateReadings:
         return mixed
 
     def _fit(self, simulator: AbstractSimulator, body: AbstractBody, prior: FingertipPrior) -> np.ndarray:
-        """Return coefficients (patches, K, S), float32."""
+        """Return coefficients (patches, K, L S), float32."""
         x, y = (np.linspace(0, side, count + 1) for side, count in zip(self.size, self._counts, strict=True))
         nodes = np.cos(np.pi * (np.arange(_RADII) + 0.5) / _RADII)
         middle, half = sum(self.radii) / 2, (self.radii[1] - self.radii[0]) / 2
         grid = np.stack(np.meshgrid(y, x, middle + half * nodes, indexing="ij"), -1)[..., [1, 0, 2]]
-        flat = disc_readings(simulator, body, grid.reshape(-1, 3), prior.rim)
+        flat = disc_readings(simulator, body, grid.reshape(-1, 3), prior.rim, self.friction)
         samples = flat.reshape(*grid.shape[:3], -1)
         # Along the radius: Chebyshev points give monomials without error.
         monomials = np.linalg.inv(np.vander(nodes, increasing=True))
@@ -186,9 +211,9 @@ class CandidateReadings:
         fit = _stencil()
         rows, columns = self._counts[1], self._counts[0]
         total = np.zeros((rows, columns, len(_POWERS), _RADII, flat.shape[1]), np.float32)
-        for number, (down, across) in enumerate(product(range(4), repeat=2)):
-            part = samples[down : down + rows, across : across + columns]
-            total += (fit[:, number][:, None, None] * part[:, :, None]).astype(np.float32)
+        for row in range(rows):
+            near = [samples[row + down, x : x + columns] for down, x in product(range(4), repeat=2)]
+            total[row] = np.einsum("km,mcrs->ckrs", fit, np.array(near), optimize=True)
         return total.reshape(rows * columns, len(_POWERS) * _RADII, flat.shape[1])
 
     def _first_boxes(self) -> Boxes:
@@ -200,7 +225,7 @@ class CandidateReadings:
         return Boxes(centre, np.broadcast_to(width, centre.shape).copy())
 
     def at(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return readings (N, S), N/N, and slopes (N, 3, S), N/N/m, at x, y and radius (N, 3), m; float32."""
+        """Return readings (N, L S), N/N, and slopes (N, 3, L S), N/N/m, at x, y and radius (N, 3), m."""
         patch = np.clip((positions[:, :2] / self._patch).astype(int), 0, self._counts - 1)
         across, down = (2 * (positions[:, :2] / self._patch - patch) - 1).T
         half = self.span / 2

@@ -12,7 +12,9 @@ from skin.inference.candidates import Boxes, CandidateReadings, FingertipPrior
 from skin.inference.likelihood import (
     Forces,
     Observation,
+    blend,
     fit_force,
+    fold,
     integrate_force,
     refit_force,
     relative_variance,
@@ -37,6 +39,8 @@ class Cloud:
         weight: (N, J), probabilities that sum to 1.
         evidence: log of the likelihood integrated over the prior.
         misfit: posterior mean of the squared misfit in variances.
+        tangential, variance: (N, J, 2), mean and variance of the force along x and y, N; (N, J, 0) without
+            friction.
     """
 
     boxes: Boxes
@@ -44,12 +48,14 @@ class Cloud:
     weight: np.ndarray
     evidence: float
     misfit: float
+    tangential: np.ndarray
+    variance: np.ndarray
 
     @property
     def mode(self) -> np.ndarray:
-        """The most probable contact (1, 4): x, y and radius, m, and force, N."""
+        """The most probable contact (1, 4 or 6): x, y and radius, m, and forces inwards, along x and y, N."""
         box, force = np.unravel_index(self.weight.argmax(), self.weight.shape)
-        return np.array([[*self.boxes.centre[box], self.force[box, force]]])
+        return np.array([[*self.boxes.centre[box], self.force[box, force], *self.tangential[box, force]]])
 
 
 class _Leaves(NamedTuple):
@@ -57,8 +63,8 @@ class _Leaves(NamedTuple):
 
     Attributes:
         boxes: N of them.
-        readings: (N, S), N/N.
-        slopes: (N, 3, S), their derivatives by position and radius, N/N/m.
+        readings: (N, L S), N/N.
+        slopes: (N, 3, L S), their derivatives by position and radius, N/N/m.
         spread: (N, S), variance from gains, thickness and positions per square newton.
         forces: of the boxes.
         evidence: (N,), log of the probability in a box.
@@ -92,8 +98,8 @@ def _each(change: Callable[..., np.ndarray], *parts: Any) -> Any:
 
 def blur_first(candidates: CandidateReadings, noise: Noise) -> tuple[np.ndarray, np.ndarray]:
     """Return the relative variance of the first boxes, without and with their width; common to all frames."""
-    spread = relative_variance(noise, candidates.readings, candidates.slopes)
-    return spread, _blurred(candidates.boxes, candidates.slopes, spread)
+    spread = relative_variance(noise, candidates.readings, candidates.slopes, candidates.sensors)
+    return spread, _blurred(candidates.boxes, candidates.slopes, spread, candidates.sensors)
 
 
 def one_contact(
@@ -143,19 +149,20 @@ def _judge(
     frame: Observation, prior: FingertipPrior, boxes: Boxes, readings: np.ndarray, slopes: np.ndarray
 ) -> _Leaves:
     """Return boxes with their probability, as if each were blurred over its width."""
-    spread = relative_variance(frame.noise, readings, slopes)
-    forces, evidence = fit_force(frame, prior, readings, _blurred(boxes, slopes, spread))
+    sensors = len(frame.readings)
+    spread = relative_variance(frame.noise, readings, slopes, sensors)
+    forces, evidence = fit_force(frame, prior, readings, _blurred(boxes, slopes, spread, sensors))
     return _Leaves(boxes, readings, slopes, spread, forces, evidence + np.log(boxes.width.prod(1)))
 
 
-def _blurred(boxes: Boxes, slopes: np.ndarray, spread: np.ndarray) -> np.ndarray:
+def _blurred(boxes: Boxes, slopes: np.ndarray, spread: np.ndarray, sensors: int) -> np.ndarray:
     """Return the variance (N, S) per square newton averaged over a box, which the box then represents."""
     scaled = slopes * (boxes.width * math.sqrt(1 / 12)).astype(np.float32)[..., None]
     scaled *= scaled
     blurred = scaled[:, 0]
     blurred += scaled[:, 1]
     blurred += scaled[:, 2]
-    return blurred + spread
+    return fold(blurred, sensors) + spread
 
 
 def _probable(evidence: np.ndarray, others: list[np.ndarray]) -> np.ndarray:
@@ -176,8 +183,13 @@ def _expand(
     Derivatives are by position and radius, at the most probable force, which depends on both: the last result
     is the derivative of its logarithm, (N, 3), 1/m.
     """
-    readings, spread = leaves.readings, leaves.spread
-    force = np.exp(leaves.forces.mode)[:, None]
+    force, spread, tangent = np.exp(leaves.forces.mode), leaves.spread, leaves.forces.tangent
+    mean, *_ = tangent(force)
+    force, readings, slopes = (
+        force[:, None],
+        blend(leaves.readings, mean),
+        blend(leaves.slopes, mean[:, None]),
+    )
     variance = np.float32(frame.noise.floor) + force * force * spread
     weight = np.broadcast_to(frame.counts / variance, readings.shape)
     pull = weight * (frame.readings - force * readings)
@@ -189,14 +201,24 @@ def _expand(
         hazard = np.exp(-0.5 * above**2 - log_ndtr(above)) / math.sqrt(2 * math.pi)
         weight = weight.copy()
         weight[:, clipped], pull[:, clipped] = hazard * (hazard + above) / deviation**2, hazard / deviation
-    slope = np.vecdot(leaves.slopes, (force * pull)[:, None])
-    weighted = leaves.slopes * (force * force * weight)[:, None]
+    slope = np.vecdot(slopes, (force * pull)[:, None])
+    weighted = slopes * (force * force * weight)[:, None]
     whole = np.vecdot(readings * readings, force * force * weight) + 1 / prior.spread**2
     crossed = np.vecdot(weighted, readings[:, None])
     distance = (leaves.forces.mode - math.log(prior.force)) / prior.spread**2
     left = np.vecdot(readings, force * pull) - distance
+    information = np.matmul(weighted, slopes.transpose(0, 2, 1))
+    if mean.shape[1]:
+        # The tangential force follows what changes, too.
+        sides = leaves.readings[:, readings.shape[1] :].reshape(len(readings), 2, readings.shape[1])
+        along = np.matmul(weighted, sides.transpose(0, 2, 1))
+        own = np.vecdot(sides, (force * force * weight * readings)[:, None])
+        covariance = tangent(force[:, 0])[1]
+        followed = np.matmul(along, covariance)
+        information = information - np.matmul(followed, along.transpose(0, 2, 1))
+        crossed = crossed - np.vecdot(followed, own[:, None])
+        whole = whole - np.vecdot(np.matmul(covariance, own[..., None])[..., 0], own)
     slope = slope - crossed * (left / whole)[:, None]
-    information = np.matmul(weighted, leaves.slopes.transpose(0, 2, 1))
     turn = -crossed / whole[:, None]
     return slope, information + crossed[:, :, None] * turn[:, None], turn
 
@@ -237,7 +259,8 @@ def _weigh(
     fit = refit_force(frame, prior, readings, spread, blurred.mode)
     leaves = leaves._replace(forces=fit)
     boxes, factor, further = _average(frame, prior, leaves)
-    force, logs = integrate_force(frame, prior, readings, spread, fit)
+    force, logs, tangent, variances = integrate_force(frame, prior, readings, spread, fit)
+    side = candidates.friction * force[..., None]
     shift, stretch = np.clip(further[0], -1, 1), np.sqrt(1 + fit.curvature * further[1])
     force = np.exp(
         fit.mode[:, None] + shift[:, None] + (np.log(force) - fit.mode[:, None]) * stretch[:, None]
@@ -247,9 +270,12 @@ def _weigh(
     weight = np.exp(logs - top)
     total = weight.sum()
     weight /= total
-    middle = np.exp(fit.mode)[:, None]
+    middle, (mean, covariance, _) = np.exp(fit.mode)[:, None], fit.tangent(np.exp(fit.mode))
     variance = frame.noise.floor + middle * middle * spread
-    misfit = ((frame.readings - middle * readings) ** 2 / variance) @ frame.counts
+    misfit = ((frame.readings - middle * blend(readings, mean)) ** 2 / variance) @ frame.counts
+    # Each parameter that readings determine and that is integrated misses by a variance.
+    misfit += 1 + mean.shape[1] - np.trace(covariance, axis1=1, axis2=2)
     extent = float(np.prod(candidates.size) * candidates.span)
     evidence = float(top + math.log(total) - math.log(extent))
-    return Cloud(boxes, force, weight, evidence, float(weight.sum(1) @ misfit) + 1)
+    sides = side * tangent, side**2 * variances
+    return Cloud(boxes, force, weight, evidence, float(weight.sum(1) @ misfit), *sides)

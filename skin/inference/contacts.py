@@ -11,10 +11,10 @@ from scipy.special import ndtr, ndtri
 from scipy.stats.qmc import Sobol
 
 from skin.inference.candidates import CandidateReadings, FingertipPrior
-from skin.inference.likelihood import Observation, fit_residual
+from skin.inference.likelihood import Observation, blend, fit_residual
 
 _STEPS = 12  # of Gauss-Newton
-_LONGEST = [-0.01, -0.01, -1, -2], [0.01, 0.01, 1, 2]  # step
+_LONGEST = 0.01, 0.01, 1, 2, 2, 2  # step
 _LATTICE = 0.0064  # m, largest distance of positions that are searched in pairs
 _TOLERANCE = 0.2  # relative misfit of a pair of such positions
 _PAIRS = 8  # pairs that are refined
@@ -24,8 +24,9 @@ _FREEDOM = 8.0  # degrees of freedom of the proposal, Student's distribution
 _MODES, _UNLIKELY, _ALIKE = 6, 6.0, 0.002  # modes that are sampled; log score below the best; m between two
 _WALKERS, _WALK = 256, 60  # and steps of each
 
-# A guess is (M, n, 4): x, y, m, and scores whose prior is the standard normal distribution: of the radius,
-# which is uniform, and of the force, which is log-normal. Posteriors are then nearly Gaussian.
+# A guess is (M, n, P): x, y, m, and scores whose prior is the standard normal distribution: of the radius,
+# which is uniform, of the force, which is log-normal (P = 4), and with friction of the tangential force along
+# x and y per newton (P = 6). Posteriors are then nearly Gaussian.
 
 
 @dataclass(frozen=True)
@@ -33,11 +34,11 @@ class Mixture:
     """Posterior of n contacts as weighted samples.
 
     Attributes:
-        samples: (N, n, 4), x, y, m, with scores of radius and force.
+        samples: (N, n, P), x, y, m, with scores of radius and forces.
         weight: (N,), probabilities that sum to 1.
         evidence: log of the likelihood integrated over the prior.
         misfit: posterior mean of the squared misfit in variances.
-        mode: (n, 4), the most probable contacts, with scores of radius and force.
+        mode: (n, P), the most probable contacts, with scores of radius and forces.
         predicted: (S,), readings at the mode, N.
     """
 
@@ -76,17 +77,18 @@ class Search:
         self.candidates, self.prior = candidates, prior
         size, radii = candidates.size, candidates.radii
         self._minimum, self._range = radii[0], radii[1] - radii[0]
-        self._scale = np.array([*(size / math.sqrt(12)), 1, 1])
+        self._scale = np.array([*(size / math.sqrt(12)), 1, 1, *((1, 1) if candidates.friction else ())])
+        self._parameters = len(self._scale)
         self._density = -math.log(size[0] * size[1])
         counts = np.ceil(size / _LATTICE).astype(int)
         x, y = ((np.arange(count) + 0.5) * side / count for count, side in zip(counts, size, strict=True))
         self._positions = np.stack(np.meshgrid(x, y, [sum(radii) / 2], indexing="ij"), -1).reshape(-1, 3)
-        self._lattice = np.ascontiguousarray(candidates.at(self._positions)[0])
+        self._lattice = np.ascontiguousarray(candidates.at(self._positions)[0][:, : candidates.sensors])
 
     @cached_property
     def _normal(self) -> np.ndarray:
-        """Normal points in twelve dimensions (2^10, 12)."""
-        return ndtri(Sobol(12, rng=0).random_base2(_SAMPLES).clip(1e-9, 1 - 1e-9))
+        """Normal points for three contacts (2^10, 3 P)."""
+        return ndtri(Sobol(3 * self._parameters, rng=0).random_base2(_SAMPLES).clip(1e-9, 1 - 1e-9))
 
     @cached_property
     def _stretch(self) -> np.ndarray:
@@ -94,16 +96,19 @@ class Search:
         return np.sqrt(_FREEDOM / np.random.default_rng(1).chisquare(_FREEDOM, 2**_SAMPLES))
 
     def predict(self, guess: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return readings (M, S), N, and their derivatives (M, 4 n, S) by position, radius and log force."""
-        count, number, _ = guess.shape
-        positions, force, stretch = self._positions_of(guess.reshape(-1, 4))
+        """Return readings (M, S), N, and their derivatives (M, P n, S) by position and scores."""
+        count, number, size = guess.shape
+        positions, force, stretch = self._positions_of(guess.reshape(-1, size))
         readings, slopes = self.candidates.at(positions)
-        predicted = force[:, None] * readings
-        columns = np.empty((len(positions), 4, predicted.shape[1]))
-        np.multiply(force[:, None, None], slopes, out=columns[:, :3])
+        tangent, sensors = guess.reshape(-1, size)[:, 4:], self.candidates.sensors
+        predicted = force[:, None] * blend(readings, tangent)
+        columns = np.empty((len(positions), size, sensors))
+        np.multiply(force[:, None, None], blend(slopes, tangent[:, None]), out=columns[:, :3])
         columns[:, 2] *= stretch[:, None]
         columns[:, 3] = self.prior.spread * predicted
-        return predicted.reshape(count, number, -1).sum(1), columns.reshape(count, 4 * number, -1)
+        sides = readings[:, sensors:].reshape(len(positions), size - 4, sensors)
+        np.multiply(force[:, None, None], sides, out=columns[:, 4:])
+        return predicted.reshape(count, number, -1).sum(1), columns.reshape(count, size * number, -1)
 
     def _positions_of(self, guess: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return positions and radii (N, 3), m, forces (N,), N, and m of radius per score (N,)."""
@@ -122,7 +127,8 @@ class Search:
         variance = frame.noise.floor + (frame.noise.relative * predicted) ** 2
         if frame.noise.position:
             for axis in (0, 1):
-                variance = variance + (frame.noise.position * columns[:, axis::4].sum(1)) ** 2
+                moved = columns[:, axis :: self._parameters].sum(1)
+                variance = variance + (frame.noise.position * moved) ** 2
         return variance
 
     def refine(self, frame: Observation, guess: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -132,7 +138,8 @@ class Search:
         for _ in range(_STEPS):
             ridge = damping[:, None] * np.diagonal(information, axis1=1, axis2=2)
             step = np.linalg.solve(information + ridge[:, None] * np.eye(pull.shape[1]), pull[..., None])
-            bounded = np.clip(step.reshape(guess.shape), *_LONGEST)
+            longest = np.array(_LONGEST[: self._parameters])
+            bounded = np.clip(step.reshape(guess.shape), -longest, longest)
             tried = self._inside(guess + bounded)
             after = self._expand(frame, tried)
             better = after[0] > score
@@ -148,10 +155,11 @@ class Search:
         return guess, score
 
     def _inside(self, guess: np.ndarray) -> np.ndarray:
-        return np.clip(guess, [0, 0, -4, -np.inf], [*self.candidates.size, 4, np.inf])
+        free = [np.inf] * (self._parameters - 3)
+        return np.clip(guess, [0, 0, -4, *np.negative(free)], [*self.candidates.size, 4, *free])
 
     def _expand(self, frame: Observation, guess: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the log posterior (M,), its gradient (M, 4 n) and information (M, 4 n, 4 n)."""
+        """Return the log posterior (M,), its gradient (M, P n) and information (M, P n, P n)."""
         predicted, columns = self.predict(guess)
         variance = self.variance(frame, predicted, columns)
         misfit = frame.readings - predicted
@@ -162,7 +170,7 @@ class Search:
             short = frame.noise.clip - predicted[:, frame.clipped]
             misfit[:, frame.clipped], counts[:, frame.clipped] = short, short > 0
         weight = counts / variance
-        distance = guess * [0, 0, 1, 1]
+        distance = guess * (np.arange(self._parameters) > 1)
         pull = np.vecdot(columns, (weight * misfit)[:, None]) - distance.reshape(len(guess), -1)
         information = np.matmul(columns * weight[:, None], columns.transpose(0, 2, 1))
         information = information + np.diag(np.tile(self._scale**-2, guess.shape[1]))
@@ -170,9 +178,9 @@ class Search:
         return frame.likelihood(predicted, variance - frame.noise.floor) - penalty, pull, information
 
     def add(self, frame: Observation, guess: np.ndarray) -> "Addition":
-        """Return what a further contact, beside a guess (n, 4), would explain.
+        """Return what a further contact, beside a guess (n, P), would explain.
 
-        The contacts of the guess may move, to first order.
+        The contacts of the guess may move, to first order. The further one has no friction.
         """
         predicted, columns = self.predict(guess[None])
         weight = frame.counts / self.variance(frame, predicted, columns)[0]
@@ -186,10 +194,10 @@ class Search:
         return Addition(mode, ratio, factor)
 
     def extend(self, guess: np.ndarray, addition: "Addition") -> np.ndarray:
-        """Return guesses (M, n + 1, 4) with the best further contacts."""
+        """Return guesses (M, n + 1, P) with the best further contacts."""
         best = self._apart(addition.ratio, self._positions, 3)
         scores = self.scores(self._positions[best, 2], np.exp(addition.mode[best]))
-        new = np.column_stack([self._positions[best, :2], *scores])[:, None]
+        new = self.without_friction(np.column_stack([self._positions[best, :2], *scores]))[:, None]
         return np.concatenate([np.repeat(guess[None], len(best), 0), new], axis=1)
 
     @staticmethod
@@ -203,7 +211,7 @@ class Search:
         return chosen
 
     def pairs(self, frame: Observation, predicted: np.ndarray) -> np.ndarray:
-        """Return the pairs (M, 2, 4) that explain best what contacts with readings (S,), N, leave over."""
+        """Return the pairs (M, 2, P) that explain best what contacts with readings (S,), N, leave over."""
         left = (frame.readings - predicted).astype(np.float32)
         weight = frame.counts / (frame.noise.floor + (_TOLERANCE * left) ** 2).astype(np.float32)
         scaled = self._lattice * weight
@@ -229,7 +237,12 @@ class Search:
         force = np.stack([first[i, j], first[j, i]], 1) / np.maximum(determinant[i, j], 1e-30)[:, None]
         positions = self._positions[index]
         radius, score = self.scores(positions[..., 2], np.maximum(force, 1e-3 * self.prior.force))
-        return np.concatenate([positions[..., :2], np.stack([radius, score.clip(-4, 4)], -1)], axis=2)
+        scores = np.stack([radius, score.clip(-4, 4)], -1)
+        return self.without_friction(np.concatenate([positions[..., :2], scores], axis=2))
+
+    def without_friction(self, guess: np.ndarray) -> np.ndarray:
+        """Return guesses (..., 4) as (..., P)."""
+        return np.pad(guess, [(0, 0)] * (guess.ndim - 1) + [(0, self._parameters - 4)])
 
     def _new(self, pair: tuple[int, int], chosen: list[tuple[int, int]]) -> bool:
         """Return whether a pair is not nearly one of those that are chosen."""
@@ -244,7 +257,7 @@ class Search:
         )
 
     def sample(self, frame: Observation, modes: np.ndarray, score: np.ndarray) -> Mixture:
-        """Return the posterior of contacts by importance samples around modes (M, n, 4), and its evidence.
+        """Return the posterior of contacts by importance samples around modes (M, n, P), and its evidence.
 
         Args:
             frame: the frame.
@@ -253,20 +266,23 @@ class Search:
         """
         chosen = self._distinct(modes, score)
         modes, number = _order(modes[chosen], modes[chosen[0]]), modes.shape[1]
+        size = self._parameters * number
         information = self._expand(frame, modes)[2]
         spread = np.linalg.cholesky(np.linalg.inv(information)) * _WIDER
         owner = np.arange(2**_SAMPLES) % len(modes)
-        normal, stretch = self._normal[:, : 4 * number], self._stretch[:, None]
-        guess = modes[owner] + np.matmul(spread[owner], (normal * stretch)[..., None]).reshape(-1, number, 4)
+        normal, stretch = self._normal[:, :size], self._stretch[:, None]
+        moved = np.matmul(spread[owner], (normal * stretch)[..., None])
+        guess = modes[owner] + moved.reshape(-1, *modes.shape[1:])
         flat, log_density = guess.reshape(len(guess), -1), list[np.ndarray]()
         for mode, lower in zip(modes.reshape(len(modes), -1), spread, strict=True):
             away = np.linalg.solve(lower, (flat - mode).T)
-            tails = -0.5 * (_FREEDOM + 4 * number) * np.log1p((away**2).sum(0) / _FREEDOM)
+            tails = -0.5 * (_FREEDOM + size) * np.log1p((away**2).sum(0) / _FREEDOM)
             log_density.append(tails - np.log(np.diagonal(lower)).sum())
         top = np.max(log_density, axis=0)
-        proposal = top + np.log(np.exp(log_density - top).mean(0)) + self._tail_constant(4 * number)
+        proposal = top + np.log(np.exp(log_density - top).mean(0)) + self._tail_constant(size)
         log_posterior, misfit = self._weigh(frame, guess)
-        constant = -number * math.log(2 * math.pi) + math.lgamma(number + 1) + number * self._density
+        scores = size - 2 * number
+        constant = -scores / 2 * math.log(2 * math.pi) + math.lgamma(number + 1) + number * self._density
         logs = log_posterior - proposal + constant
         highest = logs.max()
         weight = np.exp(logs - highest)
@@ -314,7 +330,7 @@ class Search:
         )
         guess = mixture.samples[rng.permutation(start)]
         score, misfit = self._weigh(frame, guess)
-        number = guess.shape[1]
+        size = guess[0].size
         samples, misfits, half = list[np.ndarray](), list[float](), _WALKERS // 2
         for step in range(_WALK):
             for mine, others in (
@@ -322,7 +338,7 @@ class Search:
                 (slice(half, None), slice(None, half)),
             ):
                 first, second = rng.integers(0, half, (2, half))
-                factor = 0.98 if step % 8 == 7 else 2.38 / math.sqrt(8 * number)
+                factor = 0.98 if step % 8 == 7 else 2.38 / math.sqrt(2 * size)
                 difference = guess[others][first] - guess[others][second]
                 jitter = rng.standard_normal(difference.shape) * self._scale * 1e-3
                 tried = guess[mine] + factor * difference + jitter
@@ -341,13 +357,15 @@ class Search:
         return replace(mixture, samples=every, weight=weight, misfit=float(np.mean(misfits)))
 
     def contacts(self, samples: np.ndarray) -> np.ndarray:
-        """Return x, y and radius, m, and force, N, of samples (N, n, 4)."""
-        positions, force, _ = self._positions_of(samples.reshape(-1, 4))
-        return np.column_stack([positions, force]).reshape(samples.shape)
+        """Return x, y and radius, m, force and tangential forces, N, of samples (N, n, P)."""
+        flat = samples.reshape(-1, self._parameters)
+        positions, force, _ = self._positions_of(flat)
+        tangential = self.candidates.friction * force[:, None] * flat[:, 4:]
+        return np.column_stack([positions, force, tangential]).reshape(samples.shape)
 
 
 def _order(guess: np.ndarray, mode: np.ndarray) -> np.ndarray:
-    """Return guesses (N, n, 4) with each contact in the row of the contact of a mode (n, 4) that it is near.
+    """Return guesses (N, n, P) with each contact in the row of the contact of a mode (n, P) that it is near.
 
     Contacts have no order of their own: without one, two positions would be averaged.
     """
@@ -357,6 +375,6 @@ def _order(guess: np.ndarray, mode: np.ndarray) -> np.ndarray:
 
 
 def _differ(first: np.ndarray, second: np.ndarray) -> bool:
-    """Return whether contacts (n, 4) are elsewhere than others, in whatever order."""
+    """Return whether contacts (n, P) are elsewhere than others, in whatever order."""
     away = np.linalg.norm(first[:, None, :2] - second[:, :2], axis=2)
     return bool(max(away.min(0).max(), away.min(1).max()) > _ALIKE)

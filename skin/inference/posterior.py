@@ -17,7 +17,7 @@ from skin.errors import InputError
 from skin.inference.candidates import CandidateReadings, FingertipPrior
 from skin.inference.contact import Cloud, blur_first, one_contact
 from skin.inference.contacts import Mixture, Search
-from skin.inference.likelihood import Observation, fit_force
+from skin.inference.likelihood import Observation, blend, fit_force, fold
 from skin.inference.noise import Noise
 from skin.mechanics.simulator.base import AbstractSimulator
 from skin.touch.images import load_image
@@ -64,11 +64,15 @@ class LargeContacts:
         every = draw_large(candidates, _COUNT + _HELD_OUT, rng)
         self._readings, held_out = every[:_COUNT], every[_COUNT:]
         force = np.exp(_SPREAD * rng.standard_normal((len(held_out), 1)))
-        values = force * held_out + math.sqrt(noise.floor) * rng.standard_normal(held_out.shape)
+        sensors = candidates.sensors
+        pressed = force * blend(
+            held_out, rng.standard_normal((len(held_out), 2 if candidates.friction else 0))
+        )
+        values = pressed + math.sqrt(noise.floor) * rng.standard_normal(pressed.shape)
         working = np.ones(values.shape[1], bool)
         clean = replace(noise, clip=math.inf)
         frames = [Observation.of(row, working, ~working, clean) for row in values]
-        square = self._readings**2
+        square = fold(self._readings**2, sensors)
         common = square.mean(1, keepdims=True)
 
         def spread(tolerance: tuple[float, float]) -> np.ndarray:
@@ -88,7 +92,7 @@ class LargeContacts:
 
 
 def draw_large(candidates: CandidateReadings, count: int, rng: np.random.Generator) -> np.ndarray:
-    """Return the readings (N, S), N, of large contacts under their median force, float32.
+    """Return the readings (N, L S), N, of large contacts under their median force, float32.
 
     Shape, position, angle and the logarithm of the area, from the largest fingertip up, are uniform. A
     contact consists of small fingertips with the pressures of its picture.
@@ -152,7 +156,8 @@ class ContactEstimate:
 
     Attributes:
         position, position_deviation: (2,), mean and standard deviation of x and y, m.
-        force, force_deviation: N.
+        force, force_deviation: into the skin, N.
+        tangential, tangential_deviation: (2,), along x and y, N; None where the prior has no friction.
         radius, radius_deviation: m.
         peak: highest pressure of the most probable contact, Pa.
         peak_interval: contains the highest pressure with 90 %, Pa; readings hardly determine the radius.
@@ -165,6 +170,8 @@ class ContactEstimate:
     position_deviation: np.ndarray
     force: float
     force_deviation: float
+    tangential: np.ndarray | None
+    tangential_deviation: np.ndarray | None
     radius: float
     radius_deviation: float
     peak: float
@@ -302,7 +309,7 @@ class Posterior:
             InputError: readings of another number of sensors.
         """
         values = np.asarray(readings, dtype=float)
-        sensors = self.candidates.readings.shape[1]
+        sensors = self.candidates.sensors
         if values.ndim not in (1, 2) or values.shape[-1] != sensors:
             raise InputError(
                 f"this skin has {sensors} sensors: give readings ({sensors},) or (T, {sensors}), N, got "
@@ -370,9 +377,10 @@ class Posterior:
     ) -> tuple[list[float], dict[int, Mixture]]:
         """Return the log evidence of each number of contacts, and the posteriors of several."""
         evidence, mixtures, misfit = [frame.empty(), single.evidence], dict[int, Mixture](), single.misfit
-        mode = np.column_stack(
-            [single.mode[:, :2], *self._search.scores(single.mode[:, 2], single.mode[:, 3])]
-        )
+        force, sides = single.mode[:, 3], single.mode[:, 4:]
+        scores = self._search.scores(single.mode[:, 2], force)
+        friction = sides / (force[:, None] * (self.candidates.friction or 1))
+        mode = np.column_stack([single.mode[:, :2], *scores, friction])
         sensors = max(frame.counts.sum(), 1) / 2
         predicted = self._search.predict(mode[None])[0][0]
         for number in range(2, maximum + 1):
@@ -392,7 +400,7 @@ class Posterior:
     def _refine(
         self, frame: Observation, guesses: np.ndarray, mode: np.ndarray, predicted: np.ndarray
     ) -> Mixture:
-        """Return the best contacts, one more than a mode (n, 4), from several starts."""
+        """Return the best contacts, one more than a mode (n, P), from several starts."""
         starts = [guesses]
         for index in range(len(mode)):
             others = np.delete(mode, index, 0)
@@ -408,10 +416,9 @@ class Posterior:
         if number == 0:
             return ()
         if number == 1:
-            boxes = single.boxes
-            return (
-                self._summary(boxes.centre, boxes.width, single.force, single.weight, single.mode[0, 2:]),
-            )
+            boxes, tangential = single.boxes, (single.tangential, single.variance)
+            mode = single.mode[0, 2:]
+            return (self._summary(boxes.centre, boxes.width, single.force, single.weight, mode, *tangential),)
         mixture = mixtures[number]  # the most probable number is one that was refined
         weight = mixture.weight[:, None]
         parts = list[ContactEstimate]()
@@ -422,7 +429,12 @@ class Posterior:
             spread = np.sqrt(np.maximum(_variance(contact[:, :2], weight[:, 0]), 1e-12))
             widths = np.zeros((len(contact), 3))
             widths[:, :2] = _WIDTH * spread
-            parts.append(self._summary(contact[:, :3], widths, contact[:, 3:], weight, mode[2:]))
+            tangential = contact[:, None, 4:]
+            parts.append(
+                self._summary(
+                    contact[:, :3], widths, contact[:, 3:4], weight, mode[2:], tangential, 0 * tangential
+                )
+            )
         return tuple(sorted(parts, key=lambda part: -part.force))
 
     def _summary(
@@ -432,10 +444,13 @@ class Posterior:
         force: np.ndarray,
         weight: np.ndarray,
         mode: np.ndarray,
+        tangential: np.ndarray,
+        variance: np.ndarray,
     ) -> ContactEstimate:
         """Return the moments of weighted boxes of positions and radii (N, 3), m, and forces (N, J), N.
 
-        ``mode`` (2,) holds the most probable radius, m, and force, N.
+        ``mode`` (2,) holds the most probable radius, m, and force, N; ``tangential`` and ``variance`` are
+        those of the force along x and y, (N, J, 2), or (N, J, 0).
         """
         total = weight.sum(1)
         # Three radii of the variance of a box, which is up to a third of the range: the peak falls as r^2.
@@ -445,12 +460,16 @@ class Posterior:
         middle = total @ boxes
         deviation = np.sqrt(total @ ((boxes - middle) ** 2 + widths**2 / 12))
         mean, order = float((weight * force).sum()), np.argsort(peaks, axis=None)
+        sideways = np.einsum("nj,njk->k", weight, tangential)
+        squares = np.einsum("nj,njk->k", weight, (tangential - sideways) ** 2 + variance)
         low, high = np.interp([0.05, 0.95], np.cumsum(thirds.ravel()[order]), peaks.ravel()[order]).tolist()
         return ContactEstimate(
             middle[:2],
             deviation[:2],
             mean,
             math.sqrt(float((weight * (force - mean) ** 2).sum())),
+            sideways if len(sideways) else None,
+            np.sqrt(squares) if len(sideways) else None,
             float(middle[2]),
             float(deviation[2]),
             float(self._peak(mode[:1])[0] * mode[1]),

@@ -28,7 +28,7 @@ from scipy.special import gammaincc, logsumexp, ndtr, softmax
 
 from skin.inference.candidates import CandidateReadings, FingertipPrior
 from skin.inference.contact import blur_first
-from skin.inference.likelihood import Observation, fit_force
+from skin.inference.likelihood import Observation, blend, fit_force
 from skin.inference.mechanics import Mechanics
 from skin.inference.noise import Noise
 from skin.inference.posterior import Posterior
@@ -78,7 +78,7 @@ def predict_from_others(
         frame: of the touch.
     """
     table = candidates.readings
-    expected, less, more, fits = np.zeros((4, table.shape[1]))
+    expected, less, more, fits = np.zeros((4, len(frame.readings)))
     for sensor in np.flatnonzero(frame.counts):
         others = frame.counts.copy()
         others[sensor] = 0
@@ -87,7 +87,8 @@ def predict_from_others(
         weight = np.exp(evidence[likely].astype(float) - evidence.max())
         weight /= weight.sum()
         force, spread = np.exp(forces.mode[likely, None]), 1 / forces.curvature[likely]
-        predicted = force * table[likely]
+        tangent, *_ = forces.tangent(np.exp(forces.mode))
+        predicted = force * blend(table, tangent)[likely]
         variance = force**2 * blurred[likely] + frame.noise.floor
         misfit = weight @ (((frame.readings - predicted) ** 2 / variance) @ others)
         # Four parameters of a fingertip are fitted.
@@ -160,7 +161,7 @@ class Watch:
 
     def __init__(self, candidates: CandidateReadings, prior: FingertipPrior, noise: Noise) -> None:
         self._candidates, self._prior = candidates, replace(prior, force=_FORCE, spread=_SPREAD)
-        self._blurred, sensors = blur_first(candidates, noise)[1], candidates.readings.shape[1]
+        self._blurred, sensors = blur_first(candidates, noise)[1], candidates.sensors
         # A lost gain or a dead sensor reads too little under load, an offset too much; a frozen sensor one of
         # both, as it was frozen untouched or touched.
         self._less, self._more = RankTests(sensors), RankTests(sensors)

@@ -138,7 +138,7 @@ def sensor_geometry(body: AbstractBody, sensors: Sensors, model: AbstractSimulat
     count = len(sensors)
     parts = [
         sensors.positions,
-        sensors.normals,
+        sensors.measured,
         np.broadcast_to(sensors.footprint, (count, 2)),
         np.broadcast_to(body.size, (count, 2)),
         np.full((count, 1), body.thickness),

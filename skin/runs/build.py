@@ -203,6 +203,7 @@ def _listed_settings(layout: AbstractLayout, body: AbstractBody) -> dict[str, An
     sensors = layout.sensors(body)
     normals, positions = sensors.normals.tolist(), sensors.positions.tolist()
     listed = {"positions": positions, "footprint": list(sensors.footprint), "normals": normals}
+    listed |= {"directions": sensors.measured.tolist()} if sensors.axes > 1 else {}
     return _option_settings(Listed) | listed
 
 

@@ -26,6 +26,11 @@ PORT = "device.port=/dev/ttyACM77"
         ),
         ("convert from=sdu out=x.csv", "from=sdu needs path=FOLDER"),
         ("design out=x design.radii=[0.01,0.002]", "must be a range [minimum, maximum]"),
+        (
+            "design out=x simulator=naive layout=grid layout.axes=three",
+            "set simulator=solid, or layout.tilt=0",
+        ),
+        ("design out=x layout=grid layout.axes=two", "layout.axes=two must be 'normal' or 'three'"),
         ("emulate format=xml", "format=xml must be 'text' or 'binary'"),
         ("emulate gestures=-1", "gestures=-1 is below 0: give a number above 0"),
         ("emulate emulate.rate=0", "emulate.rate=0 must be greater than 0"),

@@ -1,5 +1,6 @@
 """The posterior of contacts against brute force, calibration, and what devices do to readings."""
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -395,3 +396,40 @@ def test_errors_are_one_sentence():
         Posterior(PlatesAndBeams(body, sensors), NOISE, body)
     with pytest.raises(skin.InputError, match="this skin has 25 sensors"):
         posterior().estimate(np.zeros(24))
+
+
+@pytest.fixture(scope="module")
+def three_axes():
+    """Return a skin of 3 x 3 sites, its posterior, and readings of touches with friction (120, 27)."""
+    sensors = Grid(3, 3, (0.01, 0.01), depth=0.0295, axes="three").sensors(SMALL)
+    simulator, prior = Solid(SMALL, sensors, divisions=4), replace(SINGLE, friction=0.8)
+    rng = np.random.default_rng(8)
+    touches = np.column_stack([draw(120, 8)[:, 0, :2] / 2, draw(120, 8)[:, 0, 2:]])
+    score = rng.standard_normal((120, 2))
+    rows = disc_readings(simulator, SMALL, touches[:, :3], prior.rim, 0.8 / np.sqrt(6)).reshape(120, 3, 27)
+    true = touches[:, 3:] * (rows[:, 0] + np.einsum("nl,nls->ns", score, rows[:, 1:]))
+    force = np.column_stack([touches[:, 3:] * score * 0.8 / np.sqrt(6), touches[:, 3]])
+    return Posterior(simulator, NOISE, SMALL, prior), touches, force, measure(true, NOISE, 9)
+
+
+def test_three_axes_tell_the_vector_of_the_force(three_axes):
+    """Errors in deviations have a mean square of 1, regions hold 90 % of the positions."""
+    posterior, touches, force, readings = three_axes
+    contacts = [estimate.contacts[0] for estimate in posterior.estimate(readings)]
+    means = np.array([[*each.position, *each.tangential, each.force] for each in contacts])
+    deviations = [[*c.position_deviation, *c.tangential_deviation, c.force_deviation] for c in contacts]
+    errors = (means - np.column_stack([touches[:, :2], force])) / np.array(deviations)
+    assert np.sqrt((errors**2).mean(0)) == pytest.approx(np.ones(5), abs=0.2)
+    inside = np.mean([c.region().contains(touch[:2]) for c, touch in zip(contacts, touches, strict=True)])
+    assert inside == pytest.approx(0.9, abs=0.08)
+    assert np.median(np.abs(means[:, 2:4] - force[:, :2])) < 0.5 * np.median(np.abs(force[:, :2]))
+
+
+def test_friction_needs_a_simulator_that_has_it(three_axes):
+    body, sensors = SMALL, sensors_of(SMALL, None, 3)
+    with pytest.raises(skin.InputError, match="friction of 0 or more, got -1"):
+        FingertipPrior(friction=-1)
+    with pytest.raises(skin.InputError, match="friction needs a simulator with tangential forces"):
+        Posterior(Naive(body, sensors), NOISE, body, FingertipPrior(friction=0.8))
+    estimate = Posterior(Naive(body, sensors), NOISE, body, SINGLE).estimate(np.ones(9))
+    assert estimate.contacts[0].tangential is None

@@ -14,7 +14,7 @@ SOFT, HARD = Slab(0.005, 170e3, 0.499), Slab(0.010, 560e3, 0.49)
 @pytest.mark.parametrize("number", [5.0, 100.0, 3000.0])
 def test_one_layer_is_the_closed_form(ratio, number):
     slab = Slab(0.01, 2e5, ratio)
-    motion, stress = waves(np.array([number]), [slab], 0.0)[0]
+    motion, stress = waves(np.array([number]), [slab], 0.0)[0, [1, 3], 0]
     assert motion == pytest.approx(bonded_layer(number, slab), rel=1e-10)
     assert stress == pytest.approx(-1, rel=1e-12)
 
@@ -23,14 +23,15 @@ def test_a_layer_cut_in_two_is_one_layer():
     whole, halves = [Slab(0.015, 1e5, 0.4)], [Slab(0.005, 1e5, 0.4), Slab(0.01, 1e5, 0.4)]
     numbers = np.array([10.0, 200.0])
     for depth in (0.0, 0.003, 0.009):
-        assert waves(numbers, halves, depth) == pytest.approx(waves(numbers, whole, depth), rel=1e-10)
+        ours, exact = waves(numbers, halves, depth), waves(numbers, whole, depth)
+        assert ours == pytest.approx(exact, rel=1e-9, abs=1e-9 * float(np.abs(exact).max()))
 
 
 def test_two_layers_integrated_step_by_step():
     """Shoot from the surface through both layers: the base does not move, and the joint says the same."""
     number = 150.0
     state = np.zeros(4)
-    state[1] = waves(np.array([number]), [SOFT, HARD], 0.0)[0, 0]
+    state[1] = waves(np.array([number]), [SOFT, HARD], 0.0)[0, 1, 0]
     state[2] = -1.0
 
     def fall(slab, begin):
@@ -51,7 +52,8 @@ def test_two_layers_integrated_step_by_step():
     joint = fall(SOFT, state + along * np.eye(4)[0])
     base = fall(HARD, joint)
     assert abs(base[:2]).max() < 1e-6 * state[1]
-    assert joint[1:3] == pytest.approx(waves(np.array([number]), [SOFT, HARD], 0.005)[0], rel=1e-6)
+    exact = waves(np.array([number]), [SOFT, HARD], 0.005)[0, [0, 1, 3, 4], 0]
+    assert joint == pytest.approx(exact, rel=1e-6)
 
 
 def stress(slabs, radius, beside, depth):
@@ -74,7 +76,7 @@ def test_below_a_disc_layers_are_integrated_adaptively(slabs):
     radius, beside, depth = 0.006, 0.004, 0.0045
 
     def wave(number):
-        motion = waves(np.array([number]), slabs, depth)[0, 1]
+        motion = waves(np.array([number]), slabs, depth)[0, 3, 0]
         return -motion * radius * j1(number * radius) * j0(number * beside)
 
     exact = quad(wave, 1e-9, 40 / depth, limit=400)[0]

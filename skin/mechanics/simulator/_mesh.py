@@ -152,8 +152,8 @@ class Hexahedra:
         shape = (3 * len(self.nodes), len(force))
         return sp.csc_matrix((values.ravel(), (unknown.ravel(), cell.ravel())), shape=shape)
 
-    def pushes(self, plane: int) -> sp.csr_array:
-        """Return rows (nodes of a plane, 3 N) that read with which force each node is pushed down, N.
+    def pushes(self, plane: int, axis: int) -> sp.csr_array:
+        """Return rows (nodes of a plane, 3 N) that read the force that pushes each node along an axis, N.
 
         By the row of elements above the plane; on the surface, by the load.
         """
@@ -170,7 +170,7 @@ class Hexahedra:
             -1, 3
         )
         ends = 3 * np.arange(count + 1)
-        felt = sp.csr_array((self.frame(positions)[:, 2].ravel(), np.arange(3 * count), ends)) @ forces
+        felt = sp.csr_array((self.frame(positions)[:, axis].ravel(), np.arange(3 * count), ends)) @ forces
         return sp.csr_array(
             (felt.data, felt.indices + 3 * layer * count, felt.indptr), shape=(count, 3 * len(self.nodes))
         )

@@ -6,7 +6,7 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.linalg import spsolve
 
-from skin.body.base import Sensors
+from skin.body.base import Sensors, plane_axes
 from skin.mechanics.simulator._mesh import Hexahedra, lagrange
 
 _POINTS = 24  # along each side of a tilted footprint: what it loses is known to 4 %, its reading to 0.1 %
@@ -15,9 +15,9 @@ _LEAST_CUT = 0.03  # fraction of a footprint that causes a warning: less than a 
 
 
 def reading_rows(mesh: Hexahedra, sensors: Sensors) -> sp.csr_array:
-    """Return rows (S, 3 N) that give the normal force on each sensor, N, from nodal displacements.
+    """Return rows (S, 3 N) that give the force on each sensor along its direction, N, from nodal motions.
 
-    A sensor that faces the surface reads the pressure that belongs to the forces between the rows of elements
+    A sensor that faces the surface reads the traction that belongs to the forces between the rows of elements
     above and below its plane of nodes; between planes, the cubic through the nearest four. A tilted sensor
     reads the stress in the middles of elements.
     """
@@ -26,13 +26,14 @@ def reading_rows(mesh: Hexahedra, sensors: Sensors) -> sp.csr_array:
     fractions = np.zeros((len(sensors), len(mesh.lines[2])))
     np.put_along_axis(fractions, near, weights * ~tilted[:, None], axis=1)
     rows = sp.csr_array((len(sensors), 3 * len(mesh.nodes)))
-    for plane in np.flatnonzero(np.abs(fractions).max(axis=0) > 1e-9).tolist():
-        rows = rows + sp.diags_array(fractions[:, plane]) @ _pressed(mesh, sensors, plane)
+    parts = fractions[:, :, None] * sensors.measured[:, None]
+    for plane, axis in np.argwhere(np.abs(parts).max(axis=0) > 1e-9).tolist():
+        rows = rows + sp.diags_array(parts[:, plane, axis]) @ _pressed(mesh, sensors, plane, axis)
     return rows + _stressed(mesh, sensors) if tilted.any() else rows
 
 
-def _pressed(mesh: Hexahedra, sensors: Sensors, plane: int) -> sp.csr_array:
-    """Return rows (S, 3 N) that read the force on footprints in a plane of nodes, as if no sensor leant."""
+def _pressed(mesh: Hexahedra, sensors: Sensors, plane: int, axis: int) -> sp.csr_array:
+    """Return rows (S, 3 N) that read the force along an axis on footprints in a plane of nodes."""
     along_x, along_y = (
         _overlaps(line, sensors.positions[:, axis], sensors.footprint[axis])
         for axis, line in enumerate(mesh.lines[:2])
@@ -40,7 +41,7 @@ def _pressed(mesh: Hexahedra, sensors: Sensors, plane: int) -> sp.csr_array:
     felt = np.einsum("sy,sx->yxs", along_y, along_x).reshape(-1, len(sensors))
     pressures = spsolve(mesh.plane_areas(plane), felt).reshape(felt.shape)
     pressures[np.abs(pressures) < _NOTHING * np.abs(pressures).max()] = 0
-    return sp.csr_array(pressures.T) @ mesh.pushes(plane)
+    return sp.csr_array(pressures.T) @ mesh.pushes(plane, axis)
 
 
 def _overlaps(line: np.ndarray, middle: np.ndarray, extent: float) -> np.ndarray:
@@ -61,7 +62,7 @@ def _stressed(mesh: Hexahedra, sensors: Sensors) -> sp.csr_array:
     sums = sp.csr_matrix((np.full(len(owner), -area), (owner, np.arange(len(owner)))),
                          shape=(len(sensors), len(owner)))  # fmt: skip
     weights = (sums @ mesh.between(points[owner, number])).tocsr()
-    return sp.csr_array(mesh.mean_stress(weights, sensors.normals))
+    return sp.csr_array(mesh.mean_stress(weights, sensors.normals, sensors.measured))
 
 
 def sample(sensors: Sensors, extent: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
@@ -70,9 +71,7 @@ def sample(sensors: Sensors, extent: tuple[float, ...]) -> tuple[np.ndarray, np.
     A footprint is a rectangle about the sensor, across its normal: the chart's x and y turned the shortest
     way. What passes the surface, an edge or the base of the body, of some extent, m, reads nothing.
     """
-    x, y, z = (sensors.normals * np.where(sensors.normals[:, 2:] < 0, -1, 1)).T
-    along_x = np.stack([1 - x * x / (1 + z), -x * y / (1 + z), -x], axis=-1)
-    along_y = np.stack([-x * y / (1 + z), 1 - y * y / (1 + z), -y], axis=-1)
+    along_x, along_y = plane_axes(sensors.normals).swapaxes(0, 1)
     s, t = np.meshgrid(*(side * ((np.arange(_POINTS) + 0.5) / _POINTS - 0.5) for side in sensors.footprint))
     points = s.reshape(-1, 1) * along_x[:, None] + t.reshape(-1, 1) * along_y[:, None]
     points += sensors.positions[:, None]

@@ -50,6 +50,7 @@ class AbstractSimulator(nn.Module, ABC):
     Attributes:
         feels_shear: whether readings depend on tangential forces too.
         mechanical: whether readings depend on the thickness and stiffness of the layers.
+        axes: sensors of a site: 3 if they measure along the surface too.
         smooth: whether the loads of movies are moments of the pressure (:mod:`skin.touch.splines`) instead of
             mean pressures of cells.
     """
@@ -57,6 +58,7 @@ class AbstractSimulator(nn.Module, ABC):
     feels_shear: ClassVar[bool] = False
     mechanical: ClassVar[bool] = True
     smooth: ClassVar[bool] = False
+    axes = 1
 
     @abstractmethod
     def forward(self, pressure: Tensor, shear: Tensor | None = None) -> Response:
@@ -136,11 +138,13 @@ class AbstractSimulator(nn.Module, ABC):
             )
 
     def refuse_tilted(self, sensors: Sensors) -> None:
-        """Raise InputError for a tilted sensor if this simulator does not support it."""
-        if not self.feels_shear and sensors.tilted.any():
+        """Raise InputError for a tilted sensor, or one of three axes, if this simulator has none."""
+        along = (sensors.measured[:, :2] != 0).any(axis=1)
+        if not self.feels_shear and along.any():
             raise InputError(
-                f"sensor {int(sensors.tilted.argmax()) + 1} is tilted, but simulator={self._name} has normal "
-                "forces only: set simulator=solid, or give normals (0, 0, 1)"
+                f"sensor {int(along.argmax()) + 1} is tilted or measures along the surface, but "
+                f"simulator={self._name} has normal forces only: set simulator=solid, or layout.tilt=0 "
+                "layout.axes=normal, or directions (0, 0, 1)"
             )
 
     def motion(self, pressure: Tensor, shear: Tensor | None = None) -> Tensor:

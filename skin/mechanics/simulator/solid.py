@@ -265,9 +265,9 @@ _BODIES = WeakValueDictionary[tuple[str, int], Elastic]()
 class Solid(AbstractSimulator):
     """Layers of nearly incompressible elastic solid on a rigid base.
 
-    A sensor reads the normal force n . sigma . n on its footprint. A tilted sensor therefore responds to
-    shear, and each sensor responds to its neighbourhood. The model is linear: strains must be small (see the
-    summary of each data set).
+    A sensor reads the force d . sigma . n on its footprint along its direction d, by default n. One that is
+    tilted or has three axes responds to shear, and each sensor responds to its neighbourhood. The model is
+    linear: strains must be small (see the summary of each data set).
 
     Readings under a disc of 5 mm radius and more on the default sheet have an error of up to 2 %, those under
     uniform pressure of 0.2 %; ``make physics`` and tests/mechanics/simulator/test_solid.py check other cases.
@@ -277,7 +277,7 @@ class Solid(AbstractSimulator):
 
     Args:
         body: sheet or arm.
-        sensors: positions and normals of the sensors.
+        sensors: positions, normals and directions of the sensors.
         divisions: rows of elements in each layer.
         refinement: elements along each side of a cell.
         poisson: name of a material -> nu that replaces a value >= 0.5.
@@ -315,7 +315,7 @@ class Solid(AbstractSimulator):
         self.register_buffer("transfer", torch.from_numpy(rows.transpose(0, 2, 1).copy()).float())
         for name, count in zip(("spread_x", "spread_y"), body.cells, strict=True):
             self.register_buffer(name, torch.from_numpy(splines.of_cells(count).copy()).float())
-        self._sensors = len(sensors)
+        self._sensors, self.axes = len(sensors), sensors.axes
 
     def forward(self, pressure: Tensor, shear: Tensor | None = None) -> Response:
         """Return the response to pressure (..., H, W), Pa, and shear (..., 2), with D_s and D_t."""
@@ -351,9 +351,8 @@ class Solid(AbstractSimulator):
 
     def motion(self, pressure: Tensor, shear: Tensor | None = None) -> Tensor:
         """Return the displacement of each sensor along x, along y and into the skin, (..., S, 3), m."""
-        count = self._sensors
-        loads = self.loads(pressure)
-        inwards, _, x, y = self._rows(loads, shear, slice(count, 5 * count)).chunk(4, dim=-1)
+        rows = slice(self._sensors, 5 * self._sensors)
+        inwards, _, x, y = self._rows(self.loads(pressure), shear, rows).chunk(4, dim=-1)
         return torch.stack([x, y, inwards], dim=-1)
 
     def compliance(self) -> Tensor:
@@ -471,6 +470,7 @@ class Solid(AbstractSimulator):
         about = {
             "positions": sensors.positions.tolist(),
             "normals": sensors.normals.tolist(),
+            "directions": sensors.measured.tolist(),
             "footprint": sensors.footprint,
         }
         key = self._key(self._parts, about)

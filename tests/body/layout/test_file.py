@@ -18,6 +18,7 @@ BODY = Sheet([0.16, 0.16], [32, 32], LAYERS)
 
 
 FACING = "x_m,y_m,normal_x,normal_y,normal_z\n"
+ALONG = "x_m,y_m,direction_x,direction_y,direction_z\n"
 
 
 @pytest.fixture
@@ -62,6 +63,12 @@ def test_normals_are_made_unit_vectors(sensors):
     read = sensors(FACING + "0.1,0.1,0.3,0,0.4\n0.05,0.1,0,0,-7\n0.1,0.05,0,-4,3\n")
     np.testing.assert_allclose(read.normals, [[0.6, 0, 0.8], [0, 0, -1], [0, -0.8, 0.6]], atol=1e-15)
     assert read.tilted.tolist() == [True, False, True]
+
+
+def test_a_site_of_three_axes_has_three_rows(sensors):
+    read = sensors(ALONG + "0.1,0.1,0.6,0.8,0\n0.1,0.1,-0.8,0.6,0\n0.1,0.1,0,0,1\n")
+    np.testing.assert_array_equal(read.measured, [[0.6, 0.8, 0], [-0.8, 0.6, 0], [0, 0, 1]])
+    assert (len(read), read.axes, read.tilted.any()) == (3, 3, False)
 
 
 def test_sensors_face_the_surface_where_the_file_does_not_say(sensors):
@@ -111,6 +118,12 @@ def test_a_relative_path_is_looked_for_here_first(tmp_path, monkeypatch):
         ),
         (FACING + "0.1,0.1,0,0,1\n0.1,0.05,0,0,0\n", "line 3: a normal of length 0 has no direction"),
         (FACING + "0.1,0.1,0,up,1\n", "line 2: normal_y must be a number, got 'up'"),
+        (
+            ALONG + "0.1,0.1,1,0,0\n" * 2 + "0.1,0.1,0,0,2\n",
+            "direction of sensor 3 has length 2, but must be",
+        ),
+        (ALONG + "0.1,0.1,1,0,0\n0.1,0.1,0,0,1\n", "of three axes has three rows.*; got 2 rows"),
+        (ALONG + "0.1,0.1,1,0,0\n" * 2 + "0.1,0.1,0,0,1\n", "at right angles, .*got 3 rows with"),
         (b"x_m,y_m\n\xff\xfe,0.1\n", "cannot read the layout"),
         ("x_m,y_m\n40,13\n120,80\n", "2 of 2 sensors lie outside .*: in mm\\? positions are in metres"),
         ("x_m,y_m\n0.04,0.013\n0.3,0.08\n", "m thick: positions are in metres"),

@@ -33,6 +33,14 @@ def test_without_a_tilt_sensors_face_the_surface_to_the_last_bit():
     assert normals.tobytes() == np.tile([0.0, 0.0, 1.0], (25, 1)).tobytes()
 
 
+def test_three_axes_are_three_sensors_at_each_site():
+    sensors, sites = Grid(2, 3, tilt=0.3, axes="three").sensors(BODY), Grid(2, 3, tilt=0.3).sensors(BODY)
+    np.testing.assert_array_equal(sensors.positions, sites.positions.repeat(3, axis=0))
+    frames = sensors.measured.reshape(-1, 3, 3)
+    np.testing.assert_array_equal(frames[:, 2], sites.normals)
+    np.testing.assert_allclose(frames @ frames.transpose(0, 2, 1), np.tile(np.eye(3), (6, 1, 1)), atol=1e-12)
+
+
 @pytest.mark.parametrize(
     ("options", "says"),
     [

@@ -6,8 +6,11 @@ import torch
 from scipy.interpolate import RegularGridInterpolator
 from scipy.sparse.linalg import spsolve
 
+from experiments.laws.references import Discs, Slab
 from skin.body.base import Arm, Sensors, Sheet
+from skin.body.layout import Grid
 from skin.errors import InputError
+from skin.mechanics.geometry import Fingertip
 from skin.mechanics.simulator._mesh import Hexahedra, build_mesh
 from skin.mechanics.simulator._reading import reading_rows
 from skin.mechanics.simulator.solid import Cholesky, Elastic, Solid
@@ -141,6 +144,36 @@ def test_a_tilted_sensor_feels_shear(wide):
     change, angle = (sheared - pushed).numpy() / (1e3 * 1e-4), np.deg2rad(30)
     assert change[0] == pytest.approx(2 * 0.5 * np.sin(angle) * np.cos(angle), rel=0.03)
     assert change[1] == pytest.approx(0, abs=0.01)
+
+
+@pytest.mark.parametrize("depth", [0.005, 0.0145])
+def test_sensors_that_cover_a_plane_read_the_whole_force(depth):
+    """5 N into the skin, with 2 N of friction along x and -1 N along y."""
+    skin = Solid(SHEET, Grid(8, 8, FOOTPRINT, depth=depth, axes="three").sensors(SHEET))
+    load = Fingertip(SHEET, 0.0015, smooth=True)(torch.tensor([[0.035, 0.04, 0.008, 5.0]]))
+    forces = skin.press(load, torch.tensor([[0.4, -0.2]])).readings.reshape(-1, 3).sum(0)
+    assert forces.numpy() == pytest.approx(np.array([2.0, -1.0, 5.0]), rel=1e-4)
+
+
+def test_sensors_of_three_axes_read_what_endless_layers_do():
+    """Forces along x, along y and inwards under a fingertip, with and without friction, beside the sensor."""
+    sheet, middle, rim = Sheet([0.09, 0.09], [18, 18], [LAYERS[1] | {"thickness": 0.01}]), 0.045, 0.0015
+    skin = Solid(sheet, Sensors(np.array([[middle, middle, 0.0055]] * 3), FOOTPRINT, directions=np.eye(3)))
+    fingertips = middle + np.array([[0, 0], [0.004, 0.002], [-0.007, 0.006], [0.002, -0.015]])
+    loads = Fingertip(sheet, rim, smooth=True)(
+        torch.tensor([[x, y, 0.009, 1.0] for x, y in fingertips.tolist()])
+    )
+    ours = np.stack(
+        [skin.press(loads, torch.tensor(way)).readings for way in ([1.0, 0], [0, 1.0], [0, 0.0])], -1
+    )
+    ours[..., :2] -= ours[..., 2:]
+    edges = rim * np.log(np.arange(1, 32, 2) / np.arange(31, 0, -2))  # a soft rim is a mean of discs
+    table = Discs([Slab(0.01, 170e3, 0.499)], 0.0055, (0.008, 0.01), 0.05, edges.tolist())
+    discs = np.column_stack([fingertips, np.full(4, 0.009)])
+    exact = table.tractions(discs, np.array([[middle, middle]]), 0.01)[:, 0]
+    exact /= np.pi * np.square(0.009 + edges).mean()
+    assert np.abs(ours - exact).max() < 0.02 * np.abs(exact).max()
+    assert np.abs(ours - exact)[..., :2].max() < 0.02 * np.abs(exact[..., :2]).max()
 
 
 def test_a_sensor_may_stand_on_edge(wide):

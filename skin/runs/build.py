@@ -493,9 +493,15 @@ def load_model(
         alarm: choose the threshold of the alarm for single windows; False: it has none.
 
     Raises:
-        InputError: its weights do not fit the configuration.
+        InputError: its weights do not fit the configuration, or sensors have other axes than those of its
+            training.
     """
     config = config or run.stored
+    if len({build_skin(each).sensors.axes for each in (run.stored, config)}) > 1:
+        raise InputError(
+            f"{run.title} was trained on sensors with another number of axes than this layout has: leave out "
+            "layout.axes, or give a layout of the sensors that measure inwards"
+        )
     if device is None:
         _warn_of_unknown_skin(run.stored.device, config.device, partial(build_skin, config))
     with run.reading("config.yaml", "describes nothing that can be built"):

@@ -237,8 +237,10 @@ def serve(mechanics: Mechanics, pipe: Connection) -> None:
             try:
                 message = estimate_contacts(posterior, thickness.noise, readings)
                 watch.look(readings.values, readings.valid & ~readings.saturated, posterior.noise)
-                moment = readings.values, readings.valid, readings.saturated, posterior.noise
-                thickness.look(Observation.of(*moment), message["number"])
+                thickness.look(
+                    Observation.of(readings.values, readings.valid, readings.saturated, posterior.noise),
+                    message["number"],
+                )
             except (ArithmeticError, ValueError, AssertionError, InputError) as error:
                 message = unknown_contacts(f"the estimate failed: {error}")
             pipe.send(message | {"changed": [*watch.changed], "thickness": thickness.doubt})

@@ -14,10 +14,10 @@ from skin.inference.likelihood import (
     Observation,
     blend,
     fit_force,
-    fold,
     integrate_force,
     refit_force,
     relative_variance,
+    sum_loads,
 )
 from skin.inference.noise import Noise
 
@@ -162,7 +162,7 @@ def _blurred(boxes: Boxes, slopes: np.ndarray, spread: np.ndarray, sensors: int)
     blurred = scaled[:, 0]
     blurred += scaled[:, 1]
     blurred += scaled[:, 2]
-    return fold(blurred, sensors) + spread
+    return sum_loads(blurred, sensors) + spread
 
 
 def _probable(evidence: np.ndarray, others: list[np.ndarray]) -> np.ndarray:

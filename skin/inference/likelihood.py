@@ -71,7 +71,7 @@ class Observation:
 # deviation along x and along y. Given position and force, the tangential force is normal: it is integrated.
 
 
-def fold(squares: np.ndarray, sensors: int) -> np.ndarray:
+def sum_loads(squares: np.ndarray, sensors: int) -> np.ndarray:
     """Return the mean squares (..., S) over tangential forces, of squares (..., S) or (..., 3 S)."""
     return squares.reshape(*squares.shape[:-1], squares.shape[-1] // sensors, sensors).sum(-2)
 
@@ -86,8 +86,11 @@ def blend(readings: np.ndarray, tangent: np.ndarray) -> np.ndarray:
 
 def relative_variance(noise: Noise, readings: np.ndarray, slopes: np.ndarray, sensors: int) -> np.ndarray:
     """Return the variance (N, S) from gains, thickness and positions, per square newton of force."""
-    moved = fold(slopes[:, 0] ** 2 + slopes[:, 1] ** 2, sensors)
-    return np.float32(noise.relative**2) * fold(readings**2, sensors) + np.float32(noise.position**2) * moved
+    moved = sum_loads(slopes[:, 0] ** 2 + slopes[:, 1] ** 2, sensors)
+    return (
+        np.float32(noise.relative**2) * sum_loads(readings**2, sensors)
+        + np.float32(noise.position**2) * moved
+    )
 
 
 class Forces(NamedTuple):

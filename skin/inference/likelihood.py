@@ -86,11 +86,8 @@ def blend(readings: np.ndarray, tangent: np.ndarray) -> np.ndarray:
 
 def relative_variance(noise: Noise, readings: np.ndarray, slopes: np.ndarray, sensors: int) -> np.ndarray:
     """Return the variance (N, S) from gains, thickness and positions, per square newton of force."""
-    moved = sum_loads(slopes[:, 0] ** 2 + slopes[:, 1] ** 2, sensors)
-    return (
-        np.float32(noise.relative**2) * sum_loads(readings**2, sensors)
-        + np.float32(noise.position**2) * moved
-    )
+    moved = np.float32(noise.position**2) * sum_loads(slopes[:, 0] ** 2 + slopes[:, 1] ** 2, sensors)
+    return np.float32(noise.relative**2) * sum_loads(readings**2, sensors) + moved
 
 
 class Forces(NamedTuple):

@@ -17,7 +17,7 @@ from skin.errors import InputError
 from skin.inference.candidates import CandidateReadings, FingertipPrior
 from skin.inference.contact import Cloud, blur_first, one_contact
 from skin.inference.contacts import Mixture, Search
-from skin.inference.likelihood import Observation, blend, fit_force, fold
+from skin.inference.likelihood import Observation, blend, fit_force, sum_loads
 from skin.inference.noise import Noise
 from skin.mechanics.simulator.base import AbstractSimulator
 from skin.touch.images import load_image
@@ -72,7 +72,7 @@ class LargeContacts:
         working = np.ones(values.shape[1], bool)
         clean = replace(noise, clip=math.inf)
         frames = [Observation.of(row, working, ~working, clean) for row in values]
-        square = fold(self._readings**2, sensors)
+        square = sum_loads(self._readings**2, sensors)
         common = square.mean(1, keepdims=True)
 
         def spread(tolerance: tuple[float, float]) -> np.ndarray:

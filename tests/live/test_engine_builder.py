@@ -31,7 +31,7 @@ pytest.importorskip("onnxruntime")
 RATE = 100.0  # Hz, of the device
 PATIENCE = 300  # s
 EXAMPLE = ROOT / "docs" / "examples" / "onnx_only.py"
-LIVE = LiveSettings(0, 4.0, None, 0.2, None, None, False, True, DebounceSettings())
+LIVE = LiveSettings(0, 4.0, None, 0.2, None, None, None, False, True, DebounceSettings())
 WATCH = """
 import sys
 from skin.__main__ import main

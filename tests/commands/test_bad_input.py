@@ -61,7 +61,6 @@ PORT = "device.port=/dev/ttyACM77"
         ("record out=x +record.x=1", "record has no x: it takes free, finish"),
         ("setup", "device.port is missing: add device.port=/dev/ttyACM0"),
         (
-            "setup device.port=socket://127.0.0.1:9 step=wait",
             "there is no step=wait: give one of board, values, skin,",
         ),
         ("train trainer.max_epochs=0.5", "trainer.max_epochs=0.5 must be a whole number from 1 up"),

@@ -219,8 +219,8 @@ class Watch:
 
 _COMPARED = 9  # thicknesses; a spline joins what is known of them
 _TEMPER = 0.25
-"""Power of likelihoods: touches repeat, and operators err by up to 1.5 %. On touches of other seeds than
-those of the published figures, the deviation of the thickness is then 1 to 2.5 times its error."""
+"""Power of likelihoods: touches repeat, and operators err by up to 1.5 %. On the touches that chose it
+(seed 7 of the contact study), the deviation of the thickness is then 1 to 2.5 times its error."""
 _FEW = 20  # touches below which no other thickness is stated
 
 

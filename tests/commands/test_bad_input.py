@@ -60,7 +60,6 @@ PORT = "device.port=/dev/ttyACM77"
         ("record out=x device.silence=-1", "device.silence=-1 must be greater than or equal to 0"),
         ("record out=x +record.x=1", "record has no x: it takes free, finish"),
         ("setup", "device.port is missing: add device.port=/dev/ttyACM0"),
-        ("there is no step=wait: give one of board, values, skin,",),
         ("train trainer.max_epochs=0.5", "trainer.max_epochs=0.5 must be a whole number from 1 up"),
     ],
 )

@@ -13,6 +13,7 @@ from time import monotonic, sleep
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
 
 from skin.core.files import ROOT
 from skin.wire.protocol import Header, encode_header, encode_line
@@ -98,10 +99,14 @@ def test_a_dangerous_press_turns_the_page_red_and_a_replugged_skin_heals_it(begi
 
 @pytest.mark.slow("starts a live view of the simulator")
 def test_the_simulator_is_watched_without_hardware(run, store, tmp_path):
-    live = run(tmp_path, "live.py", "seconds=5", *store, store=False)
+    path = tmp_path / "live.mcap"
+    live = run(tmp_path, "live.py", "seconds=5", f"live.record={path}", *store, store=False)
     assert live.returncode == 0, live.stderr
     assert re.search(r"\d+ verdicts, 10\.0 Hz", live.stderr)
     assert json.loads(live.stdout.splitlines()[0])["event"] == "started"
+    with path.open("rb") as file:
+        topics = {channel.topic for _, channel, _ in make_reader(file).iter_messages()}
+    assert topics == {"/skin/readings", "/skin/verdict", "/skin/contacts"}
 
 
 @pytest.mark.parametrize(

@@ -96,7 +96,8 @@ def decide_touches(
             its first peak, a third of all, bring above it, the others are left out. No score is then higher
             than that of all decisions.
     """
-    device = device.replace(padded=False, stream=False)
+    # The live view tares. Untared, offsets hold the contact until little of a touch is left in the window.
+    device = device.replace(padded=False, stream=False, tare=True)
     parts = list[tuple[Tensor, ...]]()
     weigh = geometry.footprints if device.model.smooth else AbstractBody.footprints
     footprints = torch.from_numpy(weigh(device.body, device.sensors)).float()

@@ -360,6 +360,12 @@ def test_no_score_of_a_part_of_the_decisions_is_higher_and_the_alarms_are_the_sa
     assert (part < enough).any()
 
 
+def test_touches_are_tared_as_in_the_live_view(drawn):
+    """Offsets held the contact long after a touch: what was left of it in the window looked like a tap."""
+    offset = [decide(drawn.replace(offset=newtons, tare=False), Largest(), 100.0) for newtons in (0.0, 0.5)]
+    assert torch.allclose(*offset, atol=1e-4)
+
+
 def test_one_decision_raises_more_alarms_than_two_and_a_slow_device_needs_one(drawn):
     two, one = (decide(drawn, Onset(), 100.0, patience=patience) for patience in (0.1, 0))
     assert (one >= two).all()

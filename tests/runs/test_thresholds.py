@@ -26,13 +26,13 @@ EXPECTED = {
     "adapt profile": 0.74935,
     "train profile": 0.95305,
     "shipped": 1.0,
-    "drawn": 0.38308,
-    "live": [0.85659],
-    "live profile": [0.81568],
-    "live rate": [0.50659],
-    "export": [0.89434, 0.94341, 0.94022],
-    "export drawn": [0.91675],
-    "written": [0.93601, 1.0, 0.94341, 0.94022, 0.58056, 1.0],
+    "drawn": 0.3427,
+    "live": [0.99511],
+    "live profile": [0.83851],
+    "live rate": [0.51107],
+    "export": [0.97152, 0.98918, 0.99129],
+    "export drawn": [0.92096],
+    "written": [0.93601, 1.0, 1.0, 1.0, 0.43095, 0.92096],
 }
 
 

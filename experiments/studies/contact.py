@@ -6,6 +6,7 @@ simulator of the configuration. Touches that raise no sensor above three standar
 left out.
 """
 
+import math
 import time
 from collections.abc import Sequence
 from copy import copy
@@ -20,6 +21,7 @@ import pandas as pd
 import torch
 from annotated_types import Ge, Gt, MinLen
 from scipy.optimize import linear_sum_assignment
+from scipy.special import softmax
 from scipy.stats import binomtest
 
 from experiments.laws.references import Discs, Slab
@@ -32,7 +34,7 @@ from skin.core.settings import RISING
 from skin.device.simulated import Simulated
 from skin.errors import InputError
 from skin.inference.candidates import FingertipPrior, disc_readings
-from skin.inference.likelihood import Observation
+from skin.inference.likelihood import Forces, Observation, fit_force, integrate_force
 from skin.inference.mechanics import Mechanics
 from skin.inference.noise import Noise
 from skin.inference.posterior import FrameEstimate, Posterior
@@ -44,7 +46,8 @@ from skin.touch.shapes import Shapes
 
 _COLUMNS = (
     "rms_mm", "median_mm", "force_median_%", "peak_median_%", "peak_covered_%", "covered_%", "covered_low_%",
-    "covered_high_%", "area_median_mm2", "grid_rms_mm", "grid_force_median_%", "ms_median", "ms_p99",
+    "covered_high_%", "area_median_mm2", "direction_median_deg", "grid_rms_mm", "grid_median_mm",
+    "grid_force_median_%", "grid_direction_median_deg", "ms_median", "ms_p99",
 )  # fmt: skip
 
 
@@ -65,7 +68,8 @@ class Contact:
         thickness: range that the posterior learns from.
         counted: touches of a stream that count, from one up to another one, where the posterior learns. Each
             stream begins with the described thickness.
-        grid: whether to compare with the posterior on a grid (:func:`grid_errors`).
+        friction: largest tangential force as a fraction of the force; fractions up to it are equally likely.
+        grid: m, pitch of the grid whose posterior is compared (:func:`grid_errors`); 0: none.
         seed: of the touches, with the name of the condition.
     """
 
@@ -81,7 +85,8 @@ class Contact:
     actual: Sequence[Any] = ()
     thickness: Annotated[tuple[float, float], RISING] = (1.0, 1.0)
     counted: Annotated[tuple[int, int], RISING] = (19, 50)
-    grid: bool = False
+    friction: Annotated[float, Ge(0)] = 0.0
+    grid: Annotated[float, Ge(0)] = 0.0
     seed: Annotated[int, Ge(0)] = 0
 
     def __call__(self, subject: Subject) -> pd.DataFrame:
@@ -90,7 +95,7 @@ class Contact:
         body, sensors = device.body, device.sensors
         assert isinstance(body, Sheet)
         prior, noise = (
-            FingertipPrior(force=self.force),
+            FingertipPrior(force=self.force, friction=self.friction),
             Noise(0.05, 10, self.gain, self.clip, 0, self.position, self.thickness),
         )
         rng = np.random.default_rng([self.seed, *subject.condition.encode()])
@@ -99,15 +104,15 @@ class Contact:
         if self.number:
             touched = Sheet(body.size, body.cells, self.actual) if self.actual else body  # type: ignore[arg-type]
             shift[:, 2] = touched.thickness - body.thickness
-            exact = ExactSkin(touched, Sensors(sensors.positions + shift, sensors.footprint), prior)
+            exact = ExactSkin(touched, replace(sensors, positions=sensors.positions + shift), prior)
             contacts = self._draw_contacts(body, prior, 3 * count, rng)
-            flat = contacts.reshape(-1, 4)
-            forces = exact.readings(flat[:, :3]) * flat[:, 3:]
+            flat = contacts.reshape(-1, contacts.shape[2])
+            forces = flat[:, None, 3:] @ exact.readings(flat[:, :3], float(self.friction > 0))
             true = forces.reshape(*contacts.shape[:2], -1).sum(1)
         else:
             true = press_hands(device, 2 * count, rng)
             contacts = np.zeros((len(true), 0, 4))
-        chosen = np.flatnonzero((true > 3 * noise.frame).any(1))[:count]
+        chosen = np.flatnonzero((np.abs(true) > 3 * noise.frame).any(1))[:count]
         gains, scatter = 1 + noise.gain * rng.standard_normal(true.shape[1]), np.sqrt(noise.floor)
         readings = gains * true[chosen] + scatter * rng.standard_normal((len(chosen), len(sensors)))
         posterior = Posterior(device.model, noise, body, prior)
@@ -127,18 +132,19 @@ class Contact:
         counted = np.arange(len(readings)) % length >= first
         figures = summarise_estimates([*compress(estimates, counted)], contacts[chosen][counted], prior)
         if exact and self.grid:
-            figures |= grid_errors(exact, body, noise, prior, readings, contacts[chosen, 0])
+            figures |= grid_errors(exact, body, noise, prior, readings, contacts[chosen, 0], self.grid)
         times = 1e3 * np.quantile(seconds, [0.5, 0.99])
         figures |= {"ms_median": float(times[0]), "ms_p99": float(times[1])}
         texts = {
-            key: f"{each:.4g}" if isinstance(each, float) else str(each) for key, each in figures.items()
+            key: f"{each:.4g}".replace("nan", "") if isinstance(each, float) else str(each)
+            for key, each in figures.items()
         }
         return pd.DataFrame([{"row": subject.condition} | texts])
 
     def _draw_contacts(
         self, body: AbstractBody, prior: FingertipPrior, count: int, rng: np.random.Generator
     ) -> np.ndarray:
-        """Return contacts (count, number, 4): x, y, radius, m, and force, N."""
+        """Return contacts (count, number, 4 or 6): x, y, radius, m, force, N; with friction along x and y."""
         touches, size = list[np.ndarray](), np.array(body.size)
         while len(touches) < count:
             positions = self.margin + (size - 2 * self.margin) * rng.random((self.number, 2))
@@ -153,6 +159,10 @@ class Contact:
                 radius = rng.uniform(*prior.radii, self.number)
                 force = prior.force * np.exp(prior.spread * rng.standard_normal(self.number))
                 touches.append(np.column_stack([positions, radius, force]))
+                if self.friction:
+                    pull = self.friction * rng.random(self.number) * force
+                    pull = pull * np.exp(2j * np.pi * rng.random(self.number))
+                    touches[-1] = np.column_stack([touches[-1], pull.real, pull.imag])
         return np.array(touches)
 
 
@@ -164,7 +174,7 @@ class ExactSkin:
 
     Args:
         body: its layers count.
-        sensors: at one depth, with square footprints.
+        sensors: at one depth, facing the surface, with square footprints.
         prior: of the fingertips.
     """
 
@@ -182,11 +192,18 @@ class ExactSkin:
         depth, reach = float(sensors.positions[0, 2]), float(np.hypot(*body.size))
         self._discs = Discs(slabs, depth, prior.radii, reach, self._rims.tolist())
 
-    def readings(self, fingertips: np.ndarray) -> np.ndarray:
-        """Return the readings (N, S), N/N, of fingertips (N, 3) of 1 N: x, y and radius, m."""
+    def readings(self, fingertips: np.ndarray, friction: float = 0.0) -> np.ndarray:
+        """Return the readings (N, L, S), N/N, of fingertips (N, 3) of 1 N: x, y and radius, m.
+
+        They are those of the force into the skin (L = 1) and, if ``friction`` is above 0, of that many
+        newtons along x, and along y (L = 3).
+        """
         area = np.pi * np.square((fingertips[:, 2:] + self._rims).clip(min=0)).mean(1, keepdims=True)
-        side = self._sensors.footprint[0]
-        return self._discs.forces(fingertips, self._sensors.positions[:, :2], side) / area
+        side, axes = self._sensors.footprint[0], self._sensors.axes
+        places, parts = self._sensors.positions[::axes, :2], np.array_split(fingertips, len(area) // 500 + 1)
+        forces = np.concatenate([self._discs.tractions(part, places, side)[:, :, -axes:] for part in parts])
+        loads = forces.reshape(len(area), -1, 3).transpose(0, 2, 1) / area[..., None]
+        return loads[:, [2, 0, 1]] * np.array([[1], [friction], [friction]]) if friction else loads[:, 2:]
 
 
 def press_hands(device: Simulated, count: int, rng: np.random.Generator) -> np.ndarray:
@@ -209,6 +226,7 @@ def grid_errors(
     prior: FingertipPrior,
     readings: np.ndarray,
     truth: np.ndarray,
+    pitch: float,
 ) -> dict[str, Any]:
     """Return the figures of the best posterior that is known: on all positions of a grid, by the exact skin.
 
@@ -218,26 +236,38 @@ def grid_errors(
         noise: of the readings.
         prior: of the contacts.
         readings: (B, S), N.
-        truth: contacts (B, 4): x, y, radius, m, and force, N.
+        truth: contacts (B, 4 or 6): x, y, radius, m, and forces, N.
+        pitch: of the grid, m.
     """
-    x, y = (np.arange(0.0005, side, 0.001) for side in body.size)
-    radii, score = np.linspace(*prior.radii, 9), np.linspace(-5, 5, 101)
-    grid = np.stack(np.meshgrid(x, y, radii, indexing="ij"), -1).reshape(-1, 3)
-    table, force = skin.readings(grid), prior.force * np.exp(prior.spread * score)
-    square = (table**2).sum(1) / noise.floor
-    means = []
+    x, y = (np.arange(pitch / 2, side, pitch) for side in body.size)
+    grid = np.stack(np.meshgrid(x, y, np.linspace(*prior.radii, 9), indexing="ij"), -1).reshape(-1, 3)
+    friction = (prior.friction or 0.0) / math.sqrt(6)
+    table, works = skin.readings(grid, friction).astype(np.float32), np.ones(readings.shape[1], dtype=bool)
+    none, means = np.zeros((len(table), table.shape[2]), np.float32), list[np.ndarray]()
     for values in readings:
-        along = table @ values / noise.floor
-        best = along.clip(min=0) ** 2 / square / 2
-        likely = np.flatnonzero(best > best.max() - 25)
-        fit = np.outer(along[likely], force) - np.outer(square[likely], force**2) / 2
-        mass = np.exp(fit - score**2 / 2 - fit.max())
-        mass /= mass.sum()
-        means.append([*(mass.sum(1) @ grid[likely, :2]), mass.sum(0) @ force])
+        frame = Observation.of(values, works, ~works, noise)
+        fit, evidence = fit_force(frame, prior, table, none)
+        likely = np.flatnonzero(evidence > evidence.max() - 20)
+        fit = Forces(*(part[likely] for part in fit))
+        force, logs, tangent, _ = integrate_force(frame, prior, table[likely], none[likely], fit)
+        weight = softmax(logs)
+        sides = friction * np.einsum("nj,njk->k", weight * force, tangent)
+        means.append(np.array([*(weight.sum(1) @ grid[likely, :2]), (weight * force).sum(), *sides]))
     estimates = np.array(means)
-    position = 1e3 * float(np.sqrt(np.square(estimates[:, :2] - truth[:, :2]).mean()))
-    relative = np.abs(estimates[:, 2] / truth[:, 3] - 1)
-    return {"grid_rms_mm": position, "grid_force_median_%": 100 * float(np.median(relative))}
+    away = estimates[:, :2] - truth[:, :2]
+    return {
+        "grid_rms_mm": 1e3 * float(np.sqrt(np.square(away).mean())),
+        "grid_median_mm": 1e3 * float(np.median(np.hypot(*away.T))),
+        "grid_force_median_%": 100 * float(np.median(np.abs(estimates[:, 2] / truth[:, 3] - 1))),
+        "grid_direction_median_deg": float(pd.Series(map(turned, estimates[:, 3:], truth[:, 4:])).median()),
+    }
+
+
+def turned(estimated: np.ndarray | None, true: np.ndarray) -> float:
+    """Return the angle between forces along the skin (2,), N, degrees; NaN if the true one is below 0.5 N."""
+    if estimated is None or len(true) < 2 or np.hypot(*true) < 0.5:
+        return np.nan
+    return abs(float(np.degrees(np.angle(complex(*estimated) / complex(*true)))))
 
 
 def summarise_estimates(
@@ -258,7 +288,7 @@ def summarise_estimates(
         centres = np.array([contact.position for contact in estimate.contacts])
         distances = np.linalg.norm(centres[:, None] - truths[:, :2], axis=2)
         for index, true in zip(*linear_sum_assignment(distances**2), strict=True):
-            contact, (*position, radius, force) = estimate.contacts[index], truths[true]
+            contact, (*position, radius, force) = estimate.contacts[index], truths[true, :4]
             region, pressure = contact.region(), force * prior.peak(radius)
             low, high = contact.peak_interval
             row = {
@@ -269,6 +299,7 @@ def summarise_estimates(
                 "within": low < pressure < high,
                 "covered": region.contains(np.array(position)),
                 "area": region.area,
+                "direction": turned(contact.tangential, truths[true, 4:]),
             }
             rows.append(row)
     if not rows:
@@ -279,6 +310,7 @@ def summarise_estimates(
     numbers = (
         1e3 * np.sqrt(mean.square), 1e3 * median.distance, 100 * median.force, 100 * median.peak,
         100 * mean.within, 100 * mean.covered, 100 * interval.low, 100 * interval.high, 1e6 * median.area,
+        median.direction,
     )  # fmt: skip
     return figures | dict(zip(_COLUMNS, map(float, numbers), strict=False))
 
@@ -341,10 +373,9 @@ class Strip:
     gains: np.ndarray
     error: np.ndarray
 
-    def readings(self, x: np.ndarray, radius: float | np.ndarray | None = None) -> np.ndarray:
+    def readings(self, x: np.ndarray) -> np.ndarray:
         """Return simulated readings (N, 4) of the tip with 1 N at positions (N,) of the robot, mm."""
-        size = self.radius if radius is None else radius
-        return strip_readings(self.body, self.simulator, x / 1e3 + self.offset, size)
+        return strip_readings(self.body, self.simulator, x / 1e3 + self.offset, self.radius)
 
     def moved(self, x: np.ndarray, measured: np.ndarray) -> "Strip":
         """Return the strip at the position below the robot with which measured readings (P, 4) agree best."""

@@ -25,9 +25,13 @@ _NOTE = (
 _WIDE = ("raised\nmm", "radius\nmm", "reach\nmm", "local precision\nmm")  # no room in the table of a sweep
 
 
-def print_expected(findings: Sequence[Findings]) -> None:
-    """Print a line per force; the reach is the receptive radius."""
-    _print([_cells(finding) for finding in findings])
+def print_expected(expected: Sequence[Findings], normal: Sequence[Findings] = ()) -> None:
+    """Print a line per force; of three axes, those of the normal ones alone follow."""
+    axes = ["three"] * len(expected) + ["normal"] * len(normal)
+    rows = [
+        {"axes": name} | _cells(finding) for name, finding in zip(axes, [*expected, *normal], strict=True)
+    ]
+    _print([{key: row[key] for key in row if key not in (_WIDE[2:] if normal else "axes")} for row in rows])
 
 
 _LONGER = 20  # cells of the map along its longer side: it fits on a screen

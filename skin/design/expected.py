@@ -17,7 +17,7 @@ from rich.progress import track
 from scipy.stats.qmc import Halton
 from torch import Tensor
 
-from skin.body.base import AbstractBody, Layer
+from skin.body.base import AbstractBody, Layer, Sensors
 from skin.body.layout import Footprint, Grid
 from skin.body.material import Material
 from skin.core.files import json_text, write
@@ -27,7 +27,7 @@ from skin.device.base import AbstractDevice
 from skin.errors import InputError
 from skin.inference.candidates import CandidateReadings, FingertipPrior, disc_readings
 from skin.inference.contact import Cloud, blur_first, one_contact
-from skin.inference.likelihood import Observation
+from skin.inference.likelihood import Observation, blend
 from skin.inference.noise import Noise
 from skin.mechanics.geometry import PARAMETERS, Fingertip
 from skin.mechanics.simulator.base import AbstractSimulator
@@ -38,6 +38,8 @@ _UNITS = {
     **dict.fromkeys(("forces", "noise", "clip"), "_N"),
     "gain": "_relative",
 }
+
+_FRICTION = 0.8  # of touches on three axes, and of those on their normal ones alone
 
 Lengths = Annotated[tuple[PositiveFloat, PositiveFloat], RISING]
 
@@ -186,7 +188,7 @@ def try_touches(
     valid = np.ones(readings.shape[1], bool)
     frames = (Observation.of(frame, valid, frame >= noise.clip, noise) for frame in measured)
     moments = [_moments(one_contact(candidates, prior, frame, first)) for frame in frames]
-    raised = noise.exceeds(torch.from_numpy(readings)).numpy()
+    raised = noise.exceeds(torch.from_numpy(readings).abs()).numpy()
     return Trials(touches, raised, *(np.array(part) for part in zip(*moments, strict=True)))
 
 
@@ -239,21 +241,22 @@ class ExpectedPosterior:
         from skin.design.drawing import draw_expected, print_blind_places, print_expected
 
         simulator = skin.simulator(skin.body, skin.sensors)
-        trials = self.trials(simulator, skin.body)
-        findings = self.find(simulator, skin.body, trials)
-        print_expected(findings)
+        trials, facing = self.trials(simulator, skin.body), skin.sensors
+        found = {"expected": self.find(simulator, skin.body, trials)}
+        if facing.axes > 1:
+            facing = Sensors(facing.positions[2::3], facing.footprint, facing.normals[2::3])
+            normal = skin.simulator(skin.body, facing)
+            found["normal"] = self.find(normal, skin.body, self.trials(normal, skin.body, _FRICTION))
+        print_expected(**found)
         print_blind_places(
             skin.body,
-            skin.sensors,
+            facing,
             self.forces,
             lambda places: self.count_unfelt(simulator, skin.body, places),
         )
         settings = {name + _UNITS.get(name, ""): value for name, value in asdict(self).items()}
-        content = {
-            "sensors": len(skin.sensors),
-            "settings": settings,
-            "expected": list(map(asdict, findings)),
-        }
+        tables = {name: list(map(asdict, findings)) for name, findings in found.items()}
+        content = {"sensors": len(skin.sensors), "settings": settings} | tables
         maps = {force: self.expected_map(trial, skin.body) for force, trial in trials.items()}
         print(
             write(json_text(content), folder / "design.json"),
@@ -261,24 +264,33 @@ class ExpectedPosterior:
             sep="\n",
         )
 
-    def trials(self, simulator: AbstractSimulator, body: AbstractBody) -> dict[float, Trials]:
+    def trials(
+        self, simulator: AbstractSimulator, body: AbstractBody, friction: float | None = None
+    ) -> dict[float, Trials]:
         """Return what the posterior tells of touches around each force, N.
+
+        Args:
+            simulator, body: of the skin.
+            friction: of the touches, unknown to the posterior (:class:`FingertipPrior`).
 
         Raises:
             InputError: the margin leaves no position.
         """
         positions = self.sample(body)
-        priors = {force: FingertipPrior(force, radii=self.radii, rim=self.rim) for force in self.forces}
-        candidates = CandidateReadings(simulator, body, next(iter(priors.values())))
-        responses = disc_readings(simulator, body, positions, self.rim)
+        prior = FingertipPrior(radii=self.radii, rim=self.rim, friction=friction)
+        priors = {force: replace(prior, force=force) for force in self.forces}
+        candidates = CandidateReadings(simulator, body, prior)
+        loads = disc_readings(simulator, body, positions, self.rim, candidates.friction)
+        loads = loads.reshape(len(positions), -1, candidates.sensors)
         trials = dict[float, Trials]()
         for number, (force, prior) in enumerate(priors.items()):
             rng = generator(Stream.DESIGN, self.seed, number)
             drawn = force * np.exp(prior.spread * rng.standard_normal(len(positions)))
             touches = np.column_stack([positions, drawn])
-            trials[force] = try_touches(
-                candidates, prior, self._noise, touches, responses * drawn[:, None], rng
+            true = (
+                drawn[:, None] * blend(loads, rng.standard_normal((len(loads), 1, loads.shape[1] - 1)))[:, 0]
             )
+            trials[force] = try_touches(candidates, prior, self._noise, touches, true, rng)
         return trials
 
     def find(

@@ -162,9 +162,10 @@ class CandidateReadings:
         sensors: S, their number.
         friction: standard deviation of the tangential force along x and along y per newton; 0: without.
         boxes: the first boxes, which cover the surface and the radii.
-        readings: (N, L S), N/N, in their centres, float32: of the force into the skin (L = 1), followed with
-            friction (L = 3) by those of a tangential force of a standard deviation along x and along y.
-        slopes: (N, 3, L S), their derivatives, N/N/m, float32.
+        rows: (N, 4, L, S), float32: readings in their centres, N/N, and their derivatives by position and
+            radius, N/N/m; those of the force into the skin (L = 1), followed with friction (L = 3) by those
+            of a tangential force of a standard deviation along x, and along y.
+        readings: (N, L, S), the first of them.
     """
 
     def __init__(
@@ -183,8 +184,9 @@ class CandidateReadings:
         self._tabulate()
 
     def _tabulate(self) -> None:
-        self.readings, self.slopes = (np.ascontiguousarray(part) for part in self.at(self.boxes.centre))
-        self.sensors = self.readings.shape[1] // (3 if self.friction else 1)
+        self.rows = self.at(self.boxes.centre)
+        self.readings = np.ascontiguousarray(self.rows[:, 0])
+        self.sensors = self.readings.shape[2]
 
     @staticmethod
     def mixed(parts: "Sequence[CandidateReadings]", weights: np.ndarray) -> "CandidateReadings":
@@ -224,16 +226,22 @@ class CandidateReadings:
         centre = np.stack(np.meshgrid(y, x, radius, indexing="ij"), -1)[..., [1, 0, 2]].reshape(-1, 3)
         return Boxes(centre, np.broadcast_to(width, centre.shape).copy())
 
-    def at(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return readings (N, L S), N/N, and slopes (N, 3, L S), N/N/m, at x, y and radius (N, 3), m."""
+    def at(self, positions: np.ndarray) -> np.ndarray:
+        """Return rows (N, 4, L, S) at x, y and radius (N, 3), m."""
         patch = np.clip((positions[:, :2] / self._patch).astype(int), 0, self._counts - 1)
         across, down = (2 * (positions[:, :2] / self._patch - patch) - 1).T
         half = self.span / 2
         wide = (positions[:, 2] - self.radii[0]) / half - 1
         scales = (2 / self._patch[0], 2 / self._patch[1], 1 / half)
         powers = _monomials(across, down, wide, scales)
-        predicted = np.matmul(powers, self._coefficients[patch[:, 1] * self._counts[0] + patch[:, 0]])
-        return predicted[:, 0], predicted[:, 1:]
+        number = patch[:, 1] * self._counts[0] + patch[:, 0]
+        rows = np.empty((len(number), 4, self._coefficients.shape[2]), np.float32)
+        # Positions on one patch share its coefficients, which are larger than what is computed.
+        order = np.argsort(number, kind="stable")
+        for same in np.split(order, np.flatnonzero(np.diff(number[order])) + 1):
+            if len(same):
+                rows[same] = powers[same] @ self._coefficients[number[same[0]]]
+        return rows.reshape(len(rows), 4, 3 if self.friction else 1, -1)
 
 
 def _monomials(

@@ -2,11 +2,11 @@
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.special import log_ndtr
+from scipy.special import log_ndtr, logsumexp
 
 from skin.inference.candidates import Boxes, CandidateReadings, FingertipPrior
 from skin.inference.likelihood import (
@@ -15,15 +15,16 @@ from skin.inference.likelihood import (
     blend,
     fit_force,
     integrate_force,
+    invert_on_prior,
     refit_force,
-    relative_variance,
-    sum_loads,
+    spread_readings,
 )
 from skin.inference.noise import Noise
 
 _LENGTH = 1.8  # a box is split along an axis that is longer, in standard deviations
 _DROPPED = 1e-7  # estimated probability that a refinement may lose; 1e-6 makes forces 5 % too narrow
-_MOST = 500  # boxes
+_REST = 1e-5  # the same of the boxes in the end
+_MOST, _FEW = 500, 64  # boxes, and those of a contact that does not matter
 _ROUNDS = 12
 _FORCE_STEP = 0.5  # largest change of the logarithm of the force over a box
 _RADIUS_STEP = 0.3  # largest fraction of the radii in a box
@@ -63,23 +64,21 @@ class _Leaves(NamedTuple):
 
     Attributes:
         boxes: N of them.
-        readings: (N, L S), N/N.
-        slopes: (N, 3, L S), their derivatives by position and radius, N/N/m.
+        rows: (N, 4, L, S), as of :meth:`skin.inference.candidates.CandidateReadings.at`.
         spread: (N, S), variance from gains, thickness and positions per square newton.
         forces: of the boxes.
         evidence: (N,), log of the probability in a box.
     """
 
     boxes: Boxes
-    readings: np.ndarray
-    slopes: np.ndarray
+    rows: np.ndarray
     spread: np.ndarray
     forces: Forces
     evidence: np.ndarray
 
-    def rows(self, rows: np.ndarray) -> "_Leaves":
+    def take(self, which: np.ndarray) -> "_Leaves":
         """Return some of the boxes."""
-        return _each(lambda values: values[rows], self)
+        return _each(lambda values: values[which], self)
 
     @staticmethod
     def join(parts: "Sequence[_Leaves]") -> "_Leaves":
@@ -98,8 +97,7 @@ def _each(change: Callable[..., np.ndarray], *parts: Any) -> Any:
 
 def blur_first(candidates: CandidateReadings, noise: Noise) -> tuple[np.ndarray, np.ndarray]:
     """Return the relative variance of the first boxes, without and with their width; common to all frames."""
-    spread = relative_variance(noise, candidates.readings, candidates.slopes, candidates.sensors)
-    return spread, _blurred(candidates.boxes, candidates.slopes, spread, candidates.sensors)
+    return spread_readings(noise, candidates.rows, candidates.boxes.width)
 
 
 def one_contact(
@@ -107,6 +105,7 @@ def one_contact(
     prior: FingertipPrior,
     frame: Observation,
     first: tuple[np.ndarray, np.ndarray] | None = None,
+    least: float = -math.inf,
 ) -> Cloud:
     """Return the posterior of one contact.
 
@@ -115,17 +114,22 @@ def one_contact(
         prior: of the contact.
         frame: the frame.
         first: of :func:`blur_first` for the noise of the frame; None: it is computed.
+        least: log evidence below which a contact does not matter: the best of the first boxes stand for it.
     """
     spread, blurred = first or blur_first(candidates, frame.noise)
     boxes = candidates.boxes
     forces, evidence = fit_force(frame, prior, candidates.readings, blurred)
     # The first boxes have the same width.
     evidence = evidence + math.log(boxes.width[0].prod())
-    active = _Leaves(boxes, candidates.readings, candidates.slopes, spread, forces, evidence)
+    active = _Leaves(boxes, candidates.rows, spread, forces, evidence)
     leaves = list[_Leaves]()
+    whole = float(logsumexp(evidence) - np.log(np.prod(candidates.size) * candidates.span))
+    if whole < least:
+        best = active.take(np.argsort(-evidence, kind="stable")[:_FEW])
+        return replace(_weigh(candidates, frame, prior, best), evidence=whole)
     for _ in range(_ROUNDS):
-        kept = _probable(active.evidence, [part.evidence for part in leaves])
-        active = active.rows(kept)
+        kept = _probable(active.evidence, [part.evidence for part in leaves], _DROPPED)
+        active = active.take(kept)
         _, information, turn = _expand(frame, prior, active)
         lengths = np.sqrt(np.maximum(np.diagonal(information, axis1=1, axis2=2), 0)) * active.boxes.width
         lengths = np.maximum(lengths, np.abs(turn) * active.boxes.width * (_LENGTH / _FORCE_STEP))
@@ -138,41 +142,29 @@ def one_contact(
         split = cut.any(1)
         if len(kept) > _MOST or not split.any():
             break
-        leaves.append(active.rows(np.flatnonzero(~split)))
+        leaves.append(active.take(np.flatnonzero(~split)))
         old = Boxes(active.boxes.centre[split], active.boxes.width[split])
         boxes = old.split(cut[split])
-        active = _judge(frame, prior, boxes, *candidates.at(boxes.centre))
-    return _weigh(candidates, frame, prior, _Leaves.join([*leaves, active]))
+        active = _judge(frame, prior, boxes, candidates.at(boxes.centre))
+    every = _Leaves.join([*leaves, active])
+    return _weigh(candidates, frame, prior, every.take(_probable(every.evidence, [], _REST)))
 
 
-def _judge(
-    frame: Observation, prior: FingertipPrior, boxes: Boxes, readings: np.ndarray, slopes: np.ndarray
-) -> _Leaves:
+def _judge(frame: Observation, prior: FingertipPrior, boxes: Boxes, rows: np.ndarray) -> _Leaves:
     """Return boxes with their probability, as if each were blurred over its width."""
-    sensors = len(frame.readings)
-    spread = relative_variance(frame.noise, readings, slopes, sensors)
-    forces, evidence = fit_force(frame, prior, readings, _blurred(boxes, slopes, spread, sensors))
-    return _Leaves(boxes, readings, slopes, spread, forces, evidence + np.log(boxes.width.prod(1)))
+    spread, blurred = spread_readings(frame.noise, rows, boxes.width)
+    forces, evidence = fit_force(frame, prior, rows[:, 0], blurred)
+    return _Leaves(boxes, rows, spread, forces, evidence + np.log(boxes.width.prod(1)))
 
 
-def _blurred(boxes: Boxes, slopes: np.ndarray, spread: np.ndarray, sensors: int) -> np.ndarray:
-    """Return the variance (N, S) per square newton averaged over a box, which the box then represents."""
-    scaled = slopes * (boxes.width * math.sqrt(1 / 12)).astype(np.float32)[..., None]
-    scaled *= scaled
-    blurred = scaled[:, 0]
-    blurred += scaled[:, 1]
-    blurred += scaled[:, 2]
-    return sum_loads(blurred, sensors) + spread
-
-
-def _probable(evidence: np.ndarray, others: list[np.ndarray]) -> np.ndarray:
+def _probable(evidence: np.ndarray, others: list[np.ndarray], dropped: float) -> np.ndarray:
     """Return the indices of what holds nearly all probability, in their order, beside that of others."""
     top = max(float(part.max()) for part in [evidence, *others] if len(part))
     probability = np.exp(evidence - top)
     order = np.argsort(probability)
     lost = np.cumsum(probability[order], dtype=float)
     whole = lost[-1] + sum(float(np.exp(part - top).sum()) for part in others)
-    return np.sort(order[lost > _DROPPED * whole])
+    return np.sort(order[lost > dropped * whole])
 
 
 def _expand(
@@ -183,44 +175,31 @@ def _expand(
     Derivatives are by position and radius, at the most probable force, which depends on both: the last result
     is the derivative of its logarithm, (N, 3), 1/m.
     """
-    force, spread, tangent = np.exp(leaves.forces.mode), leaves.spread, leaves.forces.tangent
-    mean, *_ = tangent(force)
-    force, readings, slopes = (
-        force[:, None],
-        blend(leaves.readings, mean),
-        blend(leaves.slopes, mean[:, None]),
-    )
-    variance = np.float32(frame.noise.floor) + force * force * spread
-    weight = np.broadcast_to(frame.counts / variance, readings.shape)
-    pull = weight * (frame.readings - force * readings)
+    rows, force = leaves.rows, np.exp(leaves.forces.mode)[:, None]
+    mean, *_ = leaves.forces.tangent(force)
+    loads = np.concatenate([np.ones((len(mean), 1, 1)), mean], axis=2)[:, None].astype(rows.dtype)
+    # The readings and their derivatives, then what the tangential force changes.
+    every = np.concatenate([(loads @ rows)[:, :, 0], rows[:, 0, 1:]], axis=1) * force[..., None]
+    predicted = every[:, 0]
+    variance = np.float32(frame.noise.floor) + force * force * leaves.spread
+    weight = frame.counts / variance
+    pull = weight * (frame.readings - predicted)
     if len(frame.clipped):
         # A sensor that clips is most informative where its predicted reading is near its limit.
         clipped = frame.clipped
-        deviation = np.broadcast_to(np.sqrt(variance), readings.shape)[:, clipped]
-        above = (force * readings[:, clipped] - np.float32(frame.noise.clip)) / deviation
+        deviation = np.sqrt(variance[:, clipped])
+        above = (predicted[:, clipped] - np.float32(frame.noise.clip)) / deviation
         hazard = np.exp(-0.5 * above**2 - log_ndtr(above)) / math.sqrt(2 * math.pi)
-        weight = weight.copy()
         weight[:, clipped], pull[:, clipped] = hazard * (hazard + above) / deviation**2, hazard / deviation
-    slope = np.vecdot(slopes, (force * pull)[:, None])
-    weighted = slopes * (force * force * weight)[:, None]
-    whole = np.vecdot(readings * readings, force * force * weight) + 1 / prior.spread**2
-    crossed = np.vecdot(weighted, readings[:, None])
+    left = (every[:, :4] @ pull[..., None])[..., 0]
+    gram = (every * weight[:, None]) @ every.transpose(0, 2, 1)
+    # The tangential force follows what changes, and then the force.
+    across = gram[:, :4, 4:]
+    gram = gram[:, :4, :4] - across @ invert_on_prior(gram[:, 4:, 4:])[0] @ across.transpose(0, 2, 1)
     distance = (leaves.forces.mode - math.log(prior.force)) / prior.spread**2
-    left = np.vecdot(readings, force * pull) - distance
-    information = np.matmul(weighted, slopes.transpose(0, 2, 1))
-    if mean.shape[1]:
-        # The tangential force follows what changes, too.
-        sides = leaves.readings[:, readings.shape[1] :].reshape(len(readings), 2, readings.shape[1])
-        along = np.matmul(weighted, sides.transpose(0, 2, 1))
-        own = np.vecdot(sides, (force * force * weight * readings)[:, None])
-        covariance = tangent(force[:, 0])[1]
-        followed = np.matmul(along, covariance)
-        information = information - np.matmul(followed, along.transpose(0, 2, 1))
-        crossed = crossed - np.vecdot(followed, own[:, None])
-        whole = whole - np.vecdot(np.matmul(covariance, own[..., None])[..., 0], own)
-    slope = slope - crossed * (left / whole)[:, None]
-    turn = -crossed / whole[:, None]
-    return slope, information + crossed[:, :, None] * turn[:, None], turn
+    turn = -gram[:, 1:, 0] / (gram[:, :1, 0] + 1 / prior.spread**2)
+    slope = left[:, 1:] + turn * (left[:, 0] - distance)[:, None]
+    return slope, gram[:, 1:, 1:] + gram[:, 1:, :1] * turn[:, None], turn
 
 
 def _average(
@@ -233,8 +212,7 @@ def _average(
     To second order, with a normal distribution in place of the uniform one over the box.
     """
     # In double precision: what the force explains is subtracted, and may be nearly all.
-    precise = leaves._replace(readings=leaves.readings.astype(float), slopes=leaves.slopes.astype(float))
-    slope, information, turn = _expand(frame, prior, precise)
+    slope, information, turn = _expand(frame, prior, leaves._replace(rows=leaves.rows.astype(float)))
     centre, width = leaves.boxes
     # In units of the standard deviation over a box.
     unit = width / math.sqrt(12)
@@ -255,8 +233,8 @@ def _weigh(
     candidates: CandidateReadings, frame: Observation, prior: FingertipPrior, leaves: _Leaves
 ) -> Cloud:
     """Return the posterior of boxes."""
-    _, readings, _, spread, blurred, _ = leaves
-    fit = refit_force(frame, prior, readings, spread, blurred.mode)
+    readings, spread = leaves.rows[:, 0], leaves.spread
+    fit = refit_force(frame, prior, readings, spread, leaves.forces.mode)
     leaves = leaves._replace(forces=fit)
     boxes, factor, further = _average(frame, prior, leaves)
     force, logs, tangent, variances = integrate_force(frame, prior, readings, spread, fit)
@@ -270,11 +248,12 @@ def _weigh(
     weight = np.exp(logs - top)
     total = weight.sum()
     weight /= total
-    middle, (mean, covariance, _) = np.exp(fit.mode)[:, None], fit.tangent(np.exp(fit.mode))
+    middle = np.exp(fit.mode)[:, None]
+    mean, covariance, _ = fit.tangent(middle)
     variance = frame.noise.floor + middle * middle * spread
-    misfit = ((frame.readings - middle * blend(readings, mean)) ** 2 / variance) @ frame.counts
+    misfit = ((frame.readings - middle * blend(readings, mean)[:, 0]) ** 2 / variance) @ frame.counts
     # Each parameter that readings determine and that is integrated misses by a variance.
-    misfit += 1 + mean.shape[1] - np.trace(covariance, axis1=1, axis2=2)
+    misfit += 1 + mean.shape[2] - np.trace(covariance[:, 0], axis1=1, axis2=2)
     extent = float(np.prod(candidates.size) * candidates.span)
     evidence = float(top + math.log(total) - math.log(extent))
     sides = side * tangent, side**2 * variances

@@ -11,7 +11,7 @@ from scipy.special import ndtr, ndtri
 from scipy.stats.qmc import Sobol
 
 from skin.inference.candidates import CandidateReadings, FingertipPrior
-from skin.inference.likelihood import Observation, blend, fit_residual
+from skin.inference.likelihood import Observation, fit_residual
 
 _STEPS = 12  # of Gauss-Newton
 _LONGEST = 0.01, 0.01, 1, 2, 2, 2  # step
@@ -83,7 +83,7 @@ class Search:
         counts = np.ceil(size / _LATTICE).astype(int)
         x, y = ((np.arange(count) + 0.5) * side / count for count, side in zip(counts, size, strict=True))
         self._positions = np.stack(np.meshgrid(x, y, [sum(radii) / 2], indexing="ij"), -1).reshape(-1, 3)
-        self._lattice = np.ascontiguousarray(candidates.at(self._positions)[0][:, : candidates.sensors])
+        self._lattice = np.ascontiguousarray(candidates.at(self._positions)[:, 0, 0])
 
     @cached_property
     def _normal(self) -> np.ndarray:
@@ -99,15 +99,14 @@ class Search:
         """Return readings (M, S), N, and their derivatives (M, P n, S) by position and scores."""
         count, number, size = guess.shape
         positions, force, stretch = self._positions_of(guess.reshape(-1, size))
-        readings, slopes = self.candidates.at(positions)
-        tangent, sensors = guess.reshape(-1, size)[:, 4:], self.candidates.sensors
-        predicted = force[:, None] * blend(readings, tangent)
-        columns = np.empty((len(positions), size, sensors))
-        np.multiply(force[:, None, None], blend(slopes, tangent[:, None]), out=columns[:, :3])
+        rows = force[:, None, None, None] * self.candidates.at(positions)
+        loads = np.pad(guess.reshape(-1, size)[:, 4:], [(0, 0), (1, 0)], constant_values=1)
+        blended = (loads[:, None, None] @ rows)[:, :, 0]
+        predicted = blended[:, 0]
+        columns = np.empty((len(positions), size, predicted.shape[1]))
+        columns[:, :3], columns[:, 4:] = blended[:, 1:], rows[:, 0, 1:]
         columns[:, 2] *= stretch[:, None]
         columns[:, 3] = self.prior.spread * predicted
-        sides = readings[:, sensors:].reshape(len(positions), size - 4, sensors)
-        np.multiply(force[:, None, None], sides, out=columns[:, 4:])
         return predicted.reshape(count, number, -1).sum(1), columns.reshape(count, size * number, -1)
 
     def _positions_of(self, guess: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

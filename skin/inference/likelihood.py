@@ -67,27 +67,27 @@ class Observation:
         return log_ndtr((predicted - np.float32(self.noise.clip)) / deviation).sum(-1)
 
 
-# Friction. Readings (..., 3 S) hold those of the force into the skin, and of a tangential force of a standard
-# deviation along x and along y. Given position and force, the tangential force is normal: it is integrated.
-
-
-def sum_loads(squares: np.ndarray, sensors: int) -> np.ndarray:
-    """Return the mean squares (..., S) over tangential forces, of squares (..., S) or (..., 3 S)."""
-    return squares.reshape(*squares.shape[:-1], squares.shape[-1] // sensors, sensors).sum(-2)
+# Friction. Readings (..., L, S) are those of the force into the skin (L = 1) and, with friction (L = 3), of a
+# tangential force of a standard deviation along x and along y. Given position and force, the tangential force
+# is normal: it is integrated.
 
 
 def blend(readings: np.ndarray, tangent: np.ndarray) -> np.ndarray:
-    """Return readings (..., S) under tangential forces (..., 2), in standard deviations, or (..., 0)."""
-    if not tangent.shape[-1]:
-        return readings
-    inwards, x, y = np.moveaxis(readings.reshape(*readings.shape[:-1], 3, readings.shape[-1] // 3), -2, 0)
-    return inwards + tangent[..., :1] * x + tangent[..., 1:] * y
+    """Return readings (N, J, S), of (N, L, S), under tangential forces (N, J, L - 1), in their deviations."""
+    return readings[:, :1] + tangent.astype(readings.dtype) @ readings[:, 1:]
 
 
-def relative_variance(noise: Noise, readings: np.ndarray, slopes: np.ndarray, sensors: int) -> np.ndarray:
-    """Return the variance (N, S) from gains, thickness and positions, per square newton of force."""
-    moved = np.float32(noise.position**2) * sum_loads(slopes[:, 0] ** 2 + slopes[:, 1] ** 2, sensors)
-    return np.float32(noise.relative**2) * sum_loads(readings**2, sensors) + moved
+def spread_readings(noise: Noise, rows: np.ndarray, width: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return variances (N, S) per square newton of force, of candidates with rows (N, 4, L, S).
+
+    The first is that of gains, thickness and positions; the second adds that over boxes of a width (N, 3), m,
+    which a box then represents.
+    """
+    own = np.array([noise.relative, noise.position, noise.position, 0]) ** 2
+    boxes = own + np.pad(width**2 / 12, [(0, 0), (1, 0)])
+    squares = np.square(rows).sum(2)
+    both = np.stack(np.broadcast_arrays(own, boxes), axis=1).astype(np.float32) @ squares
+    return both[:, 0], both[:, 1]
 
 
 class Forces(NamedTuple):
@@ -96,39 +96,37 @@ class Forces(NamedTuple):
     Attributes:
         mode: (N,), of the logarithm of the force.
         curvature: (N,), of the log posterior there.
-        pull, cross: (N, 2), products of what a tangential force along x and y adds with the frame, and with
-            the readings of the force into the skin, over the variance; (N, 0) without friction.
-        square: (N, 3), the same of x and x, x and y, y and y; or (N, 0).
+        pull: (N, L), products of the readings of each load with the frame, over the variance.
+        gram: (N, L, L), the same with each other.
     """
 
     mode: np.ndarray
     curvature: np.ndarray
     pull: np.ndarray
-    cross: np.ndarray
-    square: np.ndarray
+    gram: np.ndarray
 
-    def tangent(self, force: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray | float]:
-        """Return the tangential force, in standard deviations, for forces (N,) or (N, J), N.
+    def tangent(self, force: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the tangential force, in standard deviations, for forces (N, J), N.
 
         Returns:
-            Mean (..., 2), covariance (..., 2, 2), and what its integral adds to the log likelihood with the
-            mean, (...,). Without friction the first has no columns.
+            Mean (N, J, L - 1), covariance (N, J, L - 1, L - 1), and what its integral adds to the log
+            likelihood with the mean, (N, J).
         """
-        if not self.pull.shape[1]:
-            return np.empty((*force.shape, 0)), np.empty((*force.shape, 0, 0)), 0.0
-        more = (slice(None), *(None,) * (force.ndim - 1))
-        pull, cross, (xx, xy, yy) = self.pull[more], self.cross[more], np.moveaxis(self.square[more], -1, 0)
-        inverse, determinant = _invert(xx * force**2 + 1, xy * force**2, yy * force**2 + 1)
-        left = force[..., None] * (pull - force[..., None] * cross)
+        pull, gram, scale = self.pull[:, None], self.gram[:, None], force[..., None]
+        inverse, determinant = invert_on_prior(gram[..., 1:, 1:] * scale[..., None] ** 2)
+        left = scale * (pull[..., 1:] - scale * gram[..., 0, 1:])
         mean = (inverse @ left[..., None])[..., 0]
-        return mean, inverse, -0.5 * ((mean**2).sum(-1) + np.log(determinant))
+        return mean, inverse, -0.5 * (np.vecdot(mean, mean) + np.log(determinant))
 
 
-def _invert(xx: np.ndarray, xy: np.ndarray, yy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the inverses (..., 2, 2) of symmetric matrices, and their determinants (...,)."""
+def invert_on_prior(information: np.ndarray) -> tuple[np.ndarray, np.ndarray | float]:
+    """Return the inverses of information (..., L - 1, L - 1) on a standard normal prior, and determinants."""
+    if not information.shape[-1]:
+        return information, 1.0
+    xx, xy, yy = information[..., 0, 0] + 1, information[..., 0, 1], information[..., 1, 1] + 1
     determinant = xx * yy - xy * xy
     rows = np.stack([yy, -xy, -xy, xx], axis=-1) / determinant[..., None]
-    return rows.reshape(*determinant.shape, 2, 2), determinant
+    return rows.reshape(information.shape), determinant
 
 
 def fit_force(
@@ -139,20 +137,17 @@ def fit_force(
     Args:
         frame: the frame.
         prior: of the force.
-        readings: (N, L S), N/N.
+        readings: (N, L, S), N/N.
         spread: (N, S), further variance per square newton.
     """
     floor, values = np.float32(frame.noise.floor), frame.readings
     plain = frame.counts / (floor + (np.float32(frame.noise.relative) * values) ** 2)
-    inwards = readings[:, : len(values)]
-    squares = inwards * inwards
-    mode = _mode(prior, inwards @ (plain * values), squares @ plain, None)[0]
+    inwards = readings[:, 0]
+    mode = _mode(prior, inwards @ (plain * values), np.square(inwards) @ plain, None)[0]
     forces = refit_force(frame, prior, readings, spread, mode)
-    force = np.exp(forces.mode)
+    force = np.exp(forces.mode)[:, None]
     tangent, _, added = forces.tangent(force)
-    force = force[:, None]
-    variance = force * force * spread
-    fit = frame.likelihood(force * blend(readings, tangent), variance) + added
+    fit = frame.likelihood(force * blend(readings, tangent)[:, 0], force * force * spread) + added[:, 0]
     return forces, fit + _density(prior, forces.mode) - np.float32(0.5) * np.log(forces.curvature)
 
 
@@ -165,28 +160,15 @@ def refit_force(
 ) -> Forces:
     """Return the force of candidates from that of a similar likelihood, (N,), its logarithm."""
     force = np.exp(mode)[:, None]
-    variance = force * force * spread + np.float32(frame.noise.floor)
-    sensors, values = len(frame.readings), frame.counts * frame.readings
-    inwards = readings[:, :sensors]
-    weight = inwards / variance
-    along = weight @ values
-    square = (weight * inwards) @ frame.counts
-    pull = cross = products = np.empty((len(mode), 0), np.float32)
-    if readings.shape[1] > sensors:
-        x, y = readings[:, sensors : 2 * sensors], readings[:, 2 * sensors :]
-        pull = np.stack([(side / variance) @ values for side in (x, y)], axis=1)
-        weight *= frame.counts
-        cross = np.stack([np.vecdot(weight, side) for side in (x, y)], axis=1)
-        x_weighed, y_weighed = (side * (frame.counts / variance) for side in (x, y))
-        products = np.stack(
-            [np.vecdot(x_weighed, x), np.vecdot(x_weighed, y), np.vecdot(y_weighed, y)], axis=1
-        )
-        # What a tangential force explains does not count for the force.
-        xx, xy, yy = products.T * force[:, 0] ** 2
-        inverse, _ = _invert(xx + 1, xy, yy + 1)
-        shared = force * (inverse @ (force * cross)[..., None])[..., 0]
-        along, square = along - np.vecdot(shared, pull), square - np.vecdot(shared, cross)
-    return Forces(*_mode(prior, along, square, mode), pull, cross, products)
+    weight = frame.counts / (force * force * spread + np.float32(frame.noise.floor))
+    weighted = readings * weight[:, None]
+    pull, gram = weighted @ frame.readings, weighted @ readings.transpose(0, 2, 1)
+    # What a tangential force explains does not count for the force.
+    inverse, _ = invert_on_prior(gram[:, 1:, 1:] * force[..., None] ** 2)
+    cross = gram[:, 0, 1:]
+    shared = force * (inverse @ (force * cross)[..., None])[..., 0]
+    along, square = pull[:, 0] - np.vecdot(shared, pull[:, 1:]), gram[:, 0, 0] - np.vecdot(shared, cross)
+    return Forces(*_mode(prior, along, square, mode), pull, gram)
 
 
 def _density(prior: FingertipPrior, mode: np.ndarray) -> np.ndarray:
@@ -226,8 +208,8 @@ def integrate_force(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return forces (N, J), N, and the log weight of each, whose sum is the integral over the prior.
 
-    With friction, the last results are mean and variance of the tangential force, (N, J, 2), in its standard
-    deviations per newton.
+    The last results are mean and variance of the tangential force, (N, J, L - 1), in its standard deviations
+    per newton.
 
     Args:
         frame, prior, readings: as of :func:`fit_force`.
@@ -240,7 +222,7 @@ def integrate_force(
     force = np.exp(logarithm)
     tangent, covariance, added = fit.tangent(force)
     further = (force * force)[..., None] * spread[:, None]
-    likelihood = added + frame.likelihood(force[..., None] * blend(readings[:, None], tangent), further)
+    likelihood = added + frame.likelihood(force[..., None] * blend(readings, tangent), further)
     factor = np.log(weights / math.sqrt(2 * math.pi)) + nodes**2 / 2 + np.log(deviation)[:, None]
     variances = np.diagonal(covariance, axis1=-2, axis2=-1)
     return force, likelihood + _density(prior, logarithm) + factor, tangent, variances

@@ -17,7 +17,7 @@ from skin.errors import InputError
 from skin.inference.candidates import CandidateReadings, FingertipPrior
 from skin.inference.contact import Cloud, blur_first, one_contact
 from skin.inference.contacts import Mixture, Search
-from skin.inference.likelihood import Observation, blend, fit_force, sum_loads
+from skin.inference.likelihood import Observation, blend, fit_force
 from skin.inference.noise import Noise
 from skin.mechanics.simulator.base import AbstractSimulator
 from skin.touch.images import load_image
@@ -64,15 +64,13 @@ class LargeContacts:
         every = draw_large(candidates, _COUNT + _HELD_OUT, rng)
         self._readings, held_out = every[:_COUNT], every[_COUNT:]
         force = np.exp(_SPREAD * rng.standard_normal((len(held_out), 1)))
-        sensors = candidates.sensors
-        pressed = force * blend(
-            held_out, rng.standard_normal((len(held_out), 2 if candidates.friction else 0))
-        )
+        tangent = rng.standard_normal((len(held_out), 1, held_out.shape[1] - 1))
+        pressed = force * blend(held_out, tangent)[:, 0]
         values = pressed + math.sqrt(noise.floor) * rng.standard_normal(pressed.shape)
         working = np.ones(values.shape[1], bool)
         clean = replace(noise, clip=math.inf)
         frames = [Observation.of(row, working, ~working, clean) for row in values]
-        square = sum_loads(self._readings**2, sensors)
+        square = np.square(self._readings).sum(1)
         common = square.mean(1, keepdims=True)
 
         def spread(tolerance: tuple[float, float]) -> np.ndarray:
@@ -92,7 +90,7 @@ class LargeContacts:
 
 
 def draw_large(candidates: CandidateReadings, count: int, rng: np.random.Generator) -> np.ndarray:
-    """Return the readings (N, L S), N, of large contacts under their median force, float32.
+    """Return the readings (N, L, S), N, of large contacts under their median force, float32.
 
     Shape, position, angle and the logarithm of the area, from the largest fingertip up, are uniform. A
     contact consists of small fingertips with the pressures of its picture.
@@ -101,17 +99,17 @@ def draw_large(candidates: CandidateReadings, count: int, rng: np.random.Generat
     steps = np.ceil(size / _SPACING).astype(int)
     x, y = ((np.arange(step) + 0.5) * side / step for step, side in zip(steps, size, strict=True))
     points = np.stack(np.meshgrid(x, y, indexing="ij"), -1).reshape(-1, 2)
-    small = candidates.at(np.column_stack([points, np.full(len(points), radii[0])]))[0]
+    small = candidates.at(np.column_stack([points, np.full(len(points), radii[0])]))[:, 0]
     pictures = [load_image(name) for name in SHAPES]
     shape, angle = rng.integers(0, len(SHAPES), count), rng.uniform(0, 2 * np.pi, count)
     minimum, maximum = math.pi * radii[1] ** 2, _SHARE * size.prod()
     area = minimum * (maximum / minimum) ** rng.random(count)
     position = size * rng.random((count, 2))
-    readings, cell = np.empty((count, small.shape[1]), np.float32), float(size.prod() / len(points))
+    readings, cell = np.empty((count, *small.shape[1:]), np.float32), float(size.prod() / len(points))
     for number in range(count):
         pressure = _sample(pictures[shape[number]], area[number], angle[number], points - position[number])
-        readings[number] = _PRESSURE * cell * (pressure @ small)
-    return readings[(readings != 0).any(1)]
+        readings[number] = _PRESSURE * cell * np.tensordot(pressure, small, 1)
+    return readings[(readings != 0).any((1, 2))]
 
 
 def _sample(picture: np.ndarray, area: float, angle: float, away: np.ndarray) -> np.ndarray:
@@ -346,7 +344,9 @@ class Posterior:
 
     def _frame(self, frame: Observation) -> FrameEstimate:
         """Return the estimate of a frame, which depends on nothing else."""
-        single = one_contact(self.candidates, self.prior, frame, self._first)
+        # A contact that is a tenth as probable as none, or less, is not estimated.
+        least = frame.empty() + float(self._numbers[0] - self._numbers[1:].max()) - math.log(10)
+        single = one_contact(self.candidates, self.prior, frame, self._first, least)
         sensors = int(frame.counts.sum()) + len(frame.clipped)
         evidence, mixtures = self._several(frame, single, min(self._maximum, max(1, sensors // _PER_CONTACT)))
         logs = np.full(len(self._numbers), -np.inf)

@@ -86,9 +86,9 @@ def predict_from_others(
         likely = evidence > evidence.max() - _LIKELY
         weight = np.exp(evidence[likely].astype(float) - evidence.max())
         weight /= weight.sum()
-        force, spread = np.exp(forces.mode[likely, None]), 1 / forces.curvature[likely]
-        tangent, *_ = forces.tangent(np.exp(forces.mode))
-        predicted = force * blend(table, tangent)[likely]
+        every = np.exp(forces.mode)[:, None]
+        force, spread = every[likely], 1 / forces.curvature[likely]
+        predicted = force * blend(table[likely], forces.tangent(every)[0][likely])[:, 0]
         variance = force**2 * blurred[likely] + frame.noise.floor
         misfit = weight @ (((frame.readings - predicted) ** 2 / variance) @ others)
         # Four parameters of a fingertip are fitted.

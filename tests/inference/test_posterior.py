@@ -1,5 +1,6 @@
 """The posterior of contacts against brute force, calibration, and what devices do to readings."""
 
+from copy import copy
 from dataclasses import replace
 from functools import cache
 
@@ -150,7 +151,7 @@ def test_a_region_holds_what_it_says():
         radii = np.linspace(*prior.radii, 5)
         grid = np.stack(np.meshgrid(x, y, radii, indexing="ij"), -1).reshape(-1, 3)
         grid[:, :2] = grid[:, :2].clip(0, 0.16)
-        table = posterior(contacts=1).candidates.at(grid)[0].astype(float)
+        table = posterior(contacts=1).candidates.at(grid)[:, 0, 0].astype(float)
         score = np.linspace(-4, 4, 61)
         force = prior.force * np.exp(prior.spread * score)
         fit = np.outer(table @ readings, force) - np.outer((table**2).sum(1), force**2) / 2
@@ -423,6 +424,18 @@ def test_three_axes_tell_the_vector_of_the_force(three_axes):
     inside = np.mean([c.region().contains(touch[:2]) for c, touch in zip(contacts, touches, strict=True)])
     assert inside == pytest.approx(0.9, abs=0.08)
     assert np.median(np.abs(means[:, 2:4] - force[:, :2])) < 0.5 * np.median(np.abs(force[:, :2]))
+
+
+def test_precise_readings_of_three_axes_have_finite_regions(three_axes):
+    posterior, touches, force, _ = three_axes
+    rows, noise = posterior.candidates.at(touches[:, :3])[:, 0], Noise(0.002, 10, gain=0.02, position=0.001)
+    tangent = force[:, :2] / posterior.candidates.friction
+    true = force[:, 2:] * rows[:, 0] + np.einsum("nl,nls->ns", tangent, rows[:, 1:])
+    posterior = copy(posterior)
+    posterior.assume(posterior.candidates, noise)
+    contacts = [each.contacts[0] for each in posterior.estimate(measure(true, noise, 9)[:60])]
+    inside = [c.region().contains(touch[:2]) for c, touch in zip(contacts, touches, strict=False)]
+    assert np.mean(inside) > 0.8
 
 
 def test_friction_needs_a_simulator_that_has_it(three_axes):

@@ -182,7 +182,7 @@ def test_touches_tell_the_thickness_and_each_counts_once(true):
     posterior = Posterior(coarse(body, mechanics.sensors), noise, body, prior, contacts=1)
     learned, described = Thickness(mechanics, posterior), posterior.candidates
     discs = np.column_stack([rng.uniform(0.02, 0.07, (30, 2)), rng.uniform(*prior.radii, 30)])
-    readings = 10 * mechanics.thicker(true, prior).at(discs)[0] + 0.016 * rng.standard_normal((30, 9))
+    readings = 10 * mechanics.thicker(true, prior).at(discs)[:, 0, 0] + 0.016 * rng.standard_normal((30, 9))
     for touch in readings[:19]:
         for part, number in ((0.5, 1), (1, 1), (2, None), (0.0, 0), (0.0, 0)):
             learned.look(Observation.of(part * touch, ~none, none, noise), number)
@@ -193,8 +193,8 @@ def test_touches_tell_the_thickness_and_each_counts_once(true):
     assert learned.noise.relative < 0.05 < noise.relative
     assert (learned.doubt is None) == (true == 1)
     assert posterior.noise is learned.noise
-    error = posterior.candidates.at(discs)[0] - mechanics.thicker(true, prior).at(discs)[0]
-    assert np.abs(error).max() < 0.25 * np.abs(described.at(discs)[0]).max()
+    error = posterior.candidates.at(discs)[:, 0, 0] - mechanics.thicker(true, prior).at(discs)[:, 0, 0]
+    assert np.abs(error).max() < 0.25 * np.abs(described.at(discs)[:, 0, 0]).max()
     known = Thickness(replace(mechanics, noise=DEVICE), posterior)  # without a range
     known.add(Observation.of(touch, ~none, none, noise))
     assert (known.touches, posterior.noise) == (0, learned.noise)

@@ -344,11 +344,6 @@ class Imperfection(ImperfectionSettings):
         curves = None if self.calibration is None else self.curves(constants)
         return readings if curves is None else curves.straighten(readings)
 
-    def is_static(self, constants: Constants) -> bool:
-        """Return whether the sensors follow the force at once and in proportion to it."""
-        in_time = constants.hysteresis.any() or constants.time_constant.any()
-        return not in_time and self.curves(constants) is None
-
     def sense(self, force: Tensor, constants: Constants, time: Tensor) -> Tensor:
         """Return the response of the sensors before the converter, (B, T, S), N.
 

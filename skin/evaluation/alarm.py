@@ -255,12 +255,12 @@ def _imperfections(used: Mapping[str, Any]) -> dict[str, Any]:
     from skin.device.imperfection import ImperfectionSettings
 
     names = {entry.name for entry in fields(ImperfectionSettings)}
-    if not names <= set(used):
+    if not names - {"cross_talk"} <= set(used):  # which earlier runs lack
         raise InputError(
             f"evaluation.profile={_DEVICE} takes the imperfections of a simulated device: add "
             "device=simulated, or name a profile"
         )
-    return {name: used[name] for name in names}
+    return {name: used[name] for name in names & set(used)}
 
 
 def profile_settings(name: str) -> dict[str, Any]:
@@ -425,7 +425,7 @@ def _describe(
             "imperfections": {
                 name: str(value)
                 for name, value in vars(device.imperfection).items()
-                if name not in ("rate", "aligned")
+                if name not in ("rate", "aligned") and (value or name != "cross_talk")
             },
             "live": asdict(live) | {"contact": round(live.contact, 3)},
             "profile": settings.profile,

@@ -318,16 +318,15 @@ def read_calibration(path: str | Path, inwards: bool = False) -> Calibration:
         raise InputError(f"{file} is no calibration: it needs format: {FORMAT}, count: and sensors:")
     try:
         check_text(text, stored)
-        calibration = _calibration(stored)
-        return calibration.inwards() if inwards else calibration
+        return _calibration(stored, inwards)
     except ChecksumError as error:
         raise InputError(f"{file}: {error}: remove its line sha256 if you changed it by hand") from error
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise InputError(f"{file} is no calibration: {error}") from error
 
 
-def _calibration(stored: Mapping[str, Any]) -> Calibration:
-    """Return the calibration that a file describes; its count is checked before memory is allocated."""
+def _calibration(stored: Mapping[str, Any], inwards: bool) -> Calibration:
+    """Return what a file describes, or its channels inwards; no count allocates memory unchecked."""
     count = stored["count"]
     if type(count) is not int or not 1 <= count <= MOST:
         raise InputError(f"count must be a whole number from 1 to {MOST}, got {count!r}")
@@ -342,7 +341,7 @@ def _calibration(stored: Mapping[str, Any]) -> Calibration:
     calibration = configured(Calibration, settings, "a calibration")
     if len(calibration) != count:
         raise InputError(f"a calibration needs as many numbers as count, {count}, got {len(calibration)}")
-    return calibration
+    return calibration.inwards() if inwards else calibration
 
 
 _LINES = {

@@ -334,10 +334,9 @@ class LiveContacts:
         try:
             if self._asked_at is not None and self._pipe.poll():
                 self._latest, self._asked_at = (self._pipe.recv(), self._asked_at), None
-                changed = self._latest[0]["changed"]
-                if self.three is not None:
-                    changed = [number // 3 for number in changed if number % 3 == 2]
-                self._latest[0]["changed"], self.changed = changed, tuple(changed)
+                each, changed = 1 if self.three is None else 3, self._latest[0]["changed"]
+                self.changed = tuple(number // each for number in changed if number % each == each - 1)
+                self._latest[0]["changed"] = [*self.changed]
             if verdicts and self._asked_at is None:
                 readings = average_readings(self._recent, conversion, masked, baseline, self._whole())
                 self._pipe.send(readings._replace(tare=id(conversion)))

@@ -407,8 +407,9 @@ def watch_exported(
             "run itself for a recording or the simulator"
         )
     model = OnnxModel(path)
-    inwards = bool(device.get("inwards"))
-    source = SerialSource(Port.select(device), len(model.positions), model.rate, (), inwards).open_source()
+    source = SerialSource(
+        Port.select(device), len(model.positions), model.rate, inwards=bool(device.get("inwards"))
+    ).open_source()
     opened.enter_context(source.skin)
     say(f"loaded {model.title} from {path}, exported by version {model.metadata.version}")
     return LiveSetup(model, source.name, source, lambda: source, partial(Mechanics.of, None, False))

@@ -538,8 +538,8 @@ def with_axes_of(trained: Config, config: Config) -> Config:
         layout = _listed_settings(
             Listed(positions.tolist(), skin.sensors.footprint, normals.tolist()), skin.body
         )
-    port = {"inwards": True} if "port" in config.device else {}
-    return replace(config, layout=layout, device=config.device | port)
+    device = {**config.device, "inwards": True} if "port" in config.device else config.device
+    return replace(config, layout=layout, device=device)
 
 
 def _with_labels(stored: Config, device: AbstractDevice) -> AbstractDevice:

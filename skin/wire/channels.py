@@ -128,8 +128,7 @@ class ChannelHealth:
         np.minimum(self._minimum, values, out=self._minimum)
         np.maximum(self._maximum, values, out=self._maximum)
         unchanged = t - self._changed_at
-        judges = unchanged[self._judges]
-        if 2 * np.count_nonzero(judges < self._active) <= len(judges):
+        if 2 * np.count_nonzero(unchanged[self._judges] < self._active) <= len(values[self._judges]):
             self._active_since = t
         # Noise below half a step changes only values near an edge; a double step is more than that.
         self._large_step_at[step > 1.5 * self._smallest[self._judges].min()] = t

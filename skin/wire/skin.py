@@ -384,8 +384,9 @@ class SerialSource:
         inwards: bool = False,
     ) -> None:
         self.settings, self._sensors, self._rate, self.layers = settings, sensors, rate, layers
-        path, every = settings.calibration, replace(settings, sensitivity=None)  # that of sensors inwards
-        self.three = SerialSource(every, 3 * sensors, rate) if inwards else None
+        # The sensitivity is that of sensors inwards.
+        self.three = SerialSource(replace(settings, sensitivity=None), 3 * sensors, rate) if inwards else None
+        path = settings.calibration
         self._calibration = None if path is None else read_calibration(path, inwards)
         if settings.scale is not None or self._calibration is not None:
             self.convert(None, None)
@@ -423,8 +424,13 @@ class SerialSource:
 
     def tare(self, skin: Skin) -> Tare:
         """Return the tare of an open skin."""
-        three = None if self.three is None else self.three.tare(skin)
-        return Tare(self.convert, self.settings.tare, self._rate, lambda: skin.header, three=three)
+        return Tare(
+            self.convert,
+            self.settings.tare,
+            self._rate,
+            lambda: skin.header,
+            three=None if self.three is None else self.three.tare(skin),
+        )
 
     def convert(self, baseline: np.ndarray | None, header: Header | None) -> UnitConversion:
         """Return the conversion of values to N, given a baseline (S,) and the header of the device.

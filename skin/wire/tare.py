@@ -271,14 +271,13 @@ class Tare:
         three: "Tare | None" = None,
     ) -> None:
         self._conversion, self._header, self.seconds, self._rate = conversion, header, seconds, rate
-        self.three = three
         self._interval, self._limited, self._lags = interval, limited, lags
         self.conversion: UnitConversion | None = None
         self._untared: UnitConversion | None = None
         self.state: TareState = "first"
         self._detail = self.warning = ""
         self.count = 0
-        self.freshness, self.glitches = Freshness(), Glitches()
+        self.freshness, self.glitches, self.three = Freshness(), Glitches(), three
         self._clock, self._quiet = StreamClock(), list[Frame]()
         self._waiting = deque[tuple[Frame, float]](maxlen=4096)  # as many as a skin queues
         self._first: float | None = None
@@ -316,9 +315,8 @@ class Tare:
         Raises:
             InputError: the scale is unknown, or the tare is too short.
         """
-        time, three = self._clock(frame), None
-        if self.three is not None and frame.three is not None:
-            three = self.three.add(frame.three, touched)
+        time = self._clock(frame)
+        three = self.three.add(frame.three, touched) if self.three and frame.three else None
         frame = self.glitches.check(frame, time, self._untared)
         if self.conversion is None or self._deadline is not None:
             self._update(frame, time, touched)

@@ -359,7 +359,7 @@ class LiveLoop:
         self._received_at, self._maximum_dead, self._tested_at = clock(), inf, inf
         self._delays: deque[float] = deque(maxlen=2000)  # verdicts for the percentile of the delay
         self._updated_at = -inf
-        self.verdicts = 0
+        self.verdicts, display.contacts.three = 0, tare.three
 
     def run(self, seconds: float | None = None) -> None:
         """Run the loop.

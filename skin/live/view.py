@@ -313,7 +313,6 @@ def show(
             _open_views(display, setup, live, opened)
             display.set_verdict(None, monotonic(), "the threshold of the alarm is being chosen")
             source, engine, nominal, final = setup.watch(live, _say)
-            display.contacts.three = source.tare.three
             if final is not None:
                 opened.callback(final.close)
                 display.add_note(Note("provisional"))

@@ -55,7 +55,6 @@ class MemoryView:
         tare.glitches.fractions = engine.fractions
         positions = np.zeros((engine.sensors, 3))
         self.display = Display("memory", "memory", positions, (0.1, 0.1), 4.0)
-        self.display.contacts.three = tare.three
         self.display.observers.append(lambda assessment, now, event: self.said.append((now, *assessment)))
         self.loop = LiveLoop(skin, tare, replace(engine), self.display, verify)
         for arrival, data in stream:

@@ -359,7 +359,7 @@ class LiveLoop:
         self._received_at, self._maximum_dead, self._tested_at = clock(), inf, inf
         self._delays: deque[float] = deque(maxlen=2000)  # verdicts for the percentile of the delay
         self._updated_at = -inf
-        self.verdicts, display.contacts.three = 0, tare.three
+        self.verdicts = 0
 
     def run(self, seconds: float | None = None) -> None:
         """Run the loop.
@@ -447,7 +447,7 @@ class LiveLoop:
 
     def _begin(self, conversion: UnitConversion, now: float) -> None:
         """Begin anew with another conversion; test it if it is the first."""
-        raised = None
+        raised, self._display.contacts.three = None, self._tare.three
         if self._verify is not None:
             (self._maximum_dead, raised), self._verify = self._verify(conversion), None
             self._tested_at = now

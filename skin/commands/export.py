@@ -172,7 +172,12 @@ def _load(
     rate = used.device.get("rate") or model.rate
     rates = rates or [rate if isinstance(rate, int | float) else 100.0]  # Hz
     patience = DebounceSettings().alarm
-    return run, used, model, [model.live_conditions(rate, patience, False) for rate in rates if model.alarms]
+    return (
+        run,
+        model.config or used,
+        model,
+        [model.live_conditions(rate, patience, False) for rate in rates if model.alarms],
+    )
 
 
 def _choose_thresholds(source: "AlarmSource", conditions: "Sequence[LiveConditions]") -> dict[str, Any]:

@@ -6,7 +6,7 @@ Their YAML file is that of ``skin calibrate``. A curve is the value that a senso
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -18,6 +18,7 @@ from skin.body.base import MOST
 from skin.core import files
 from skin.core.safe_loading import TEXT, ChecksumError, check_text, parse_yaml, read_file, text_sum
 from skin.core.settings import RISING, check_settings, checked, configured
+from skin.device.resampling import INWARDS
 from skin.errors import InputError
 
 _LEAST = 1e-9  # of the reference: below, a power law is a line, whose slope is finite
@@ -243,6 +244,22 @@ class Calibration:
                 "made with, as in layout=file layout.path=FILE.csv, or device.calibration=null"
             )
 
+    def inwards(self) -> "Calibration":
+        """Return the calibration of the channels inwards of sites with three axes; without ranges."""
+        numbers = range(len(self))[INWARDS]
+        return replace(
+            self,
+            sensors={name: values[INWARDS] for name, values in self.sensors.items()},
+            broken={
+                kind: [numbers.index(number) for number in group if number in numbers]
+                for kind, group in self.broken.items()
+            },
+            tables={numbers.index(number): t for number, t in self.tables.items() if number in numbers},
+            ranges={},
+            polarity=self.polarity[INWARDS],
+            channels=(),
+        )
+
     def known(self, name: str) -> np.ndarray:
         """Return a quantity, (S,): unknown values are the median of known ones, or neutral without any.
 
@@ -278,11 +295,12 @@ class Calibration:
         return converted | {"dead": rank < count, "level": np.zeros(shape)}
 
 
-def read_calibration(path: str | Path) -> Calibration:
+def read_calibration(path: str | Path, inwards: bool = False) -> Calibration:
     """Read a calibration file; a single number applies to every sensor.
 
     Args:
         path: YAML file; relative paths are searched in the current folder, then beside the package.
+        inwards: it is of sites with three axes, and only the channels inwards are used.
 
     Raises:
         InputError: no such file, unreadable, invalid contents, or a line ``sha256`` with the checksum of
@@ -300,15 +318,15 @@ def read_calibration(path: str | Path) -> Calibration:
         raise InputError(f"{file} is no calibration: it needs format: {FORMAT}, count: and sensors:")
     try:
         check_text(text, stored)
-        return _calibration(stored)
+        return _calibration(stored, inwards)
     except ChecksumError as error:
         raise InputError(f"{file}: {error}: remove its line sha256 if you changed it by hand") from error
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise InputError(f"{file} is no calibration: {error}") from error
 
 
-def _calibration(stored: Mapping[str, Any]) -> Calibration:
-    """Return the calibration that a file describes; its count is checked before memory is allocated."""
+def _calibration(stored: Mapping[str, Any], inwards: bool) -> Calibration:
+    """Return what a file describes, or its channels inwards; no count allocates memory unchecked."""
     count = stored["count"]
     if type(count) is not int or not 1 <= count <= MOST:
         raise InputError(f"count must be a whole number from 1 to {MOST}, got {count!r}")
@@ -323,7 +341,7 @@ def _calibration(stored: Mapping[str, Any]) -> Calibration:
     calibration = configured(Calibration, settings, "a calibration")
     if len(calibration) != count:
         raise InputError(f"a calibration needs as many numbers as count, {count}, got {len(calibration)}")
-    return calibration
+    return calibration.inwards() if inwards else calibration
 
 
 _LINES = {

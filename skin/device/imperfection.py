@@ -37,6 +37,8 @@ class Constants(NamedTuple):
         quantum: step of the converter, N; 0: none.
         exponent, exponent_at: of the sensor's curve (:class:`skin.device.calibration.Curves`); 1, N: linear.
         rate: frames per second, Hz, one number per device.
+        cross_talk: fractions of the forces along other axes that an axis of a site reads, (S / 3, 3, 3), or
+            (B, 1, S / 3, 3, 3); 0: none, or sites with one axis.
     """
 
     gain: Tensor
@@ -53,6 +55,7 @@ class Constants(NamedTuple):
     exponent: Tensor
     exponent_at: Tensor
     rate: Tensor
+    cross_talk: Tensor = torch.zeros(())
 
     def to(self, device: torch.device | str) -> "Constants":
         """Return these constants on ``device``."""
@@ -135,6 +138,8 @@ class ImperfectionSettings:
             a real skin.
         without_lag: fraction of devices without lag, whatever ``time_constant`` says.
         framed: fraction of devices that read the frames of the model whatever ``rate`` and ``aligned`` say.
+        cross_talk: standard deviation of the fraction that an axis of a site reads of the force along each
+            other one; sites with one axis have none.
     """
 
     gain_spread: Spread = 0.05
@@ -159,6 +164,7 @@ class ImperfectionSettings:
     aligned: bool = True
     without_lag: Annotated[float, Ge(0), Le(1)] = 0.0
     framed: Annotated[float, Ge(0), Le(1)] = 0.0
+    cross_talk: Annotated[float, Ge(0), Le(0.5)] = 0.02
 
     @property
     def slowest(self) -> float:
@@ -176,12 +182,14 @@ class Imperfection(ImperfectionSettings):
     Attributes:
         calibration: of a real device; replaces all settings but ``rate``, ``tare`` and ``dead``, which breaks
             further sensors. Constants drawn for ``gestures`` come from its ranges.
+        cross_talk: above 0 only of sites with three axes.
 
     Raises:
         InputError: a setting of the wrong type or out of its range.
     """
 
     calibration: Calibration | None = None
+    cross_talk: Annotated[float, Ge(0), Le(0.5)] = 0.0
 
     def signs(self, sensors: int) -> np.ndarray:
         """Return 1 or -1 per sensor, (S,): -1 where the values that the device sends fall with force."""
@@ -201,9 +209,13 @@ class Imperfection(ImperfectionSettings):
         return (self.dead, self.dead) if isinstance(self.dead, int) else (self.dead[0], self.dead[1])
 
     @classmethod
-    def of(cls, settings: ImperfectionSettings, calibration: str | None) -> "Imperfection":
-        """Return imperfections of these settings, and of a file of ``skin calibrate`` where one is given."""
+    def of(cls, settings: ImperfectionSettings, calibration: str | None, axes: int = 1) -> "Imperfection":
+        """Return imperfections of these settings, and of a file of ``skin calibrate`` where one is given.
+
+        Sites with one of the ``axes`` have no cross-talk.
+        """
         own = {entry.name: getattr(settings, entry.name) for entry in fields(ImperfectionSettings)}
+        own["cross_talk"] *= axes > 1
         return cls(**own, calibration=None if calibration is None else read_calibration(calibration))
 
     def constants(
@@ -239,6 +251,9 @@ class Imperfection(ImperfectionSettings):
             if minimum == maximum
             else np.exp(generator.uniform(minimum, maximum, (*shape[:-1], 1)))
         )
+        if self.cross_talk:
+            drawn = generator.standard_normal((*shape[:-1], sensors // 3, 3, 3))
+            values["cross_talk"] = self.cross_talk * drawn * (1 - np.eye(3))
         tensors = {name: torch.from_numpy(np.asarray(value)).float() for name, value in values.items()}
         rate = torch.from_numpy(values["rate"])
         return Constants(**tensors | {"dead": tensors["dead"].bool(), "rate": rate})
@@ -344,21 +359,19 @@ class Imperfection(ImperfectionSettings):
         curves = None if self.calibration is None else self.curves(constants)
         return readings if curves is None else curves.straighten(readings)
 
-    def is_static(self, constants: Constants) -> bool:
-        """Return whether the sensors follow the force at once and in proportion to it."""
-        in_time = constants.hysteresis.any() or constants.time_constant.any()
-        return not in_time and self.curves(constants) is None
-
     def sense(self, force: Tensor, constants: Constants, time: Tensor) -> Tensor:
         """Return the response of the sensors before the converter, (B, T, S), N.
 
-        Hysteresis, a first-order lag, the gain, and the curve, in this order.
+        Cross-talk, hysteresis, a first-order lag, the gain, and the curve, in this order.
 
         Args:
             force: (B, T, S), true readings, N.
             constants: of this device.
             time: of every frame, (T,), s.
         """
+        if constants.cross_talk.any():
+            sites = force.unflatten(-1, (-1, 3))
+            force = force + (constants.cross_talk @ sites[..., None]).flatten(-3)
         if constants.hysteresis.any():
             force = apply_hysteresis(force, constants.hysteresis)
         if constants.time_constant.any():

@@ -1,6 +1,6 @@
 """Resampling of a device's frames to the rate of a model, for live and recorded touches."""
 
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -14,6 +14,8 @@ After = Literal["", "gap", "cut", "reset", "reconnect"]
 """Interruption before a frame: none; lost frames; another touch of a recording; a restart of the device; a
 reconnection. Of several, the last in this list counts."""
 
+INWARDS = slice(2, None, 3)
+"""Channels that measure inwards, of sites with three axes: a network of normal sensors takes these."""
 _WEIGHT: dict[After, int] = {"": 0, "gap": 1, "cut": 2, "reset": 3, "reconnect": 4}
 
 
@@ -35,6 +37,8 @@ class Frame(NamedTuple):
         polarity: (S,), float64: -1 where the value falls with force, else 1; None: 1 for all.
         mask: (S,), int: why values are not valid or at their limit, bits of
             :class:`skin.wire.channels.Reason`; None: not known.
+        three: the frame of all channels of sites with three axes, of which this one has those inwards; None:
+            this one has all that the device sent.
     """
 
     seq: int | None
@@ -48,6 +52,13 @@ class Frame(NamedTuple):
     saturated: np.ndarray | None = None
     polarity: np.ndarray | None = None
     mask: np.ndarray | None = None
+    three: "Frame | None" = None
+
+    def inwards(self) -> "Frame":
+        """Return the channels :data:`INWARDS` of this frame, which that keeps."""
+        names = ("values", "valid", "saturated", "polarity", "mask")
+        parts: Any = {name: part[INWARDS] for name in names if (part := getattr(self, name)) is not None}
+        return self._replace(three=self, **parts)
 
     def behind(self, dropped: "Frame") -> "Frame":
         """Return this frame with the previous one, which was dropped, counted as lost."""

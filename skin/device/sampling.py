@@ -120,7 +120,8 @@ def _measure_each(
         framed = noise.random(batch) < imperfection.framed
         ratios, shifts = np.where(framed, 1, ratios), np.where(framed, 0, shifts)
     padded, fine = torch.nn.functional.pad(force, (0, 0, 0, 1)), 1
-    if not imperfection.is_static(constants):
+    in_time = constants.hysteresis.any() or constants.time_constant.any()
+    if in_time or imperfection.curves(constants) is not None:
         fine = _SENSED
         padded = between_frames(padded, model_rate, fine * model_rate)
     time = torch.arange(padded.shape[1], device=force.device) / (fine * model_rate)

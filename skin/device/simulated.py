@@ -367,7 +367,7 @@ class Simulated(ImperfectionSettings, AbstractDevice):
         self.sampler = self._sampler(self.body, self.true_sensors, self.model)
         if self.sampler.settings.shear:
             self.model.refuse_shear()
-        self.imperfection = Imperfection.of(self, self.calibration)
+        self.imperfection = Imperfection.of(self, self.calibration, self.sensors.axes)
         drawn = generator(Stream.CONSTANTS, self.seed)
         self.constants = draw_constants(self.imperfection, len(self.sensors), self.model_rate, drawn)
         self._kept: dict[str, Recording] = {}

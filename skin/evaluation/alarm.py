@@ -255,12 +255,12 @@ def _imperfections(used: Mapping[str, Any]) -> dict[str, Any]:
     from skin.device.imperfection import ImperfectionSettings
 
     names = {entry.name for entry in fields(ImperfectionSettings)}
-    if not names <= set(used):
+    if not names - {"cross_talk"} <= set(used):  # which earlier runs lack
         raise InputError(
             f"evaluation.profile={_DEVICE} takes the imperfections of a simulated device: add "
             "device=simulated, or name a profile"
         )
-    return {name: used[name] for name in names}
+    return {name: used[name] for name in names & set(used)}
 
 
 def profile_settings(name: str) -> dict[str, Any]:
@@ -278,13 +278,13 @@ def profile_settings(name: str) -> dict[str, Any]:
     return OmegaConf.to_container(compose(f"profile/{name}").device, resolve=True)  # type: ignore[return-value]
 
 
-def _remaining(path: str) -> dict[str, Any]:
+def _remaining(path: str, inwards: bool) -> dict[str, Any]:
     """Return the imperfections that a calibrated device is left with: its gains are known to 2 %.
 
     Readings are linear after the conversion: the limit is that of the force, and the noise is that at the
     reading at which the curves meet.
     """
-    calibration = read_calibration(path)
+    calibration = read_calibration(path, inwards)
     values, curves = calibration.values(), calibration.curves
     if curves is not None:
         values |= {"clip": curves.straighten(values["clip"]), "noise": values["noise"] / curves.slopes}
@@ -409,7 +409,9 @@ def _describe(
         settings = replace(settings, profile=_USUAL)
     device = threshold_device(replace(source, settings=settings))
     if path and settings.profile is None:
-        device = device.replace(**_remaining(path), randomise=True, calibration=None)
+        device = device.replace(
+            **_remaining(path, bool(source.used.get("inwards"))), randomise=True, calibration=None
+        )
     live = _snapped(live, device)
     return (
         device,
@@ -423,7 +425,7 @@ def _describe(
             "imperfections": {
                 name: str(value)
                 for name, value in vars(device.imperfection).items()
-                if name not in ("rate", "aligned")
+                if name not in ("rate", "aligned") and (value or name != "cross_talk")
             },
             "live": asdict(live) | {"contact": round(live.contact, 3)},
             "profile": settings.profile,

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from skin.core.settings import checked
 from skin.device.touches import Touches
 from skin.errors import InputError
-from skin.learning.representation import AbstractRepresentation, Frames, channels
+from skin.learning.representation import AbstractRepresentation, Frames, channels, count_axes
 
 Edges = Literal["knn", "delaunay"]
 Weight = Literal["exp", "distance", "stiffness", "none"]
@@ -47,14 +47,10 @@ def neighbours(positions: np.ndarray, edges: Edges, count: int = 6) -> np.ndarra
 
 
 def typical_distance(positions: np.ndarray) -> float:
-    """Return d0, the median distance of sensors (S, 3), m, to their nearest neighbours elsewhere, m.
-
-    Channels of a sensor with three axes have one position. Of a single position it is 1.
-    """
-    points = np.unique(positions, axis=0)
-    if len(points) < 2:
+    """Return d0, the median distance of sensors (S, 3), m, to their nearest neighbours; of a single one 1."""
+    if len(positions) < 2:
         return 1.0
-    distance = cdist(points, points)
+    distance = cdist(positions, positions)
     return float(np.median((distance + np.diag(np.full(len(distance), np.inf))).min(axis=1)))
 
 
@@ -98,7 +94,8 @@ def normalised(edges: np.ndarray) -> np.ndarray:
 class Graph(AbstractRepresentation):
     """Represents sensors as nodes with edges between neighbours (report, section 2.2).
 
-    It needs positions only and applies to any layout and number of sensors. The adjacency is one dense
+    It needs positions only and applies to any layout and number of sensors. A site with three axes is one
+    node with three readings. The adjacency is one dense
     matrix, normalised once and shared by all frames; with ``positions=deformed`` each frame has its own
     (report, section 4.2). Edges and the unit d0 always follow from the layout at rest, so that the graph
     changes continuously.
@@ -142,7 +139,8 @@ class Graph(AbstractRepresentation):
                 "representation.positions=deformed changes nothing at representation.weight=none: set "
                 "representation.weight=exp, or representation.positions=layout"
             )
-        points = layout.cpu().numpy().astype(float)
+        self.axes = count_axes(layout)
+        points = layout[:: self.axes].cpu().numpy().astype(float)
         weights = adjacency(points, neighbours(points, edges, count), weight)
         self.unit = typical_distance(points)
         self.adjacency = nn.Buffer(torch.from_numpy(normalised(weights)).to(torch.float32))
@@ -168,9 +166,10 @@ class Graph(AbstractRepresentation):
                 "representation.positions=deformed needs touches with displacements of sensors: give "
                 "Touches(motion=...), or set representation.positions=layout"
             )
-        positions = self.layout + motion if deformed and motion is not None else self.layout
+        moved = motion if motion is None else motion[:, :, :: self.axes]
+        positions = self.layout + moved if deformed and moved is not None else self.layout
         matrix = self._adjacency_at(positions) if deformed and self.weight != "none" else self.adjacency
-        x = channels(readings, valid, self.scale, self.mask)
+        x = channels(readings, valid, self.scale, self.mask, self.axes)
         if self.coordinates:
             coordinates = (positions[..., :2] / self.size).to(x.dtype).expand(*x.shape[:-1], 2)
             x = torch.cat([x, coordinates], dim=-1)

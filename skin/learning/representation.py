@@ -58,7 +58,12 @@ class AbstractRepresentation(nn.Module, ABC):
         return self(touches.readings, touches.valid)
 
 
-def channels(readings: Tensor, valid: Tensor, scale: float, mask: bool) -> Tensor:
+def count_axes(positions: Tensor) -> int:
+    """Return the channels of each site: 3 where the sensors (S, 3), m, are three at each position, else 1."""
+    return 3 if torch.equal(positions[::3], positions[2::3]) else 1
+
+
+def channels(readings: Tensor, valid: Tensor, scale: float, mask: bool, axes: int = 1) -> Tensor:
     """Return scaled readings and, optionally, a mask: the common input of all representations.
 
     Args:
@@ -67,12 +72,14 @@ def channels(readings: Tensor, valid: Tensor, scale: float, mask: bool) -> Tenso
         scale: N; readings are divided by it.
         mask: append a channel that is 1 where the reading is not valid. It is 0 for valid readings, because
             a constant channel of ones is large beside small readings (docs/results/study_dead.csv).
+        axes: channels of each site.
 
     Returns:
-        (B, T, S, C), with C = 2 under ``mask`` and else 1.
+        (B, T, S / axes, C axes), with C = 2 under ``mask`` and else 1: first the readings along all axes.
     """
     values = torch.where(valid, readings / scale, readings.new_zeros(()))
-    return torch.stack([values, (~valid).to(values.dtype)] if mask else [values], dim=-1)
+    stacked = torch.stack([values, (~valid).to(values.dtype)] if mask else [values], dim=-1)
+    return stacked if axes == 1 else stacked.unflatten(2, (-1, axes)).transpose(3, 4).flatten(3)
 
 
 # Plain readings, one feature per sensor.
@@ -182,7 +189,7 @@ class Image(AbstractRepresentation):
     """Writes each reading to the pixel of its sensor; all other pixels are 0 (report, section 2.2).
 
     It needs positions only and applies to any layout. Sensors that share a pixel are averaged, because a sum
-    would depend on the density of sensors.
+    would depend on the density of sensors. Sites with three axes give three channels.
 
     Args:
         positions: (S, 3), m.
@@ -206,15 +213,16 @@ class Image(AbstractRepresentation):
         mask: bool = False,
     ) -> None:
         super().__init__()
-        self.pixels, self.scale, self.mask = pixels, scale, mask
-        used, numbers = np.unique(pixel_of(positions.cpu().numpy(), size, pixels), return_inverse=True)
+        self.pixels, self.scale, self.mask, self.axes = pixels, scale, mask, count_axes(positions)
+        sites = positions[:: self.axes].cpu().numpy()
+        used, numbers = np.unique(pixel_of(sites, size, pixels), return_inverse=True)
         members = np.eye(len(used))[numbers]
         self.pixels_used = nn.Buffer(torch.from_numpy(used))
         self.average = nn.Buffer(torch.from_numpy(members / members.sum(axis=0)).to(torch.float32))
 
     def forward(self, readings: Tensor, valid: Tensor) -> Frames:
         """Return frames (B, T, C, pixels, pixels) of readings (B, T, S), N."""
-        values = channels(readings, valid, self.scale, self.mask).mT @ self.average
+        values = channels(readings, valid, self.scale, self.mask, self.axes).mT @ self.average
         blank = values.new_zeros((*values.shape[:-1], self.pixels**2))
         image = blank.scatter(-1, self.pixels_used.expand_as(values), values)
         return Frames(image.unflatten(-1, (self.pixels, self.pixels)), None)
@@ -286,15 +294,15 @@ class Interpolation(AbstractRepresentation):
         mask: bool = False,
     ) -> None:
         super().__init__()
-        self.pixels, self.scale, self.mask = pixels, scale, mask
+        self.pixels, self.scale, self.mask, self.axes = pixels, scale, mask, count_axes(positions)
         methods: Sequence = method if isinstance(method, list | tuple) else [method]
-        points, targets = positions[:, :2].cpu().numpy(), centres(size, pixels)
+        points, targets = positions[:: self.axes, :2].cpu().numpy(), centres(size, pixels)
         matrix = np.concatenate([weights(points, targets, method) for method in methods])
         self.matrix = nn.Buffer(torch.from_numpy(matrix).to(torch.float32))
 
     def forward(self, readings: Tensor, valid: Tensor) -> Frames:
         """Return frames (B, T, C, pixels, pixels) of readings (B, T, S), N."""
-        values = channels(readings, valid, self.scale, self.mask).mT @ self.matrix.mT
+        values = channels(readings, valid, self.scale, self.mask, self.axes).mT @ self.matrix.mT
         # Images (B, T, readings or mask, methods, H, W), whose methods become channels.
         return Frames(values.unflatten(-1, (-1, self.pixels, self.pixels)).flatten(2, 3), None)
 
@@ -334,9 +342,9 @@ class Fourier(AbstractRepresentation):
 
     def forward(self, readings: Tensor, valid: Tensor) -> Frames:
         """Return frames (B, T, C, pixels, pixels) of readings (B, T, S), N."""
-        image = self.image(readings, valid).x
-        spectrum = torch.fft.fftshift(torch.fft.fft2(image[:, :, :1]).abs(), dim=(-2, -1))
-        return Frames(torch.cat([torch.log1p(spectrum), image[:, :, 1:]], dim=2), None)
+        image, axes = self.image(readings, valid).x, self.image.axes
+        spectrum = torch.fft.fftshift(torch.fft.fft2(image[:, :, :axes]).abs(), dim=(-2, -1))
+        return Frames(torch.cat([torch.log1p(spectrum), image[:, :, axes:]], dim=2), None)
 
 
 # Readings averaged onto virtual sites: the same input for any number and order of sensors.

@@ -16,11 +16,14 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from skin.device.resampling import INWARDS
 from skin.errors import InputError
+from skin.evaluation.decisions import DECISIONS, DRIFT
 from skin.evaluation.operating_point import start_beside
 from skin.inference.mechanics import QUIET, Mechanics
 from skin.live.verdict import Verdict
 from skin.wire.channels import NewtonFrame, UnitConversion
+from skin.wire.tare import Tare
 
 if TYPE_CHECKING:
     from skin.inference.noise import Noise
@@ -256,7 +259,13 @@ class LiveContacts:
 
     Attributes:
         changed: sensors that have changed since the latest tare.
+        three: tare of all channels, where readings are those inwards of sites with three axes; else None.
+        tangential: (S, 2), N along x and y at the latest frame of such a skin; None: unknown.
     """
+
+    three: Tare | None = None
+    tangential: np.ndarray | None = None
+    _conversion: UnitConversion | None = None
 
     def __init__(
         self, reason: str = "this view estimates none", stale: float = 0.5, span: float = 0.1
@@ -307,9 +316,15 @@ class LiveContacts:
             verdicts: on them.
             baseline: (S,), N, what the untouched skin reads by now.
         """
+        masked: Sequence[int] = verdicts[-1].masked if verdicts else ()
+        if self.three is not None:
+            stream = [each.three for each in stream if each.three is not None]
+            conversion, masked = self.three.conversion or conversion, [3 * number + 2 for number in masked]
+            if stream:
+                baseline = self._rest_of_axes(stream[-1].newtons, conversion, verdicts, baseline)
+        self._conversion = conversion  # kept, so that the next one has another identity
         if self._pipe is None or not stream:
             return
-        self._conversion = conversion  # kept, so that the next one has another identity
         self._recent.extend(stream)
         last = stream[-1].frame
         while (first := self._recent[0].frame).segment != last.segment or not (
@@ -319,14 +334,35 @@ class LiveContacts:
         try:
             if self._asked_at is not None and self._pipe.poll():
                 self._latest, self._asked_at = (self._pipe.recv(), self._asked_at), None
-                self.changed = tuple(self._latest[0]["changed"])
+                each, changed = 1 if self.three is None else 3, self._latest[0]["changed"]
+                self.changed = tuple(number // each for number in changed if number % each == each - 1)
+                self._latest[0]["changed"] = [*self.changed]
             if verdicts and self._asked_at is None:
-                masked, whole = verdicts[-1].masked, self._whole()
-                readings = average_readings(self._recent, conversion, masked, baseline, whole)
+                readings = average_readings(self._recent, conversion, masked, baseline, self._whole())
                 self._pipe.send(readings._replace(tare=id(conversion)))
                 self._asked_at = last.t_host
         except (OSError, EOFError):
             self.explain("the process that estimates them has ended")
+
+    def _rest_of_axes(
+        self,
+        newtons: np.ndarray,
+        conversion: UnitConversion,
+        verdicts: Sequence[Verdict],
+        inwards: np.ndarray,
+    ) -> np.ndarray:
+        """Return what all channels read untouched, (3 S,), N, given that of those ``inwards``, (S,), N.
+
+        That of the others follows as slowly as a baseline does, while nothing touches the skin.
+        """
+        if conversion is not self._conversion:
+            self._drift = np.zeros(len(newtons))
+        self._drift[INWARDS] = inwards
+        rise = newtons - self._drift - (0.0 if conversion.rest is None else conversion.rest)
+        self.tangential = rise.reshape(-1, 3)[:, :2]
+        limit = DRIFT / DECISIONS * sum(verdict.state != "touch" for verdict in verdicts)
+        self._drift = self._drift + np.clip(rise, -limit, limit)
+        return self._drift
 
     def state(self, now: float) -> dict[str, Any]:
         """Return what is known at ``now``, s, on the host's monotonic clock, as JSON data."""

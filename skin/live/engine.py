@@ -181,10 +181,6 @@ class Engine:
         self._tick, self._decided = -1, True
         self.reset()
 
-    def adopt(self, above: float, danger: DangerScore | None) -> None:
-        """Take another threshold, with its score, from the next decision on; an alarm stays as it is."""
-        self.above, self.danger = above, danger
-
     @property
     def fractions(self) -> np.ndarray | None:
         """(S, S), readings of other sensors under a touch, relative to that of the sensor; None: unknown."""

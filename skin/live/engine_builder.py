@@ -407,7 +407,9 @@ def watch_exported(
             "run itself for a recording or the simulator"
         )
     model = OnnxModel(path)
-    source = SerialSource(Port.select(device), len(model.positions), model.rate).open_source()
+    source = SerialSource(
+        Port.select(device), len(model.positions), model.rate, inwards=bool(device.get("inwards"))
+    ).open_source()
     opened.enter_context(source.skin)
     say(f"loaded {model.title} from {path}, exported by version {model.metadata.version}")
     return LiveSetup(model, source.name, source, lambda: source, partial(Mechanics.of, None, False))
@@ -439,12 +441,12 @@ def watch_run(
     import torch
 
     from skin.record.serial import open_source
-    from skin.runs.build import build_device, equation10_warning, load_model
+    from skin.runs.build import build_device, equation10_warning, load_model, with_axes_of
     from skin.runs.run import find_run
 
     torch.set_num_threads(config.tracking.threads or 1)
     run = find_run(config.tracking, name, config.trust)
-    configured = run.configured(overrides)
+    configured = with_axes_of(run.stored, run.configured(overrides))
     device = build_device(configured)
     # A port is opened first: that it is missing must not take as long to say as a run takes to load.
     port = open_source(device) if device.real else None
@@ -458,7 +460,9 @@ def watch_run(
     # Without a simulator nothing could tune a contact threshold.
     touch = None if "simulator" in run.stored.device else live.touch
     model = load_model(run, trained, configured, touch=touch, alarm=False)
-    mechanics = partial(Mechanics.of, model.device.reference, bool(config.device.get("calibration")))
+    # Contacts take all channels that the device sends.
+    whole = build_device(trained) if configured.device.get("inwards") else model.device
+    mechanics = partial(Mechanics.of, whole.reference, bool(config.device.get("calibration")))
 
     def begin() -> Source:
         source = open_source(device)

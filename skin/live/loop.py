@@ -68,6 +68,7 @@ class DisplayState:
         peak: (S,), N, the largest of each sensor in the touch that the verdict is about; 0 without touch.
         notes: on what may be wrong, the gravest first.
         contacts: what is known of them, as in :func:`skin.live.contacts.contact_message`.
+        tangential: (S, 2), N along x and y at the latest frame, of sites with three axes; None: unknown.
     """
 
     number: int
@@ -80,6 +81,7 @@ class DisplayState:
     peak: np.ndarray
     notes: tuple[Note, ...]
     contacts: dict[str, Any]
+    tangential: np.ndarray | None = None
 
     @property
     def reason(self) -> str:
@@ -274,7 +276,7 @@ class Display:
             peak, number, valid = self._peak, self._number, self._valid
         values, saturated = (np.max(part, axis=0) for part in zip(*latest, strict=True))
         readings = np.where(valid, values, 0.0), valid, saturated & valid
-        notes = self.describe(assessment, now)
+        notes = *self.describe(assessment, now), self.contacts.tangential
         return DisplayState(number, *readings, assessment.verdict, line, assessment.alarm, peak, *notes)
 
     def describe(self, assessment: Assessment, now: float) -> tuple[tuple[Note, ...], dict[str, Any]]:
@@ -445,7 +447,7 @@ class LiveLoop:
 
     def _begin(self, conversion: UnitConversion, now: float) -> None:
         """Begin anew with another conversion; test it if it is the first."""
-        raised = None
+        raised, self._display.contacts.three = None, self._tare.three
         if self._verify is not None:
             (self._maximum_dead, raised), self._verify = self._verify(conversion), None
             self._tested_at = now

@@ -412,5 +412,6 @@ def adopt_final(final: FinalThreshold | None, engine: Engine, display: Display) 
     if isinstance(point, str):
         display.add_note(Note("provisional", detail=f", and stays so: {point}"))
     elif point is not None:
-        engine.adopt(point.announced(_say), point.score)
+        # From the next decision on; an alarm stays as it is.
+        engine.above, engine.danger = point.announced(_say), point.score
         display.remove_note("provisional")

@@ -83,6 +83,7 @@ def message(state: DisplayState, now: float) -> dict[str, Any]:
         "saturated": state.saturated.tolist(),
         "peak": [round(value, 3) for value in state.peak.tolist()],
         "held": state.held,
+        "tangential": None if state.tangential is None else state.tangential.round(3).tolist(),
         "unknown": list(range(len(state.valid))) if verdict is None else list(verdict.unknown),
         "since": "" if verdict is None else contact_text(verdict.contact),
         "words": [] if verdict is None else verdict.words(),

@@ -83,6 +83,7 @@ class Serial(AbstractDevice):
             noise, also the force above which a prompted gesture is detected.
         touch: rate and window of the model (``conf/touch``).
         stream: add the label ``touch``.
+        inwards: the device sends three values for each sensor, along x, y and inwards; the last is used.
         timeout, port, baudrate, tare, ...: as in :class:`skin.wire.reader.Port`.
 
     Attributes:
@@ -106,9 +107,10 @@ class Serial(AbstractDevice):
         touch: Mapping[str, Any] | TouchSettings | None = None,
         stream: bool = False,
         timeout: PositiveFloat = 10.0,
+        inwards: bool = False,
         **port: Any,
     ) -> None:
-        chosen = {"labels": labels, "gestures": gestures, "timeout": timeout}
+        chosen = {"labels": labels, "gestures": gestures, "timeout": timeout, "inwards": inwards}
         check_settings(Serial, chosen, "device")
         self.port = configured(Port, port | {"timeout": timeout}, "device")
         self.body, self.labels, self.gestures, self.seed, self.trigger = body, labels, gestures, seed, trigger
@@ -119,7 +121,7 @@ class Serial(AbstractDevice):
         self.sensors = layout.sensors(body)
         self._positions = torch.from_numpy(self.sensors.positions).float()
         self._recording: Recording | None = None
-        self.wire = SerialSource(self.port, len(self.sensors), self.model_rate, body.layers)
+        self.wire = SerialSource(self.port, len(self.sensors), self.model_rate, body.layers, inwards)
 
     def touches(self, split: Split, epoch: int = 0) -> Touches:
         """Return the gestures, read at the first call; labels are None if unknown."""

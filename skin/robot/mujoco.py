@@ -148,7 +148,7 @@ class Mujoco(ImperfectionSettings, AbstractDevice):
         self.settings = read_touch(self.touch)
         self.task = TOUCH.with_labels(tuple(self.settings.labels))
         check_rate(self.slowest, self.settings.rate, "device.rate")
-        self.imperfection = Imperfection.of(self, self.calibration)
+        self.imperfection = Imperfection.of(self, self.calibration, self.sensors.axes)
         self._kept: dict[Split | None, Recording] = {}
 
     def blank(self) -> Blank:

@@ -24,6 +24,7 @@ from skin.core.files import CONF
 from skin.core.messages import one_line, to_input_error
 from skin.core.settings import check_groups, configured
 from skin.device.base import AbstractDevice
+from skin.device.resampling import INWARDS
 from skin.device.touches import Touches
 from skin.errors import InputError
 from skin.evaluation.alarm import AlarmSource, choose_alarm_threshold
@@ -493,14 +494,15 @@ def load_model(
         alarm: choose the threshold of the alarm for single windows; False: it has none.
 
     Raises:
-        InputError: its weights do not fit the configuration, or sensors have other axes than those of its
-            training.
+        InputError: its weights do not fit the configuration, or it was trained on sensors of three axes, and
+            those of the layout have one.
     """
-    config = config or run.stored
-    if len({build_skin(each).sensors.axes for each in (run.stored, config)}) > 1:
+    given = config or run.stored
+    config = with_axes_of(run.stored, given)
+    used = config if used is None else with_axes_of(run.stored, used)
+    if device is not None and config is not given:
         raise InputError(
-            f"{run.title} was trained on sensors with another number of axes than this layout has: leave out "
-            "layout.axes, or give a layout of the sensors that measure inwards"
+            f"{run.title} takes sensors that measure inwards, these touches have three axes: leave out run="
         )
     if device is None:
         _warn_of_unknown_skin(run.stored.device, config.device, partial(build_skin, config))
@@ -511,7 +513,33 @@ def load_model(
     run.load_weights(learner, data)
     source = alarm_source(run, learner, config) if alarm else None
     point = choose_alarm_threshold(source, one_skin=one_skin) if source else None
-    return TorchModel(device, learner, data.example, point, touch, run, used or config)
+    return TorchModel(device, learner, data.example, point, touch, run, used)
+
+
+def with_axes_of(trained: Config, config: Config) -> Config:
+    """Return a configuration with sensors like those of a training: of sites with three axes those inwards.
+
+    The limits, masks and thresholds that follow from it are then those of these channels.
+
+    Raises:
+        InputError: the training had sensors of three axes, and those of the layout have one.
+    """
+    known, skin = build_skin(trained).sensors, build_skin(config)
+    if known.axes > skin.sensors.axes:
+        raise InputError(
+            "this run was trained on sensors of three axes, the layout has one: give layout.axes=three, or "
+            "a layout with directions"
+        )
+    if known.axes == skin.sensors.axes:
+        return config
+    layout = config.layout | {"axes": "normal"}
+    if "axes" not in config.layout:  # a file, or a layout that was built in Python
+        positions, normals = (values[INWARDS] for values in (skin.sensors.positions, skin.sensors.normals))
+        layout = _listed_settings(
+            Listed(positions.tolist(), skin.sensors.footprint, normals.tolist()), skin.body
+        )
+    device = {**config.device, "inwards": True} if "port" in config.device else config.device
+    return replace(config, layout=layout, device=device)
 
 
 def _with_labels(stored: Config, device: AbstractDevice) -> AbstractDevice:
@@ -544,7 +572,7 @@ def _warn_of_unknown_skin(
     unlike = configured(SkinDistribution, distributed, "device.skins").outside(skin.body, skin.sensors)
     if "skins" not in used:
         path = used.get("calibration")
-        measured = {} if path is None else read_calibration(path).values()
+        measured = {} if path is None else read_calibration(path, bool(used.get("inwards"))).values()
         ranges = {name: (values.min(), values.max()) for name, values in measured.items()}
         unlike += outside({**used, **ranges}, trained)
     if unlike:

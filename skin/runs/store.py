@@ -289,14 +289,6 @@ def _database(uri: str) -> Path:
     return Path(unquote(uri.removeprefix("sqlite:///").partition("?")[0]))
 
 
-def _make(path: Path, artifacts: Path) -> None:
-    """Create a database atomically: an incomplete one could not be opened again."""
-    from mlflow.store.tracking.sqlalchemy_store import SqlAlchemyStore  # heavy, and seldom needed
-
-    with whole(path, "tracking.uri=sqlite:////FOLDER/runs.db") as partial:
-        SqlAlchemyStore(database_uri(partial), str(artifacts)).engine.dispose()
-
-
 @contextmanager
 def _lock_creation(uri: str, artifacts: Path) -> Iterator[Any]:
     """Lock the creation of a SQLite database, which fails in two processes at the same time."""
@@ -309,7 +301,11 @@ def _lock_creation(uri: str, artifacts: Path) -> Iterator[Any]:
     existed = encoded.exists()
     with FileLock(f"{path}.lock"):
         if not path.exists() or not path.stat().st_size:
-            _make(path, artifacts)
+            from mlflow.store.tracking.sqlalchemy_store import SqlAlchemyStore  # heavy, and seldom needed
+
+            # Atomically: an incomplete one could not be opened again.
+            with whole(path, "tracking.uri=sqlite:////FOLDER/runs.db") as partial:
+                SqlAlchemyStore(database_uri(partial), str(artifacts)).engine.dispose()
         with closing(sqlite3.connect(path)) as connection:
             # Readers and writers at the same time; the mode stays with the file.
             connection.execute("PRAGMA journal_mode=WAL")

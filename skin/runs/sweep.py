@@ -7,7 +7,7 @@ import sys
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn, cast
 
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.global_hydra import GlobalHydra
@@ -119,8 +119,7 @@ def _parse_choices(overrides: Iterable[str]) -> dict[str, str]:
 
 def _words(config: DictConfig) -> list[str]:
     """Return the overrides of a command line or a job, with interpolations as they were written."""
-    words: Any = OmegaConf.to_container(config.hydra.overrides.task)
-    return words
+    return cast(list[str], OmegaConf.to_container(config.hydra.overrides.task))
 
 
 class SweepCallback(Callback):

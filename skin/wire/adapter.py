@@ -162,11 +162,6 @@ class Adapter:
         return [entry.name for entry in fields(self) if getattr(self, entry.name) != entry.default]
 
     @cached_property
-    def _wide(self) -> dict[str, str]:
-        """Fields of integers of three bytes, and their type."""
-        return {name: kind[-3:] for name, kind in (self.struct or {}).items() if kind[-2:] in ("i3", "u3")}
-
-    @cached_property
     def _record(self) -> np.dtype:
         struct = {
             name: re.sub(r"(?:\((\d+),\))?[<>][iu]3", lambda found: f"({3 * int(found[1] or 1)},)u1", kind)
@@ -283,7 +278,11 @@ class Adapter:
 
     def struct_reader(self, repeat: int, offset: int) -> StructReader:
         """Return what reads ``struct``, ``repeat`` times from byte ``offset`` on."""
-        return StructReader(self._record, self._wide, repeat, offset)
+        kinds = (self.struct or {}).items()
+        wide = {
+            name: kind[-3:] for name, kind in kinds if kind[-2:] in ("i3", "u3")
+        }  # integers of three bytes
+        return StructReader(self._record, wide, repeat, offset)
 
     def _reader(self, lines: Sequence[bytes]) -> Reader:
         """Return what reads the fields of lines like these."""

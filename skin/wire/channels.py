@@ -77,6 +77,8 @@ class ChannelHealth:
         active: s within which most channels change, if their noise can be seen at all.
         far: smallest steps of a channel: more than its noise ranges over.
         below: fraction of the range below 0 that an offset explains.
+        judges: channels whose changes tell what the skin does: not those along the surface of three axes,
+            whose faults would then hide those of the others.
 
     Attributes:
         limits: as given; a new value applies from the next frame on.
@@ -91,8 +93,9 @@ class ChannelHealth:
         active: float = 1.0,
         far: float = 20.0,
         below: float = 0.01,
+        judges: slice = slice(None),
     ) -> None:
-        self.limits, self.largest = limits, inf
+        self.limits, self.largest, self._judges = limits, inf, judges
         self._silent, self._active, self._far, self._below = silent, active, far, below
         self._last: np.ndarray | None = None
         self._begins, self.mask = True, np.zeros(0, dtype=int)
@@ -125,13 +128,13 @@ class ChannelHealth:
         np.minimum(self._minimum, values, out=self._minimum)
         np.maximum(self._maximum, values, out=self._maximum)
         unchanged = t - self._changed_at
-        if 2 * np.count_nonzero(unchanged < self._active) <= len(values):
+        if 2 * np.count_nonzero(unchanged[self._judges] < self._active) <= len(values[self._judges]):
             self._active_since = t
         # Noise below half a step changes only values near an edge; a double step is more than that.
-        self._large_step_at[step > 1.5 * self._smallest.min()] = t
+        self._large_step_at[step > 1.5 * self._smallest[self._judges].min()] = t
         self._noisy_since[t - self._large_step_at >= self._active] = t
         others_change = t - self._active_since >= self._silent
-        never = ~self._ever & (t - self._noisy_since.min() >= self._silent)
+        never = ~self._ever & (t - self._noisy_since[self._judges].min() >= self._silent)
         inactive = (unchanged >= self._silent) & (others_change | never)
         low, high = self.limits
         low, high = -inf if low is None else low, inf if high is None else high
@@ -161,12 +164,14 @@ class NewtonFrame(NamedTuple):
         newtons: (S,), float32; 0 where there is no usable value.
         mask: (S,), int, of :class:`Reason`.
         frame: as the device sent it.
+        three: all channels of sites with three axes, where these are those inwards; None: unknown, or none.
     """
 
     t: float
     newtons: np.ndarray
     mask: np.ndarray
     frame: Frame
+    three: "NewtonFrame | None" = None
 
     @property
     def usable(self) -> np.ndarray:

@@ -17,7 +17,7 @@ from urllib.parse import urlsplit
 from pydantic import AfterValidator, NonNegativeFloat, PositiveFloat, PositiveInt
 
 from skin.core.settings import RISING, checked
-from skin.device.resampling import After, Frame
+from skin.device.resampling import INWARDS, After, Frame
 from skin.errors import InputError
 from skin.wire.adapter import Adapter, read_adapter
 from skin.wire.channels import ChannelHealth, Limits, Reason
@@ -274,6 +274,8 @@ class WireFeed:
         silence: s without a byte after which the stream counts as gone.
         again: s between two attempts to start a board, which may take seconds to boot.
         unanswered: s without an answer after which a board is polled again.
+        inwards: the device has sites with three axes, frames have the channels inwards, and their masks
+            depend on no other channel.
     """
 
     def __init__(
@@ -284,10 +286,11 @@ class WireFeed:
         silence: float = inf,
         again: float = 1.0,
         unanswered: float = 0.25,
+        inwards: bool = False,
     ) -> None:
         self._opener, self._decoder, self._limits, self._silence = opener, decoder, limits, silence
-        self._again, self._unanswered = again, unanswered
-        self._health = ChannelHealth(limits or (None, None))
+        self._again, self._unanswered, self._taken = again, unanswered, INWARDS if inwards else slice(None)
+        self._health = ChannelHealth(limits or (None, None), judges=self._taken)
         self._begin()
 
     def open(self) -> None:
@@ -349,7 +352,7 @@ class WireFeed:
     @property
     def states(self) -> tuple[str, ...]:
         """State of each channel: ``ok``, or a :class:`skin.wire.channels.Reason`."""
-        return self._health.states()
+        return self._health.states()[self._taken]
 
     @property
     def unanswered(self) -> str:
@@ -407,7 +410,8 @@ class WireFeed:
         if frame.after not in ("", "gap"):
             self._health.restart()
         mask = self._health.check(frame.values, frame.t, frame.saturated) | ~frame.valid * Reason.MISSING
-        return frame._replace(valid=mask <= Reason.SATURATED, saturated=mask == Reason.SATURATED, mask=mask)
+        frame = frame._replace(valid=mask <= Reason.SATURATED, saturated=mask == Reason.SATURATED, mask=mask)
+        return frame.inwards() if self._taken == INWARDS else frame
 
 
 class PlaybackFeed:

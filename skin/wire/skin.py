@@ -272,6 +272,7 @@ def open_skin(
     polarity: Sequence[int] = (),
     queue: int = 4096,
     reconnect: bool = False,
+    inwards: bool = False,
     **settings: Any,
 ) -> Skin:
     """Open a skin; use it in a ``with`` statement.
@@ -285,6 +286,7 @@ def open_skin(
         polarity: 1 or -1 per sensor, -1 where values fall with force; empty: 1 for all.
         queue: number of frames that are buffered.
         reconnect: wait for an unplugged skin; its next frame has ``after="reconnect"``.
+        inwards: of sites with three axes, frames have the channels inwards; ``three`` has all.
         settings: baudrate, adapter, limits, timeout, backoff and silence, as in :class:`Port`.
 
     Raises:
@@ -302,7 +304,8 @@ def open_skin(
     watched = reconnect and address.startswith("socket://")
     opener = opener or partial(open_stream, address, about.baudrate)
     try:
-        feed = WireFeed(opener, decoder, about.limits, (about.silence if watched else None) or inf)
+        silence = (watched and about.silence) or inf
+        feed = WireFeed(opener, decoder, about.limits, silence, inwards=inwards)
     except OSError as error:
         raise InputError(f"cannot open {address}: {error}") from error
     return Skin(feed, decoder, about, baseline, queue, reconnect)
@@ -362,15 +365,29 @@ class SerialSource:
         sensors: S.
         rate: of the model, Hz.
         layers: of the body; empty: unknown.
+        inwards: the device sends three values for each of S sites, of which the last is used.
+
+    Attributes:
+        three: the same port with the sensors of all axes, if ``inwards``; else None.
 
     Raises:
         InputError: a calibration of another number of sensors, or a conversion that contradicts
             ``device.sensitivity``.
     """
 
-    def __init__(self, settings: Port, sensors: int, rate: float, layers: "Sequence[Layer]" = ()) -> None:
+    def __init__(
+        self,
+        settings: Port,
+        sensors: int,
+        rate: float,
+        layers: "Sequence[Layer]" = (),
+        inwards: bool = False,
+    ) -> None:
         self.settings, self._sensors, self._rate, self.layers = settings, sensors, rate, layers
-        self._calibration = None if settings.calibration is None else read_calibration(settings.calibration)
+        # The sensitivity is that of sensors inwards.
+        self.three = SerialSource(replace(settings, sensitivity=None), 3 * sensors, rate) if inwards else None
+        path = settings.calibration
+        self._calibration = None if path is None else read_calibration(path, inwards)
         if settings.scale is not None or self._calibration is not None:
             self.convert(None, None)
 
@@ -390,12 +407,14 @@ class SerialSource:
         """Open the port; ``reconnect`` waits for an unplugged skin."""
         if self.settings.port is None:
             raise InputError("device=serial needs a port, device.port=/dev/ttyACM0; skin emulate makes one")
+        sent = self.three or self
         return open_skin(
             self.settings,
-            range(self._sensors),
+            range(sent._sensors),
             reconnect=reconnect,
-            channels=self.channels,
-            polarity=self.polarity,
+            channels=sent.channels,
+            polarity=sent.polarity,
+            inwards=self.three is not None,
         )
 
     def open_source(self) -> Source:
@@ -405,7 +424,13 @@ class SerialSource:
 
     def tare(self, skin: Skin) -> Tare:
         """Return the tare of an open skin."""
-        return Tare(self.convert, self.settings.tare, self._rate, lambda: skin.header)
+        return Tare(
+            self.convert,
+            self.settings.tare,
+            self._rate,
+            lambda: skin.header,
+            three=None if self.three is None else self.three.tare(skin),
+        )
 
     def convert(self, baseline: np.ndarray | None, header: Header | None) -> UnitConversion:
         """Return the conversion of values to N, given a baseline (S,) and the header of the device.

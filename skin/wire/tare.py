@@ -245,9 +245,12 @@ class Tare:
         interval: s between two attempts to take the baseline.
         limited: fraction of the time at its limit from which a channel cannot be tared.
         lags: frames of the longest block that is recognised when it is sent again and again.
+        three: of all channels of sites with three axes, where frames have those inwards: of its own, so that
+            nothing that a channel along the surface does delays the baseline of the others. None: there are
+            no other channels.
 
     Attributes:
-        seconds: as given.
+        seconds, three: as given.
         conversion: of values to N; None until unit and baseline are known.
         state: what the tare is waiting for; empty if for nothing.
         warning: message about what the latest baseline lacks; empty if nothing.
@@ -265,6 +268,7 @@ class Tare:
         interval: float = 0.2,
         limited: float = 0.5,
         lags: int = 1000,
+        three: "Tare | None" = None,
     ) -> None:
         self._conversion, self._header, self.seconds, self._rate = conversion, header, seconds, rate
         self._interval, self._limited, self._lags = interval, limited, lags
@@ -273,7 +277,7 @@ class Tare:
         self.state: TareState = "first"
         self._detail = self.warning = ""
         self.count = 0
-        self.freshness, self.glitches = Freshness(), Glitches()
+        self.freshness, self.glitches, self.three = Freshness(), Glitches(), three
         self._clock, self._quiet = StreamClock(), list[Frame]()
         self._waiting = deque[tuple[Frame, float]](maxlen=4096)  # as many as a skin queues
         self._first: float | None = None
@@ -294,6 +298,8 @@ class Tare:
         Args:
             force: take it from the next frames, even if the skin seems touched.
         """
+        if self.three is not None:
+            self.three.restart(force)
         if self.seconds and self.conversion is not None:
             self._quiet.clear()
             self._tried, self._deadline, self._forced = -inf, inf, force
@@ -310,6 +316,7 @@ class Tare:
             InputError: the scale is unknown, or the tare is too short.
         """
         time = self._clock(frame)
+        three = self.three.add(frame.three, touched) if self.three and frame.three else None
         frame = self.glitches.check(frame, time, self._untared)
         if self.conversion is None or self._deadline is not None:
             self._update(frame, time, touched)
@@ -317,7 +324,7 @@ class Tare:
         if self.conversion is None:
             self._waiting.append((frame, time))
             return None
-        return self.conversion.convert(frame, time, mask)
+        return self.conversion.convert(frame, time, mask)._replace(three=three)
 
     def take_earlier(self) -> list[NewtonFrame]:
         """Return the frames before the first conversion in newtons, once that is known, and once."""

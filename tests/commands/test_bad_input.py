@@ -39,7 +39,6 @@ PORT = "device.port=/dev/ttyACM77"
         ("export export.rates=[]", "export.rates=[] has too few entries"),
         ("export out=x.txt", "out=x.txt must end in .onnx"),
         ("export format=c out=x.onnx", "out=x.onnx must end in .h: as in out=skin.h"),
-        ("export run=any_skin layout=grid layout.axes=three", "another number of axes than this layout has"),
         ("generate n=-1", "n=-1 is below 0: give a number above 0"),
         ("generate n=32", "add out=touches.parquet"),
         ("generate n=32 out=x.txt", "got x.txt"),

@@ -42,6 +42,24 @@ def test_a_person_may_write_little(tmp_path):
     assert np.isinf(values["clip"]).all()
 
 
+def test_channels_inwards_have_what_is_known_of_them(tmp_path):
+    """Of sites with three axes; broken channels along the surface are left out."""
+    tables = {1: [[0, 1], [0, 2]], 5: [[0, 1], [0, 3]]}
+    gains = {"gain": [1.0, 1.0, 0.8, 1.0, 1.0, 1.2]}
+    three = Calibration(
+        gains,
+        {"dead": [0, 5]},
+        {"dead": [0, 6]},
+        polarity=[1, 1, -1] * 2,
+        channels=[*range(6)],
+        tables=tables,
+    )
+    read = read_calibration(write_calibration(three, tmp_path / "three.yaml"), inwards=True)
+    assert read == Calibration(
+        {"gain": [0.8, 1.2]}, {"dead": [1]}, polarity=(-1, -1), tables={1: [[0, 1], [0, 3]]}
+    )
+
+
 def test_true_readings_behind_raw_ones():
     """What is unknown of a sensor is the median of the others."""
     values = WHOLE.values()

@@ -41,6 +41,21 @@ def test_noise_and_offset_come_after_gain_and_clip():
     assert torch.equal(below[0], below[1])
 
 
+def test_axes_of_a_site_talk_to_each_other_and_to_no_other_site():
+    """Fractions are normal with the deviation as set; each channel has a gain of its own, too."""
+    force = torch.zeros(1, 1, 3 * 4000)
+    force[..., 2::3] = 10.0
+    said = apply(force, cross_talk=0.02, clip=100.0)[0].unflatten(-1, (-1, 3))[0, 0]
+    assert (said[:, 2] == 10).all()
+    assert (said[:, :2].std(dim=0) / 10).tolist() == pytest.approx([0.02, 0.02], rel=0.05)
+    force[..., 3:] = 0
+    assert (apply(force, cross_talk=0.02)[0][..., 3:] == 0).all()
+    many = Imperfection(cross_talk=0.1).constants(6, generator(), gestures=5).cross_talk
+    assert (many.shape, len(many.unique())) == ((5, 1, 2, 3, 3), 5 * 2 * 6 + 1)
+    gains = apply(torch.ones(1, 1, 3000), gain_spread=0.1)[0].log().view(-1, 3)
+    assert np.abs(np.corrcoef(gains.T.numpy()) - np.eye(3)).max() < 0.15
+
+
 def test_constants_belong_to_the_device_and_noise_does_not():
     idle = torch.zeros(5, 30, 25)
     one, *_ = apply(idle, offset=0.1)

@@ -33,6 +33,7 @@ class MemoryView:
         stream: (s of the host's clock, bytes that arrive then).
         engine: with its settings.
         verify: called with the conversion before the first decision.
+        inwards: the stream has three channels for each sensor of the engine.
         port: settings of the port.
 
     Attributes:
@@ -40,14 +41,17 @@ class MemoryView:
         said: (s, verdict or None, reason, alarm) of all assessments for observers.
     """
 
-    def __init__(self, stream, engine, verify=None, **port):
+    def __init__(self, stream, engine, verify=None, inwards=False, **port):
         self.looks, self.said = [], []
         port = Port(**port)
-        source = SerialSource(port, engine.sensors, engine.rate)
-        decoder = Decoder(engine.sensors, adapter=port.frames, polarity=source.polarity)
-        feed = WireFeed(SimpleNamespace, decoder, port.limits)  # opens a stream that nobody reads
+        source = SerialSource(port, engine.sensors, engine.rate, inwards=inwards)
+        sensors = engine.sensors * (3 if inwards else 1)
+        decoder = Decoder(sensors, adapter=port.frames, polarity=source.polarity)
+        # It opens a stream that nobody reads.
+        feed = WireFeed(SimpleNamespace, decoder, port.limits, inwards=inwards)
         skin = SimpleNamespace(stats=decoder.stats)
-        tare = Tare(source.convert, 2.0, engine.rate, lambda: decoder.header)
+        three = None if source.three is None else Tare(source.three.convert, 2.0, engine.rate)
+        tare = Tare(source.convert, 2.0, engine.rate, lambda: decoder.header, three=three)
         tare.glitches.fractions = engine.fractions
         positions = np.zeros((engine.sensors, 3))
         self.display = Display("memory", "memory", positions, (0.1, 0.1), 4.0)

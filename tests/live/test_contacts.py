@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from itertools import count
 from time import monotonic, sleep
+from types import SimpleNamespace
 
 import numpy as np
 import psutil
@@ -66,6 +67,28 @@ def posterior():
 def felt(simulator):
     """Return the readings of a fingertip of 5 N."""
     return 5 * disc_readings(simulator, BODY, TRUTH, 0.0015)[0]
+
+
+def test_contacts_take_all_channels_of_three_axes(felt):
+    """What changed, or is masked, is counted by sensors of the alarm: a channel along the surface is none."""
+    sent, answers, contacts = [], [{"changed": [1, 5]}], LiveContacts()
+    contacts._pipe = SimpleNamespace(poll=lambda: True, recv=answers.pop, send=sent.append)
+    contacts._whole, contacts._asked_at = bool, 0.0
+    three = replace(CONVERSION, scale=np.ones(3 * SENSORS), zero=np.zeros(3 * SENSORS), rest=None, noise=None,
+                    broken=np.zeros(3 * SENSORS, dtype=bool))  # fmt: skip
+    contacts.three = SimpleNamespace(conversion=three)
+    values = np.stack([felt + 1, felt - 2, felt], axis=1).ravel()
+    every = three.convert(Frame(None, 1.0, 0.0, values, values < np.inf))
+    stream = [each._replace(three=every) for each in frames(felt)]
+    contacts.look(stream, CONVERSION, [replace(TOUCHED, masked=(0,))], np.full(SENSORS, 0.5))
+    assert contacts.changed == (1,)
+    assert np.flatnonzero(~sent[0].valid).tolist() == [2]
+    np.testing.assert_allclose(
+        sent[0].values.reshape(-1, 3) - felt[:, None], [[1, -2, -0.5]] * SENSORS, atol=1e-6
+    )
+    np.testing.assert_allclose(contacts.tangential, np.stack([felt + 1, felt - 2], axis=1), atol=1e-6)
+    contacts.look([each._replace(three=None) for each in stream], CONVERSION, [TOUCHED], np.zeros(SENSORS))
+    assert len(sent) == 1  # no readings before the tare of all channels
 
 
 AGAIN = pytest.mark.slow("starts a process that imports anew, once more")

@@ -65,9 +65,35 @@ def arriving(stream, each=1):
             waiting = b""
 
 
-def watch(stream, each=1, verify=None, **port):
+def watch(stream, each=1, verify=None, inwards=False, **port):
     """Return the live view of the bytes of frames."""
-    return MemoryView(arriving(stream, each), settings(), verify, **port)
+    return MemoryView(arriving(stream, each), settings(), verify, inwards, **port)
+
+
+@pytest.mark.parametrize("broken", ["nothing", "saturated", "dead", "frozen", "touched"])
+def test_what_channels_along_the_surface_do_changes_no_verdict(broken):
+    """A normal channel at its limit and one that dies count as on a skin without the other channels."""
+    values = force(12, (6, 7, 4, 6.0), (9, 10, 8, 6.0))
+    values[:, 2], values[300:, 7] = 50.0, -4.0
+    along = np.random.default_rng(1).normal(scale=0.02, size=(len(values), SENSORS, 2))
+    along[600:700, 4] += [1.0, -2.0]
+    along = {
+        "nothing": along,
+        "saturated": along + 50.0,
+        "dead": along * 0 - 4.0,
+        "frozen": np.where(np.arange(len(values))[:, None, None] > 500, 1.0, along),
+        "touched": along + 3 * np.sin(np.arange(len(values)))[:, None, None],
+    }[broken]
+    every = np.concatenate([along, values[..., None]], axis=2).reshape(len(values), -1)
+    counts = lambda row: np.clip(np.round(200 + row / SCALE), 0, 1023).astype(int)  # noqa: E731
+    alone = watch(lines(values, header=COUNTS, encode=counts), scale=SCALE)
+    header = encode_header(Header(n=3 * SENSORS, rate=RATE, unit="adc", bits=10))
+    seen = watch(lines(every, header=header, encode=counts), inwards=True, scale=SCALE)
+    assert seen.said == alone.said
+    assert 6 <= seen.first(3) <= 6.5 + LATE
+    assert list(map(vars, seen.looks)) == list(map(vars, alone.looks))
+    tangential = seen.display.contacts.tangential
+    assert broken != "nothing" or np.abs(tangential).max() < 0.2
 
 
 class Paced:

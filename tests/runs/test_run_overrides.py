@@ -5,6 +5,7 @@ from hydra import initialize_config_dir
 
 from skin.core.files import CONF
 from skin.errors import InputError
+from skin.runs.build import build_device, build_skin, with_axes_of
 from skin.runs.configuration import recompose, settings_of
 
 
@@ -125,3 +126,19 @@ def test_an_option_cannot_change_what_the_weights_depend_on_nor_what_has_no_effe
     assert with_option(("+trainer.gradient_clip_val=1.0",), text=text)["layout"]["path"] == "mine.csv"
     back = with_option(("evaluation.devices=7",), text=f"{OWN}evaluation: {{devices: 3}}\n")
     assert back["evaluation"]["devices"] == 7
+
+
+def test_a_run_of_normal_sensors_takes_those_inwards_of_three_axes(configured, tmp_path):
+    trained, three = configured("layout=grid"), configured("layout=grid", "layout.axes=three")
+    assert with_axes_of(trained, three) == trained
+    assert with_axes_of(three, three) is three
+    with pytest.raises(InputError, match="trained on sensors of three axes, the layout has one"):
+        with_axes_of(three, trained)
+    columns = ["x_m,y_m,direction_x,direction_y,direction_z"]
+    rows = [f"0.05,{y},{axis}" for y in (0.03, 0.06) for axis in ("1,0,0", "0,1,0", "0,0,1")]
+    path = tmp_path / "three.csv"
+    path.write_text("\n".join(columns + rows))
+    words = ("layout=file", f"layout.path={path}", "device=serial", "device.port=/dev/x")
+    used = with_axes_of(trained, configured(*words))
+    assert (build_skin(used).sensors.positions[:, 1].tolist(), used.device["inwards"]) == ([0.03, 0.06], True)
+    assert build_device(used).wire.three is not None

@@ -11,6 +11,7 @@ from skin.body.base import GEOMETRY
 from skin.device.touches import Touches
 from skin.errors import InputError
 from skin.learning.features import engineered_features
+from skin.learning.graph import Graph
 from skin.learning.representation import (
     Features,
     Fourier,
@@ -36,6 +37,22 @@ def test_x_is_the_column_and_y_the_row_also_on_an_oblong_sheet():
     assert picture[2, 15] == 0.5
     assert picture[14, 1] == 1.0
     assert picture.count_nonzero() == 2
+
+
+@pytest.mark.parametrize("kind", [Fourier, Graph, Image, Interpolation])
+def test_three_axes_of_a_site_are_three_features_of_one_place(kind):
+    """Each is what a skin with sensors along this axis alone shows; masks come behind all readings."""
+    places = torch.tensor([[0.02, 0.01, 0.0], [0.05, 0.06, 0.0], [0.11, 0.03, 0.0], [0.15, 0.07, 0.0]])
+    readings, valid = torch.randn(2, 5, 12), torch.rand(2, 5, 12) > 0.2
+    alone, three = (
+        kind(sites, (0.16, 0.08), mask=True) for sites in (places, places.repeat_interleave(3, 0))
+    )
+    frames = three(readings, valid)
+    along = -1 if kind is Graph else 2
+    parts = [alone(readings[..., axis::3], valid[..., axis::3]) for axis in range(3)]
+    values, masks = zip(*(part.x.split(1, dim=along) for part in parts), strict=True)
+    torch.testing.assert_close(frames.x, torch.cat([*values, *masks], dim=along))
+    assert kind is not Graph or torch.equal(frames.adjacency, parts[0].adjacency)
 
 
 def test_a_sensor_on_the_far_edges_falls_in_the_last_pixel():

@@ -239,7 +239,7 @@ def record_session(
             try:
                 for frame in skin:
                     done = segmenter.add(frame)
-                    if done is not None and not done.broken and done.number not in log.done:
+                    if done is not None and done.number not in log.done:
                         log.write((done, conversion))
                         words = (
                             f"{len(log.done)} of {number} gestures" if number else f"gesture {len(log.done)}"

@@ -16,13 +16,10 @@ from annotated_types import Ge
 from skin.core.files import CONF
 from skin.core.safe_loading import load_yaml
 from skin.core.settings import check_settings
-from skin.device.resampling import FrameError
 from skin.errors import InputError
 from skin.wire.formats import (
-    DetectedFormat,
-    FieldFormat,
+    FrameFormat,
     Roles,
-    RowsFormat,
     SensorCountError,
     cycles,
     find_roles,
@@ -34,16 +31,18 @@ from skin.wire.formats import (
 from skin.wire.lines import (
     LABEL,
     NUMBER,
-    CobsReader,
-    JsonReader,
     NumberWords,
-    PatternReader,
     Reader,
-    SeparatedReader,
-    StructReader,
+    StructField,
+    find_json,
+    find_row,
     learn_keys,
+    read_named,
+    read_pattern,
+    read_struct,
+    read_words,
 )
-from skin.wire.protocol import INVALID, OVER, SEPARATORS, Line, parse_header, parse_words
+from skin.wire.protocol import INVALID, OVER, SEPARATORS, Line, decode_frame, parse_header, parse_words
 
 _PLAIN = ("protocol", "auto")  # kinds that need no other setting
 _RUN = 12  # frames alike that show a format: that noise rises as often by chance is improbable
@@ -134,7 +133,7 @@ class Adapter:
                     f"device.adapter.{name}={text} is not a regular expression: {error}"
                 ) from error
         binary = self.kind == "binary"
-        size = self._record.itemsize if self.struct else 1
+        size = sum(field.size for field in self._fields) if self.struct else 1
         empty = [name for name in ("start", "poll", "separator", "label") if getattr(self, name) == ""]
         for wrong, message in (
             (
@@ -162,19 +161,19 @@ class Adapter:
         return [entry.name for entry in fields(self) if getattr(self, entry.name) != entry.default]
 
     @cached_property
-    def _record(self) -> np.dtype:
-        struct = {
-            name: re.sub(r"(?:\((\d+),\))?[<>][iu]3", lambda found: f"({3 * int(found[1] or 1)},)u1", kind)
-            for name, kind in (self.struct or {}).items()
-        }
-        try:
-            record = np.dtype(list(struct.items()))
-        except (TypeError, ValueError, SyntaxError) as error:
-            raise InputError(f"device.adapter.struct={dict(self.struct or {})}: {error}") from error
-        kinds = {record[name].base.kind for name in record.names or ()}
-        if not kinds <= set("iuf"):
-            raise InputError("device.adapter.struct holds numbers alone, as in <u2, i1 or (16,)<f4")
-        return record
+    def _fields(self) -> list[StructField]:
+        """The fields of a binary frame."""
+        table = list[StructField]()
+        for name, kind in (self.struct or {}).items():
+            try:
+                described = np.dtype(re.sub(r"([iu])3$", r"\g<1>4", kind))
+            except (TypeError, ValueError, SyntaxError) as error:
+                raise InputError(f"device.adapter.struct={dict(self.struct or {})}: {error}") from error
+            if described.base.kind not in "iuf":
+                raise InputError("device.adapter.struct holds numbers alone, as in <u2, i1 or (16,)<f4")
+            code = described.base.str[:2] + ("3" if kind[-1] == "3" else str(described.base.itemsize))
+            table.append(StructField(name, code, int(np.prod(described.shape, dtype=int))))
+        return table
 
     def _mark(self, text: str) -> bytes:
         try:
@@ -219,30 +218,33 @@ class Adapter:
     def _delimiter(self, data: bytes) -> bytes:
         return self.end.encode() if self.end else b"\n" if b"\n" in data or self.kind == "protocol" else b"\r"
 
-    def detect(self, data: bytes, sensors: int | None) -> DetectedFormat:
+    def detect(self, data: bytes, sensors: int | None) -> FrameFormat | int | None:
         """Return the format of the first bytes of a connection.
 
         Args:
             data: from the first byte on; an incomplete piece at the end is ignored.
             sensors: S, or None to detect it.
+
+        Returns:
+            the format; a number: values of readable frames, not those of the layout; None: not known yet.
         """
-        protocol, seen = self.kind == "protocol", DetectedFormat()
+        protocol, seen = self.kind == "protocol", None
         for layout in self.layouts(data):
             # Without a checksum, the first line may be half of one.
             pieces = layout.split(data)[0][layout.frame is None and not protocol :]
             rows = self.rows is not None or self.index is not None
             detected = (self._detect_rows if rows else self._detect_run)(layout, pieces, sensors)
-            if detected.frame_format:
+            if isinstance(detected, FrameFormat):
                 return detected
-            seen = seen if detected.count_seen is None and not detected.header else detected
+            seen = seen if detected is None else detected
         return seen
 
-    def layouts(self, data: bytes) -> Iterator[FieldFormat]:
+    def layouts(self, data: bytes) -> Iterator[FrameFormat]:
         """Yield how data may be cut and read; what the adapter leaves open follows from them."""
-        ignore = None if self.ignore is None else re.compile(self.ignore.encode())
         if self.kind == "binary":
             yield from self._binary_layouts(data)
-        elif self.length is not None:
+            return
+        if self.length is not None:
             mark = (
                 self.separator.encode()
                 if self.separator
@@ -254,68 +256,69 @@ class Adapter:
             pattern = re.escape(mark).join([number] * count)
             if not odd and width > 0 and count > 1 and re.search(b"(?:" + pattern + b"){%d}" % _RUN, data):
                 split = fixed_length(self.length, pattern, number + re.escape(mark), width + len(mark))
-                yield FieldFormat(split, self._reader([data]), frame=re.compile(pattern))
-        else:
-            lines = [line for line in self._lines(data) if not (ignore and ignore.fullmatch(line))]
-            plain = self.kind == "protocol"
-            if plain:
-                whole = re.compile(b".*", re.DOTALL)
-                yield FieldFormat(partial(split_at, b"\0"), CobsReader(), "binary", frame=whole, plain=True)
-            cut = partial(split_at, self._delimiter(data))
-            yield FieldFormat(cut, self._reader(lines), "text" if plain else self.kind, ignore, plain=plain)
+                yield FrameFormat(split, *self._reader([data]), frame=re.compile(pattern))
+            return
+        plain = self.kind == "protocol"
+        if plain:
+            whole = re.compile(b".*", re.DOTALL)
+            yield FrameFormat(partial(split_at, b"\0"), decode_frame, name="binary", frame=whole, plain=True)
+        ignore = None if self.ignore is None else re.compile(self.ignore.encode())
+        lines = [line for line in self._lines(data) if not (ignore and ignore.fullmatch(line))]
+        cut, name = partial(split_at, self._delimiter(data)), "text" if plain else self.kind
+        yield FrameFormat(cut, *self._reader(lines), name, ignore, plain=plain)
 
-    def _binary_layouts(self, data: bytes, maximum_repeats: int = 256) -> Iterator[FieldFormat]:
+    def _binary_layouts(self, data: bytes, maximum_repeats: int = 256) -> Iterator[FrameFormat]:
         head, tail = self._mark(self.head), self._mark(self.tail)
         repeats = [self.repeat] if self.repeat else range(1, maximum_repeats)
+        names = [field.name for field in self._fields for _ in range(field.numbers)]
         for repeat in repeats if data.count(head or tail) >= _RUN else ():
-            size = repeat * self._record.itemsize
+            size = repeat * sum(field.size for field in self._fields)
             pattern = re.escape(head) + b".{%d}" % size + re.escape(tail)
             if re.search(b"(?:" + pattern + b"){%d}" % _RUN, data, re.DOTALL):
                 follow = b"" if tail else head
                 split = fixed_length(len(head) + size + len(tail), pattern, re.escape(follow), len(follow))
-                reader, frame = self.struct_reader(repeat, len(head)), re.compile(pattern, re.DOTALL)
-                yield FieldFormat(split, reader, "binary", frame=frame)
+                reader, frame = (
+                    partial(read_struct, self._fields, repeat, len(head)),
+                    re.compile(pattern, re.DOTALL),
+                )
+                yield FrameFormat(split, reader, names, "binary", frame=frame)
 
-    def struct_reader(self, repeat: int, offset: int) -> StructReader:
-        """Return what reads ``struct``, ``repeat`` times from byte ``offset`` on."""
-        kinds = (self.struct or {}).items()
-        wide = {
-            name: kind[-3:] for name, kind in kinds if kind[-2:] in ("i3", "u3")
-        }  # integers of three bytes
-        return StructReader(self._record, wide, repeat, offset)
-
-    def _reader(self, lines: Sequence[bytes]) -> Reader:
-        """Return what reads the fields of lines like these."""
+    def _reader(self, lines: Sequence[bytes]) -> tuple[Reader, Sequence[str]]:
+        """Return what reads the fields of lines like these, and their names."""
+        numbers, keys = self._words, tuple(self.names)
         if self.kind == "json":
-            reader = JsonReader(self._words)
-            return replace(reader, keys=tuple(self.names) or learn_keys(reader.fields, lines))
+            keys = keys or learn_keys(find_json, lines)
+            return partial(read_named, numbers, find_json, keys), keys
         marks = [self.separator.encode()] if self.separator and self.separator.strip() else []
         if self.separator is None:
             marks = [mark for mark in SEPARATORS if mark.decode() not in (self.decimal, self.thousands)]
-        bodies = [line.rpartition(b"*")[0 if b"*" in line else 2].rstrip(b" \r") for line in lines]
-        ends = sum(body.endswith(tuple(marks)) for body in bodies)
-        split = SeparatedReader(self._words, marks, self.names, 2 * ends > len(bodies))
-        pattern = self.pattern or (self.label and LABEL % re.escape(self.label))
-        pattern = pattern or (self.number and NUMBER % self.number)
-        if pattern is None:
-            return split
-        named = PatternReader(re.compile(pattern.encode()), split)
-        groups = named.pattern.groupindex
-        if "name" not in groups:
-            return named
-        learn = "value" in groups and self.rows is None and not self.names
-        return replace(named, keys=learn_keys(named.fields, lines) if learn else tuple(self.names))
+        text = self.pattern or (self.label and LABEL % re.escape(self.label))
+        text = text or (self.number and NUMBER % self.number)
+        if text is None:
+            bodies = [line.rpartition(b"*")[0 if b"*" in line else 2].rstrip(b" \r") for line in lines]
+            trailing = 2 * sum(body.endswith(tuple(marks)) for body in bodies) > len(bodies)
+            return partial(read_words, numbers, marks, trailing), keys
+        pattern = re.compile(text.encode())
+        groups = list(pattern.groupindex)
+        if "value" not in groups:
+            rows = {name.encode(): b"%d" % row for row, name in enumerate(keys if "name" in groups else ())}
+            titles = ["values.*" if name == "values" else name for name in groups]
+            return partial(read_pattern, numbers, pattern, marks, rows), titles
+        find, named = partial(find_row, pattern), "name" in groups
+        if named and self.rows is None:
+            keys = keys or learn_keys(find, lines)
+        return partial(read_named, numbers, find, keys if named else ()), keys
 
     def _lines(self, data: bytes) -> list[bytes]:
         """Return the complete lines with fields; the first may be half of one."""
         lines = [line.strip(b"\r\n") for line in data.split(self._delimiter(data))[:-1]][1:]
         return [line for line in lines if line and not line.startswith(b"#")]
 
-    def _columns(
-        self, rows: Sequence[Line], reader: Reader, sensors: int | None, *index: int
+    def _roles(
+        self, rows: Sequence[Line], layout: FrameFormat, sensors: int | None, *index: int
     ) -> Roles | int | None:
         """Return the roles of the fields of lines; None: a word stands in a field that is not dropped."""
-        names = reader.names(len(rows[0].fields))
+        names = layout.names(len(rows[0].fields))
         dropped = [*resolve(self.drop, names, len(rows[0].fields)), *index]
         if any(position not in dropped for row in rows for position in row.strange):
             return None
@@ -333,8 +336,8 @@ class Adapter:
         )
 
     def _detect_run(
-        self, layout: FieldFormat, pieces: Sequence[bytes], sensors: int | None
-    ) -> DetectedFormat:
+        self, layout: FrameFormat, pieces: Sequence[bytes], sensors: int | None
+    ) -> FrameFormat | int | None:
         header, count_seen, run = None, None, list[Line]()
         binary = layout.plain and layout.frame is not None
         for piece in pieces:
@@ -347,26 +350,24 @@ class Adapter:
                 continue
             if run and (len(run[-1].fields), run[-1].check) != (len(read.fields), read.check):
                 run = []
-            run = [*run[1 - _RUN :], read]
-            found: Roles | int | None = None
+            run, found = [*run[1 - _RUN :], read], None
             if layout.plain:
                 found = protocol_roles(run[-8:], sensors, header and header.n, binary)
             elif len(run) == _RUN:
-                found = self._columns(run, layout.reader, sensors)
-            if isinstance(found, int):
-                count_seen = found
-            elif found is not None:
-                return DetectedFormat(replace(layout, roles=found, check=read.check), None, header)
-        return DetectedFormat(count_seen=count_seen, header=header)
+                found = self._roles(run, layout, sensors)
+            if isinstance(found, Roles):
+                return replace(layout, roles=found, check=read.check)
+            count_seen = count_seen if found is None else found
+        return count_seen
 
     def _detect_rows(
-        self, layout: FieldFormat, pieces: Sequence[bytes], sensors: int | None
-    ) -> DetectedFormat:
+        self, layout: FrameFormat, pieces: Sequence[bytes], sensors: int | None
+    ) -> FrameFormat | int | None:
         reads = [read if isinstance(read := _numeric(layout, piece), Line) else None for piece in pieces]
         width = Counter(len(read.fields) for read in reads if read).most_common(1)
         rows = [read if read and len(read.fields) == width[0][0] else None for read in reads]
-        numbered, starts, first, count = [row for row in rows if row], list[Line](), 0.0, 0
-        index = self._find_index(numbered, layout.reader) if numbered else None
+        numbered, first = [row for row in rows if row], 0.0
+        index = self._find_index(numbered, layout) if numbered else None
         if index is not None:
             numbers = [row.fields[index] for row in numbered if isfinite(row.fields[index])] or [0.0]
             first, count = min(numbers), int(max(numbers) - min(numbers)) + 1
@@ -376,18 +377,17 @@ class Adapter:
             count = Counter(map(len, blocks)).most_common(1)[0][0] if blocks else 0
             starts = [block[0] for block in blocks if len(block) == count]
         if len(starts) < _RUN or self.rows not in (None, 0, count):
-            return DetectedFormat()
-        columns = self._columns(starts, layout.reader, None, *([] if index is None else [index]))
-        if columns is None or isinstance(columns, int):
-            return DetectedFormat(count_seen=columns)
-        total = count * columns.sensors
-        if sensors not in (None, total):
-            return DetectedFormat(count_seen=total)
-        return DetectedFormat(RowsFormat(replace(layout, roles=columns), count, index, first))
+            return None
+        roles = self._roles(starts, layout, None, *([] if index is None else [index]))
+        if not isinstance(roles, Roles):
+            return roles
+        detected = replace(layout, name="rows", roles=roles, rows=count, index=index, first=first)
+        return detected if sensors in (None, detected.sensors) else detected.sensors
 
-    def _find_index(self, rows: Sequence[Line], reader: Reader) -> int | None:
+    def _find_index(self, rows: Sequence[Line], layout: FrameFormat) -> int | None:
         """Return the field that numbers the rows; None if there is none."""
-        names, table = reader.names(len(rows[0].fields)), np.array([row.fields for row in rows])
+        table = np.array([row.fields for row in rows])
+        names = layout.names(table.shape[1])
         if self.index is not None or ("name" in names and self.names):
             return resolve(["name" if self.index is None else self.index], names, table.shape[1])[0]
         leading = range(min(2, table.shape[1] - 1))
@@ -399,16 +399,14 @@ class Adapter:
             return SensorCountError(count_seen, sensors)
         hint, start = "skin listen adapter=auto proposes an adapter", data[:64]
         sample = repr(start.decode("ascii", "replace")) if is_text(start) else start.hex(" ")
+        missing = f"no frame in {len(data)} bytes, which begin with {sample}"
         if self.kind == "protocol":
             return InputError(
-                f"no frame in {len(data)} bytes, which begin with {sample}: is the baud rate right, as in "
-                f"device.baudrate=115200? For another format, {hint}"
+                f"{missing}: is the baud rate right, as in device.baudrate=115200? For another format, {hint}"
             )
         texts = [] if self.kind == "binary" or self.length is not None else self._lines(data)[-3:]
         if not texts:
-            return InputError(
-                f"the adapter reads no frame in {len(data)} bytes, which begin with {sample}: {hint}"
-            )
+            return InputError(f"the adapter reads {missing}: {hint}")
         layout = next(self.layouts(data))
         shown = "; ".join(
             f"{line[:80].decode('ascii', 'replace')!r} ({_why(layout, line)})" for line in texts
@@ -427,11 +425,13 @@ def read_adapter(described: str | Mapping[str, Any] | Adapter) -> Adapter:
     """
     if isinstance(described, Adapter):
         return described
+    if described in _PLAIN:
+        described = {"kind": described}
     if isinstance(described, str):
         shipped = {path.stem: path for path in sorted((CONF / "adapters").glob("*.yaml"))}
         path = shipped.get(described, Path(described))
         try:
-            described_settings = {"kind": described} if described in _PLAIN else load_yaml(path)
+            described = load_yaml(path)
         except (OSError, ValueError) as error:
             if path.suffix in (".yaml", ".yml"):
                 raise InputError(f"device.adapter={path} cannot be read: {error}") from error
@@ -439,13 +439,12 @@ def read_adapter(described: str | Mapping[str, Any] | Adapter) -> Adapter:
                 f"there is no device.adapter={described}: there are {', '.join((*_PLAIN, *shipped))}, or "
                 "give a file, as in device.adapter=board.yaml, which skin listen adapter=auto proposes"
             ) from error
-    else:
-        described_settings = described
-    check_settings(Adapter, described_settings, "device.adapter", whole=True)
-    settings: dict[str, Any] = {
-        name: tuple(value) if isinstance(value, list) else value for name, value in described_settings.items()
+    settings: dict[str, Any] = described  # type: ignore[assignment]
+    check_settings(Adapter, settings, "device.adapter", whole=True)
+    plain: Any = {
+        name: tuple(value) if isinstance(value, list) else value for name, value in settings.items()
     }
-    return Adapter(**settings)
+    return Adapter(**plain)
 
 
 def is_text(data: bytes) -> bool:
@@ -453,30 +452,19 @@ def is_text(data: bytes) -> bool:
     return sum(byte in b"\r\n\t\0\x1b" or 32 <= byte < 127 for byte in data) > 0.95 * len(data)
 
 
-def try_fields(layout: FieldFormat, piece: bytes) -> Line | bytes | None:
-    """Return the fields of a piece, or a line that is no frame; None: it is neither."""
-    try:
-        return layout.fields(piece)
-    except FrameError:
-        return None
-
-
-def _numeric(layout: FieldFormat, piece: bytes) -> Line | bytes | None:
+def _numeric(layout: FrameFormat, piece: bytes) -> Line | bytes | None:
     """Return the fields of a piece with any number, of our protocol with most; or a line that is none."""
-    read = try_fields(layout, piece)
+    read = layout.try_fields(piece)
     if not isinstance(read, Line):
         return read
     count = np.count_nonzero(np.isfinite(read.fields))
     return read if (2 * count > len(read.fields) and not read.strange if layout.plain else count) else None
 
 
-def _why(layout: FieldFormat, line: bytes) -> str:
+def _why(layout: FrameFormat, line: bytes) -> str:
     """Return why a line is no frame."""
-    try:
-        read = layout.fields(line)
-    except FrameError:
-        return "its shape is another"
-    if isinstance(read, bytes):
-        return "ignored"
+    read = layout.try_fields(line)
+    if not isinstance(read, Line):
+        return "its shape is another" if read is None else "ignored"
     word = next(iter(read.strange.values()), b"").decode("ascii", "replace")
     return f"field {word!r} is not a number" if word else f"{len(read.fields)} fields"

@@ -229,13 +229,12 @@ class Decoder:
             return False
         self._unseen = 0
         detected = self.adapter.detect(self._buffer, self.sensors)
-        self.frame_format, self._count_seen = detected.frame_format, detected.count_seen
-        if self.frame_format is None:
+        if not isinstance(detected, FrameFormat):
+            self._count_seen = detected
             return False
-        self._update_header(detected.header)
-        self.sensors = self.frame_format.sensors
-        self.stats.format, self.stats.check = self.frame_format.name, self.frame_format.check
-        if (roles := self.frame_format.roles) and roles.unit is not None:
+        self.frame_format, self.sensors = detected, detected.sensors
+        self.stats.format, self.stats.check = detected.name, detected.check
+        if (roles := detected.roles) and roles.unit is not None:
             self._clock.expect(roles.unit, self.adapter.time_unit is not None)
         self._all_valid = np.ones(self.sensors, dtype=bool)
         self._all_valid.flags.writeable = False

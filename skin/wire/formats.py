@@ -2,13 +2,12 @@
 
 import re
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from functools import cached_property
 from itertools import pairwise
 from math import inf, nan
-from typing import ClassVar, Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 
@@ -16,7 +15,7 @@ from skin.device.resampling import Check, FrameError
 from skin.errors import InputError
 from skin.wire.clocks import UNITS
 from skin.wire.lines import Reader
-from skin.wire.protocol import Header, Line, RawFrame, frames_ahead
+from skin.wire.protocol import Line, RawFrame, frames_ahead
 
 
 @dataclass(frozen=True)
@@ -124,42 +123,64 @@ def fixed_length(length: int, pattern: bytes, follow: bytes = b"", margin: int =
     return split
 
 
-_ANSI = re.compile(rb"\x1b\[[0-9;]*[A-Za-z]|\0")  # colours of a terminal, and the end of a string in C
+ANSI = re.compile(rb"\x1b\[[0-9;]*[A-Za-z]|\0")  # colours of a terminal, and the end of a string in C
 
 
-@dataclass(frozen=True)
-class FieldFormat:
-    """Frames of one piece each: a splitter, and a reader of the fields.
+@dataclass
+class FrameFormat:
+    """How bytes are cut into pieces, and how the frames that end with them are read.
+
+    A frame is a piece, or several: the rows of a matrix, or an index and its values. It counts only if each
+    of its rows arrived, in order.
 
     Attributes:
         split: cuts bytes into pieces.
         reader: of the fields of a piece.
+        titles: names of the fields; ``values.*`` stands for as many as are left. They repeat over all fields.
         name: word for the user.
         ignore: regular expression of the lines that are no frames.
         frame: regular expression of a frame of bytes; None: pieces are lines.
         plain: the frames are those of our protocol, in which no byte is left out.
         roles: of the fields; None: not known yet.
         check: kind of checksum.
+        rows: pieces of a frame.
+        index: field with the number of the row; None: other lines stand between two frames.
+        first: the smallest index.
     """
 
     split: Split
     reader: Reader
+    titles: Sequence[str] = ()
     name: str = "text"
     ignore: re.Pattern[bytes] | None = None
     frame: re.Pattern[bytes] | None = None
     plain: bool = False
     roles: Roles | None = None
     check: Check = "none"
+    rows: int = 0
+    index: int | None = None
+    first: float = 0.0
+
+    def __post_init__(self) -> None:
+        self._partial, self._open, self._reported = list[Line](), False, True
 
     @property
     def sensors(self) -> int:
         """S."""
-        return self.roles.sensors if self.roles else 0
+        return self.roles.sensors * (self.rows or 1) if self.roles else 0
+
+    def names(self, count: int) -> Sequence[str]:
+        """Return the names of ``count`` fields; empty: they have none."""
+        if "values.*" in self.titles:
+            inner = [f"values.{number}" for number in range(count - len(self.titles) + 1)]
+            return [name for title in self.titles for name in (inner if title == "values.*" else [title])]
+        fits = self.titles and count % len(self.titles) == 0
+        return list(self.titles) * (count // len(self.titles)) if fits else ()
 
     def fields(self, piece: bytes) -> Line | bytes:
         """Return the fields of a piece; the line where it is empty, ignored or a comment; else FrameError."""
         if self.frame is None:
-            piece = (piece if self.plain else _ANSI.sub(b"", piece)).strip(b"\r\n")
+            piece = (piece if self.plain else ANSI.sub(b"", piece)).strip(b"\r\n")
             if not piece or piece.startswith(b"#") or (self.ignore and self.ignore.fullmatch(piece)):
                 return piece
         elif not self.frame.fullmatch(piece):
@@ -173,45 +194,30 @@ class FieldFormat:
             raise FrameError("fields", len(read.fields) - self.roles.count + len(self.roles.values))
         return read
 
+    def try_fields(self, piece: bytes) -> Line | bytes | None:
+        """Return the fields of a piece, or a line that is no frame; None: it is neither."""
+        try:
+            return self.fields(piece)
+        except FrameError:
+            return None
+
     def read(self, piece: bytes) -> RawFrame | bytes:
-        """Return the frame in a piece, or the line where it is none; else raise FrameError."""
+        """Return the frame that ends with a piece; the line, or nothing, where none does; else FrameError."""
+        if self.rows:
+            return self._read_row(self.try_fields(piece))
         read = self.fields(piece)
         return read if isinstance(read, bytes) else self.roles.frame(read)  # type: ignore[union-attr]
 
-
-class RowsFormat:
-    """Several lines per frame: the rows of a matrix, or an index and its values.
-
-    A frame counts only if each of its rows arrived, in order.
-
-    Args:
-        line: format of a row.
-        rows: of a frame.
-        index: field with the number of the row; None: other lines stand between two frames.
-        first: the smallest index.
-    """
-
-    name: ClassVar[str] = "rows"
-
-    def __init__(self, line: FieldFormat, rows: int, index: int | None, first: float) -> None:
-        self.line, self.rows, self.index, self._first = line, rows, index, first
-        self._partial: list[Line] = []
-        self._open, self._reported = False, True
-        self.sensors, self.check, self.split = rows * line.sensors, line.check, line.split
-        self.roles = line.roles
-
-    def read(self, piece: bytes) -> RawFrame | bytes:
-        """Return the frame whose last row this line is; bytes within a frame; else raise FrameError."""
-        row: Line | bytes | None = None
-        with suppress(FrameError):
-            row = self.line.fields(piece)
+    def _read_row(self, row: Line | bytes | None) -> RawFrame | bytes:
+        """Return the frame whose last row this is; bytes within a frame; else raise FrameError."""
         if isinstance(row, bytes) and (self.index is not None or row.startswith(b"# skin")):
             return row
+        expected = len(self._partial)
         if self.index is not None:
-            number = row.fields[self.index] - self._first if isinstance(row, Line) else -1
+            number = row.fields[self.index] - self.first if isinstance(row, Line) else -1
         else:
-            number = (len(self._partial) if self._open else -1) if isinstance(row, Line) else 0
-        expected, fits = len(self._partial), number in (0, len(self._partial))
+            number = (expected if self._open else -1) if isinstance(row, Line) else 0
+        fits = number in (0, expected)
         incomplete = number != expected and bool(expected or not self._reported)
         kept = self._partial if number and fits else []
         self._partial = [*kept, row] if fits and isinstance(row, Line) else []
@@ -220,27 +226,10 @@ class RowsFormat:
             raise FrameError("rows")
         if len(self._partial) < self.rows:
             return row if isinstance(row, bytes) else b""
-        frames, self._partial, self._open = [self.line.roles.frame(row) for row in self._partial], [], False  # type: ignore[union-attr]
+        frames = [self.roles.frame(line) for line in self._partial]  # type: ignore[union-attr]
+        self._partial, self._open = [], False
         values = np.concatenate([frame.values for frame in frames])
         return RawFrame(frames[0].seq, frames[0].ticks, values, all(frame.finite for frame in frames))
-
-
-FrameFormat = FieldFormat | RowsFormat
-"""Cuts bytes into pieces, and reads the frames that end with them."""
-
-
-class DetectedFormat(NamedTuple):
-    """What the first bytes of a connection show.
-
-    Attributes:
-        frame_format: None if it is not known yet.
-        count_seen: number of values in readable frames that do not match the layout; or None.
-        header: the last one received.
-    """
-
-    frame_format: FrameFormat | None = None
-    count_seen: int | None = None
-    header: Header | None = None
 
 
 def protocol_roles(
@@ -368,26 +357,23 @@ def find_roles(
     """
     count = table.shape[1]
     names = names if len(names) == count else ()
-    free = [position for position in range(count) if position not in resolve(drop, names, count)]
-    if values is not None:
-        chosen = resolve(values, names, count)
-    # As many fields as sensors: none is a counter.
+    left_out = resolve(drop, names, count)
+    free = [position for position in range(count) if position not in left_out]
     each = 1 if axes == "plain" else _AXES
-    closed = sensors == (len(free) / each if values is None else -1) and not names
+    # As many fields as sensors: none is a counter.
+    closed = values is None and sensors == len(free) / each and not names
     roles: dict[str, int | None] = {}
     for role, setting, behaves, pattern in (
         ("counter", counter, counts, _COUNTERS),
         ("time", time, runs, _CLOCKS),
     ):
-        if setting is None or (closed and setting == "auto"):
-            roles[role] = None
-        elif setting != "auto":
-            roles[role] = resolve([setting], names, count)[0]
+        taken = [position for position in free if position not in roles.values()]
+        if setting == "auto":
+            roles[role] = None if closed else _recognise(table, names, taken, behaves, pattern)
         else:
-            taken = [position for position in free if position not in roles.values()]
-            roles[role] = _recognise(table, names, taken, behaves, pattern)
+            roles[role] = None if setting is None else resolve([setting], names, count)[0]
     others = [position for position in free if position not in roles.values()]
-    picked = others if values is None else chosen
+    picked = others if values is None else resolve(values, names, count)
     if len(picked) % each:
         raise InputError(
             f"device.adapter.axes={axes} takes x, y, z of each place, but {len(picked)} values "

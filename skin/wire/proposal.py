@@ -6,7 +6,7 @@ match.
 
 import re
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import chain, pairwise
@@ -16,15 +16,24 @@ import numpy as np
 
 from skin.device.resampling import FrameError
 from skin.errors import InputError
-from skin.wire.adapter import Adapter, is_text, read_adapter, try_fields
-from skin.wire.binary_adapters import SAME, binary_adapters
+from skin.wire.adapter import Adapter, is_text, read_adapter
+from skin.wire.clocks import UNITS
 from skin.wire.decoder import Decoder, kind_of_line
-from skin.wire.formats import RowsFormat, counts, cycles, last_part, runs
+from skin.wire.formats import ANSI, FrameFormat, counts, cycles, last_part, runs
+from skin.wire.lines import unpack
 from skin.wire.protocol import INVALID, OVER, Line, split_words
 
 Pieces = Sequence[tuple[float, bytes]]
 """Bytes with the time of their arrival, s."""
 
+_SAME = 0.98
+"""Part of the bytes or characters that repeat from frame to frame; others are damaged."""
+_KINDS = ("<f4", ">f4", "<u2", ">u2", "<i2", ">i2", "<i4", ">i4", "<i3", ">i3", "u1")
+_HEADERS = tuple(
+    tuple(words.split())
+    for words in ("", "u1", "<u2", "<u4", ">u2", ">u4", "u1 <u4", "<u2 <u4", "<u4 <u4", ">u2 >u4")
+)
+"""Types of values, and of a counter and a clock before them."""
 _FRAMES = 10  # that a candidate must read
 _NUMBER = re.compile(rb"\d{1,2}:\d\d:\d\d(?:\.\d+)?|(?:(?<!\w)[-+])?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]\d+)?")
 _WORD = r"[-+.:\w/]+"  # a number, or a word in its position
@@ -76,7 +85,7 @@ def propose(pieces: Pieces, seconds: float | None = None, margin: float = 0.25) 
         )
     _refuse_pauses([time for time, _ in pieces], seconds)
     readings, reasons = list[Proposal](), list[str]()
-    for number, adapter in enumerate(chain(_text(data), binary_adapters(data, pieces[-1][0] - pieces[0][0]))):
+    for number, adapter in enumerate(chain(_text(data), _binary(data, pieces[-1][0] - pieces[0][0]))):
         if readings and (adapter.kind == "binary" or number / 100 > readings[0].score + margin):
             break
         try:
@@ -166,7 +175,7 @@ def _read(adapter: Adapter, pieces: Pieces, data: bytes) -> Proposal:
     return Proposal(adapter, "; ".join(filter(None, words)), decoder.sensors or 0, score, values)
 
 
-def _judge_values(values: np.ndarray, frame_format: Any, maximum: int = 64) -> float:
+def _judge_values(values: np.ndarray, frame_format: FrameFormat, maximum: int = 64) -> float:
     """Return how implausible values (F, S) are.
 
     Raises:
@@ -184,7 +193,7 @@ def _judge_values(values: np.ndarray, frame_format: Any, maximum: int = 64) -> f
                 "the firmware send a line per frame, or number the lines"
             )
     score = 0.5 * (1 - moving.shape[1] / values.shape[1])
-    if isinstance(frame_format, RowsFormat) and frame_format.index is not None:
+    if frame_format.index is not None:
         rows = np.median(np.nan_to_num(values), axis=0).reshape(frame_format.rows, -1)
         # A counter of a few bits numbers lines that are all alike.
         score += 3.0 * bool((np.ptp(rows, axis=0) <= 2 * np.median(near)).all())
@@ -224,51 +233,47 @@ def _settle(adapter: Adapter, data: bytes) -> tuple[Adapter, list[str], float]:
     """Return an adapter with the roles of its fields, what it leaves out, in words, and its score."""
     layout = next(adapter.layouts(data))
     pieces = layout.split(data)[0][1:]
-    reads = [(piece, try_fields(layout, piece)) for piece in pieces]
-    lines = [read for _, read in reads if isinstance(read, Line) and not _is_title(read)]
+    reads = [(piece, layout.try_fields(piece)) for piece in pieces]
+    lines = [(piece, read) for piece, read in reads if isinstance(read, Line) and not _is_title(read)]
     if len(lines) < _FRAMES:
         raise FrameError("structure")
-    width = Counter(len(line.fields) for line in lines).most_common(1)[0][0]
-    reads = [(piece, None if _is_title(read) else read) for piece, read in reads]
-    lines = [read for _, read in reads if isinstance(read, Line) and len(read.fields) == width]
-    names = layout.reader.names(width)
-    if not names and adapter.pattern is None and adapter.rows is None:
-        names = _titles(adapter, pieces, width)
-    text = _text_columns(lines)
+    width = Counter(len(read.fields) for _, read in lines).most_common(1)[0][0]
+    table = [read for _, read in lines if len(read.fields) == width]
     others = [
         piece.strip(b"\r\n ")
         for piece, read in reads
-        if not (isinstance(read, bytes) or (isinstance(read, Line) and len(read.fields) == width))
+        if read is None or (isinstance(read, Line) and (_is_title(read) or len(read.fields) != width))
     ]
-    ignore, kinds = _ignored(others, [piece for piece, read in reads if isinstance(read, Line)])
-    score = 0.1 * len(kinds) + 0.2 * len(others) / (len(others) + len(lines))
-    if adapter.rows is not None:
+    names = layout.names(width)
+    if not names and adapter.pattern is None and adapter.rows is None:
+        names = _titles(pieces, width)
+    left_out = dict.fromkeys(_text_columns(table), "is text")
+    ignore, kinds = _ignored(others, [piece for piece, _ in lines])
+    if adapter.rows is None:
+        score = 0.1 * len(kinds) + 0.2 * len(others) / (len(others) + len(table))
+        roles, reasons = _roles(np.array([read.fields for read in table]), names, left_out)
+        left_out = reasons | left_out
+    else:
         # Text or other data between lines of one sensor each does not make them rows.
         between = {kind_of_line(line) for line in others}
-        score = 0.5 * any(
-            kind.count("#") > 1 or re.fullmatch(r"[^#]*[^\W\d_]{2}[^#]*", kind) for kind in between
-        )
-        ignore, kinds = None, []
-    table = np.array([line.fields for line in lines])
-    roles, left_out = _roles(table, names, text) if adapter.rows is None else ({"counter": None}, {})
-    left_out |= dict.fromkeys(text, "is text")
+        wordy = re.compile(r"[^#]*[^\W\d_]{2}[^#]*")
+        score = 0.5 * any(kind.count("#") > 1 or wordy.fullmatch(kind) for kind in between)
+        ignore, kinds, roles = None, [], {"counter": None}
     by_name = bool(names) and len(set(names)) == len(names)
-    described = [names[position] if by_name else position for position in sorted(left_out)]
-    notes = [
-        f"field {names[position] if by_name else position} {why}"
-        for position, why in sorted(left_out.items())
-    ]
+    described = {position: names[position] if by_name else position for position in sorted(left_out)}
+    notes = [f"field {field} {left_out[position]}" for position, field in described.items()]
     notes += [f"{count} lines such as {kind!r} are ignored" for kind, count in kinds]
     if by_name and adapter.pattern is None and adapter.number is None:
         roles["names"] = tuple(names)
-    return replace(adapter, drop=(*adapter.drop, *described), ignore=ignore, **roles), notes, score
+    drop = (*adapter.drop, *described.values())
+    return replace(adapter, drop=drop, ignore=ignore, **roles), notes, score
 
 
-def _is_title(read: Line | bytes | None) -> bool:
-    return isinstance(read, Line) and len(read.strange) == len(read.fields)
+def _is_title(read: Line) -> bool:
+    return len(read.strange) == len(read.fields)
 
 
-def _titles(adapter: Adapter, pieces: Sequence[bytes], width: int) -> Sequence[str]:
+def _titles(pieces: Sequence[bytes], width: int) -> Sequence[str]:
     """Return the names in a line of names between separators; empty: there is none."""
     for piece in pieces:
         line = piece.strip(b"\r\n #")
@@ -330,46 +335,39 @@ def _ignored(others: Sequence[bytes], frames: Sequence[bytes]) -> tuple[str | No
 
 
 def _roles(
-    table: np.ndarray, names: Sequence[str], text: Sequence[int]
+    table: np.ndarray, names: Sequence[str], text: Collection[int]
 ) -> tuple[dict[str, Any], dict[int, str]]:
     """Return the settings of counter and time of fields (L, C), and why other fields are no sensors."""
     free = [position for position in range(table.shape[1]) if position not in text]
-    roles = dict[str, Any](counter=None, time=None)
-    many = len(table) > 30  # of a few lines, only the first two fields may look like a clock
+    roles, many = dict[str, Any](counter=None, time=None), len(table) > 30
     for role, behaves in (("counter", partial(counts, wraps=many)), ("time", runs)):
-        seen = free if many or names else [position for position in free if position < 2]
-        rising = next((position for position in seen if behaves(table[:, position])), None)
-        if rising is not None and len(free) > 1:
-            roles[role] = rising
-            free.remove(rising)
+        # Of a few lines, only the first two fields may look like a clock.
+        seen = [position for position in free if many or names or position < 2] if len(free) > 1 else []
+        roles[role] = next((position for position in seen if behaves(table[:, position])), None)
+        free = [position for position in free if position != roles[role]]
     counter = roles["counter"]
     if counter is not None and np.count_nonzero(np.diff(table[:, counter]) < 0) > 1:
         roles["modulus"] = int(table[:, counter].max()) + 1
     named = {position: names[position] if names else "" for position in free}
+    last = {position: last_part(name) for position, name in named.items()}
     aside = [
-        position
-        for position in free
-        if _ASIDE.fullmatch(named[position]) or _ASIDE.fullmatch(last_part(named[position]))
+        position for position in free if _ASIDE.fullmatch(named[position]) or _ASIDE.fullmatch(last[position])
     ]
-    moving = [position for position in free if np.ptp(table[:, position]) > 0 and position not in aside]
-    low, high = (table[:, moving].min(), table[:, moving].max()) if moving else (0, 0)
-    outside = [
-        position
-        for position in free
-        if np.ptp(table[:, position]) == 0 and not low < table[0, position] < high
-    ]
-    pair = outside == [free[0], free[-1]] and np.count_nonzero(table[0, outside] <= low) == 1
-    guides = [position for position in outside if pair or _GUIDE.fullmatch(last_part(named[position]))]
     left_out = dict.fromkeys(aside, "is no force, by its name")
+    still = np.ptp(table, axis=0) == 0
+    moving = table[:, [position for position in free if not still[position] and position not in aside]]
+    low, high = moving.min(initial=np.inf), moving.max(initial=-np.inf)
+    outside = [position for position in free if still[position] and not low < table[0, position] < high]
+    pair = outside == [free[0], free[-1]] and np.count_nonzero(table[0, outside] <= low) == 1
+    guides = [position for position in outside if pair or _GUIDE.fullmatch(last[position])]
     left_out |= {position: f"is always {table[0, position]:g}, a guide of a plotter" for position in guides}
     rest = [position for position in free if position not in left_out]
     for position in (rest[-1], rest[0]) if len(rest) > 2 else ():
         inner, column = table[:, [other for other in rest if other != position]], table[:, position]
         # What varies as the others do: quiet sensors at rest are near their mean, too.
-        near = [total - column for total in _sums(inner, table, counter) if np.ptp(column) > 0]
-        if any(np.mean(np.abs(error) < 0.51) > SAME and error.std() < 0.3 * column.std() for error in near):
-            left_out[position] = "is a sum of the others"
-            break
+        near = [total - column for total in _sums(inner, table, counter) if not still[position]]
+        if any(np.mean(np.abs(error) < 0.51) > _SAME and error.std() < 0.3 * column.std() for error in near):
+            return roles, left_out | {position: "is a sum of the others"}
     return roles, left_out
 
 
@@ -382,93 +380,85 @@ def _sums(inner: np.ndarray, table: np.ndarray, counter: int | None) -> Iterator
             yield from (total, total % 256, total % 65536)
 
 
-def _text(data: bytes) -> Iterator[Adapter]:
+def _text(data: bytes, longest: int = 512) -> Iterator[Adapter]:
     """Yield adapters of text, the most specific first."""
     yield Adapter()
-    if data.count(b"\n") + data.count(b"\r") < _FRAMES:
-        yield from _endless(data)
+    if data.count(b"\n") + data.count(b"\r") >= _FRAMES:
+        mark = b"\n" if b"\n" in data else b"\r"
+        lines = (ANSI.sub(b"", line).strip(b"\r\n ") for line in data.split(mark)[1:-1])
+        yield from _lines([line for line in lines if line and not line.startswith(b"#")])
         return
-    mark = b"\n" if b"\n" in data else b"\r"
-    lines = [
-        re.sub(rb"\x1b\[[0-9;]*[A-Za-z]|\0", b"", line).strip(b"\r\n ") for line in data.split(mark)[1:-1]
-    ]
-    yield from _lines([line for line in lines if line and not line.startswith(b"#")], {})
+    # Text without lines: of a fixed length, or with a word at the end of each frame.
+    classes = np.frombuffer(re.sub(rb"[-+.\d ]", b"0", data), np.uint8)
+    for length in range(3, min(longest, len(data) // 4)):
+        if np.mean(classes[length:] == classes[:-length]) > _SAME:
+            yield Adapter(kind="text", end="", length=length)
+    for word, count in Counter(re.findall(rb"[^\d\s.,;+-]+", data)).most_common(2):
+        if count >= _FRAMES and word.isascii():
+            yield from _lines(data.split(word)[1:-1], word.decode())
 
 
-def _lines(lines: Sequence[bytes], ending: dict[str, Any]) -> Iterator[Adapter]:
-    yield Adapter(kind="json", **ending)
-    for label in (":", "="):
-        yield from (Adapter(kind="text", label=label, decimal=sign, **ending) for sign in (".", ","))
-    words = [word for line in lines for word in re.split(rb"[;\t ]+", line)]
+def _lines(lines: Sequence[bytes], end: str | None = None) -> Iterator[Adapter]:
+    text = partial(Adapter, kind="text", end=end)
+    yield Adapter(kind="json", end=end)
+    yield from (text(label=label, decimal=sign) for label in (":", "=") for sign in (".", ","))
+    words = re.split(rb"[;\t ]+", b" ".join(lines))
     if (
         any(re.fullmatch(rb"[-+]?\d{1,3}(,\d{3})+", word) for word in words)
         and len(words) >= 2 * len(lines)
         and any(word.isdigit() and int(word) < 1000 for word in words)
     ):
-        yield Adapter(kind="text", thousands=",", **ending)
-    digits = re.split(r"[,;\t ]+", b" ".join(lines).decode("latin-1").strip())
-    if all(re.fullmatch(r"(?i)(0x)?[0-9a-f]{2,}", word) for word in digits) and re.search(
-        r"(?i)[a-f]|0x", str(digits)
-    ):
-        yield Adapter(kind="text", base=16, **ending)
-    yield from (Adapter(kind="text", decimal=sign, **ending) for sign in (".", ","))
-    yield Adapter(kind="text", rows=0, counter=None, **ending)
+        yield text(thousands=",")
+    digits = re.split(rb"[,;\t ]+", b" ".join(lines).strip())
+    hexadecimal = all(re.fullmatch(rb"(?i)(0x)?[0-9a-f]{2,}", word) for word in digits)
+    if hexadecimal and any(not word.isdigit() for word in digits):
+        yield text(base=16)
+    yield from (text(decimal=sign) for sign in (".", ","))
+    yield text(rows=0, counter=None)
     firsts = [match[1].decode() for line in lines if (match := re.match(rb"\W*([A-Za-z_]\w*)", line))]
     if 2 * sum(before != word for before, word in pairwise(firsts)) > len(lines) and len(set(firsts)) <= 64:
         order, pattern = list(dict.fromkeys(firsts[1:])), r"\W*(?P<name>[A-Za-z_]\w*)[^-+.\w]+(?P<values>.*)"
         begin = order.index(min(order))
-        names = (*order[begin:], *order[:begin])
-        yield Adapter(kind="text", pattern=pattern, names=names, rows=0, counter=None, **ending)
-    yield from (replace(adapter, **ending) for adapter in _patterns(lines))
-    yield replace(read_adapter("anyskin"), **ending)
-    yield from (
-        Adapter(kind="text", number=rf"-?\d+\.\d{{{decimals}}}", **ending) for decimals in range(1, 7)
-    )
+        yield text(pattern=pattern, names=(*order[begin:], *order[:begin]), rows=0, counter=None)
+    yield from (text(**described) for described in _patterns(lines))
+    yield replace(read_adapter("anyskin"), end=end)
+    yield from (text(number=rf"-?\d+\.\d{{{decimals}}}") for decimals in range(1, 7))
 
 
-def _patterns(lines: Sequence[bytes]) -> Iterator[Adapter]:
+def _patterns(lines: Sequence[bytes]) -> Iterator[dict[str, Any]]:
     """Yield patterns of the text around the numbers that many lines share."""
-    shapes = Counter(tuple(b" ".join(text.split()) for text in _NUMBER.split(line)) for line in lines)
-    for shape, _ in shapes.most_common(3):
-        alike = [line for line in lines if tuple(b" ".join(t.split()) for t in _NUMBER.split(line)) == shape]
-        if len(alike) < _FRAMES or len(shape) < 2:
+    shapes = [tuple(b" ".join(text.split()) for text in _NUMBER.split(line)) for line in lines]
+    for shape, count in Counter(shapes).most_common(3):
+        alike = [line for line, other in zip(lines, shapes, strict=True) if other == shape]
+        if count < _FRAMES or len(shape) < 2:
             continue
-        literals = [
-            Counter(column).most_common(1)[0][0] for column in zip(*map(_NUMBER.split, alike), strict=True)
-        ]
+        texts = zip(*map(_NUMBER.split, alike), strict=True)
+        literals = [Counter(column).most_common(1)[0][0] for column in texts]
         columns = list(zip(*map(_NUMBER.findall, alike), strict=True))
         if INVALID & {word.lower() for text in literals for word in re.findall(rb"[A-Za-z/]+", text)}:
             continue  # the text is a value that is missing
-        index = next(
-            (
-                position
-                for position in range(len(columns) - 1)
-                if b"".join(columns[position]).isdigit() and cycles(np.array(columns[position], float))
-            ),
-            None,
-        )
+        whole = [b"".join(column).isdigit() and cycles(np.array(column, float)) for column in columns[:-1]]
+        index = whole.index(True) if True in whole else None
         first = len(columns) - 1
         while first > 0 and shape[first] == shape[-2] in (b"", b",", b";") and first - 1 != index:
             first -= 1
-        parts, used = list[str](), set[str]()
-        for position, column in enumerate(
-            columns[: first if first < len(columns) - 1 or index is not None else None]
-        ):
+        separated = first < len(columns) - 1 or index is not None
+        parts, used = list[str](), {"values", "value", "name"}
+        for position, column in enumerate(columns[: first if separated else None]):
             parts.append(_literal(literals[position]))
             if len(set(column)) == 1 and re.search(rb"\w$", literals[position]):
                 parts.append(re.escape(column[0].decode()))  # digits of a word
                 continue
             word = re.sub(r"\W+", "_", literals[position].decode("ascii", "ignore")).strip("_").lower()
-            name = "row" if position == index else word if word and not word[0].isdigit() else f"f{position}"
-            name = name if name not in (*used, "values", "value", "name") else f"f{position}"
+            name = "row" if position == index else word if word.isidentifier() else f"f{position}"
+            name = f"f{position}" if name in used else name
             used.add(name)
             others = rf"(?P<{name}>{_WORD})" if index is None else rf"{_WORD}?"
             parts.append(rf"(?P<{name}>\d+)" if position == index else others)
-        if first < len(columns) - 1 or index is not None:
+        if separated:
             parts += [_literal(literals[first]), "(?P<values>.*?)"]
-        pattern = "".join(parts) + _literal(literals[-1])
         rows: dict[str, Any] = {} if index is None else {"rows": 0, "index": "row", "counter": None}
-        yield Adapter(kind="text", pattern=pattern, **rows)
+        yield {"pattern": "".join(parts) + _literal(literals[-1])} | rows
 
 
 def _literal(text: bytes) -> str:
@@ -478,13 +468,124 @@ def _literal(text: bytes) -> str:
     return rf"\s*{inner}\s*" if inner else r"\s+" if text else ""
 
 
-def _endless(data: bytes, longest: int = 512) -> Iterator[Adapter]:
-    """Yield adapters of text without lines: of a fixed length, or with a word at the end of each frame."""
-    classes = np.frombuffer(re.sub(rb"[-+.\d ]", b"0", data), np.uint8)
-    for length in range(3, min(longest, len(data) // 4)):
-        if np.mean(classes[length:] == classes[:-length]) > SAME:
-            yield Adapter(kind="text", end="", length=length)
-    words = Counter(re.findall(rb"[^\d\s.,;+-]+", data))
-    for word, count in words.most_common(2):
-        if count >= _FRAMES and word.isascii():
-            yield from _lines(data.split(word)[1:-1], {"end": word.decode()})
+def _binary(data: bytes, seconds: float, longest: int = 512) -> Iterator[Adapter]:
+    """Yield adapters of frames of a fixed length between bytes that repeat, the most plausible first.
+
+    Args:
+        data: what was received.
+        seconds: in which it was.
+        longest: bytes of a frame.
+    """
+    if is_text(data):
+        return
+    options = list[tuple[float, Adapter]]()
+    for length in range(3, min(longest, len(data) // 6)):
+        table = np.frombuffer(data[: len(data) // length * length], np.uint8).reshape(-1, length)
+        constant = np.mean(table == np.median(table, axis=0), axis=0) > _SAME
+        if not constant.any() or constant.all():
+            continue
+        begin, ring = _longest(constant), np.median(table, axis=0).astype(np.uint8)
+        for skip in range(begin[1]):
+            for size in range(1, min(begin[1] - skip, 4) + 1):
+                mark = bytes(np.roll(ring, -begin[0] - skip)[:size])
+                frames = np.roll(table.ravel(), -begin[0] - skip).reshape(-1, length)[:-1, size:]
+                tail = mark in (b"\r\n", b"\n")
+                position: dict[str, Any] = {"tail" if tail else "head": mark.hex(" ")}
+                options += [
+                    (
+                        cost + _mark_cost(mark),
+                        Adapter(kind="binary", struct=struct, drop=drop, **position, **roles),
+                    )
+                    for cost, struct, drop, roles in _structs(frames, seconds * length / len(data))
+                ]
+        if options:
+            break
+    options.sort(key=lambda option: option[0])
+    yield from _chips(data)
+    yield from (adapter for cost, adapter in options[:4] if cost < options[0][0] + 2)
+
+
+def _chips(data: bytes) -> Iterator[Adapter]:
+    """Yield the adapter of chips of which each sends four floats, the first its temperature."""
+    chips = read_adapter("anyskin_binary")
+    for layout in chips.layouts(data):
+        reads = (layout.try_fields(piece) for piece in layout.split(data)[0])
+        table = np.array([read.fields for read in reads if isinstance(read, Line)])
+        temperatures = np.median(table, axis=0)[::4]
+        if len(temperatures) > 1 and np.ptp(temperatures) < 3 and (abs(temperatures - 30) < 20).all():
+            yield chips
+
+
+def _mark_cost(mark: bytes) -> float:
+    """Return how unlikely bytes mark a frame: zeros and small numbers are rather parts of values."""
+    return sum(1.5 for byte in mark if byte in (0, 1)) + 0.5 * (len(mark) == 1) - 0.2 * len(mark)
+
+
+def _longest(constant: np.ndarray) -> tuple[int, int]:
+    """Return begin and size of the longest run of True in a ring."""
+    count = len(constant)
+    sizes = [
+        next((step for step in range(count) if not constant[(begin + step) % count]), count)
+        for begin in range(count)
+    ]
+    return int(np.argmax(sizes)), max(sizes)
+
+
+def _structs(
+    frames: np.ndarray, period: float
+) -> Iterator[tuple[float, dict[str, str], tuple[str, ...], dict[str, Any]]]:
+    """Yield structs of frames (F, B) without marks: bits that their changes need, what to drop, roles."""
+    for header in _HEADERS:
+        head, roles, used = dict[str, str](), dict[str, Any](counter=None, time=None), 0
+        for kind in header:
+            if used + int(kind[-1]) >= frames.shape[1]:
+                break
+            column = _numbers(frames, used, kind, 1)[:, 0]
+            counting = counts(column[:256], wraps=True)
+            ticks = [np.median(np.diff(column)) * unit / (period or 1) for unit in UNITS.values()]
+            clock = runs(column[:64]) and any(0.6 < tick < 1.6 for tick in ticks)
+            name = "counter" if counting and "counter" not in head else "time" if clock else ""
+            if not name or name in head:
+                break
+            head[name], roles[name], used = kind, name, used + int(kind[-1])
+        if len(head) < len(header):
+            continue
+        for spare, end, drop, cost in _tails(frames[:, used:]):
+            for kind in _KINDS:
+                count, odd = divmod(frames.shape[1] - used - spare, int(kind[-1]))
+                if count < 1 or odd:
+                    continue
+                bits = _bits(_numbers(frames, used, kind, count), kind)
+                if np.isfinite(bits):
+                    yield bits + cost, head | {"force": f"({count},){kind}"} | end, drop, roles
+
+
+def _tails(body: np.ndarray) -> Iterator[tuple[int, dict[str, str], tuple[str, ...], float]]:
+    """Yield the size of a checksum at the end of bodies (F, B), its type, what to drop, its cost in bits."""
+    sums = body[:, :-1].sum(axis=1) % 256, np.bitwise_xor.reduce(body[:, :-1], axis=1)
+    if body.shape[1] > 2 and any(np.mean(check == body[:, -1]) > _SAME for check in sums):
+        yield 1, {"checksum": "u1"}, ("checksum",), 0.0
+        return
+    yield 0, {}, (), 0.0
+    random = np.abs(np.diff(body.astype(int), axis=0)).mean(axis=0) > 60  # 85 of bytes drawn at random
+    for size, kind in ((1, "u1"), (2, "<u2")):
+        if body.shape[1] > size and random[-size:].all():
+            yield size, {"checksum": kind}, ("checksum",), 4.0 * size
+
+
+def _numbers(frames: np.ndarray, first: int, kind: str, count: int) -> np.ndarray:
+    """Return numbers (F, N) of a type from byte ``first`` on."""
+    return unpack(frames[:, first : first + count * int(kind[-1])], kind.rjust(3, "|"))
+
+
+def _bits(values: np.ndarray, kind: str) -> float:
+    """Return the bits per frame that the changes of values (F, S) need: few where bytes are read as sent."""
+    if kind.endswith("f4"):
+        size = np.abs(values[values != 0])
+        if not np.isfinite(values).all() or not ((size >= 1e-4) & (size <= 1e7)).all():
+            return np.inf
+        values = values / max(np.median(np.abs(values)), 1e-3) * 2**12  # about three digits
+    bits = np.log2(1 + 2 * np.abs(np.diff(values, axis=0))).mean(axis=0)
+    if (bits > 0.7 * 8 * int(kind[-1])).any():  # as of random bytes
+        return np.inf
+    return float(bits.sum() + 2 * np.count_nonzero(np.ptp(values, axis=0) == 0))

@@ -290,6 +290,8 @@ def decode_frame(data: bytes) -> Line | bytes:
     Raises:
         FrameError: ``structure`` (no COBS, too short, unknown type), ``checksum`` or ``fields``.
     """
+    if not data:
+        return b""
     body = unstuff(data)
     if len(body) < 4 or body[0] != _MAGIC or body[1] not in (*_TYPE, _COMMENT):
         raise FrameError("structure")
@@ -342,7 +344,6 @@ def unstuff(data: bytes) -> bytes:
 
 MOST_CONTACTS = 100
 """Contacts at a time that an announcement or a session may have."""
-_MOST_FRAMES = 100_000  # of a window: a damaged or foreign line must not allocate more
 
 
 @dataclass(frozen=True)
@@ -367,16 +368,13 @@ class Announcement:
 
 
 def encode_announcement(announcement: Announcement) -> bytes:
-    """Return ``# {"number": 0, "seq": 300, ..., "contacts": {"shape": [T, K], "rows": [...]}}*HHHH``.
+    """Return ``# {"number": 0, "seq": 300, ..., "contacts": [[[x, y, radius, force, pressure]]]}*HHHH``.
 
-    A row is a contact: frame, number of the contact, x, y, radius (m), force (N) and peak pressure (Pa).
+    In SI units; null where there is no contact.
     """
-    content, contacts = vars(announcement), announcement.contacts
-    if contacts is not None:
-        present = np.argwhere(np.isfinite(contacts).all(axis=2)).tolist()
-        rows = [[*position, *contacts[tuple(position)].tolist()] for position in present]
-        content = content | {"contacts": {"shape": contacts.shape[:2], "rows": rows}}
-    return _checked(f"# {json.dumps(content)}", "crc16")
+    contacts = announcement.contacts
+    known = None if contacts is None else np.where(np.isnan(contacts), np.array(None), contacts).tolist()
+    return _checked(f"# {json.dumps(vars(announcement) | {'contacts': known})}", "crc16")
 
 
 def parse_announcement(line: bytes) -> Announcement | None:
@@ -387,26 +385,13 @@ def parse_announcement(line: bytes) -> Announcement | None:
     try:
         announcement = Announcement(**json.loads(body[2:]))
         described: Any = announcement.contacts
-        return replace(announcement, contacts=None if described is None else _read_contacts(**described))
-    except (IndexError, TypeError, ValueError):
+        if described is None:
+            return announcement
+        contacts = np.array(described, dtype=float).reshape(len(described), -1, len(CONTACT))
+    except (TypeError, ValueError):
         return None
-
-
-def _read_contacts(shape: tuple[int, int], rows: Sequence[Sequence[float]]) -> np.ndarray:
-    """Return contacts (T, K, 5); IndexError, TypeError or ValueError if they are invalid."""
-    frames, maximum = shape
-    table = np.array(rows, dtype=float).reshape(-1, 2 + len(CONTACT))
-    if (
-        frames > _MOST_FRAMES
-        or maximum > MOST_CONTACTS
-        or not np.isfinite(table).all()
-        or (table[:, :2] < 0).any()
-    ):
-        raise ValueError("no contacts of a gesture")
-    contacts = np.full((frames, maximum, len(CONTACT)), nan)
-    frame, position = table[:, :2].T.astype(int)
-    contacts[frame, position] = table[:, 2:]
-    return contacts
+    fits = contacts.shape[1] <= MOST_CONTACTS and not np.isinf(contacts).any()
+    return replace(announcement, contacts=contacts) if fits else None
 
 
 _WRAPS = (2**16, 2**32)  # of seq: what firmware counts in

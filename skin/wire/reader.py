@@ -4,9 +4,8 @@ import errno
 import logging
 import os
 import socket
-from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass, field, fields
 from itertools import count
 from math import inf
@@ -109,7 +108,7 @@ class SkinDisconnected(_TooFewFramesError, ConnectionError):  # noqa: N818
     """The skin was unplugged, or a recording has ended."""
 
 
-_WAIT = 0.1  # s that one read waits for bytes
+_WAIT = 0.002  # s that a read without bytes waits
 _CONNECT = 5.0  # s
 _MOST = 65536  # bytes at once
 
@@ -133,7 +132,9 @@ def open_stream(port: str, baudrate: int) -> ByteStream:
     Raises:
         InputError: there is no such port, it cannot be opened, or it is in use.
     """
-    return _Socket(port) if port.startswith("socket://") else _Serial(port, baudrate)
+    if port.startswith("socket://"):
+        _address(port)
+    return _Stream(port, baudrate)
 
 
 def check_port(port: str) -> None:
@@ -157,59 +158,25 @@ def check_port(port: str) -> None:
         raise InputError(f"no port {port}: {_existing()}")
 
 
-@contextmanager
-def _os_error() -> Iterator[None]:
-    """Raise OSError for any error: pyserial lets ``termios.error`` through, which is none."""
-    try:
-        yield
-    except Exception as error:
-        raise OSError(str(error)) from error
-
-
-class _Serial:
+class _Stream:
     def __init__(self, port: str, baudrate: int) -> None:
         import serial
 
         try:
             # Exclusive, or two readers would get half the bytes each.
-            self._port = serial.Serial(port, baudrate, timeout=_WAIT, write_timeout=_CONNECT, exclusive=True)
+            settings = {"timeout": 0, "write_timeout": _CONNECT, "exclusive": True, "do_not_open": True}
+            self._port = serial.serial_for_url(port, baudrate, **settings)
+            self._port.reset_input_buffer = lambda: None  # what a socket sends at once is no rest
+            self._port.open()
         except Exception as error:
             raise _refused(port, baudrate, error) from error
+        self.write, self.close = self._port.write, self._port.close
 
     def read(self) -> bytes:
-        with _os_error():
-            return self._port.read(max(1, min(self._port.in_waiting, _MOST)))
-
-    def write(self, data: bytes) -> None:
-        with _os_error():
-            self._port.write(data)
-
-    def close(self) -> None:
-        self._port.close()
-
-
-class _Socket:
-    def __init__(self, port: str) -> None:
-        try:
-            self._socket = socket.create_connection(_address(port), timeout=_CONNECT)
-        except OSError as error:
-            raise InputError(f"cannot reach {port}: {error}; does anything listen there?") from error
-        self._socket.settimeout(_WAIT)
-
-    def read(self) -> bytes:
-        try:
-            data = self._socket.recv(_MOST)
-        except TimeoutError:
-            return b""
+        data = bytes(self._port.read(_MOST))
         if not data:
-            raise ConnectionResetError("the other side closed the connection")
+            sleep(_WAIT)
         return data
-
-    def write(self, data: bytes) -> None:
-        self._socket.sendall(data)
-
-    def close(self) -> None:
-        self._socket.close()
 
 
 def _address(port: str) -> tuple[str, int]:
@@ -224,6 +191,8 @@ def _address(port: str) -> tuple[str, int]:
 def _refused(port: str, baudrate: int, error: Exception) -> InputError:
     """Return why a serial port cannot be opened; Windows reports "access is denied" for a port in use."""
     number, text, existing = getattr(error, "errno", None), str(error), _existing()
+    if port.startswith("socket://"):
+        return InputError(f"cannot reach {port}: {text}; does anything listen there?")
     reasons = (
         ((errno.ENOENT, errno.ENODEV, errno.ENXIO), "FileNotFoundError", f"no port {port}: {existing}"),
         (
@@ -263,7 +232,7 @@ _WEAK = {
 
 
 class WireFeed:
-    """Frames decoded from bytes, with checked channels; logs bad frames once a second.
+    """Frames decoded from bytes, with checked channels.
 
     It sends the strings of the adapter: to start the board, for each frame, and to stop it.
 
@@ -310,8 +279,7 @@ class WireFeed:
         )
         self._asked_at = self._polled_at = -inf
         self._attempts, self._started, self._answered, self._warned = 0, False, True, False
-        self._received_at = self._reported_at = inf
-        self._reported, self._logged_clock = Counter(self._decoder.stats.bad), ""
+        self._received_at, self._logged_clock = inf, ""
 
     def poll(self, clock: Callable[[], float]) -> list[Frame]:
         """Return the frames received since the last call.
@@ -346,7 +314,6 @@ class WireFeed:
             raise error
         if frames:
             self._prepare()
-        self._report(now)
         return [self._judge(frame) for frame in frames]
 
     @property
@@ -394,18 +361,6 @@ class WireFeed:
             self._health.largest = 2**header.bits - 1
             self._health.limits = self._limits or (None, self._health.largest)
 
-    def _report(self, now: float) -> None:
-        """Log the bad frames of the last second."""
-        self._reported_at = min(self._reported_at, now)
-        if now - self._reported_at < 1:
-            return
-        stats = self._decoder.stats
-        fresh, self._reported, self._reported_at = stats.bad - self._reported, Counter(stats.bad), now
-        if fresh:
-            reasons = ", ".join(f"{number} {reason}" for reason, number in fresh.most_common())
-            trouble = f"; {stats.trouble}" if stats.trouble else ""
-            _log.warning("%d bad frames (%s)%s", fresh.total(), reasons, trouble)
-
     def _judge(self, frame: Frame) -> Frame:
         if frame.after not in ("", "gap"):
             self._health.restart()
@@ -426,7 +381,6 @@ class PlaybackFeed:
 
     def __init__(self, strips: "Iterable[Touches]") -> None:
         self._start, self._frames = inf, self._play(strips)
-        self._next = next(self._frames, None)
 
     def _play(self, strips: "Iterable[Touches]") -> Iterator[Frame]:
         number, segments = count(), count()
@@ -438,12 +392,11 @@ class PlaybackFeed:
                 after: After = "cut" if segment else ""
                 for values, valid, limited in zip(*touch, strict=True):
                     seq = next(number)
-                    t = seq / strip.rate
-                    yield Frame(seq, t, t, values, valid, segment, 0, after, limited)
+                    yield Frame(seq, seq / strip.rate, 0.0, values, valid, segment, 0, after, limited)
                     after = ""
 
     def poll(self, clock: Callable[[], float]) -> list[Frame]:
-        """Return the frames that are due.
+        """Return the next frame when it is due.
 
         Args:
             clock: gives the host's monotonic time, s.
@@ -451,15 +404,12 @@ class PlaybackFeed:
         Raises:
             EOFError: the recording has ended.
         """
-        if self._next is None:
+        frame = next(self._frames, None)
+        if frame is None:
             raise EOFError("the recording has ended")
         self._start = min(self._start, clock())
-        sleep(min(_WAIT, max(0.0, self._start + self._next.t - clock())))
-        frames, due = list[Frame](), clock() - self._start
-        while self._next and self._next.t <= due:
-            frames.append(self._next._replace(t_host=self._start + self._next.t))
-            self._next = next(self._frames, None)
-        return frames
+        sleep(max(0.0, self._start + frame.t - clock()))
+        return [frame._replace(t_host=self._start + frame.t)]
 
     def open(self) -> None:
         """Do nothing: memory is never disconnected."""

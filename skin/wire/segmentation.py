@@ -6,6 +6,7 @@ from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import count
 from queue import SimpleQueue
 from threading import Thread
 
@@ -34,8 +35,8 @@ class RecordedGesture:
         segment: of the device's clock.
         frames: of the window.
         lost: number of frames known to be missing.
-        broken: it cannot be used: the device restarted within the window, or detected nothing.
-        resampled: the window at the model's rate, in the device's unit; None until it is complete.
+        resampled: the window at the model's rate, in the device's unit; None until it is complete, or if
+            the device restarted within it.
         contacts: (T, K, 5) at the model's rate, as of :class:`skin.device.touches.Touches`; None if unknown.
     """
 
@@ -45,7 +46,6 @@ class RecordedGesture:
     segment: int
     frames: list[Frame] = field(default_factory=list)
     lost: int = 0
-    broken: bool = False
     resampled: Resampled | None = None
     contacts: np.ndarray | None = None
 
@@ -90,10 +90,13 @@ class AbstractSegmenter(ABC):
         self.over = False
 
     def add(self, frame: Frame) -> RecordedGesture | None:
-        """Add a frame; return the gesture whose window ended before it, complete or broken; else None."""
-        done = self._close(frame)
-        if done is not None and not done.broken:
-            done.resampled = self.window.since(done.begin)
+        """Add a frame; return the whole gesture whose window ended before it; else None."""
+        gesture, done = self.gesture, None
+        if gesture is not None:
+            whole = frame.segment == gesture.segment
+            if not whole or frame.t >= gesture.begin + self._length - 1e-7:
+                gesture.resampled = self.window.since(gesture.begin) if whole else None
+                self.gesture, done = None, gesture if self._keeps(gesture) else None
         self.window.add(frame)
         if self.gesture is None:
             self.gesture = self._begin(frame)
@@ -103,15 +106,9 @@ class AbstractSegmenter(ABC):
             self.gesture.frames.append(frame)
         return done
 
-    def _close(self, frame: Frame) -> RecordedGesture | None:
-        gesture = self.gesture
-        if gesture is None:
-            return None
-        gesture.broken = frame.segment != gesture.segment
-        if not gesture.broken and frame.t < gesture.begin + self._length - 1e-7:
-            return None
-        self.gesture = None
-        return gesture
+    def _keeps(self, gesture: RecordedGesture) -> bool:
+        """Return whether a gesture that has ended can be used."""
+        return gesture.resampled is not None
 
     @abstractmethod
     def _begin(self, frame: Frame) -> RecordedGesture | None:
@@ -140,31 +137,26 @@ class AnnouncedSegmenter(AbstractSegmenter):
     def _begin(self, frame: Frame) -> RecordedGesture | None:
         if frame.seq is None:
             raise InputError("announcements need frames with numbers: give device.labels=prompted")
-        while self._announcements:
-            announced = self._announcements[0]
-            if frame.seq < announced.seq:
-                return None
-            self._announcements.popleft()
-            # Most of a gesture that began long before the port was opened is missing.
-            if frame.seq <= announced.seq + self._late * announced.frames:
-                late = frame.seq - announced.seq
-                begin = frame.t - late * self._length / announced.frames
-                labels = {"touch": 1} | dict(announced.labels)
-                if missing := [name for name in self._task.names if name not in labels]:
-                    raise InputError(f"the skin announces no {missing[0]}: give device.labels=prompted")
-                fits = announced.contacts is not None and (len(announced.contacts), announced.rate) == (
-                    self.window.frames,
-                    self.window.rate,
-                )
-                task_labels = {name: labels[name] for name in self._task.names}
-                return RecordedGesture(
-                    announced.number,
-                    task_labels,
-                    begin,
-                    frame.segment,
-                    lost=late,
-                    contacts=announced.contacts if fits else None,
-                )
+        window = self.window.frames, self.window.rate
+        while self._announcements and frame.seq >= self._announcements[0].seq:
+            announced = self._announcements.popleft()
+            late = frame.seq - announced.seq
+            if late > self._late * announced.frames:
+                continue  # most of a gesture that began long before the port was opened is missing
+            labels = {"touch": 1} | dict(announced.labels)
+            if missing := [name for name in self._task.names if name not in labels]:
+                raise InputError(f"the skin announces no {missing[0]}: give device.labels=prompted")
+            contacts = announced.contacts
+            return RecordedGesture(
+                announced.number,
+                {name: labels[name] for name in self._task.names},
+                frame.t - late * self._length / announced.frames,
+                frame.segment,
+                lost=late,
+                contacts=contacts
+                if contacts is not None and (len(contacts), announced.rate) == window
+                else None,
+            )
         return None
 
 
@@ -205,22 +197,23 @@ class PromptedSegmenter(AbstractSegmenter):
         self._typed.put("q")
 
     def add(self, frame: Frame) -> RecordedGesture | None:
-        """As in the base class; a gesture that was not detected is broken, too."""
+        """As in the base class; a gesture that was not detected is asked for again."""
         done = super().add(frame)
-        if done is not None and done.labels is not None:
-            done.broken = done.resampled is None or (
-                done.labels.get("touch") != 0 and not self._responded(done.resampled)
-            )
-            if done.broken:
-                self._notify(_INTERRUPTED if done.resampled is None else _NO_RESPONSE)
-                self._ask((done.number, done.labels))
-        elif self.gesture is None and self._asked is None and not self.over:
-            # A frame after a gesture, so that the message about that is printed first.
+        # A frame after a gesture, so that the message about that is printed first.
+        if done is None and self.gesture is None and self._asked is None and not self.over:
             following = next(self._wanted, None)
             self.over = following is None
             if following is not None:
                 self._ask(following)
         return done
+
+    def _keeps(self, gesture: RecordedGesture) -> bool:
+        labels, resampled = gesture.labels or {}, gesture.resampled
+        felt = resampled is not None and (labels.get("touch") == 0 or self._responded(resampled))
+        if not felt:
+            self._notify(_INTERRUPTED if resampled is None else _NO_RESPONSE)
+            self._ask((gesture.number, labels))
+        return felt
 
     def _begin(self, frame: Frame) -> RecordedGesture | None:
         if self._asked is None or self._typed.empty():
@@ -253,10 +246,9 @@ class ContinuousSegmenter(AbstractSegmenter):
         self, window: Window, first: int = 0, begins: Callable[[np.ndarray], bool] | None = None
     ) -> None:
         super().__init__(window)
-        self._number, self._wanted = first, begins
+        self._numbers, self._wanted = count(first), begins
 
     def _begin(self, frame: Frame) -> RecordedGesture | None:
         if self._wanted is not None and not self._wanted(frame.values):
             return None
-        self._number += 1
-        return RecordedGesture(self._number - 1, None, frame.t, frame.segment)
+        return RecordedGesture(next(self._numbers), None, frame.t, frame.segment)

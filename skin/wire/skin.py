@@ -167,11 +167,10 @@ class Skin:
         frames, start = list[Frame](), self._clock()
         while not frames or frames[-1].t_host < start + seconds:
             frames += [frame for frame in self.read(1) if frame.t_host >= start]
-        if len({frame.segment for frame in frames}) > 1:
+        if frames[0].segment != frames[-1].segment:
             raise InputError("the skin was restarted meanwhile: tare again; the old baseline is kept")
-        touch = 0.02 * 2**self.header.bits if self.header and self.header.bits else 0.0
         values, valid = (np.stack([getattr(frame, name) for frame in frames]) for name in ("values", "valid"))
-        self.baseline = take_baseline(values, valid, self.baseline, touch, force)
+        self.baseline = take_baseline(values, valid, self.baseline, force)
         return self.baseline
 
     @property

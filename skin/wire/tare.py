@@ -21,7 +21,6 @@ def take_baseline(
     values: np.ndarray,
     valid: np.ndarray,
     before: np.ndarray | None = None,
-    touch: float = 0.0,
     force: bool = False,
     moved: tuple[float, float] = (8.0, 3.0),
     shifted: tuple[float, float] = (20.0, 10.0),
@@ -36,7 +35,6 @@ def take_baseline(
         values: (F, S).
         valid: (F, S); channels without a valid value are not checked.
         before: the previous baseline, (S,), or None.
-        touch: smallest shift of the baseline that counts as a touch, however small the noise.
         force: do not check for a touch.
         moved: standard deviations of the noise, and smallest steps, that are a touch within the frames.
         shifted: the same against the previous baseline, because offsets drift.
@@ -59,11 +57,11 @@ def take_baseline(
     noise = np.where((steps**2).mean(axis=0) < smooth * values.var(axis=0), 0.0, noise)
     smallest = np.where(steps > 0, steps, np.inf).min(axis=0)
     smallest[np.isinf(smallest)] = 0.0
-    changes = {"moved by": (np.abs(values - baseline).max(axis=0), moved, 0.0)}
+    changes = {"moved by": (np.abs(values - baseline).max(axis=0), moved)}
     if before is not None:
-        changes["differs from its old baseline by"] = (np.abs(baseline - before), shifted, touch)
-    for what, (change, (sigmas, counts), minimum) in changes.items():
-        limit = np.maximum(np.maximum(sigmas * noise, counts * smallest), minimum)
+        changes["differs from its old baseline by"] = (np.abs(baseline - before), shifted)
+    for what, (change, (sigmas, counts)) in changes.items():
+        limit = np.maximum(sigmas * noise, counts * smallest)
         beyond = np.where(valid.any(axis=0), change - limit, -np.inf)
         channel = int(beyond.argmax())
         if beyond[channel] > 0:

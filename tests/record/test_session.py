@@ -65,7 +65,7 @@ def segmented(log, frames, conversion, pause=0):
     segmenter, gestures = ContinuousSegmenter(Window(5, 50.0, 2), max(log.done, default=-1) + 1), {}
     for one in frames:
         done = segmenter.add(one)
-        if done is not None and not done.broken:
+        if done is not None:
             done.labels = {"big": done.number % 2, "dangerous": 1}
             gestures[done.number] = done, conversion
             log.write((done, conversion))

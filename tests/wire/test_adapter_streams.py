@@ -11,7 +11,6 @@ import pytest
 from skin.errors import InputError
 from skin.wire.adapter import Adapter, read_adapter
 from skin.wire.decoder import Decoder
-from skin.wire.formats import DetectedFormat
 from skin.wire.proposal import propose
 
 RATE = 50.0  # Hz
@@ -88,25 +87,17 @@ STREAMS: dict[str, tuple[Callable, np.ndarray, float | None]] = {
     "sixty-four channels": (joined(","), table(64), None),
     "negative exponents": (joined(",", shape="%.3e"), table(4, 0, -300.0, 5.0), None),
     "parentheses": (joined(",", before="(", after=")"), table(4), None),
-    "braces": (joined(" ", before="{", after="}"), table(4), None),
     "word before": (joined(",", before="DATA,"), table(4), None),
     "nmea-like": (joined(",", before="$FSR,", end="\r\n"), table(6), None),
-    "arrow before": (joined(" ", before="skin > "), table(5), None),
     "units after": (joined(" N; ", shape=F2, after=" N"), FLOATS, None),
     "millivolts": (labelled("ch{}={}mV", " "), table(4), None),
-    "labels equals": (labelled("P{}={}", " "), table(5), None),
     "labels blank": (labelled("Sensor {}: {}", ", "), table(3), None),
-    "labels float tab": (labelled("pad{}:{}", "\t", shape=F2), FLOATS, None),
     "labels semicolons": (labelled("c{} = {}", "; ", "\r\n"), table(9), None),
     "decimal comma tabs": (lambda n, r: joined("\t", shape=F2)(n, r).replace(b".", b","), FLOATS, None),
-    "decimal comma blanks": (
-        lambda n, r: joined("  ", shape=F3)(n, r).replace(b".", b","), table(4, 3, 2, 0.3), None
-    ),
     "milliseconds": (clocked(20, first=88_213), table(4), 0.02),
     "microseconds": (clocked(20_000, ";", first=5_000_000), table(4), 0.02),
     "seconds": (clocked(0.02, "\t", shape="%.3f"), table(4), 0.02),
     "counter of 256, ms": (clocked(20, counter=256), table(4), 0.02),
-    "counter of 100, us": (clocked(20_000, counter=100), table(4), 0.02),
     "counter of 37, s": (clocked(0.02, counter=37, shape="%.2f"), table(4), 0.02),
     "counter alone": (clocked(0, counter=10_000), table(4), None),
     "clock of 16 bits": (
@@ -128,11 +119,9 @@ STREAMS: dict[str, tuple[Callable, np.ndarray, float | None]] = {
     ),
     "matrix, blank line": (matrix(4), table(12), None),
     "matrix, word": (matrix(3, lambda n: b"frame %d\n" % n), table(9), None),
-    "matrix, dashes, crlf": (matrix(5, b"-----\r\n", end="\r\n"), table(10), None),
     "matrix, index": (matrix(4, b"", index=0), table(16), None),
     "matrix, index from 1": (matrix(2, b"", index=1), table(8), None),
     "index and value": (pairs("{},{}\n"), table(6), None),
-    "index colon value": (pairs("{}: {}\r\n"), table(6), None),
     "word index value": (pairs("ch{}={}\n"), table(8), None),
     "u16 head": (packed("<{}H", b"\xaa\x55"), table(8), None),
     "u16 big-endian head and tail": (packed(">{}H", b"\xff\xfe", b"\r\n"), table(6), None),
@@ -249,10 +238,9 @@ def test_a_proposed_adapter_reads_what_was_sent(name):
 
 
 @pytest.mark.parametrize("name", ["pipes", "milliseconds", "json nested", "matrix, index", "u16 head"])
-@pytest.mark.parametrize("burst", [10, 25])
-def test_bursts_are_read_with_the_time_between_their_frames(name, burst):
+def test_bursts_are_read_with_the_time_between_their_frames(name):
     _, rows, period = STREAMS[name]
-    pieces = sent(name)
+    pieces, burst = sent(name), 25
     bursts = [
         (pieces[min(n + burst, len(pieces)) - 1][0], b"".join(data for _, data in pieces[n : n + burst]))
         for n in range(0, len(pieces), burst)
@@ -438,9 +426,7 @@ def test_the_time_for_a_long_line_grows_with_its_length(adapter):
 def test_what_is_read_to_find_a_format_grows_with_what_is_received(monkeypatch):
     """Each of many small pieces made the decoder read all of those before it."""
     read, decoder = [], Decoder(adapter=read_adapter("csv"))
-    monkeypatch.setattr(
-        Adapter, "detect", lambda self, data, sensors: read.append(len(data)) or DetectedFormat()
-    )
+    monkeypatch.setattr(Adapter, "detect", lambda self, data, sensors: read.append(len(data)))
     for _ in range(3000):
         decoder.feed(b"xyz 1 of\r\n")
     assert sum(read) < 20 * 30_000

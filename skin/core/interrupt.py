@@ -74,7 +74,9 @@ def _watch(receiver: socket.socket, answered: list[int], ended: Event, last: Cal
         while signal.SIGTERM not in (numbers := receiver.recv(64)):
             if not numbers:
                 return
-    if not ended.wait(_PATIENCE) and not (answered and ended.wait(_CLOSING)):
+        # It stays open meanwhile: else the interpreter complains about a further signal.
+        in_time = ended.wait(_PATIENCE) or (answered and ended.wait(_CLOSING))
+    if not in_time:
         Timer(_LAST, os._exit, [128 + signal.SIGTERM]).start()
         with suppress(Exception):  # nobody can be informed any more
             last()

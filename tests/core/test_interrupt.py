@@ -128,3 +128,26 @@ def test_two_signals_end_a_process_once_everything_is_closed(times):
     line = [sys.executable, "-c", DOUBLED, str(times)]
     done = subprocess.run(line, capture_output=True, text=True, cwd=ROOT, check=True)
     assert Counter(done.stdout.splitlines()) == {"143 closed": times}
+
+
+NOTICED = """
+import signal, time
+from skin.core.interrupt import ends_on_signal
+
+try:
+    with ends_on_signal():
+        try:
+            signal.raise_signal(signal.SIGTERM)
+        finally:
+            time.sleep(0.2)  # the thread has read the first signal
+            signal.raise_signal(signal.SIGTERM)
+except SystemExit:
+    print("closed")
+"""
+
+
+def test_a_second_signal_is_not_complained_about():
+    done = subprocess.run(
+        [sys.executable, "-c", NOTICED], capture_output=True, text=True, cwd=ROOT, check=True
+    )
+    assert (done.stdout, done.stderr) == ("closed\n", "")

@@ -51,7 +51,7 @@ def test_a_killed_command_goes_on_where_it_was(run, begin, tmp_path):
         killed.kill()
         assert killed.wait() < 0
     finished = [name for name, status in runs(tmp_path) if status == "FINISHED"]
-    assert len(finished) == 2
+    assert 2 <= len(finished) < 4  # the third may end before the signal arrives
     done = run(tmp_path, "results", *PARTS, *SMALL)
     assert done.returncode == 0, done.stderr
     assert done.stdout.count("== [") == 3

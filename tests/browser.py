@@ -1,7 +1,8 @@
 """A real browser, driven over HTTP as the W3C's WebDriver has it: no package is needed for that.
 
-Beside ``skin live demo=true`` on an idle machine, this records the animation of the README:
+On an idle machine, this records the animation of the README:
 
+    skin live demo=true 'touch.press=[0.8,1.5]'
     python -m tests.browser http://127.0.0.1:8765 docs/results/live.gif
 """
 
@@ -12,6 +13,7 @@ import subprocess
 import sys
 import urllib.request
 from base64 import b64decode
+from collections import deque
 from io import BytesIO
 from time import monotonic, sleep
 from typing import Any
@@ -81,17 +83,26 @@ class Browser:
             self._process.stdout.close()
 
 
-def record(address: str, path: str, frames: int = 26, interval: float = 0.3) -> None:
-    """Write what a page shows as GIF below 1 MB, a frame each ``interval`` s; octrees keep rare colours."""
-    browser, shots, begin = Browser(*(installed() or sys.exit("needs Chromium"))), [], monotonic() + 5
+def record(address: str, path: str, frames: int = 26, interval: float = 0.3, after: int = 6) -> None:
+    """Write what a page shows up to an alarm, and ``after`` frames more, as GIF; octrees keep rare colours.
+
+    Earlier frames show contacts in a quarter of them, else it waits for another alarm.
+    """
+    browser, shots, states = Browser(*(installed() or sys.exit("needs Chromium"))), deque(maxlen=frames), ""
     browser.open(address)
-    for number in range(frames):
+    begin, number = monotonic() + 5, 0
+    while not re.search(f"[^d]{{{after}}}d{{{after}}}$", states) or states[-frames:].count("c") < frames // 4:
         sleep(max(0.0, begin + number * interval - monotonic()))
         shot = Image.open(BytesIO(browser.picture())).convert("RGB")
         shot = shot.resize((shot.width * 3 // 4, shot.height * 3 // 4))
         shots.append(shot.quantize(128, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE))
+        states += browser.run(
+            "return document.body.dataset.state == 'danger' ? 'd'"
+            " : document.getElementById('contacts').textContent.includes('±') ? 'c' : '-'"
+        )
+        number += 1
     browser.close()
-    shots[0].save(path, save_all=True, append_images=shots[1:], duration=round(1e3 * interval), loop=0)
+    shots[0].save(path, save_all=True, append_images=list(shots)[1:], duration=round(1e3 * interval), loop=0)
 
 
 if __name__ == "__main__":

@@ -29,9 +29,9 @@ from skin.device.simulated import Simulated
 from skin.device.touches import Recording
 from skin.errors import InputError
 from skin.evaluation.alarm import choose_alarm_threshold
-from skin.evaluation.margins import ALARM_NAME, measure_margins
 from skin.evaluation.metrics import compute_metrics, encode
 from skin.evaluation.operating_point import OperatingPoint
+from skin.evaluation.report import ALARM_NAME, measure_margins
 from skin.evaluation.settings import StreamSettings, check_evaluation
 from skin.evaluation.streams import WindowReport, evaluate_windows
 from skin.learning.graph import neighbours

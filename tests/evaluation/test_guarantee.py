@@ -14,7 +14,7 @@ from skin.evaluation import guarantee, touch_scores
 from skin.evaluation.decisions import LiveConditions
 from skin.evaluation.guarantee import anytime_bound, threshold_for_misses
 from skin.runs.build import build_device
-from skin.touch.sampler import balanced
+from skin.touch.movie import balanced
 
 
 class Largest:

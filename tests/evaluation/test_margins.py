@@ -7,8 +7,8 @@ import torch
 from skin.device.base import AbstractDevice
 from skin.device.touches import Touches
 from skin.errors import InputError
-from skin.evaluation.margins import ALARM_NAME, measure_margins, span_rows
 from skin.evaluation.operating_point import OperatingPoint
+from skin.evaluation.report import ALARM_NAME, measure_margins, span_rows
 from skin.touch.labels import TOUCH
 
 POINT = OperatingPoint(0.5, 0.02, 64, 1, 0)

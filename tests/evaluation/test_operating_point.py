@@ -26,7 +26,7 @@ from skin.evaluation.settings import Evaluation, check_evaluation
 from skin.live.engine import Detection, Engine
 from skin.runs.build import build_device
 from skin.touch.labels import TOUCH, TOUCH_OR_NOT, Task
-from skin.touch.sampler import balanced
+from skin.touch.movie import balanced
 from skin.wire.channels import UnitConversion
 
 SETTINGS = Evaluation(devices=0, layouts=0, false_alarm_rate=0.1, safe_gestures=64)

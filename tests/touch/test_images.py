@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from skin.errors import InputError
-from skin.touch.images import load_image, pyramid
+from skin.touch.shapes import load_image, pyramid
 
 DATA = Path(__file__).parents[2] / "data"
 

@@ -11,8 +11,7 @@ from skin.body.sheet import Sheet
 from skin.errors import InputError
 from skin.mechanics.contact.prescribed import Prescribed
 from skin.touch.gestures import GestureSettings, TouchSampler
-from skin.touch.movie import join_movies
-from skin.touch.sampler import balanced
+from skin.touch.movie import balanced, join_movies
 
 LAYER = [{"material": "EcoFlex 00-30", "thickness": 0.005}]
 SHEETS = {

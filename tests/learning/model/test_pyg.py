@@ -5,7 +5,7 @@ from torch_geometric.nn import DenseGCNConv
 from torch_geometric.nn.models import GCN, GraphSAGE
 
 from skin.learning.graph import Graph
-from skin.learning.pyg import Pyg
+from skin.learning.model import Pyg
 
 
 def graphs(count=3):

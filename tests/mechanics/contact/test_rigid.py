@@ -15,8 +15,8 @@ from skin.mechanics.contact.rigid import Rigid, solids
 from skin.mechanics.simulator.base import AbstractSimulator, Response
 from skin.mechanics.simulator.naive import Naive
 from skin.touch.gestures import GestureSettings, TouchSampler
+from skin.touch.movie import ContactProblem
 from skin.touch.paths import Trajectories
-from skin.touch.sampler import ContactProblem
 from skin.touch.shapes import Pose, Shapes
 from tests.touch.movie_labels import movie_labels
 

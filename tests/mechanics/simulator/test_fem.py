@@ -9,9 +9,8 @@ from scipy.special import erf
 from skin.body.base import Sensors, Sheet
 from skin.body.layout import Grid, Scattered
 from skin.errors import InputError
-from skin.mechanics.simulator.fem import PlatesAndBeams, build
+from skin.mechanics.simulator.fem import PlatesAndBeams, Structure, build
 from skin.mechanics.simulator.naive import Naive
-from skin.mechanics.simulator.plates import Structure
 
 LAYERS = [
     {"material": "Dragon Skin 10 Medium", "thickness": 0.010},

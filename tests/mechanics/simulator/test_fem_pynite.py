@@ -7,8 +7,7 @@ from scipy.interpolate import RegularGridInterpolator
 from scipy.sparse.linalg import spsolve
 
 from skin.body.base import Sensors, Sheet
-from skin.mechanics.simulator.fem import PlatesAndBeams
-from skin.mechanics.simulator.plates import Structure
+from skin.mechanics.simulator.fem import PlatesAndBeams, Structure
 from tests.mechanics import pynite_model
 
 DRAGON = {"material": "Dragon Skin 10 Medium", "thickness": 0.010}

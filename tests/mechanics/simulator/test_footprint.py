@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from skin.body.base import Sensors, Sheet
-from skin.mechanics.simulator._reading import sample
+from skin.mechanics.geometry import sample
 from skin.mechanics.simulator.solid import Solid
 
 EXTENT = (0.16, 0.12, 0.015)

@@ -10,8 +10,7 @@ import pytest
 from skin.body.base import Sensors, Sheet
 from skin.mechanics.array_cache import folder as cache_folder
 from skin.mechanics.simulator import fem as _operator
-from skin.mechanics.simulator.fem import build, cached
-from skin.mechanics.simulator.plates import Structure
+from skin.mechanics.simulator.fem import Structure, build, cached
 
 ECOFLEX = {"material": "EcoFlex 00-30", "thickness": 0.005}
 STRUCTURE = Structure(Sheet([0.04, 0.03], [4, 3], [ECOFLEX]))

@@ -12,9 +12,8 @@ from skin.body.layout import Grid
 from skin.device.simulated import Simulated
 from skin.errors import InputError
 from skin.mechanics.relaxation import Relaxing, speeds, times
-from skin.mechanics.simulator.fem import PlatesAndBeams
+from skin.mechanics.simulator.fem import PlatesAndBeams, Structure
 from skin.mechanics.simulator.naive import Naive
-from skin.mechanics.simulator.plates import Structure
 from skin.mechanics.simulator.solid import Solid
 
 RATE = 10.0

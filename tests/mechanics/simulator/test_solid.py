@@ -10,11 +10,10 @@ from experiments.laws.references import Discs, Slab
 from skin.body.base import Arm, Sensors, Sheet
 from skin.body.layout import Grid
 from skin.errors import InputError
-from skin.mechanics.geometry import Fingertip
+from skin.mechanics.geometry import Fingertip, reading_rows
 from skin.mechanics.simulator._mesh import Hexahedra, build_mesh
-from skin.mechanics.simulator._reading import reading_rows
 from skin.mechanics.simulator.solid import Cholesky, Elastic, Solid
-from skin.touch import splines
+from skin.touch.shapes import cell_moments
 
 LAYERS = [
     {"material": {"name": "muscle", "young": 560e3, "poisson": 0.49}, "thickness": 0.010},
@@ -80,7 +79,7 @@ def _interpolated(mesh, points, strain):
 
 def test_the_operator_is_a_direct_solve_on_two_meshes():
     pressure = 1e4 * np.random.default_rng(0).random(64)
-    moments = np.kron(splines.of_cells(8), splines.of_cells(8)) @ pressure
+    moments = np.kron(cell_moments(8), cell_moments(8)) @ pressure
     expected = np.zeros(2)
     for weight, divisions, refinement in ((4 / 3, 2, 2), (-1 / 3, 1, 1)):
         mesh = build_mesh(SHEET, divisions, {}, refinement)
@@ -117,7 +116,7 @@ def test_factors_solve_what_the_stiffness_says(cells):
 def test_forces_are_mutual():
     """Maxwell and Betti: cell a moves under cell b as cell b does under cell a."""
     elastic = Elastic(build_mesh(SHEET, 2, {}, 2), 2)
-    loads = elastic.loads(2) @ np.kron(splines.of_cells(8), splines.of_cells(8))
+    loads = elastic.loads(2) @ np.kron(cell_moments(8), cell_moments(8))
     compliance = loads.T @ elastic.solve(loads)
     assert np.abs(compliance - compliance.T).max() < 1e-10 * np.abs(compliance).max()
     kept = solid().compliance().numpy() * np.prod(SHEET.cell)

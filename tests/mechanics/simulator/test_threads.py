@@ -11,8 +11,8 @@ import torch
 from skin.body.base import Sensors, Sheet
 from skin.core.files import ROOT
 from skin.mechanics.contact.rigid import solve_contact, stabilise_checkerboard
+from skin.mechanics.geometry import reading_rows
 from skin.mechanics.simulator._mesh import build_mesh
-from skin.mechanics.simulator._reading import reading_rows
 from skin.mechanics.simulator.solid import Elastic, Solid
 
 CELLS = 8

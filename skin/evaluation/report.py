@@ -324,9 +324,13 @@ def measure_margins(
     probabilities = learner.probabilities(touches)[:, columns]
     predicted, parameters = probabilities > 0.5, recording.parameters
     settings, thresholds = simulation.sampler.settings, simulation.sampler.settings.thresholds
-    limits = thresholds.area, thresholds.travel, settings.frames.duration, thresholds.pressure
-    measures = ("area", "travel", "frames", "pressure")  # in the order of TOUCH
-    fractions = [parameters[name] / limit for name, limit in zip(measures, limits, strict=True)]
+    limits = {  # in the order of TOUCH
+        "area": thresholds.area,
+        "travel": thresholds.travel,
+        "frames": settings.frames.duration,
+        "pressure": thresholds.pressure,
+    }
+    fractions = [parameters[name] / limit for name, limit in limits.items()]
     danger = TOUCH.names.index(LABEL)
     fractions[danger] = parameters.get("excess", fractions[danger])
     said = [*predicted.T, point.alarm(probabilities[:, danger])]

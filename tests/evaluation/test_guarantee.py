@@ -122,11 +122,3 @@ def test_the_pressure_of_a_touch_is_that_over_footprints_of_valid_sensors(config
     assert_close(decisions.sensed, (means.max(1) * works.numpy()).max(1), atol=1e-4)
     assert (decisions.peak > 1).tolist() == labels[:, 3].tolist()
     assert (decisions.sensed < 0.9 * decisions.peak).any()
-
-
-def test_a_promise_is_one_sentence_with_its_conditions():
-    promise = guarantee.Guarantee(0.001, 20_000, 12, "mild, 100 Hz")
-    assert promise.sentence() == (
-        "in simulation, above 1.1 x the limit and on a sensor: at most 0.1 % missed, 95 %, 20,000 touches, "
-        "mild, 100 Hz"
-    )

@@ -39,12 +39,6 @@ def test_spans_hold_what_is_said_and_what_is_wrong():
     assert found["mean"][1] == pytest.approx(0.985)
 
 
-def test_ranges_are_exact():
-    """None of ten: the upper end p has (1 - p)^10 = 0.025."""
-    (one,) = span_rows("big", torch.zeros(10, dtype=torch.bool), torch.zeros(10))
-    assert (one["lower"], one["upper"]) == pytest.approx((0, 1 - 0.025**0.1))
-
-
 @pytest.fixture(scope="module")
 def device(configured) -> AbstractDevice:
     from skin.runs.build import build_device

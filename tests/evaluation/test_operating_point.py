@@ -79,15 +79,6 @@ def test_a_new_safe_gesture_raises_the_alarm_as_often_as_wanted():
     assert np.std(rates) == pytest.approx(beta(10, 490).std(), rel=0.15)
 
 
-def test_equal_scores_raise_the_alarm_together_or_not_at_all():
-    """A vote of five members: 3 % of the safe gestures have all of them, 10 % four or more."""
-    votes = torch.tensor([1.0] * 30 + [0.8] * 70 + [0.0] * 900)
-    assert 0.8 < alarm._lowest_threshold(votes, 0.05) < 1
-    assert int((votes > alarm._lowest_threshold(votes, 0.05)).sum()) == 30
-    assert int((votes > alarm._lowest_threshold(votes, 0.2)).sum()) == 100
-    assert alarm._lowest_threshold(votes, 0.02) > 1
-
-
 def test_the_last_digit_of_a_score_decides_nothing():
     """Scores of another processor differ in the last digit; the same gestures raise the alarm."""
     scores = torch.rand(3000, generator=torch.Generator().manual_seed(0)).round(decimals=3)
@@ -161,14 +152,6 @@ def test_the_chosen_point_has_the_wanted_rate_on_its_gestures(device):
     assert (point.dangerous, point.found) == (reached.dangerous, reached.found) == (64, reached.found)
     assert f"finds {100 * reached.recall:.1f} % of 64 dangerous ones" in point.sentence()
     assert choose(Peak(), device, replace(SETTINGS, false_alarm_rate=0.5)).threshold < point.threshold
-
-
-def test_streams_are_drawn_until_enough_windows_show_a_safe_touch(device):
-    streamed = device.replace(stream=True)
-    fresh = threshold_gestures(streamed, SETTINGS)
-    here = fresh.labels[:, 4] > 0.5
-    assert int((here & (fresh.labels[:, 3] < 0.5)).sum()) >= 64
-    assert choose(Peak(TOUCH_OR_NOT), streamed, SETTINGS).safe >= 64
 
 
 def test_a_device_without_fresh_gestures_gives_its_validation_split_and_says_so(made_up_device):
@@ -331,15 +314,6 @@ def test_the_misses_of_touches_that_count_are_those_that_were_asked_for(drawn):
     assert float(missed.float().mean()) == pytest.approx(true.mean(), abs=3 * spread)
 
 
-class Blurred(Largest):
-    """Knows the level of a touch to about 30 %."""
-
-    def probabilities(self, touches):
-        peak = touches.readings.flatten(1).amax(1)
-        blur = torch.sin(1e4 * peak) * 0.4  # of each touch, without a state
-        return torch.sigmoid(4 * (torch.log(peak) + blur - 1))[:, None].expand(-1, 4)
-
-
 class Onset(Largest):
     """Looks at the change from one interval to the next."""
 
@@ -399,16 +373,3 @@ def test_a_larger_reading_never_lowers_the_score_and_nan_stays():
     assert score.level == 0
     assert (np.diff(DangerScore(1.0, 2.0, 0.0).probability(np.full(9, 0.5), np.arange(9.0))) > 0).all()
     assert np.isnan(score.probability(np.array([np.nan]), np.array([1.0]))).all()
-
-
-def test_the_score_finds_what_a_blurred_model_misses(drawn):
-    """A model that sees the level only half is helped by the reading; the score is monotone in it."""
-    point = choose(Blurred(), drawn, replace(SETTINGS, safe_gestures=400), watching(100.0))
-    labels = balanced(800, generator(Stream.TEST, 8))
-    decisions = touch_scores.decide_touches(Blurred(), drawn, watching(100.0), labels, 99)
-    alone, both = decisions.scores(None), decisions.scores(point.score)
-    danger = torch.from_numpy(labels[:, 3])
-    found = [
-        float((scores > scores[~danger].quantile(0.9))[danger].float().mean()) for scores in (alone, both)
-    ]
-    assert found[1] > found[0] + 0.1

@@ -63,11 +63,6 @@ def test_a_killed_command_goes_on_where_it_was(run, begin, tmp_path):
     assert {"study_table.csv", "study_ensemble.csv"} <= {path.name for path in (tmp_path / "docs").iterdir()}
     again = run(tmp_path, "results", *PARTS, *SMALL)
     assert (again.returncode, again.stdout.count(": done")) == (0, 0), again.stderr
-    fresh = run(
-        tmp_path, "results", *PARTS, *SMALL, "results.fresh=true", "results.part=studies", store=False
-    )
-    assert fresh.returncode == 1, "the study trains nothing"
-    assert (tmp_path / "results" / "fresh.db").is_file()
 
 
 @pytest.mark.slow("trains several rows")
@@ -81,10 +76,9 @@ def test_a_command_that_fails_does_not_stop_the_others(run, tmp_path):
     assert "failed:\nskin study study=nope" in done.stderr
 
 
-@pytest.mark.slow("trains several rows")
 def test_bounds_are_published_in_a_folder_of_their_own(run, tmp_path):
     parts = "results.parts.design=[['design design.touches=64 simulator=naive out=a/b', 1]]"
-    done = run(tmp_path, "results", *PARTS, parts, "results.part=design", "results.budget=smoke", *SMALL)
+    done = run(tmp_path, "results", *PARTS, parts, "results.part=design", *SMALL)
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "docs" / "a" / "b" / "design.json").is_file()
 

@@ -144,7 +144,6 @@ def test_finished_runs_are_tried_under_conditions_once(command, run, trained):
     assert len(files) == 2 * 4 * 2
     assert command(trained, "study", *words).stdout == done.stdout
     assert runs(trained) == before
-    assert [name for name, _ in before].count("study dead") == 1
     assert {path: path.stat().st_mtime_ns for path in trained.rglob("*-*.parquet")} == files
     assert lines(trained / "dead" / "study_dead.csv") == found
     refused = run(trained, "study", *words[:3], "study.rows=[gru]")
@@ -168,14 +167,12 @@ def test_a_condition_changes_the_device_as_an_evaluation_does(command, trained):
 def test_verdicts_are_sorted_by_margins(command, trained):
     few = ["study.rows=[rules,temporal_graph]", "simulator=naive", "out=margins"]
     said = command(trained, "study", "study=margins", "study.measure.gestures=400", *few).stdout.splitlines()
-    assert "within 10 % of their thresholds lie " in said[0]
     assert "chosen on 64 fresh safe gestures for 2 % false alarms, finds " in said[0]
     (path,) = (trained / "margins").glob("margins_rules_*.csv")
     table = pd.read_csv(path)
     sums = table[table.label == "big"].groupby("by")[["touches", "wrong"]].sum()
     assert sums.touches.tolist() == [400, 400]
     assert sums.wrong.nunique() == 1
-    assert f"of {sums.wrong.iloc[0]} errors of big" in said[0]
     assert "## alarm by threshold" in path.with_suffix(".md").read_text()
     with Image.open(path.with_suffix(".png")) as picture:
         assert picture.size[0] > 800
@@ -212,18 +209,6 @@ def test_a_run_is_probed_beside_graph_embeddings(command, trained):
 
 
 SKIN = ["body.cells=[8,8]", "study.seeds=[0]", "out=r"]
-
-
-@pytest.mark.slow("trains with every simulator")
-def test_every_simulator_against_every_other(command, tmp_path):
-    skin = ["layout=grid", "layout.rows=3", "layout.columns=3", "touch.redraws=100", "study.rows=[rules]"]
-    words = [*SKIN, *skin, "touch.small_area=[0.1,0.3]", *SMALL]
-    command(tmp_path, "study", "study=mechanics", "study.part=crosscheck", *words)
-    found = lines(tmp_path / "r" / "study_crosscheck.csv")
-    names = ["naive", "fem, equation 10", "fem, interface", "solid"]
-    assert [(line["variant"], line["condition"]) for line in found] == [(a, b) for a in names for b in names]
-    assert all(0.4 < float(line[ACCURACY]) <= 1 for line in found)
-    assert "| variant | naive | fem, equation 10 |" in (tmp_path / "r" / "study_crosscheck.md").read_text()
 
 
 @pytest.mark.slow("trains several rows")

@@ -6,7 +6,6 @@ import torch
 
 from skin.device.base import AbstractDevice
 from skin.device.touches import Touches
-from skin.errors import InputError
 from skin.evaluation.operating_point import OperatingPoint
 from skin.evaluation.report import ALARM_NAME, measure_margins, span_rows
 from skin.touch.labels import TOUCH
@@ -70,11 +69,6 @@ def test_errors_are_found_where_they_are(device):
     spans, faint, _ = measured(device, but)
     assert [part.groupby("label").wrong.sum()["dynamic"] for part in (spans, faint)] == [7, 7]
     assert spans.groupby("label").wrong.sum()["big"] == 0
-
-
-def test_only_simulated_touches_are_known(made_up_device):
-    with pytest.raises(InputError, match="device=simulated"):
-        measure_margins(Sure(torch.zeros(40, 4, dtype=torch.bool)), made_up_device, 40, POINT)
 
 
 def test_the_alarm_is_raised_at_the_operating_point_and_the_label_at_one_half(device):

@@ -158,15 +158,6 @@ def test_a_vote_is_the_outcome_of_the_answers_of_most_models(members):
     assert disagreement(codes) == pytest.approx(float(differ.float().mean()))
 
 
-def test_a_tie_is_a_wrong_answer_and_no_alarm():
-    labels = torch.ones(2, 4)
-    right, wrong = labels.clone(), labels.clone()
-    wrong[0] = 0
-    codes = np.stack([encode(one, labels, TOUCH, POINT) for one in (right, wrong)])
-    assert decode(vote(codes), "overall/accuracy", TOUCH).tolist() == [0, 1]
-    assert decode(vote(codes), "dangerous/alarm_recall", TOUCH).tolist() == [0, 1]
-
-
 def test_unknown_labels_do_not_count(scored):
     """Each label is scored on the touches for which it is known, and none where it is never known."""
     probabilities, labels = scored

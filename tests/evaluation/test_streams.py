@@ -126,11 +126,6 @@ def test_bins_by_hand():
     assert found[2].majority == {"big": 0.5, "dynamic": 1.0, "press": 1.0, "dangerous": 0.5}
 
 
-def test_devices_without_streams_are_refused(made_up_device):
-    with pytest.raises(InputError, match="device=simulated"):
-        evaluate_windows(Knows(TOUCH), made_up_device, COURSE, POINT)
-
-
 @pytest.mark.parametrize("wrong", [{"hours": 0}, {"stride": 0}, {"gap": [5, 2]}, {"gap": [0, 2]}])
 def test_courses_that_lead_nowhere(wrong):
     with pytest.raises(InputError, match=r"measure\."):

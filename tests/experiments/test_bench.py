@@ -24,11 +24,6 @@ def test_a_verdict_is_timed_by_the_wall_and_by_the_core(name):
     assert 0 < figures["core_share"] < 1
 
 
-@pytest.mark.slow("measures epochs of training")
-def test_the_epochs_of_a_row_are_timed():
-    assert run_alone("training.temporal_graph", 1)["seconds_per_epoch"] > 0
-
-
 @pytest.mark.parametrize(
     ("words", "reason"),
     [

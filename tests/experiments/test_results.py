@@ -98,20 +98,6 @@ def test_bad_settings_are_refused(run, tmp_path, words, reason):
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.slow("trains several rows")
-def test_runs_in_another_precision_are_found(run, tmp_path):
-    small = SMALL[1:]
-    for row, seed in (("best_fresh", "0"), ("rules", "0")):
-        words = [f"experiment={row}", f"seed={seed}", "trainer.precision=bf16-mixed"]
-        done = run(tmp_path, "train", *words, *SMALL)
-        assert done.returncode == 0, done.stderr
-    rows = "study.trainings.0.experiment=[rules]"
-    done = run(tmp_path, "study", "study=table", "study.trainings.0.simulator=[naive]", rows, *small)
-    assert done.returncode == 0, done.stderr
-    assert "…" not in done.stdout, "nothing was to be trained"
-    assert "best_fresh" in (tmp_path / "results" / "study_table.md").read_text()
-
-
 LINES = [run for steps in OmegaConf.load(CONF / "results.yaml").results.parts.values() for run, _ in steps]
 
 

@@ -208,36 +208,6 @@ def test_a_run_is_probed_beside_graph_embeddings(command, trained):
     assert path.read_text().count("**undecided**") == 3  # one seed decides nothing
 
 
-SKIN = ["body.cells=[8,8]", "study.seeds=[0]", "out=r"]
-
-
-@pytest.mark.slow("trains several rows")
-def test_skins_of_one_study_feel_the_same_touches(command, tmp_path):
-    words = ["study=mechanics", "study.part=direction", *SKIN, "study.rows=[features]", *SMALL]
-    words.append("+simulator.divisions=1")
-    command(tmp_path, "study", *words)
-    found = lines(tmp_path / "r" / "study_direction.csv")
-    names = ["upright", "upright with friction", "leaning with friction"]
-    assert [line["variant"] for line in found] == names
-    assert all(0 < float(line["same/direction/degrees"]) < 180 for line in found)
-    assert len(ask(tmp_path, "select distinct value from tags where key = 'data_hash'")) == 3
-    assert ": done" not in command(tmp_path, "study", *words).stdout
-
-
-@pytest.mark.slow("evaluates trained rows")
-def test_rows_decide_together(command, trained):
-    """A multirun of studies is no run itself."""
-    words = ["study=models", "study.part=ensemble", "study.rows=[rules,temporal_graph]", "study.seeds=[0]"]
-    words += ["trainer.max_epochs=1", "study.train=false", *NAIVE]
-    before = runs(trained)
-    command(trained, "study", "-m", *words, "out=one,two")
-    assert {*runs(trained)} - {*before} <= {("study ensemble", "FINISHED")}
-    for folder in ("one", "two"):
-        found = {line["variant"]: line for line in lines(trained / folder / "study_ensemble.csv")}
-        assert list(found) == ["rules", "temporal_graph", "vote"]
-        assert 0 < float(found["vote"]["same/any/disagreement"]) < 1
-
-
 @pytest.mark.slow("trains several rows")
 def test_a_study_of_ones_own_needs_a_file_only(command, tmp_path):
     mine = "# @package _global_\ndefaults:\n  - override /learner: rules\nrow: mine\n"
@@ -263,18 +233,6 @@ def test_a_row_that_cannot_take_a_skin_is_named_so_also_where_thresholds_are_cho
     assert float(found["own"][ACCURACY]) > 0
     assert not found.get("four", {}).get(ACCURACY)
     assert "cannot" in (trained / "four" / "study_four.md").read_text()
-
-
-@pytest.mark.slow("trains several rows")
-def test_a_simulator_that_selects_runs_keeps_their_settings(command, tmp_path):
-    """Independent answer: skin evaluate, which changes nothing but the device."""
-    command(tmp_path, "train", "experiment=rules", "simulator=fem", "simulator.reading=interface", *SMALL)
-    words = ["study=robustness", "study.part=dead", "simulator=fem", "study.rows=rules", "study.devices=1"]
-    command(tmp_path, "study", *words, "device.test_gestures=48")
-    found = lines(tmp_path / "results" / "study_dead.csv")[0]
-    device = ["device.seed=1", "device.dead=0", "device.test_gestures=48"]
-    command(tmp_path, "evaluate", "run=latest", *device, *SMALL[2:4])
-    assert float(found[ACCURACY]) == pytest.approx(evaluated_accuracy(tmp_path))
 
 
 @pytest.mark.slow("trains several rows")

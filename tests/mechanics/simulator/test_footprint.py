@@ -29,12 +29,6 @@ def test_points_lie_across_the_normal_about_the_sensor(way):
     assert (away**2).sum(axis=1).mean() == pytest.approx(SIDE**2 / 6, rel=0.01)
 
 
-def test_what_passes_the_surface_is_cut_off():
-    points, inside, _ = sampled((1, 0, 0), (0.08, 0.06, 0.001))
-    assert points[inside][:, 2].min() >= 0
-    assert inside.mean() == pytest.approx(4 / 6, abs=0.04)
-
-
 def test_a_cut_footprint_is_said_with_its_share():
     """Leaning by 45 degrees 0.5 mm above the base, 3.5 mm of 10 mm reach into the base: with 0.5 mm, 43 %."""
     body = Sheet([0.08, 0.08], [8, 8], [{"material": "EcoFlex 00-30", "thickness": 0.012}])

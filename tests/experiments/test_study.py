@@ -183,19 +183,6 @@ def test_verdicts_are_sorted_by_margins(command, trained):
 
 
 @pytest.mark.slow("evaluates trained rows")
-def test_every_course_is_played_and_no_alarm_ends_early(command, trained):
-    few = ["study.rows=[rules]", "simulator=naive", "out=holds"]
-    words = ["study=holds", "study.measure.gestures=2", "study.measure.rate=10", *few]
-    done = command(trained, "study", *words)
-    found = lines(next((trained / "holds").glob("holds_rules_*.csv")))
-    assert len(found) == 9
-    assert {one["course"] for one in found} >= {"tap", "press", "hold 600 s", "ramp 10 s"}
-    assert all(one["kept"] == one["touches"] for one in found)
-    assert sum(int(one["alarms"]) for one in found) > 0
-    assert f"course {found[0]['course']}, touches 2" in done.stdout
-
-
-@pytest.mark.slow("evaluates trained rows")
 def test_a_run_is_probed_beside_graph_embeddings(command, trained):
     few = ["train=80", "test=40", "seeds=[0]", "epochs=2", "layouts=2", "attributes=[reading]"]
     words = ["study.rows=[temporal_graph]", "simulator=naive", *(f"study.measure.{one}" for one in few)]

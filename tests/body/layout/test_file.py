@@ -95,7 +95,9 @@ def test_a_relative_path_is_looked_for_here_first(tmp_path, monkeypatch):
             "no column normal_y, found x_m, y_m, normal_x, normal_z",
         ),
         (FACING + "0.1,0.1,0,0,1\n0.1,0.05,0,0,0\n", "line 3: a normal of length 0 has no direction"),
+        (FACING + "0.1,0.1,1e-300,0,0\n", "a normal of length 0"),
         (FACING + "0.1,0.1,0,up,1\n", "line 2: normal_y must be a number, got 'up'"),
+        ("x_m,y_m,x_m\n0.1,0.1,0.2\n", "the column x_m is there twice"),
         (
             ALONG + "0.1,0.1,1,0,0\n" * 2 + "0.1,0.1,0,0,2\n",
             "direction of sensor 3 has length 2, but must be",
@@ -146,13 +148,3 @@ def test_more_sensors_than_any_skin_has_are_refused_before_they_take_memory(sens
     rows = "".join(f"{0.00001 * number},0.1\n" for number in range(10_000))
     with pytest.warns(UserWarning, match="overlap"):
         assert len(sensors("x_m,y_m\n" + rows)) == 10_000
-
-
-def test_a_column_twice_is_refused(sensors):
-    with pytest.raises(InputError, match="the column x_m is there twice"):
-        sensors("x_m,y_m,x_m\n0.1,0.1,0.2\n")
-
-
-def test_a_normal_too_short_to_have_a_direction_is_refused(sensors):
-    with pytest.raises(InputError, match="a normal of length 0"):
-        sensors(f"{FACING}0.1,0.1,1e-300,0,0\n")

@@ -87,23 +87,6 @@ def test_a_file_that_is_not_right_is_rebuilt(damage, tmp_path, built):
     assert len(built) == 2
 
 
-def test_nothing_in_a_file_is_executed(tmp_path):
-    """An object array would be unpickled, which runs code of the file's choice."""
-
-    class Bomb:
-        def __reduce__(self):
-            return (Path.touch, (tmp_path / "executed",))
-
-    folder = tmp_path / "operators"
-    cached(STRUCTURE, SENSORS, folder)
-    with np.load(stored(folder)) as file:
-        arrays = dict(file)
-    arrays["sensor"] = np.array([[Bomb()]], dtype=object)
-    np.savez(stored(folder), **arrays)
-    cached(STRUCTURE, SENSORS, folder)
-    assert not (tmp_path / "executed").exists()
-
-
 def other_body(**changes):
     return replace(STRUCTURE, body=replace(STRUCTURE.body, **changes)), SENSORS
 

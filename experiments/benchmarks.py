@@ -1,10 +1,9 @@
 """Measure what docs/results.md publishes of speed and memory.
 
     python -m experiments.benchmarks --repeats 3 --out results
-    python -m experiments.benchmarks --only live.onnx wire --against ../other
+    python -m experiments.benchmarks --only live.onnx wire
 
-Writes bench.json into ``--out``. With ``--against`` every figure is also measured with the package ``skin``
-of that checkout, in turns, and ``ratios`` has what this checkout measures over what the other does.
+Writes bench.json into ``--out``.
 """
 
 import json
@@ -53,44 +52,34 @@ def main(words: Sequence[str]) -> None:
     parser.add_argument("--repeats", type=int, choices=range(3, 100), default=3, metavar="3, 4, ...")
     parser.add_argument("--out", default="results")
     parser.add_argument("--only", nargs="+", choices=BENCHMARKS, default=list(BENCHMARKS))
-    parser.add_argument("--against", type=Path)
     settings = parser.parse_args(words)
-    if settings.against and not (settings.against / "skin").is_dir():
-        parser.error(f"{settings.against} has no folder skin: give another checkout of this project")
-    machine = f"{platform.machine()}, {os.cpu_count()} cores, {platform.processor() or 'unknown'}"
-    versions = {name: version(name) for name in ("torch", "pytorch-lightning", "numpy", "scipy")}
-    measured: dict[str, Any] = {"repeats": settings.repeats, "machine": machine, "versions": versions}
+    measured: dict[str, Any] = {
+        "repeats": settings.repeats,
+        "machine": f"{platform.machine()}, {os.cpu_count()} cores, {platform.processor() or 'unknown'}",
+        "versions": {name: version(name) for name in ("torch", "pytorch-lightning", "numpy", "scipy")},
+    }
     for name in settings.only:
         print(name, file=sys.stderr)
         measured[name] = run_alone(name, settings.repeats)
-        if settings.against:
-            baseline = run_alone(name, settings.repeats, settings.against)
-            ratios = {key: value / baseline[key] for key, value in measured[name].items() if baseline[key]}
-            measured[name] = {"here": measured[name], "there": baseline, "ratios": ratios}
     text = json.dumps(measured, indent=2)
     write(text + "\n", results(settings.out) / "bench.json")
     print(text)
 
 
-def run_alone(name: str, repeats: int, checkout: Path = ROOT) -> Figures:
+def run_alone(name: str, repeats: int) -> Figures:
     """Run a benchmark in its own process, so that its peak memory and its threads are its own.
 
     Args:
         name: of the benchmark.
         repeats: of what it measures.
-        checkout: folder of the package ``skin`` that is measured.
     """
     code = (
         "import json, sys; from experiments.benchmarks import BENCHMARKS; "
         "print(json.dumps(BENCHMARKS[sys.argv[1]](int(sys.argv[2]))))"
     )
-    with TemporaryDirectory() as folder:
-        # These benchmarks, and not those of the other checkout.
-        (Path(folder) / "experiments").symlink_to(ROOT / "experiments")
-        env = os.environ | {"PYTHONPATH": os.pathsep.join([folder, str(checkout.resolve())])}
-        command = [sys.executable, "-P", "-c", code, name, str(repeats)]
-        done = subprocess.run(command, env=env, stdout=subprocess.PIPE, text=True, check=True)
-        return json.loads(done.stdout)
+    command = [sys.executable, "-c", code, name, str(repeats)]
+    done = subprocess.run(command, cwd=ROOT, stdout=subprocess.PIPE, text=True, check=True)
+    return json.loads(done.stdout)
 
 
 def training_config(*overrides: str) -> Config:

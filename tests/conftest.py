@@ -275,12 +275,8 @@ def starter(shared, empty_database) -> Iterator[TextIO]:
     with FileLock(f"{named}.lock"):
         if not named.exists() or not (connection := connected(named.read_text())):
             folder = mkdtemp(prefix="skin-")  # a socket's path must be short
-            command = [
-                sys.executable,
-                str(Path(__file__).with_name("starter.py")),
-                folder,
-                str(empty_database()),
-            ]
+            script = Path(__file__).with_name("starter.py")
+            command = [sys.executable, str(script), folder, str(empty_database())]
             process = subprocess.Popen(command, stdout=subprocess.PIPE)
             process.stdout.readline()
             named.write_text(folder)
@@ -327,22 +323,14 @@ def forked(starter: TextIO, job: dict) -> tuple[int, Callable[[], int | None]]:
     return number, ended
 
 
-def started(job: dict) -> tuple[int, Callable[[], int | None]]:
-    """Begin a command anew, as :func:`forked` does."""
-    with open(job["in"]) as given, open(job["out"], "w") as out, open(job["err"], "w") as err:
-        command, files = [sys.executable, *job["command"]], {"stdin": given, "stdout": out, "stderr": err}
-        process = subprocess.Popen(command, cwd=job["folder"], env=job["environment"], **files)
-    return process.pid, process.poll
-
-
 @pytest.fixture(scope="session")
 def begin(request, tmp_path_factory) -> Callable[..., Command]:
     """Return a function that starts a verb of ``skin``, or a script at a path, in a folder.
 
-    The command is a process of its own that shares its imports with others, where there are forks (not on
-    Windows) that libraries bear (not on macOS). ``stdin`` is the path of what it reads, such as a terminal.
+    The command is a process of its own that shares its imports with others. ``stdin`` is the path of what it
+    reads, such as a terminal.
     """
-    said, numbers, forks = tmp_path_factory.mktemp("said"), count(), sys.platform == "linux"
+    said, numbers = tmp_path_factory.mktemp("said"), count()
 
     def begin(folder, script, *arguments, stdin=os.devnull) -> Command:
         files = [said / f"{next(numbers)}" for _ in range(2)]
@@ -351,7 +339,7 @@ def begin(request, tmp_path_factory) -> Callable[..., Command]:
         job = {"command": [*named(script), *map(str, arguments)], "folder": str(folder)}
         job |= {"in": stdin, "out": str(files[0]), "err": str(files[1])}
         job |= {"environment": dict(os.environ), "seconds": PATIENCE}
-        return Command(partial(forked, request.getfixturevalue("starter")) if forks else started, job)
+        return Command(partial(forked, request.getfixturevalue("starter")), job)
 
     return begin
 
@@ -361,18 +349,14 @@ def run(begin, stores_are_copied) -> Callable[..., subprocess.CompletedProcess]:
     """Return a function that runs a command, named as for ``begin``, in a folder with a store of its own.
 
     ``store=False`` names no store. A verb of ``skin`` runs in this process; ``apart=True``, or ``.py`` behind
-    it, gives it a process of its own as ``begin`` does, and ``fresh=True`` one that shares nothing, as where
-    a person starts it.
+    it, gives it a process of its own as ``begin`` does.
     """
 
-    def run(folder, script, *arguments, store=True, apart=False, fresh=False) -> subprocess.CompletedProcess:
+    def run(folder, script, *arguments, store=True, apart=False) -> subprocess.CompletedProcess:
         settings = (
             [f"tracking.uri=sqlite:///{folder}/m.db", f"tracking.artifacts={folder}/a"] if store else []
         )
         words = [*map(str, arguments), *settings]
-        if fresh:
-            command = [sys.executable, *named(script), *words]
-            return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=PATIENCE)
         if apart or Path(script).suffix:
             return begin(folder, script, *words).completed()
         return run_here(folder, [str(script), *words])

@@ -99,12 +99,6 @@ def test_nothing_outside_of_their_room_imports_a_device():
         assert not {target for target in imports(path) & devices if not target.startswith(f"{room}.")}, name
 
 
-def test_the_library_needs_nothing_of_the_experiments():
-    theirs = {path.stem for path in (ROOT / "experiments").iterdir()} - {"__pycache__"}
-    for name, path in library().items():
-        assert not {target.split(".")[0] for target in imports(path)} & theirs, name
-
-
 def test_a_file_is_read_in_one_sitting():
     long = {str(path): len((ROOT / path).read_text().splitlines()) for path in trees()}
     assert not {path: lines for path, lines in long.items() if lines > 600}

@@ -73,8 +73,3 @@ def test_a_mistake_is_one_sentence(run, own, overrides, said):
     done = run(own, "train", "--config-dir", "conf", *overrides, "data.gestures=48")
     assert (done.returncode, done.stderr.count("\n")) == (2, 1), done.stderr
     assert said in done.stderr
-
-
-def test_a_simulator_without_epochs_trains_as_long_as_fem(configured):
-    config = configured("experiment=sequence_graph", "data.name=gaussian")
-    assert config.trainer["max_epochs"] == config.epochs["fem"]

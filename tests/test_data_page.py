@@ -11,7 +11,6 @@ from skin.device.files import DataSet, Manifest
 from skin.runs.build import build_device
 from skin.runs.configuration import settings_of, validate_config
 from skin.runs.generation import generate_data_set
-from skin.touch.labels import CONTACT
 
 PAGE = (ROOT / "docs" / "data.md").read_text()
 LINES = {
@@ -64,10 +63,6 @@ def first_column(table: str) -> list[str]:
     return re.findall(r"`(\w+)`", " ".join(row.split("|")[1] for row in table.splitlines() if "|" in row))
 
 
-def test_three_libraries_have_lines():
-    assert sorted(LINES) == ["duckdb", "pandas", "polars"]
-
-
 def test_the_page_names_the_keys_of_the_manifest():
     table = PAGE[PAGE.index("| key |") : PAGE.index("`touches/shards/00000.parquet` and so on")]
     named = first_column(table)
@@ -81,8 +76,3 @@ def test_the_page_names_the_columns(position):
     assert {name for name in named if not name.endswith("_")} <= set(known)
     own = {name for name in known if not name.startswith(("reading_", "saturated_", "gesture_"))}
     assert own <= set(named)
-
-
-def test_the_page_names_the_columns_of_contacts():
-    named = set(re.findall(r"`(contact_00_\w+)`", PAGE))
-    assert named == {f"contact_00_{name}" for name in CONTACT}

@@ -1,10 +1,7 @@
 """Links of the pages lead somewhere, every page is in the site, and commands name what exists."""
 
-import ast
 import re
 import shlex
-from importlib import import_module
-from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -58,21 +55,6 @@ def test_every_model_has_a_page_of_its_card():
 def test_the_reference_lists_the_public_names():
     names = set(re.findall(r"^\| `skin\.(\w+)`", (DOCS / "api.md").read_text(), re.MULTILINE))
     assert names == set(skin.__all__)
-
-
-@pytest.mark.parametrize("path", sorted((DOCS / "gallery").glob("*.py")), ids=lambda path: path.stem)
-def test_the_gallery_uses_functions_that_exist(path):
-    tree = ast.parse(path.read_text())
-    modules = {
-        name.asname or name.name: f"{node.module}.{name.name}"
-        for node in ast.walk(tree)
-        if isinstance(node, ast.ImportFrom)
-        for name in node.names
-        if find_spec(node.module).submodule_search_locations and find_spec(f"{node.module}.{name.name}")
-    }
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Attribute) and getattr(node.value, "id", None) in modules:
-            assert hasattr(import_module(modules[node.value.id]), node.attr), ast.unparse(node)
 
 
 def documented_commands(page: Path) -> list[list[str]]:

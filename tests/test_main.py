@@ -12,8 +12,6 @@ from skin.__main__ import main, verbs
 from skin.core.files import ROOT
 
 VERBS = [name for name, module in verbs().items() if module.startswith("skin.")]
-OTHERS = ["results", "study"]
-SCRIPTS = ["evaluate", "generate", "live", "record", "train"]
 HEAVY = {"hydra", "numpy", "torch", "mlflow", "pytorch_lightning"}
 
 
@@ -41,15 +39,6 @@ def test_a_verb_shows_its_own_groups_and_settings(verb, capsys):
     assert "hydra" not in text
 
 
-@pytest.mark.parametrize("verb", OTHERS)
-def test_a_verb_of_the_repository_shows_its_settings(verb, capsys):
-    main([verb, "--help"])
-    text = capsys.readouterr().out
-    assert f"skin {verb}" in text
-    assert f"{verb}:" in text
-    assert verbs()[verb] == f"experiments.studies.{verb}"
-
-
 def test_what_only_the_repository_has_is_refused_elsewhere(tmp_path):
     """As in an installed package, whose entry points are there, and whose experiments are not."""
     (tmp_path / "x-1.dist-info").mkdir()
@@ -68,30 +57,12 @@ def test_what_only_the_repository_has_is_refused_elsewhere(tmp_path):
     assert "studies" not in done.stdout
 
 
-def test_help_knows_overrides_and_mistakes(capsys):
-    main(["train", "model=mlp", "--help"])
-    assert "[mlp]" in capsys.readouterr().out
-    with pytest.raises(SystemExit) as stop:
-        main(["train", "model=cn", "--help"])
-    assert stop.value.code == 2
-    assert "cn" in capsys.readouterr().err
-
-
 @pytest.mark.parametrize(("verb", "words"), [("trian", "did you mean train?"), ("x", "animate, calibrate")])
 def test_a_mistyped_verb_is_told_the_right_one(verb, words, capsys):
     with pytest.raises(SystemExit) as stop:
         main([verb])
     assert stop.value.code == 2
     assert words in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("name", SCRIPTS)
-def test_a_script_is_short_for_its_verb(run, tmp_path, name):
-    assert f'main(before=["{name}"])' in (ROOT / "experiments" / f"{name}.py").read_text()
-    done = run(tmp_path, f"{name}.py", "typo=1", store=False)
-    assert done.returncode == 2
-    assert "typo" in done.stderr
-    assert "is now" not in done.stderr
 
 
 @pytest.mark.parametrize(
@@ -141,10 +112,3 @@ def test_bash_completes_verbs_groups_options_and_settings(line, choices):
         ["bash", "-c", script], env=environment, capture_output=True, text=True, timeout=120, check=True
     )
     assert set(done.stdout.split()) == choices
-
-
-def test_another_shell_is_refused(capsys):
-    with pytest.raises(SystemExit) as ended:
-        main(["-sc", "install=fish"])
-    assert ended.value.code == 2
-    assert "install=bash" in capsys.readouterr().err

@@ -1,6 +1,5 @@
 """What ``import skin`` offers to a script."""
 
-import ast
 import re
 import runpy
 import subprocess
@@ -43,14 +42,6 @@ def test_there_are_sixteen_names_and_they_cost_nothing_yet():
     code = f"import sys, skin; print(*({HEAVY} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
     assert done.stdout.strip() == "", done.stderr
-
-
-def test_names_for_type_checkers_are_the_names():
-    tree = ast.parse((ROOT / "skin" / "__init__.py").read_text())
-    checked = {
-        alias.asname for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) for alias in node.names
-    }
-    assert checked - {None} == set(skin.__all__)
 
 
 def test_a_skin_is_described_simulated_and_differentiated():
@@ -145,15 +136,6 @@ def test_a_loop_of_ones_own_trains(capsys):
     made = runpy.run_path(str(ROOT / "docs/tutorials/tutorial_6_own_loop.py"))
     assert made["loss"] < 0.65  # ln 2 at the start
     assert "dangerous" in capsys.readouterr().out
-
-
-def test_settings_of_data_are_those_of_a_training():
-    data = skin.data(
-        {"data.gestures": 40, "seed": 3}, simulator="naive", representation="readings", data={"batch_size": 9}
-    )
-    frames, labels = next(iter(data.train_dataloader()))
-    assert (frames.x.shape[0], labels.shape, data.seed) == (9, (9, 4), 3)
-    assert sum(data.count("train")) == 32
 
 
 @pytest.mark.parametrize(

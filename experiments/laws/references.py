@@ -322,12 +322,9 @@ def block(
 
 def graded(fine: float, count: int, far: float, growth: float) -> np.ndarray:
     """Return grid lines from 0: ``count`` steps of length ``fine``, then growing steps to beyond ``far``."""
-    lines = list(fine * np.arange(count + 1))
-    step = fine
-    while lines[-1] < far:
-        step *= growth
-        lines.append(lines[-1] + step)
-    return np.array(lines)
+    beyond = math.log1p((far / fine - count) * (1 - 1 / growth)) / math.log(growth)  # of a geometric sum
+    steps = fine * growth ** np.arange(1, math.ceil(beyond) + 1)
+    return np.concatenate([fine * np.arange(count + 1), fine * count + steps.cumsum()])
 
 
 def held(mesh: Hexahedra, faces: Mapping[str, tuple[int, ...]]) -> np.ndarray:

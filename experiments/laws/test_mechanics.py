@@ -28,8 +28,8 @@ from skin.body.base import AbstractBody, Sensors
 from skin.body.sheet import Sheet
 from skin.mechanics.contact.rigid import solve_contact as press
 from skin.mechanics.contact.rigid import stabilise_checkerboard
+from skin.mechanics.geometry import reading_rows
 from skin.mechanics.simulator._mesh import Hexahedra, build_mesh, build_meshes
-from skin.mechanics.simulator._reading import reading_rows
 from skin.mechanics.simulator.solid import Elastic
 from skin.touch.shapes import Shapes
 

@@ -10,6 +10,7 @@ import pandas as pd
 from scipy.stats import t
 
 from experiments.studies.study import Statement, Study
+from skin.errors import InputError
 from skin.evaluation.metrics import decodable, decode
 from skin.touch.labels import TOUCH
 
@@ -91,18 +92,23 @@ def compare_samples(
 
     Args:
         left, right: figures by seed, or by device.
-        ratio: take left / right instead of left - right.
+        ratio: take left / right instead of left - right; of figures without devices and gestures.
         across: the same by what the first two are not by, device or seed.
         gestures: the same by gesture, in the same unit.
+
+    Raises:
+        InputError: a ratio of figures by gesture.
     """
     pairs, devices = _pair(left, right, ratio), np.zeros(2)
     if pairs.empty:
         return None
+    if ratio and gestures[0] is not None:
+        raise InputError("a ratio needs a metric without figures by gesture, such as seconds_per_epoch")
     seeds = uncertainty(pairs) if len(pairs) > 1 else np.full(2, math.inf)
     if across is not None and not across[0].empty and not across[1].empty:
         shared = _pair(*across, ratio)
-        devices = uncertainty(shared) if len(shared) > 1 else _unpaired(*across, ratio)
-    error, margin = together(seeds, devices, _over_gestures(*gestures, ratio))
+        devices = uncertainty(shared) if len(shared) > 1 else _unpaired(*across)
+    error, margin = together(seeds, devices, _over_gestures(*gestures))
     return Estimate(fmean(pairs), error, margin, len(pairs))
 
 
@@ -111,24 +117,17 @@ def _pair(left: pd.Series, right: pd.Series, ratio: bool) -> pd.Series:
     return first / second if ratio else first - second
 
 
-def _unpaired(left: pd.Series | np.ndarray, right: pd.Series | np.ndarray, ratio: bool) -> np.ndarray:
-    first, second = np.nanmean(left), np.nanmean(right)
-    scales = (1 / second, first / second**2) if ratio else (1.0, 1.0)
-    return together(scales[0] * uncertainty(left), scales[1] * uncertainty(right))
+def _unpaired(left: pd.Series | np.ndarray, right: pd.Series | np.ndarray) -> np.ndarray:
+    return together(uncertainty(left), uncertainty(right))
 
 
-def _over_gestures(left: np.ndarray | None, right: np.ndarray | None, ratio: bool) -> np.ndarray:
+def _over_gestures(left: np.ndarray | None, right: np.ndarray | None) -> np.ndarray:
     """Return the uncertainty over gestures: unpaired if their numbers differ, 0 if they are unknown."""
     if left is None or right is None:
         return np.zeros(2)
     if len(left) != len(right):
-        return _unpaired(left, right, ratio)
-    if not ratio:
-        return uncertainty(left - right)
-    counted = ~np.isnan(left + right)
-    first, below = left[counted].mean(), right[counted].mean()
-    # The ratio of two means, linearised (delta method).
-    return uncertainty((left - first / below * right) / below) if below else np.zeros(2)
+        return _unpaired(left, right)
+    return uncertainty(left - right)
 
 
 def judge(statement: Statement, compared: Estimate | None) -> str:

@@ -10,13 +10,10 @@ import pandas as pd
 import torch
 from annotated_types import Ge, Gt
 from hydra.utils import instantiate
-from matplotlib.figure import Figure
-from rich.progress import track
 from scipy.ndimage import gaussian_filter
 from scipy.stats import binomtest
 
 from experiments.studies.measures import Subject
-from experiments.studies.pages import Page
 from skin.calibration.bench import BenchSession
 from skin.calibration.known_loads import KnownLoad, Protocol, emulate_placements, fit_known_load
 from skin.core.rng import Stream, generator
@@ -30,7 +27,6 @@ from skin.evaluation.operating_point import LABEL, OperatingPoint
 from skin.evaluation.touch_scores import decide_touches
 from skin.live.engine import DebounceSettings, Engine
 from skin.live.engine_builder import engine_settings
-from skin.plot.figures import COLOURS
 from skin.runs.build import TorchModel, build_device, load_model
 from skin.runs.configuration import recompose
 from skin.touch.labels import TOUCH
@@ -146,8 +142,8 @@ class Holds:
         for course, load in self.courses.items():
             number = max(1, self.gestures // 10) if load and load[0][-1] >= 60 else self.gestures
             forces = dangerous_touches(device, number, course == "tap", load)
-            steps = track(enumerate(forces), course, number, transient=True)
-            timings = pd.DataFrame(play_touch(engine, device, force, self.rate, n) for n, force in steps)
+            played = (play_touch(engine, device, force, self.rate, n) for n, force in enumerate(forces))
+            timings = pd.DataFrame(played)
             raised, counts = timings.raised, {"touches": len(timings), "alarms": timings.raised.count()}
             counts |= timings[["kept", "early"]].sum().to_dict()
             times = {"median_s": raised.median(), "p95_s": raised.quantile(0.95)}
@@ -310,42 +306,22 @@ class KnownLoadGains:
     devices: Annotated[int, Ge(1)] = 10
 
     def __call__(self, subject: Subject) -> pd.DataFrame:
-        nominal, parts, drawn = make_skin(subject), list[pd.DataFrame](), dict[str, Any]()
+        nominal, parts = make_skin(subject), list[pd.DataFrame]()
         for seed in range(self.devices):
             device = make_skin(subject, seed)
             working = ~device.constants.dead.numpy()
             true = device.constants.gain.numpy()[working]
             for procedure in ROUNDS:
-                session = record(device, procedure, seed)
-                gains = fit_known_load(nominal, session, WEIGHT).calibration.known("gain")[working]
+                fitted = fit_known_load(nominal, record(device, procedure, seed), WEIGHT)
+                gains = fitted.calibration.known("gain")[working]
                 parts.append(pd.DataFrame({"procedure": procedure, "device": seed, "ratio": gains / true}))
-                drawn = drawn or _shown(session, gains, true)
         sensors = pd.concat(parts)
         sensors["scale"] = sensors.groupby(["procedure", "device"]).ratio.transform("median")
         rows = [
             {"skin": subject.condition, "procedure": name, "devices": self.devices} | _errors(group)
             for name, group in sensors.groupby("procedure", sort=False)
         ]
-        frame = pd.DataFrame(rows)
-        frame.attrs["drawn"] = drawn
-        return frame
-
-    def page(self, frame: pd.DataFrame, title: str) -> Page:
-        """Return the rows, and of one skin a figure of a session with a weight, and its gains."""
-        if frame.skin[0] != "default, solid":
-            return Page("", {}, frame)
-        figure, drawn = Figure(figsize=(9.0, 3.2), layout="constrained"), frame.attrs["drawn"]
-        trace, scatter = figure.subplots(1, 2, width_ratios=[2, 1])
-        for name, readings in drawn["readings"].items():
-            trace.plot(drawn["time"], readings, linewidth=0.7, label=name)
-        trace.set(xlabel="time, s", ylabel="reading, N", title="2 kg put on one sensor after the other")
-        trace.legend(fontsize=8, ncols=2)
-        true, estimated = drawn["gains"]
-        ends = [min(true) * 0.9, max(true) * 1.1]
-        scatter.plot(ends, ends, color="grey", linewidth=0.8)
-        scatter.plot(true, estimated, "o", markersize=4, color=COLOURS[0])
-        scatter.set(xlabel="true gain", ylabel="gain from the weight", title=f"{len(true)} working sensors")
-        return Page("", {}, frame, figure)
+        return pd.DataFrame(rows)
 
 
 def _errors(sensors: pd.DataFrame) -> dict[str, float]:
@@ -357,17 +333,8 @@ def _errors(sensors: pd.DataFrame) -> dict[str, float]:
         f"{name}_rms_percent": round(100 * float(np.sqrt(np.mean((sample - 1) ** 2))), 2)
         for name, sample in samples.items()
     }
-    median = round(100 * float(np.median(scales) - 1), 2)
-    return errors | {"scale_median_percent": median, "without_gain": len(sensors) - len(known)}
-
-
-def _shown(session: BenchSession, gains: np.ndarray, true: np.ndarray) -> dict[str, Any]:
-    """Return the readings of the six strongest sensors, N, for 45 s, and the gains, of the figure."""
-    part = session.time < 45.0
-    strongest = np.argsort(-np.nanmax(session.raw[part], axis=0))[:6]
-    readings = {f"sensor {number}": session.raw[part, number].tolist() for number in strongest}
-    gain_pairs = [true.tolist(), gains.tolist()]
-    return {"time": session.time[part].tolist(), "readings": readings, "gains": gain_pairs}
+    errors["scale_median_percent"] = round(100 * float(np.median(scales) - 1), 2)
+    return errors | {"without_gain": len(sensors) - len(known)}
 
 
 @dataclass(frozen=True)

@@ -15,8 +15,6 @@ import numpy as np
 import pandas as pd
 from annotated_types import Ge, MinLen
 from matplotlib.figure import Figure
-from rich.console import Console
-from rich.progress import track
 from sklearn.decomposition import PCA
 from sklearn.manifold import TSNE
 from sklearn.model_selection import GridSearchCV
@@ -29,7 +27,7 @@ from experiments.studies.measures import Subject
 from experiments.studies.pages import Page, figure_text
 from experiments.studies.study import Statement
 from skin.device.base import AbstractDevice
-from skin.device.simulated import Simulated, report_balance
+from skin.device.simulated import Simulated
 from skin.device.touches import Touches
 from skin.errors import InputError
 from skin.evaluation.report import scattered_devices
@@ -75,11 +73,7 @@ class Embeddings:
 
     def __call__(self, subject: Subject) -> pd.DataFrame:
         device, learner = subject.device, subject.learner if subject.model else None
-        report_balance(device)
-        count = (len(self.attributes) * 3 + (learner is not None) + 2) * len(self.seeds)
-        frame = pd.DataFrame(
-            track(self.probe(device, learner), "probing", count, console=Console(stderr=True))
-        )
+        frame = pd.DataFrame(self.probe(device, learner))
         frame.attrs["labels"] = list(device.task.names)
         return frame
 

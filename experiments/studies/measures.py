@@ -9,7 +9,7 @@ not accept the touches). A measure may have ``page(frame, title)``.
 import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from importlib import import_module
 from typing import Annotated, Any
 
@@ -18,8 +18,6 @@ import pandas as pd
 import torch
 from annotated_types import Ge
 from hydra.utils import instantiate
-from rich.console import Console
-from rich.progress import track
 from torch import Tensor
 
 from experiments.studies.pages import Page, Panel, draw_panels
@@ -29,9 +27,9 @@ from skin.device.simulated import Simulated
 from skin.device.touches import Recording
 from skin.errors import InputError
 from skin.evaluation.alarm import choose_alarm_threshold
-from skin.evaluation.margins import ALARM_NAME, measure_margins
 from skin.evaluation.metrics import compute_metrics, encode
 from skin.evaluation.operating_point import OperatingPoint
+from skin.evaluation.report import ALARM_NAME, measure_margins
 from skin.evaluation.settings import StreamSettings, check_evaluation
 from skin.evaluation.streams import WindowReport, evaluate_windows
 from skin.learning.graph import neighbours
@@ -131,7 +129,7 @@ class Margins:
     def __call__(self, subject: Subject) -> pd.DataFrame:
         point = subject.point()
         frame, reached = measure_margins(subject.learner, subject.device, self.gestures, point)
-        frame.attrs["about"] = f"{describe_margins(frame)}; {point.sentence()}; {reached.sentence()}"
+        frame.attrs["about"] = f"{point.sentence()}; {reached.sentence()}"
         return frame
 
     def page(self, frame: pd.DataFrame, title: str) -> Page:
@@ -162,41 +160,19 @@ class Margins:
         return Page(frame.attrs["about"], tables, data, draw_panels(title, panels))
 
 
-def describe_margins(frame: pd.DataFrame) -> str:
-    """Return in words where the errors lie that :func:`measure_margins` found."""
-    low, high = frame.low.astype(float), frame.high.astype(float)
-    spans = frame.by == "threshold"
-    close = frame[spans & (low >= 0.9) & (high <= 1.1)].groupby("label").wrong.sum()
-    weak = frame[~spans & (high <= 1.0)].groupby("label").wrong.sum()  # N
-    wrong = frame[spans].groupby("label").wrong.sum()
-    clear = frame[spans & (frame.label == ALARM_NAME) & (low >= 1.1)]
-    return (
-        f"within 10 % of their thresholds lie {close.get('big', 0)} of {wrong.big} errors of big and "
-        f"{close.get('dangerous', 0)} of {wrong.dangerous} of dangerous; no reading passes 1 N in "
-        f"{weak.get('dynamic', 0)} of {wrong.dynamic} errors of dynamic; {clear.wrong.sum()} of "
-        f"{clear.touches.sum()} touches more than 10 % above the threshold of dangerous raise no alarm"
-    )
-
-
 class Streams(StreamSettings):
     """False alarms per hour of a stream, and accuracy by the fraction of a touch that a window shows."""
 
     def __call__(self, subject: Subject) -> pd.DataFrame:
-        progress = partial(track, description="streams", console=Console(stderr=True), transient=True)
-        report = evaluate_windows(subject.learner, subject.device, self, subject.point(), progress)
-        return streams_frame(report)
+        return streams_frame(evaluate_windows(subject.learner, subject.device, self, subject.point()))
 
     def page(self, frame: pd.DataFrame, title: str) -> Page:
-        """Return the page of a run, with the accuracy by the fraction that is seen."""
+        """Return the page of a run."""
         tables = {}
         for measure, group in frame.groupby("measure", sort=False):
             table = group.pivot(index="name", columns="at", values="value").fillna("")
             tables[measure] = table.reindex(columns=group["at"].unique()).reset_index()
-        accuracy = tables.get("accuracy", pd.DataFrame({"name": []})).set_index("name").astype(float)
-        lines = {name: np.stack([np.arange(len(row)), 100 * row]) for name, row in accuracy.iterrows()}
-        across, up = "fraction of the touch in the window", "accuracy, %"
-        figure = draw_panels(title, [Panel(across, up, lines, ticks=list(accuracy.columns))])
-        return Page(frame.attrs["about"], tables, frame, figure)
+        return Page(frame.attrs["about"], tables, frame)
 
 
 def streams_frame(report: WindowReport) -> pd.DataFrame:
@@ -209,8 +185,7 @@ def streams_frame(report: WindowReport) -> pd.DataFrame:
     cells = ("idle said idle", "idle said touched", "touched said idle", "touched said touched")
     for gate, counts in report.gates.items():
         rows += ([cell, gate, "", int(n)] for cell, n in zip(cells, counts.flatten(), strict=True))
-    bins = (report.bins[0], report.bins[-1]) if report.bins else ()
-    parts = [f"accuracy {100 * part.overall:.1f} % at share {part.name}" for part in bins]
+    parts = list[str]()
     for gate, alarms in report.alarms.items():
         rows += ([f"alarms {name}", gate, "", value] for name, value in vars(alarms).items())
         low, high = alarms.range
@@ -224,8 +199,7 @@ def streams_frame(report: WindowReport) -> pd.DataFrame:
         ["stream, h", "", "", report.hours],
     ]
     rows += (["window, s", "overall", f"{window:g}", value] for window, value in report.lengths.items())
-    trained = "windows of streams" if report.streamed else "whole touches"
-    parts.append(f"trained on {trained}; {report.point.sentence()}")
+    parts.append(report.point.sentence())
     frame = pd.DataFrame(rows, columns=["measure", "name", "at", "value"]).map(str)
     frame.attrs |= {"metrics": report.metrics(), "about": "; ".join(parts)}
     return frame
@@ -285,10 +259,8 @@ def frozen_hash(recording: Recording, overrides: Sequence[str]) -> str:
     """
     touches, names = recording.touches, ("shape", "duration", "onset", "draws")
     parts = [touches.known_labels.bool(), touches.valid, *(recording.parameters[name] for name in names)]
-    content = hashlib.sha256("\n".join(overrides).encode())
-    for part in parts:
-        content.update(part.contiguous().numpy().tobytes())
-    return content.hexdigest()[:16]
+    content = ["\n".join(overrides).encode(), *(part.contiguous().numpy().tobytes() for part in parts)]
+    return hashlib.sha256(b"".join(content)).hexdigest()[:16]
 
 
 @dataclass(frozen=True)

@@ -1,22 +1,25 @@
-"""Write docs/reproduce.md: every statement, tested on the published results.
+"""Write docs/reproduce.md: every statement, tested on the published results. Draw the methods side by side.
 
     python -m experiments.studies.reproduce
 
 The statements are in conf/study/, and those without a study in statements.yaml beside this file.
 """
 
+import math
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
+from matplotlib.figure import Figure
 from omegaconf import OmegaConf
 
-from experiments.studies.comparison import conclude
+from experiments.studies.comparison import conclude, uncertainty, values
 from experiments.studies.pages import comparison_text
 from experiments.studies.study import Statement, Study, configured_study, trained_settings
 from skin.core.files import CONF, ROOT, write
 from skin.core.settings import configured
+from skin.plot.figures import COLOURS, save_figure
 
 _PAGE = ROOT / "docs" / "reproduce.md"
 _HEAD = """# Reproduction of the report's statements
@@ -76,6 +79,43 @@ def published_trials(name: str, chosen: Mapping[str, Mapping[str, str]] | None =
     return trials.assign(device="", outcomes=None)
 
 
+_METHODS = {
+    **{f"{name} (report)": ("fem " + name, "", COLOURS[0]) for name in (
+        "linked_graph", "sequence_graph", "temporal_image", "sequence_image", "temporal_graph")},
+    "boosted trees": ("features", "", COLOURS[1]),
+    "best_fresh": ("best_fresh", "", COLOURS[2]),
+    "any_skin (solid)": ("any_skin", "25 sensors", COLOURS[3]),
+}  # fmt: skip
+"""Name -> variant, condition and colour; the networks of the report share one."""
+
+_QUANTITIES = (
+    ("same/overall/accuracy", 4000, "accuracy of the four labels, %"),
+    ("same/dangerous/alarm_recall", 2000, "recall of dangerous touches, %"),
+)
+"""Metric, number of test gestures that count, and label."""
+
+
+def methods_figure() -> Figure:
+    """Draw accuracy and recall of each method, from the published files.
+
+    Intervals are over trainings and over gestures, of which the latter are those of a binomial distribution.
+    """
+    trials = pd.concat(map(published_trials, ("table", "table_best", "any_skin")))
+    figure = Figure(figsize=(9, 3), layout="constrained")
+    panels = figure.subplots(ncols=2, sharey=True)
+    for axis, (metric, count, label) in zip(panels, _QUANTITIES, strict=True):
+        for number, (variant, condition, colour) in enumerate(_METHODS.values()):
+            figures = values(trials[(trials.variant == variant) & (trials.condition == condition)], metric)
+            mean = figures.mean()
+            margin = math.hypot(uncertainty(figures)[1], 1.96 * math.sqrt(mean * (100 - mean) / count))
+            axis.errorbar(mean, -number, xerr=margin, fmt="o", color=colour, ms=5, capsize=3)
+        axis.set(xlabel=label, xlim=(None, 101))
+        axis.grid(alpha=0.3)
+    panels[0].set_yticks(range(0, -len(_METHODS), -1), _METHODS)
+    figure.suptitle("4000 simulated touches; mean and 95 % interval over trainings and touches", fontsize=9)
+    return figure
+
+
 def _study_lines(command: str, study: Study) -> Iterator[str]:
     trials = published_trials(study.name, trained_settings(study))
     if trials.empty:
@@ -109,3 +149,4 @@ def _line(*cells: str) -> str:
 
 if __name__ == "__main__":
     print(write(reproduce_page(), _PAGE))
+    print(save_figure(methods_figure(), _PAGE.with_name("results") / "methods.png"))

@@ -13,11 +13,10 @@ from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 from shlex import join, split
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from annotated_types import Ge, Gt
 
-from experiments import peers
 from skin.commands._command import command
 from skin.core.files import results as results_folder
 from skin.core.settings import configured
@@ -35,11 +34,8 @@ class PublishedResults:
 
     part: str
     optional: Sequence[str]
-    budget: Literal["full", "smoke"]
     jobs: Annotated[int, Ge(1)]
-    fresh: bool
     parts: Mapping[str, Sequence[tuple[str, Annotated[float, Gt(0)]]]]
-    smoke: Mapping[str, Sequence[str]]
 
     def __post_init__(self) -> None:
         if self.part not in ("all", *self.parts):
@@ -52,28 +48,20 @@ class PublishedResults:
             folder: of the results.
             passed: overrides of every training and study.
         """
-        smoke, parts = self.budget == "smoke", [name for name in self.parts if name not in self.optional]
-        fresh = ["tracking.uri=sqlite:///results/fresh.db", "tracking.artifacts=results/fresh"]
-        general = [*(fresh if self.fresh else []), *passed]
+        chosen = (
+            [part for part in self.parts if part not in self.optional] if self.part == "all" else [self.part]
+        )
         jobs = {
             "train": ["hydra/launcher=joblib", f"hydra.launcher.n_jobs={self.jobs}"],
             "study": [f"study.jobs={self.jobs}"],
         }
-        for run, hours in chain(
-            *(self.parts[part] for part in (parts if self.part == "all" else [self.part]))
-        ):
+        for run, hours in chain(*(self.parts[part] for part in chosen)):
             verb, *words = split(run)
-            if smoke and "experiments/peers/conf" in words and not peers.python().is_file():
-                print(
-                    f"left out without {peers.python()}, which make peers builds: skin {run}", file=sys.stderr
-                )
-                continue
-            words += self.smoke.get(verb, ()) if smoke else ()
             if verb == "design":  # has no runs, and takes no settings of trainings
                 words = [f"out={folder / word[4:]}" if word.startswith("out=") else word for word in words]
             else:
                 parallel, out = jobs.get(verb, []) if self.jobs > 1 else [], [f"out={folder}"]
-                words += [*parallel, *(out if verb == "study" else []), *general]
+                words += [*parallel, *(out if verb == "study" else []), *passed]
             yield hours, [verb, *words]
 
 
@@ -88,13 +76,11 @@ def main(config: Config, results: dict[str, Any], out: str | None) -> None:
 
     quiet()
     passed = [word for word in overrides() if word.split("=")[0].split(".")[0] not in ("results", "out")]
-    # Smoke budgets are published in a folder of their own.
-    folder = results_folder(out or ("results" if chosen.budget == "smoke" else "docs/results"))
+    folder = results_folder(out or "docs/results")
     failed, lines = [], list(chosen.lines(folder, passed))
     for number, (_, line) in enumerate(lines):
         left = sum(each for each, _ in lines[number:])
-        estimate = f", at most {left:.1f} h left" if chosen.budget == "full" else ""
-        print(f"== [{number + 1}/{len(lines)}] skin {join(line)}{estimate}", flush=True)
+        print(f"== [{number + 1}/{len(lines)}] skin {join(line)}, at most {left:.1f} h left", flush=True)
         try:
             code = run_command(cli.main, line)
         except Exception:  # is reported, and must not stop the others

@@ -117,8 +117,6 @@ def run_study(study: Study, config: Config, folder: Path, smoke: bool) -> bool:
             simulator(config.device): config for run in planned for config in run.variant.configs.values()
         }
         print(f"{len(draw_report(frame, skins, folder))} figures of the report in {folder}")
-    if store and (study.measure or frame.condition.any()):
-        log_summary(store, study, frame, paths)
     return complete
 
 
@@ -401,22 +399,6 @@ def write_frame(frame: pd.DataFrame, path: Path) -> None:
     """Write a frame and its ``attrs`` as a file, whole."""
     with whole(path) as partial:
         frame.to_parquet(partial, compression="zstd", write_page_checksum=True)
-
-
-def log_summary(store: Store, study: Study, trials: pd.DataFrame, files: Sequence[Path]) -> None:
-    """Log what a study measured as one run: its files, and the mean of every metric over its trials.
-
-    The next summary of this study replaces it.
-    """
-    means = trials.groupby(["variant", "condition"], sort=False).mean(numeric_only=True).stack()
-    named = {
-        re.sub(r"[^\w./: -]", "-", "/".join(filter(None, name))): float(mean) for name, mean in means.items()
-    }
-    before = store.find("FINISHED", study=study.name)
-    with store.run(f"study {study.name}", {"study": study.name}, again=next(iter(before), None)) as run:
-        store.log_metrics(run, named)
-        for path in files:
-            store.client.log_artifact(run.info.run_id, str(path))
 
 
 def votes(study: Study, trials: pd.DataFrame) -> Iterator[dict[str, Any]]:

@@ -223,7 +223,7 @@ GROUPS = {
     "body": "skin.body.base",
     "layout": "skin.body.layout",
     "simulator": "skin.mechanics.simulator.base",
-    "contact": "skin.touch.sampler",
+    "contact": "skin.touch.movie",
     "device": "skin.device.base",
     "representation": "skin.learning.representation",
     "model": "skin.learning.model",

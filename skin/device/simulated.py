@@ -31,9 +31,8 @@ from skin.mechanics.relaxation import Relaxing, relaxes
 from skin.mechanics.simulator.base import AbstractSimulator
 from skin.touch.fingertips import read_touch
 from skin.touch.labels import ALARM, TOUCH, TOUCH_OR_NOT, TOUCH_SLIDING
-from skin.touch.movie import Movie
+from skin.touch.movie import AbstractContact, AbstractSampler, Movie
 from skin.touch.paths import TouchSettings
-from skin.touch.sampler import AbstractContact, AbstractSampler
 
 # The true sensors of a simulated device and its model of them.
 

@@ -15,8 +15,7 @@ from torch.nn.functional import pad
 from skin.body.base import GEOMETRY
 from skin.errors import InputError
 from skin.touch.labels import CONTACT, TOUCH, TOUCH_OR_NOT, Task
-from skin.touch.movie import Movie, join_movies
-from skin.touch.sampler import AbstractSampler
+from skin.touch.movie import AbstractSampler, Movie, join_movies
 
 
 @dataclass(frozen=True)

@@ -57,8 +57,6 @@ if TYPE_CHECKING:
     from skin.device.simulated import Simulated
     from skin.device.touches import Touches
 
-SAFE_TOUCHES = ENOUGH
-"""Safe touches on which a threshold is chosen."""
 DANGEROUS_TOUCHES = 400
 """Dangerous touches on which a threshold of the live view is checked: 75 % are then 71 to 79 % (95 %)."""
 FITTED_TOUCHES = 300
@@ -317,7 +315,6 @@ def threshold_gestures(device: "AbstractDevice", settings: Evaluation) -> "Touch
     A simulated device draws fresh gestures until enough of them are safe; other devices give their validation
     split.
     """
-    check_evaluation(settings)
     simulation = device.simulation
     if simulation is None or LABEL not in device.task.names:
         return device.touches("validation")
@@ -359,7 +356,7 @@ def _on_touches(
     It ships with the model or is kept on disk, unless the device is given.
     """
     target, missed = settings.false_alarm_rate, settings.miss_rate
-    count = min(settings.safe_gestures, SAFE_TOUCHES)
+    count = min(settings.safe_gestures, ENOUGH)
     if source.device is not None:
         device = source.device.simulated("touches are simulated")
         point = _on_touches_of(device, source.learner, _snapped(live, device), settings, count)
@@ -431,7 +428,7 @@ def _describe(
             "profile": settings.profile,
             "target": settings.false_alarm_rate,
             "missed": settings.miss_rate,
-            "count": min(settings.safe_gestures, SAFE_TOUCHES),
+            "count": min(settings.safe_gestures, ENOUGH),
         },
     )
 

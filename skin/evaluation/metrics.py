@@ -43,14 +43,14 @@ def compute_metrics(
     alarm: dict[str, float] = {}
     if point is not None:
         reached = point.reached(probabilities, labels, task)
-        alarm[f"{LABEL}/alarm_recall"] = reached.recall
-        alarm[f"{LABEL}/false_alarm_rate"] = reached.false_alarm_rate
+        alarm |= {
+            f"{LABEL}/alarm_recall": reached.recall,
+            f"{LABEL}/false_alarm_rate": reached.false_alarm_rate,
+        }
     if task.kind == "regression":
         return _errors(probabilities, labels, task)
     if task.kind == "exclusive":
         rows = task.counts(labels)[:, 0]
-        if not rows.any():
-            return {"overall/accuracy": math.nan} | alarm
         right = probabilities[rows].argmax(1) == labels[rows].argmax(1)
         return {"overall/accuracy": float(right.float().mean())} | alarm
     values: dict[str, float] = {}
@@ -58,10 +58,8 @@ def compute_metrics(
     for name, (probability, label) in zip(task.binary, pairs, strict=True):
         right = ((probability > 0.5) == (label > 0)).float()
         values[f"{name}/accuracy"] = float(right.mean())
-        values[f"{name}/balanced_accuracy"] = math.nan
-        if 0 < int(label.sum()) < len(label):
-            recall, specificity = right[label > 0].mean(), right[label == 0].mean()
-            values[f"{name}/balanced_accuracy"] = float((recall + specificity) / 2)
+        recall, specificity = right[label > 0].mean(), right[label == 0].mean()  # nan of none
+        values[f"{name}/balanced_accuracy"] = float((recall + specificity) / 2)
         values[f"{name}/ece"] = calibration_error(probability, label)
     # A label that is unknown in all test touches does not count in the overall values.
     unknown = {name for name, column in zip(task.names, labels.T, strict=True) if column.isnan().all()}

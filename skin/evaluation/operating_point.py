@@ -266,9 +266,11 @@ def parse_operating_point(text: str) -> OperatingPoint | None:
             int(stored["dangerous"]),
             int(stored["found"]),
         )
-        usable = stored["label"] == LABEL and point.threshold > 0 and 0 < point.target < 1
-        usable &= 0 <= point.raised <= point.safe and 0 <= point.found <= point.dangerous
-        if not usable or not math.isfinite(point.threshold):
+        usable = (
+            stored["label"] == LABEL and 0 < point.threshold < math.inf and 0 < point.target < 1,
+            0 <= point.raised <= point.safe and 0 <= point.found <= point.dangerous,
+        )
+        if not all(usable):
             raise ValueError(text)
     except (ValueError, TypeError, KeyError, OverflowError, RecursionError) as error:
         raise InputError(

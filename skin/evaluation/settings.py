@@ -1,6 +1,6 @@
 """Settings of evaluations, without heavy imports, so that errors are reported early."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -25,27 +25,26 @@ class Evaluation:
     miss_rate: float | None = None
 
 
+_RULES: dict[str, tuple[Callable[[float], bool], str, object]] = {
+    "devices": (lambda count: count >= 0, "a number of devices is 0 or more", 10),
+    "layouts": (lambda count: count >= 0, "a number of layouts is 0 or more", 10),
+    "false_alarm_rate": (lambda rate: 0 < rate < 1, "a false-alarm rate is between 0 and 1", 0.02),
+    "miss_rate": (
+        lambda rate: 0 < rate < 0.5, "a miss rate is a fraction of dangerous touches between 0 and 0.5", 0.001
+    ),
+    "safe_gestures": (
+        lambda count: count >= 1, "the alarm's threshold is chosen on 1 safe gesture or more", ENOUGH
+    ),
+}  # fmt: skip
+"""Setting -> which values are valid, the same in words, and an example."""
+
+
 def check_evaluation(settings: Evaluation | None) -> Evaluation:
     """Return the settings of an evaluation, or raise InputError where they cannot be used."""
     assert settings is not None
-    for name, minimum in (("devices", 0), ("layouts", 0)):
-        if getattr(settings, name) < minimum:
-            raise InputError(f"evaluation.{name}={getattr(settings, name)} must be at least {minimum}")
-    if not 0 < settings.false_alarm_rate < 1:
-        raise InputError(
-            f"a false-alarm rate is between 0 and 1, got {settings.false_alarm_rate:g}: "
-            "use evaluation.false_alarm_rate=0.02"
-        )
-    if settings.miss_rate is not None and not 0 < settings.miss_rate < 0.5:
-        raise InputError(
-            "a miss rate is a fraction of dangerous touches between 0 and 0.5, got "
-            f"{settings.miss_rate:g}: use evaluation.miss_rate=0.001"
-        )
-    if settings.safe_gestures < 1:
-        raise InputError(
-            "the alarm's threshold is chosen on 1 safe gesture or more, got "
-            f"{settings.safe_gestures}: use evaluation.safe_gestures={ENOUGH}"
-        )
+    for name, (valid, rule, example) in _RULES.items():
+        if (value := getattr(settings, name)) is not None and not valid(value):
+            raise InputError(f"{rule}, got {value:g}: use evaluation.{name}={example}")
     return settings
 
 

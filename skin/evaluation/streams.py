@@ -4,7 +4,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from statistics import fmean
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -187,7 +186,6 @@ class WindowReport:
         alarms: gate -> alarms on the long stream.
         hours: length of that stream.
         lengths: length of a window, s -> overall accuracy, or why the learner does not accept such windows.
-        streamed: whether the learner was trained on windows of streams.
         point: operating point of the alarm.
     """
 
@@ -197,7 +195,6 @@ class WindowReport:
     alarms: dict[str, Alarms]
     hours: float
     lengths: dict[float, float | str]
-    streamed: bool
     point: OperatingPoint
 
     def metrics(self) -> dict[str, float]:
@@ -235,7 +232,6 @@ def evaluate_windows(
     device: AbstractDevice,
     settings: StreamSettings,
     point: OperatingPoint,
-    track: Callable[..., Any] = iter,
 ) -> WindowReport:
     """Evaluate a learner on windows of test streams of its device.
 
@@ -244,7 +240,6 @@ def evaluate_windows(
         device: its device.
         settings: the streams and windows to test.
         point: operating point of the alarm.
-        track: wraps the chunks of the long stream to show progress, such as ``rich.progress.track``.
 
     Raises:
         InputError: the device has no streams.
@@ -264,10 +259,9 @@ def evaluate_windows(
         bin_by_fraction(probabilities, labels, recording.parameters["share"], device.task),
         {name: count_confusions(gate[:, None].float(), labels[:, -1:])[0] for name, gate in answers.items()},
         threshold.minimum,
-        _listen(learner, streamed, device.task, all_gates, settings, point, track),
+        _listen(learner, streamed, device.task, all_gates, settings, point),
         settings.hours,
         {window: _measure_length(learner, device, window) for window in settings.windows},
-        device.stream,
         point,
     )
 
@@ -312,7 +306,6 @@ def _listen(
     all_gates: dict[str, Gate],
     settings: StreamSettings,
     point: OperatingPoint,
-    track: Callable[..., Any],
 ) -> dict[str, Alarms]:
     """Return the alarms of each gate on sliding windows over a long stream."""
     rate = device.model_rate
@@ -323,7 +316,7 @@ def _listen(
     starts = torch.arange(0, frames - device.window + 1, stride)
     dangerous = task.names.index(LABEL)
     raised: dict[str, list[Tensor]] = {name: [] for name in all_gates}
-    for part in track(starts.split(1024)):
+    for part in starts.split(1024):
         touches = stream.cut(part, device.window).touches
         probabilities = learner.probabilities(touches)
         for name, gate in all_gates.items():

@@ -183,8 +183,7 @@ def _draw_decisions(shape: torch.Size, first: int, step: float, draw: np.random.
     """Return the frames at which it is decided about each touch, (B, J): the ticks have any phase to it."""
     begin = first - 1 + step * draw.random(shape[0])
     count = int((shape[1] - first - step) / step)
-    ends = np.floor(begin[:, None] + step * np.arange(count)).astype(np.int64)
-    return torch.from_numpy(ends)
+    return torch.from_numpy(np.floor(begin[:, None] + step * np.arange(count)).astype(np.int64))
 
 
 def _classify(

@@ -20,7 +20,7 @@ from skin.inference.contacts import Mixture, Search
 from skin.inference.likelihood import Observation, blend, fit_force
 from skin.inference.noise import Noise
 from skin.mechanics.simulator.base import AbstractSimulator
-from skin.touch.images import load_image
+from skin.touch.shapes import load_image
 
 MOST_CONTACTS = 3
 """Largest number of contacts in an estimate."""

@@ -19,7 +19,7 @@ from torch import Tensor
 from skin.body.base import AbstractBody
 from skin.errors import InputError
 from skin.mechanics.simulator.base import AbstractSimulator, factorised
-from skin.mechanics.simulator.plates import Constraint, Structure
+from skin.mechanics.simulator.fem import Constraint, Structure
 
 # The base of every animated view: the touch that is shown, and its readings over time.
 
@@ -132,7 +132,7 @@ def deflection(body: AbstractBody, pressure: Tensor, constraint: Constraint = "v
     Args:
         body: the sheet.
         pressure: (F, H, W), Pa, on the cells of its surface.
-        constraint: as in :class:`skin.mechanics.simulator.plates.Structure`.
+        constraint: as in :class:`skin.mechanics.simulator.fem.Structure`.
     """
     structure = Structure(body, constraint)
     factors = factorised(structure.stiffness())

@@ -25,9 +25,8 @@ from skin.mechanics.simulator.base import AbstractSimulator
 from skin.robot.mujoco_skin import MujocoSurface, Press, Pressing, load_package
 from skin.touch.fingertips import read_touch
 from skin.touch.labels import TOUCH, report_labels
-from skin.touch.movie import Movie, measure_gestures
+from skin.touch.movie import Movie, balanced, measure_gestures
 from skin.touch.paths import Above0, Draws, TouchSettings, draw_motion, draw_times, fold
-from skin.touch.sampler import balanced
 
 Kind = Literal["ball", "rod", "box", "hand"]
 _PARAMETERS = ("shape", "angle", "duration", "onset", "direction", "speed", "friction")

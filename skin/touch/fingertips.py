@@ -15,9 +15,8 @@ from skin.body.base import AbstractBody
 from skin.core.settings import RISING, checked
 from skin.errors import InputError
 from skin.touch.gestures import GestureSettings
-from skin.touch.images import load_image
 from skin.touch.labels import CONTACT, TOUCH
-from skin.touch.movie import Movie, join_movies, measure_gestures
+from skin.touch.movie import AbstractContact, AbstractSampler, Movie, join_movies, measure_gestures
 from skin.touch.paths import (
     Draws,
     TouchSettings,
@@ -27,8 +26,7 @@ from skin.touch.paths import (
     draw_until_fit,
     sample_paths,
 )
-from skin.touch.sampler import AbstractContact, AbstractSampler
-from skin.touch.shapes import Shapes
+from skin.touch.shapes import Shapes, load_image
 
 
 @checked("touch")
@@ -200,7 +198,7 @@ class FingertipSampler(AbstractSampler):
     The other labels are what the movie gives: a touch is hardly ever big or dangerous.
 
     Args:
-        body, footprints, contact, padded, moments: as of :class:`skin.touch.sampler.AbstractSampler`.
+        body, footprints, contact, padded, moments: as of :class:`skin.touch.movie.AbstractSampler`.
         settings: ranges of the fingertips.
 
     Raises:

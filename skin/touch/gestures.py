@@ -17,9 +17,17 @@ from annotated_types import Ge, Le, MinLen
 from skin.body.base import AbstractBody
 from skin.core.settings import checked
 from skin.errors import InputError
-from skin.touch import splines
 from skin.touch.labels import TOUCH
-from skin.touch.movie import Movie, add_second, join_movies, measure_gestures
+from skin.touch.movie import (
+    AbstractContact,
+    AbstractSampler,
+    ContactProblem,
+    ContactResult,
+    Movie,
+    add_second,
+    join_movies,
+    measure_gestures,
+)
 from skin.touch.paths import (
     Above0,
     Draws,
@@ -30,8 +38,7 @@ from skin.touch.paths import (
     draw_until_fit,
     sample_paths,
 )
-from skin.touch.sampler import AbstractContact, AbstractSampler, ContactProblem, ContactResult
-from skin.touch.shapes import Shapes
+from skin.touch.shapes import Shapes, cell_moments
 
 
 @checked("touch")
@@ -298,7 +305,7 @@ class TouchSampler(AbstractSampler):
     then the whole gesture.
 
     Args:
-        body, footprints, contact, padded, moments: as in :class:`skin.touch.sampler.AbstractSampler`.
+        body, footprints, contact, padded, moments: as in :class:`skin.touch.movie.AbstractSampler`.
         settings: ranges of the gestures, as in ``conf/touch/gestures.yaml``.
 
     Attributes:
@@ -433,7 +440,7 @@ class TouchSampler(AbstractSampler):
             frames, index, profile, weights, self.body.cell, self.settings.thresholds.contact, area
         )
         if self.moments is not None and area is None:
-            down, across = (torch.from_numpy(splines.of_cells(count)).float() for count in self.body.shape)
+            down, across = (torch.from_numpy(cell_moments(count)).float() for count in self.body.shape)
             frames = down @ frames @ across.T
         if not self.contact.proportional:
             # The contact area grows with force, which moves the centre of pressure of a static touch.

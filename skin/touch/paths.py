@@ -20,7 +20,7 @@ from skin.touch.labels import RELEASE, TOUCH_OR_NOT, TOUCH_SLIDING, Label, Limit
 from skin.touch.shapes import Pose
 
 if TYPE_CHECKING:
-    from skin.touch.sampler import AbstractContact, AbstractSampler
+    from skin.touch.movie import AbstractContact, AbstractSampler
 
 Draws = dict[str, np.ndarray]
 """Named parameters of gestures, one entry each along the first axis."""

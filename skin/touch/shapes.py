@@ -1,4 +1,4 @@
-"""Shapes that press, as images of any size, angle and stretch."""
+"""Shapes that press, as images of any size, angle and stretch, and the moments of their pressure."""
 
 from __future__ import annotations
 
@@ -6,19 +6,185 @@ import hashlib
 import math
 from collections.abc import Callable, Iterator, Sequence
 from copy import copy
-from functools import cached_property
+from functools import cached_property, lru_cache
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from PIL import Image
+from scipy.interpolate import BSpline
 from scipy.ndimage import distance_transform_edt
+from scipy.spatial import ConvexHull
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, grid_sample
+from torch.nn.functional import adaptive_avg_pool2d, avg_pool2d, grid_sample
 
 from skin.body.base import AbstractBody
 from skin.body.sheet import Sheet
-from skin.touch import splines
-from skin.touch.images import halve, hulls, load_image, pyramid
+from skin.core.files import BUNDLED, candidates
+from skin.errors import InputError
+
+# Grey-scale images of objects.
+
+
+_FOLDER = BUNDLED / "data" / "shapes"
+
+
+def load_image(name: str) -> np.ndarray:
+    """Return a shape's image (h, w), float64, 0 to 1: its brightest pixel is 1.
+
+    Args:
+        name: the stem of a file in ``data/shapes``, or the path of any picture; a relative path is looked
+            for in the current folder, then beside the package.
+
+    Raises:
+        InputError: no such picture, or it is unreadable, empty or black, or has a pixel that is not finite.
+    """
+    path = _find(name)
+    try:
+        with Image.open(path) as file:
+            image: Image.Image = file
+            # Transparent means no force; deep and floating-point pictures keep their own range.
+            if "A" in image.getbands() or "transparency" in image.info:
+                cover = image.convert("RGBA")
+                image = Image.alpha_composite(Image.new("RGBA", cover.size, "black"), cover).convert("L")
+            elif image.mode not in ("F", "I") and not image.mode.startswith("I;16"):
+                image = image.convert("L")
+            pixels = np.asarray(image, dtype=float)
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+        raise InputError(
+            f"cannot read the shape {name} ({path}): {error}; touch.shapes takes grey-scale pictures, "
+            "such as a PNG, white = full pressure"
+        ) from error
+    if pixels.ndim != 2 or not np.isfinite(pixels).all() or pixels.min(initial=0) < 0 or not pixels.any():
+        span = f" from {pixels.min():g} to {pixels.max():g}" if pixels.size else ""
+        raise InputError(
+            f"the shape {name} must be a grey-scale picture (h, w) of finite values from 0 up, not all "
+            f"0, got {pixels.shape} pixels{span}: white = full pressure"
+        )
+    return pixels / pixels.max()
+
+
+def _find(name: str) -> Path:
+    path = Path(name).expanduser()
+    for candidate in candidates(path) if path.suffix else [_FOLDER / f"{name}.png", path]:
+        if candidate.is_file():
+            return candidate.resolve()
+    names = ", ".join(sorted(file.stem for file in _FOLDER.glob("*.png")))
+    raise InputError(
+        f"no shape {name}: touch.shapes takes {names}, or the path of a picture, as in "
+        "touch.shapes=[disc,my.png]"
+    )
+
+
+def pyramid(images: Sequence[np.ndarray], pixels: int) -> list[Tensor]:
+    """Return the images at halving resolutions, each centred in a square of ``pixels``, a power of two.
+
+    A larger image is averaged down to the square; a smaller one keeps its pixels. A border of one black
+    pixel remains around it, so that sampling does not extend its edge.
+
+    Returns:
+        levels (N, 1, p, p), float32, p = pixels, pixels / 2, ... 1.
+    """
+    base = torch.zeros(len(images), 1, pixels, pixels, dtype=torch.float64)
+    for square, image in zip(base[:, 0], images, strict=True):
+        shrink = min(1.0, (pixels - 2) / max(image.shape))
+        height, width = (max(1, round(side * shrink)) for side in image.shape)
+        small = adaptive_avg_pool2d(torch.from_numpy(image)[None], (height, width))[0]
+        top, left = (pixels - height) // 2, (pixels - width) // 2
+        square[top : top + height, left : left + width] = small / small.max()
+    return [level.float() for level in halve(base)]
+
+
+def halve(base: Tensor) -> list[Tensor]:
+    """Return images (N, C, p, p), p a power of two, at resolutions p, p / 2, ... 1."""
+    levels = [base]
+    while levels[-1].shape[-1] > 1:
+        levels.append(avg_pool2d(levels[-1], 2))
+    return levels
+
+
+def hulls(images: np.ndarray, contact: float) -> np.ndarray:
+    """Return the corners (N, K, 2) of the convex outlines of images (N, p, p), in scales."""
+    pixels = images.shape[-1]
+    outlines = []
+    for image in images:
+        rows, columns = np.nonzero(image > contact)
+        corners = np.concatenate([np.stack([columns + dx, rows + dy], 1) for dx in (0, 1) for dy in (0, 1)])
+        outlines.append(corners[ConvexHull(corners).vertices] / pixels * 2 - 1)
+    maximum = max(map(len, outlines))
+    return np.stack([np.pad(hull, ((0, maximum - len(hull)), (0, 0)), mode="edge") for hull in outlines])
+
+
+# Moments of a pressure with cubic B-splines, one centred at each cell.
+#
+# The moment of a cell is the integral of the pressure times the spline, divided by the cell's area, Pa. Sums
+# of the splines represent a smooth influence far better than constants on the cells do, so that moments tell
+# where within a cell a small contact presses. At an edge of the sheet a spline beyond it is folded back. The
+# splines then add up to 1 everywhere: an even pressure is its own moment, and moments conserve force.
+
+
+REACH = 2
+"""How far a spline reaches from the middle of its cell, in cells."""
+
+_PIECE = BSpline.basis_element(np.arange(-REACH, REACH + 1.0), extrapolate=False)
+_GAUSS, _WEIGHTS = np.polynomial.legendre.leggauss(4)  # exact for products of two cubics
+_PIECES = 4  # in which a cell is integrated
+
+
+def spline_values(points: np.ndarray, count: int) -> np.ndarray:
+    """Return the splines of ``count`` cells at points (P,), in cells, (P, count)."""
+    middles = np.arange(-REACH, count + REACH) + 0.5
+    return fold_back(torch.from_numpy(np.nan_to_num(_PIECE(points[:, None] - middles)))).numpy()
+
+
+def sampled_splines(
+    begin: np.ndarray, count: int, samples: int, minimum: np.ndarray, maximum: np.ndarray
+) -> torch.Tensor:
+    """Return the splines of cells -2 to ``count`` + 2 at even samples of ``count`` cells' lengths.
+
+    Args:
+        begin: (F,), of the first length, in cells, 0 to 1 unless it begins beyond an edge.
+        count: of lengths.
+        samples: of each length.
+        minimum, maximum: (F,), the edges of the sheet, in cells; samples beyond them weigh 0.
+
+    Returns:
+        (F, count * samples, count + 5), float32, divided by ``samples``.
+    """
+    start, low, high = (torch.from_numpy(ends)[:, None].float() for ends in (begin, minimum, maximum))
+    points = start + (torch.arange(count * samples) + 0.5) / samples
+    inside = (points >= low) & (points <= high)
+    middles = torch.arange(-REACH, count + 1 + REACH) + 0.5
+    away = (points[:, :, None] - middles).abs()
+    # The spline at a distance d is ((2 - d)+^3 - 4 (1 - d)+^3) / 6.
+    wide, narrow = (2 - away).clamp_(min=0), (1 - away).clamp_(min=0)
+    cubes = wide.square().mul_(wide).sub_(narrow.square().mul_(narrow), alpha=4)
+    return cubes.mul_(inside[:, :, None] / (6 * samples))
+
+
+def fold_back(wide: torch.Tensor) -> torch.Tensor:
+    """Return values (B, H + 4, ...) of splines with those beyond the edges folded back, (B, H, ...)."""
+    inner = wide[:, REACH:-REACH].clone()
+    for beyond in range(REACH):
+        inner[:, beyond] += wide[:, REACH - 1 - beyond]
+        inner[:, inner.shape[1] - 1 - beyond] += wide[:, inner.shape[1] + REACH + beyond]
+    return inner
+
+
+def gauss_points(low: float, high: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return Gauss points and weights between two points, in cells, by pieces of a quarter of a cell."""
+    cuts = np.unique([low, *(np.arange(np.ceil(low * _PIECES), high * _PIECES) / _PIECES), high])
+    middle, half = (cuts[1:] + cuts[:-1]) / 2, np.diff(cuts) / 2
+    return (middle[:, None] + np.outer(half, _GAUSS)).ravel(), np.outer(half, _WEIGHTS).ravel()
+
+
+@lru_cache
+def cell_moments(count: int) -> np.ndarray:
+    """Return the moments (count, count) of 1 Pa on each cell (columns) along one axis."""
+    points, weights = gauss_points(0, count)
+    return (weights[:, None] * spline_values(points, count)).reshape(count, -1, count).sum(1).T
+
 
 # Cells rendered at once: their sampling grid, 8 bytes for each of 4 points, stays in the cache (4 MiB).
 _CELLS_AT_ONCE = 128 * 1024
@@ -67,7 +233,7 @@ class Shapes:
         hulls: (N, K, 2), corners of each shape's convex outline (pixels above ``contact``), in scales.
 
     Raises:
-        InputError: no shape, or a picture that cannot be used (:func:`skin.touch.images.load_image`).
+        InputError: no shape, or a picture that cannot be used (:func:`skin.touch.shapes.load_image`).
     """
 
     def __init__(
@@ -288,17 +454,17 @@ class Shapes:
         for axis, side in enumerate(self.body.cells):
             size = pictures.shape[2 - axis] // count
             first = np.clip(np.floor(corner[:, axis]), 0, max(side - size - 1, 0))
-            tables.append(splines.sampled(corner[:, axis] - first, size, count, -first, side - first))
+            tables.append(sampled_splines(corner[:, axis] - first, size, count, -first, side - first))
             cells.append(torch.from_numpy(first.astype(int)))
         box = tables[1].mT @ pictures @ tables[0]
-        wide = [side + 2 * splines.REACH for side in self.body.shape]
+        wide = [side + 2 * REACH for side in self.body.shape]
         height, width = (max(side, part) for side, part in zip(wide, box.shape[1:], strict=True))
         row, column = (torch.arange(part) for part in box.shape[1:])
         position = (cells[1][:, None, None] + row[:, None]) * width + cells[0][:, None, None] + column
         sheet = torch.zeros(len(box), height * width)
         sheet.scatter_(1, position.flatten(1), box.flatten(1))
-        sheet = splines.fold_back(sheet.view(-1, height, width)[:, : wide[0], : wide[1]])
-        return splines.fold_back(sheet.mT).mT
+        sheet = fold_back(sheet.view(-1, height, width)[:, : wide[0], : wide[1]])
+        return fold_back(sheet.mT).mT
 
     def render(
         self,

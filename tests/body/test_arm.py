@@ -2,14 +2,9 @@
 
 import numpy as np
 import pytest
-import torch
 
 from skin.body.arm import Arm
-from skin.body.layout import Grid
-from skin.body.sheet import Sheet
 from skin.errors import InputError
-from skin.mechanics.simulator.fem import PlatesAndBeams
-from skin.mechanics.simulator.naive import Naive
 
 LAYERS = [
     {"material": {"name": "Dragon Skin 10 Medium", "poisson": 0.49}, "thickness": 0.010},
@@ -19,12 +14,6 @@ LAYERS = [
 
 def arm(**changes) -> Arm:
     return Arm(**{"radius": 0.05, "length": 0.2, "angle": 2.0, "cells": [8, 6], "layers": LAYERS, **changes})
-
-
-def test_its_chart_is_the_outer_surface_unrolled():
-    assert arm().size == pytest.approx((0.1, 0.2))
-    assert arm().cell == pytest.approx((0.0125, 0.2 / 6))
-    assert arm().sensor_depth == 0.005
 
 
 def test_places_by_hand():
@@ -61,16 +50,6 @@ def test_straight_lines_of_the_chart_are_the_shortest_on_the_surface():
         assert np.linalg.norm(np.diff(body.locate(detour), axis=0), axis=1).sum() > along
 
 
-def test_a_large_arm_is_a_sheet():
-    size = (0.1, 0.2)
-    sheet = Sheet(size, [8, 6], LAYERS)
-    large = arm(radius=1e4, angle=size[0] / 1e4)
-    given = np.random.default_rng(0).uniform(size=(50, 3)) * [*size, 0.015]
-    middle = np.array([size[0] / 2, 0, -1e4])
-    np.testing.assert_allclose(large.locate(given) + middle, sheet.locate(given), atol=1e-6)
-    np.testing.assert_allclose(large.frame(given), sheet.frame(given), atol=1e-5)
-
-
 @pytest.mark.parametrize(
     ("changes", "says"),
     [
@@ -94,10 +73,3 @@ def test_it_says_how_to_give_it_another_size():
     body = arm()
     typed = dict(part.removeprefix("body.").split("=") for part in body.resized((0.12, 0.16)).split())
     assert arm(**{name: float(value) for name, value in typed.items()}).size == pytest.approx((0.12, 0.16))
-
-
-def test_plates_do_not_bend_around_it():
-    sensors = Grid(2, 2).sensors(arm())
-    with pytest.raises(InputError, match="plates and beams are flat, body=arm is not: set simulator=solid"):
-        PlatesAndBeams(arm(), sensors)
-    assert Naive(arm(), sensors)(torch.ones(6, 8)).readings.numpy() == pytest.approx(1e-4)

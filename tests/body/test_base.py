@@ -32,15 +32,6 @@ def test_the_chart_is_a_grid_of_equal_cells(body):
     assert replace(body, cells=(8, 6)).shape == (6, 8)
 
 
-@pytest.mark.parametrize("shape", [(), (5,), (2, 4)])
-def test_places_and_frames_have_the_shape_of_their_points(body, shape):
-    given = points(body, *shape)
-    assert body.locate(given).shape == (*shape, 3)
-    assert body.frame(given).shape == (*shape, 3, 3)
-    alone = body.locate(given.reshape(-1, 3)[0])
-    np.testing.assert_array_equal(body.locate(given).reshape(-1, 3)[0], alone)
-
-
 def test_the_axes_are_orthonormal_and_one_way_round(body):
     frame = body.frame(points(body, 50))
     np.testing.assert_allclose(

@@ -49,19 +49,6 @@ def test_a_value_off_by_a_unit_is_refused_with_the_range(configured, override, m
     assert isinstance(refused.value, InputError) or isinstance(refused.value.__cause__, InputError)
 
 
-@pytest.mark.parametrize(
-    ("overrides", "message"),
-    [
-        (["body.radius=50"], r"body.radius=50 m"),
-        (["body.length=160"], r"body.length=160 m"),
-        (["contact=rigid", "contact.relief=4"], r"contact.relief=4 m is not plausible"),
-    ],
-)
-def test_so_is_one_of_an_arm_or_a_rigid_object(configured, overrides, message):
-    with pytest.raises(InputError, match=message):
-        build_device(configured("body=arm", "simulator=solid", *overrides))
-
-
 def test_a_class_takes_what_a_proof_needs():
     assert Sheet([1.0, 1.0], [2, 2], [{"material": "EcoFlex 00-30", "thickness": 1.0}]).thickness == 1
 
@@ -83,23 +70,10 @@ def test_sensors_on_the_surface_are_warned_of(configured, simulator):
         build_device(config)
 
 
-def test_without_mechanics_nobody_is_warned(configured):
-    build_device(configured("simulator=naive", *SMALL, ONE))
-
-
 STACK = (
     "body.layers=[{material: {name: a, young: 560e3, poisson: 0.45}, thickness: 0.006},"
     "{material: {name: b, young: YOUNG, poisson: 0.45}, thickness: 0.006}]"
 )
-
-
-def test_on_the_surface_of_plates_nothing_below_is_felt(configured):
-    """83 kPa and 83 MPa read the same, and so do 12 and 50 mm: what the warning says."""
-    layers = [ONE, ONE.replace("83e3", "83e6"), ONE.replace("0.012", "0.050")]
-    with pytest.warns(UserWarning, match="on the surface"):
-        first, *others = (readings(configured, "simulator=fem", one) for one in layers)
-    for other in others:
-        torch.testing.assert_close(other, first)
 
 
 @pytest.mark.parametrize(

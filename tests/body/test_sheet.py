@@ -24,30 +24,6 @@ def test_interfaces_run_from_the_table_up():
     assert body.thickness == pytest.approx(0.017)
 
 
-def test_equal_sheets_are_equal_however_they_were_given():
-    assert sheet() == sheet(size=(0.16, 0.08), cells=(8, 6), layers=sheet().layers)
-    assert hash(sheet()) == hash(sheet())
-
-
-def test_footprint_weighs_partly_covered_cells_by_area():
-    """A footprint three quarters in one column and one quarter in the next."""
-    body = sheet(size=[0.04, 0.04], cells=[4, 4])
-    sensors = Sensors(np.array([[0.0175, 0.015, 0.005]]), (0.01, 0.01))
-    weights = body.footprints(sensors).reshape(body.shape)
-    expected = np.zeros((4, 4))
-    expected[1, 1], expected[1, 2] = 0.75, 0.25
-    np.testing.assert_allclose(weights, expected, atol=1e-12)
-
-
-def test_footprint_is_cut_at_the_edge():
-    body = sheet(size=[0.04, 0.04], cells=[4, 4])
-    sensors = Sensors(np.array([[0.0, 0.04, 0.005]]), (0.02, 0.02))
-    areas = body.footprint_areas(sensors).reshape(body.shape)
-    assert areas.sum() == pytest.approx(1e-4)
-    assert areas[3, 0] == pytest.approx(1e-4)
-    assert body.footprints(sensors).sum() == pytest.approx(1)
-
-
 def test_footprint_mean_is_the_integral_of_a_fine_raster():
     """Independent answer: sample the footprint on a raster much finer than the cells."""
     body = sheet(cells=[7, 5])

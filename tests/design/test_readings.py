@@ -8,7 +8,7 @@ from skin.body.base import Sensors
 from skin.core.rng import Stream, generator
 from skin.design.place import reading_covariance
 from skin.runs.build import build_device
-from skin.touch.sampler import balanced
+from skin.touch.movie import balanced
 
 SMALL = ("body.cells=[12,12]", "layout=grid", "layout.rows=3", "layout.columns=3", "touch.over_sensors=false")
 SIMULATORS = [("naive", ()), ("solid", ("simulator.divisions=1",)), ("fem", ())]

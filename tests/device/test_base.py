@@ -11,9 +11,8 @@ from skin.device.files import write_recording
 from skin.device.simulated import Simulated, report_balance
 from skin.errors import InputError
 from skin.evaluation.alarm import threshold_gestures
-from skin.evaluation.margins import measure_margins
 from skin.evaluation.operating_point import OperatingPoint
-from skin.evaluation.report import touch_sets
+from skin.evaluation.report import measure_margins, touch_sets
 from skin.evaluation.settings import Evaluation
 from skin.evaluation.streams import evaluate_windows
 from skin.record.serial import open_source

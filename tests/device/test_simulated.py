@@ -16,7 +16,7 @@ from skin.device.touches import concatenate
 from skin.errors import InputError
 from skin.mechanics.simulator.fem import PlatesAndBeams
 from skin.mechanics.simulator.naive import Naive
-from skin.touch.sampler import balanced
+from skin.touch.movie import balanced
 from tests.touch.movie_labels import movie_labels
 
 LAYERS = [

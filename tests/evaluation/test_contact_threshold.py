@@ -27,14 +27,6 @@ def test_the_rise_is_the_largest_reading_above_what_the_untouched_skin_reads(noi
         assert value.item() == pytest.approx(max(max(row) for row in window.tolist()), abs=1e-5)
 
 
-def test_a_press_that_is_held_all_through_the_window_rises(noisy):
-    pressed = noisy.clone()
-    pressed[:, :, 2] += 1.5
-    assert (rise(touches(pressed)) > 1.3).all()
-    assert ContactThreshold(0.5).touched(touches(pressed)).all()
-    assert not ContactThreshold(0.5).touched(touches(noisy)).any()
-
-
 def test_a_sensor_that_means_nothing_does_not_rise(noisy):
     broken = noisy.clone()
     broken[:, 10, 4] = 50

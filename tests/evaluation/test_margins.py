@@ -6,9 +6,8 @@ import torch
 
 from skin.device.base import AbstractDevice
 from skin.device.touches import Touches
-from skin.errors import InputError
-from skin.evaluation.margins import ALARM_NAME, measure_margins, span_rows
 from skin.evaluation.operating_point import OperatingPoint
+from skin.evaluation.report import ALARM_NAME, measure_margins, span_rows
 from skin.touch.labels import TOUCH
 
 POINT = OperatingPoint(0.5, 0.02, 64, 1, 0)
@@ -37,12 +36,6 @@ def test_spans_hold_what_is_said_and_what_is_wrong():
         ["2", "inf", 1, "1", 0],
     ]
     assert found["mean"][1] == pytest.approx(0.985)
-
-
-def test_ranges_are_exact():
-    """None of ten: the upper end p has (1 - p)^10 = 0.025."""
-    (one,) = span_rows("big", torch.zeros(10, dtype=torch.bool), torch.zeros(10))
-    assert (one["lower"], one["upper"]) == pytest.approx((0, 1 - 0.025**0.1))
 
 
 @pytest.fixture(scope="module")
@@ -76,11 +69,6 @@ def test_errors_are_found_where_they_are(device):
     spans, faint, _ = measured(device, but)
     assert [part.groupby("label").wrong.sum()["dynamic"] for part in (spans, faint)] == [7, 7]
     assert spans.groupby("label").wrong.sum()["big"] == 0
-
-
-def test_only_simulated_touches_are_known(made_up_device):
-    with pytest.raises(InputError, match="device=simulated"):
-        measure_margins(Sure(torch.zeros(40, 4, dtype=torch.bool)), made_up_device, 40, POINT)
 
 
 def test_the_alarm_is_raised_at_the_operating_point_and_the_label_at_one_half(device):

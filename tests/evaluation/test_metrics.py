@@ -43,25 +43,10 @@ def test_accuracies_are_those_of_scikit_learn_and_overall_their_mean(scored):
     assert found["overall/accuracy"] == pytest.approx(sum(each) / 4)
 
 
-def test_calibration_error_of_a_constant_is_its_distance_from_the_share():
-    labels = torch.zeros(100, 4)
-    labels[:30] = 1
-    found = compute_metrics(torch.full((100, 4), 0.9), labels, TOUCH)
-    assert found["press/ece"] == pytest.approx(0.6, abs=1e-6)
-    assert found["overall/ece"] == pytest.approx(0.6, abs=1e-6)
-
-
 def test_confusion_has_the_true_class_down(scored):
     probabilities, labels = scored
     for i, counts in enumerate(count_confusions(probabilities, labels).numpy()):
         assert (counts == confusion_matrix(labels[:, i], probabilities[:, i] > 0.5)).all()
-
-
-def test_exclusive_labels_have_one_accuracy():
-    task = Task(("poke", "stroke", "slap"), "exclusive")
-    labels = torch.eye(3)[torch.tensor([0, 1, 2, 2])]
-    probabilities = torch.tensor([[0.8, 0.1, 0.1], [0.1, 0.7, 0.2], [0.5, 0.3, 0.2], [0.2, 0.2, 0.6]])
-    assert compute_metrics(probabilities, labels, task) == {"overall/accuracy": 0.75}
 
 
 def test_a_gate_leaves_the_other_labels_to_the_touches_it_lets_through(scored):
@@ -171,15 +156,6 @@ def test_a_vote_is_the_outcome_of_the_answers_of_most_models(members):
     assert recall == pytest.approx(float(alarms[dangerous].float().mean()))
     differ = ((probabilities > 0.5).any(0) & ~(probabilities > 0.5).all(0)).any(1)
     assert disagreement(codes) == pytest.approx(float(differ.float().mean()))
-
-
-def test_a_tie_is_a_wrong_answer_and_no_alarm():
-    labels = torch.ones(2, 4)
-    right, wrong = labels.clone(), labels.clone()
-    wrong[0] = 0
-    codes = np.stack([encode(one, labels, TOUCH, POINT) for one in (right, wrong)])
-    assert decode(vote(codes), "overall/accuracy", TOUCH).tolist() == [0, 1]
-    assert decode(vote(codes), "dangerous/alarm_recall", TOUCH).tolist() == [0, 1]
 
 
 def test_unknown_labels_do_not_count(scored):

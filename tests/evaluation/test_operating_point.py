@@ -26,7 +26,7 @@ from skin.evaluation.settings import Evaluation, check_evaluation
 from skin.live.engine import Detection, Engine
 from skin.runs.build import build_device
 from skin.touch.labels import TOUCH, TOUCH_OR_NOT, Task
-from skin.touch.sampler import balanced
+from skin.touch.movie import balanced
 from skin.wire.channels import UnitConversion
 
 SETTINGS = Evaluation(devices=0, layouts=0, false_alarm_rate=0.1, safe_gestures=64)
@@ -70,24 +70,6 @@ def test_as_many_safe_gestures_raise_the_alarm_as_are_allowed(count, target, all
     assert allowed / count <= target
 
 
-def test_a_new_safe_gesture_raises_the_alarm_as_often_as_wanted():
-    """The true rate is a beta variable of mean (k + 1) / (n + 1): exact, whatever the scores are."""
-    rng = np.random.default_rng(0)
-    # The true rate of a threshold on uniform scores is one minus the threshold.
-    rates = [1 - alarm._lowest_threshold(torch.from_numpy(rng.random(499)), 0.02) for _ in range(400)]
-    assert np.mean(rates) == pytest.approx(10 / 500, abs=4 * beta(10, 490).std() / 20)
-    assert np.std(rates) == pytest.approx(beta(10, 490).std(), rel=0.15)
-
-
-def test_equal_scores_raise_the_alarm_together_or_not_at_all():
-    """A vote of five members: 3 % of the safe gestures have all of them, 10 % four or more."""
-    votes = torch.tensor([1.0] * 30 + [0.8] * 70 + [0.0] * 900)
-    assert 0.8 < alarm._lowest_threshold(votes, 0.05) < 1
-    assert int((votes > alarm._lowest_threshold(votes, 0.05)).sum()) == 30
-    assert int((votes > alarm._lowest_threshold(votes, 0.2)).sum()) == 100
-    assert alarm._lowest_threshold(votes, 0.02) > 1
-
-
 def test_the_last_digit_of_a_score_decides_nothing():
     """Scores of another processor differ in the last digit; the same gestures raise the alarm."""
     scores = torch.rand(3000, generator=torch.Generator().manual_seed(0)).round(decimals=3)
@@ -96,16 +78,6 @@ def test_the_last_digit_of_a_score_decides_nothing():
     for other in (up, down):
         assert torch.equal(other > threshold, scores > threshold)
         assert int((scores > alarm._lowest_threshold(other, 0.05)).sum()) == int((scores > threshold).sum())
-
-
-def test_one_comparison_in_single_and_double_precision():
-    threshold = alarm._lowest_threshold(torch.rand(500, generator=torch.Generator().manual_seed(1)), 0.1)
-    assert threshold == float(np.float32(threshold))
-    near = np.nextafter(np.float32(threshold), np.float32([0, 0.5, 1]), dtype=np.float32)
-    probabilities = torch.from_numpy(np.append(near, np.float32(threshold)))
-    said = OperatingPoint(threshold, 0.1, 500, 49, 0).alarm(probabilities).tolist()
-    assert said == [probability > threshold for probability in probabilities.tolist()]
-    assert not said[-1]
 
 
 def test_reached_rates_are_counted_their_range_is_exact_and_accuracy_is_at_one_half():
@@ -161,14 +133,6 @@ def test_the_chosen_point_has_the_wanted_rate_on_its_gestures(device):
     assert (point.dangerous, point.found) == (reached.dangerous, reached.found) == (64, reached.found)
     assert f"finds {100 * reached.recall:.1f} % of 64 dangerous ones" in point.sentence()
     assert choose(Peak(), device, replace(SETTINGS, false_alarm_rate=0.5)).threshold < point.threshold
-
-
-def test_streams_are_drawn_until_enough_windows_show_a_safe_touch(device):
-    streamed = device.replace(stream=True)
-    fresh = threshold_gestures(streamed, SETTINGS)
-    here = fresh.labels[:, 4] > 0.5
-    assert int((here & (fresh.labels[:, 3] < 0.5)).sum()) >= 64
-    assert choose(Peak(TOUCH_OR_NOT), streamed, SETTINGS).safe >= 64
 
 
 def test_a_device_without_fresh_gestures_gives_its_validation_split_and_says_so(made_up_device):
@@ -331,15 +295,6 @@ def test_the_misses_of_touches_that_count_are_those_that_were_asked_for(drawn):
     assert float(missed.float().mean()) == pytest.approx(true.mean(), abs=3 * spread)
 
 
-class Blurred(Largest):
-    """Knows the level of a touch to about 30 %."""
-
-    def probabilities(self, touches):
-        peak = touches.readings.flatten(1).amax(1)
-        blur = torch.sin(1e4 * peak) * 0.4  # of each touch, without a state
-        return torch.sigmoid(4 * (torch.log(peak) + blur - 1))[:, None].expand(-1, 4)
-
-
 class Onset(Largest):
     """Looks at the change from one interval to the next."""
 
@@ -399,16 +354,3 @@ def test_a_larger_reading_never_lowers_the_score_and_nan_stays():
     assert score.level == 0
     assert (np.diff(DangerScore(1.0, 2.0, 0.0).probability(np.full(9, 0.5), np.arange(9.0))) > 0).all()
     assert np.isnan(score.probability(np.array([np.nan]), np.array([1.0]))).all()
-
-
-def test_the_score_finds_what_a_blurred_model_misses(drawn):
-    """A model that sees the level only half is helped by the reading; the score is monotone in it."""
-    point = choose(Blurred(), drawn, replace(SETTINGS, safe_gestures=400), watching(100.0))
-    labels = balanced(800, generator(Stream.TEST, 8))
-    decisions = touch_scores.decide_touches(Blurred(), drawn, watching(100.0), labels, 99)
-    alone, both = decisions.scores(None), decisions.scores(point.score)
-    danger = torch.from_numpy(labels[:, 3])
-    found = [
-        float((scores > scores[~danger].quantile(0.9))[danger].float().mean()) for scores in (alone, both)
-    ]
-    assert found[1] > found[0] + 0.1

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from skin.device.files import read_recording, write_recording
-from skin.errors import InputError
+from skin.device.files import read_recording
 from skin.runs.build import build_data, build_device
 
 SOLID = (
@@ -34,13 +33,6 @@ def test_generated_touches_train_and_are_evaluated(run, tmp_path):
     assert list(tmp_path.glob("evaluation_recording_*.md"))
 
 
-def test_plates_do_not_bend_and_a_sentence_says_what_does(run, tmp_path):
-    done = run(tmp_path, "train.py", "body=arm", "simulator=fem")
-    assert done.returncode == 2
-    assert "plates and beams are flat, body=arm is not: set simulator=solid" in done.stderr
-    assert "Traceback" not in done.stderr
-
-
 @pytest.mark.parametrize("representation", ["image", "interp", "graph", "features"])
 def test_without_mechanics_an_arm_shows_what_a_sheet_of_its_size_shows(configured, representation):
     """Touches, labels and pictures live in the chart, so nothing but mechanics can tell the two apart."""
@@ -54,15 +46,6 @@ def test_without_mechanics_an_arm_shows_what_a_sheet_of_its_size_shows(configure
         shown.append([labels, frames.x] + [frames.adjacency] * (representation == "graph"))
     for sheet, arm in zip(*shown, strict=True):
         torch.testing.assert_close(arm, sheet)
-
-
-def test_a_recording_keeps_the_size_of_the_arm(configured, tmp_path):
-    arm = "body=arm", "body.angle=2.5", "layout=grid", "simulator=naive", "data.gestures=12"
-    path = write_recording(build_device(configured(*arm)).recording(), tmp_path / "x.parquet")
-    recorded = "device=recording", f"device.path={path}", *arm[:3]
-    assert build_device(configured(*recorded)).size == pytest.approx((0.125, 0.16))
-    with pytest.raises(InputError, match=r"of 0.125 x 0.16 m, the body is 0.1 x 0.16 m: add body.angle=2.5 "):
-        build_device(configured(*recorded, "body.angle=2"))
 
 
 def test_sensors_on_the_arm_move_and_graphs_follow_them(configured):

@@ -1,11 +1,8 @@
 """The benchmark measures what it says, in a form that others can read."""
 
-import json
-
 import pytest
 
 from experiments.benchmarks import main, run_alone
-from skin.core.files import ROOT
 
 
 @pytest.mark.slow("measures the generation of data")
@@ -27,34 +24,12 @@ def test_a_verdict_is_timed_by_the_wall_and_by_the_core(name):
     assert 0 < figures["core_share"] < 1
 
 
-@pytest.mark.slow("measures a second checkout")
-def test_another_checkout_is_measured_in_the_same_run(tmp_path, capsys):
-    other = tmp_path / "other"
-    other.mkdir()
-    for name in ("skin", "conf", "data"):
-        (other / name).symlink_to(ROOT / name)
-    main(["--only", "wire", "--against", str(other), "--out", str(tmp_path)])
-    figures = json.loads((tmp_path / "bench.json").read_text())
-    assert json.loads(capsys.readouterr().out) == figures
-    here, there = figures["wire"]["here"], figures["wire"]["there"]
-    assert (
-        figures["wire"]["ratios"]["decode_core_share"]
-        == here["decode_core_share"] / there["decode_core_share"]
-    )
-
-
-@pytest.mark.slow("measures epochs of training")
-def test_the_epochs_of_a_row_are_timed():
-    assert run_alone("training.temporal_graph", 1)["seconds_per_epoch"] > 0
-
-
 @pytest.mark.parametrize(
     ("words", "reason"),
     [
         (["--repeats", "1"], "choose from 3"),
         (["--repeat", "x"], "invalid int"),
         (["--only", "page"], "choose from 'generation.fem'"),
-        (["--against", "nowhere"], "has no folder skin"),
     ],
 )
 def test_a_bad_setting_is_refused(words, reason, capsys):

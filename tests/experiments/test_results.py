@@ -63,11 +63,6 @@ def test_a_killed_command_goes_on_where_it_was(run, begin, tmp_path):
     assert {"study_table.csv", "study_ensemble.csv"} <= {path.name for path in (tmp_path / "docs").iterdir()}
     again = run(tmp_path, "results", *PARTS, *SMALL)
     assert (again.returncode, again.stdout.count(": done")) == (0, 0), again.stderr
-    fresh = run(
-        tmp_path, "results", *PARTS, *SMALL, "results.fresh=true", "results.part=studies", store=False
-    )
-    assert fresh.returncode == 1, "the study trains nothing"
-    assert (tmp_path / "results" / "fresh.db").is_file()
 
 
 @pytest.mark.slow("trains several rows")
@@ -81,10 +76,9 @@ def test_a_command_that_fails_does_not_stop_the_others(run, tmp_path):
     assert "failed:\nskin study study=nope" in done.stderr
 
 
-@pytest.mark.slow("trains several rows")
 def test_bounds_are_published_in_a_folder_of_their_own(run, tmp_path):
     parts = "results.parts.design=[['design design.touches=64 simulator=naive out=a/b', 1]]"
-    done = run(tmp_path, "results", *PARTS, parts, "results.part=design", "results.budget=smoke", *SMALL)
+    done = run(tmp_path, "results", *PARTS, parts, "results.part=design", *SMALL)
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "docs" / "a" / "b" / "design.json").is_file()
 
@@ -102,20 +96,6 @@ def test_bad_settings_are_refused(run, tmp_path, words, reason):
     assert (done.returncode, done.stderr.count("\n")) == (2, 1), done.stderr
     assert reason in done.stderr
     assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.slow("trains several rows")
-def test_runs_in_another_precision_are_found(run, tmp_path):
-    small = SMALL[1:]
-    for row, seed in (("best_fresh", "0"), ("rules", "0")):
-        words = [f"experiment={row}", f"seed={seed}", "trainer.precision=bf16-mixed"]
-        done = run(tmp_path, "train", *words, *SMALL)
-        assert done.returncode == 0, done.stderr
-    rows = "study.trainings.0.experiment=[rules]"
-    done = run(tmp_path, "study", "study=table", "study.trainings.0.simulator=[naive]", rows, *small)
-    assert done.returncode == 0, done.stderr
-    assert "…" not in done.stdout, "nothing was to be trained"
-    assert "best_fresh" in (tmp_path / "results" / "study_table.md").read_text()
 
 
 LINES = [run for steps in OmegaConf.load(CONF / "results.yaml").results.parts.values() for run, _ in steps]

@@ -144,7 +144,6 @@ def test_finished_runs_are_tried_under_conditions_once(command, run, trained):
     assert len(files) == 2 * 4 * 2
     assert command(trained, "study", *words).stdout == done.stdout
     assert runs(trained) == before
-    assert [name for name, _ in before].count("study dead") == 1
     assert {path: path.stat().st_mtime_ns for path in trained.rglob("*-*.parquet")} == files
     assert lines(trained / "dead" / "study_dead.csv") == found
     refused = run(trained, "study", *words[:3], "study.rows=[gru]")
@@ -168,14 +167,12 @@ def test_a_condition_changes_the_device_as_an_evaluation_does(command, trained):
 def test_verdicts_are_sorted_by_margins(command, trained):
     few = ["study.rows=[rules,temporal_graph]", "simulator=naive", "out=margins"]
     said = command(trained, "study", "study=margins", "study.measure.gestures=400", *few).stdout.splitlines()
-    assert "within 10 % of their thresholds lie " in said[0]
     assert "chosen on 64 fresh safe gestures for 2 % false alarms, finds " in said[0]
     (path,) = (trained / "margins").glob("margins_rules_*.csv")
     table = pd.read_csv(path)
     sums = table[table.label == "big"].groupby("by")[["touches", "wrong"]].sum()
     assert sums.touches.tolist() == [400, 400]
     assert sums.wrong.nunique() == 1
-    assert f"of {sums.wrong.iloc[0]} errors of big" in said[0]
     assert "## alarm by threshold" in path.with_suffix(".md").read_text()
     with Image.open(path.with_suffix(".png")) as picture:
         assert picture.size[0] > 800
@@ -183,19 +180,6 @@ def test_verdicts_are_sorted_by_margins(command, trained):
     assert {variant.split()[0] for variant in joined.variant} == {"rules", "temporal_graph"}
     own = joined[joined.variant.str.startswith("rules")].reset_index(drop=True)
     pd.testing.assert_frame_equal(own[table.columns], table)
-
-
-@pytest.mark.slow("evaluates trained rows")
-def test_every_course_is_played_and_no_alarm_ends_early(command, trained):
-    few = ["study.rows=[rules]", "simulator=naive", "out=holds"]
-    words = ["study=holds", "study.measure.gestures=2", "study.measure.rate=10", *few]
-    done = command(trained, "study", *words)
-    found = lines(next((trained / "holds").glob("holds_rules_*.csv")))
-    assert len(found) == 9
-    assert {one["course"] for one in found} >= {"tap", "press", "hold 600 s", "ramp 10 s"}
-    assert all(one["kept"] == one["touches"] for one in found)
-    assert sum(int(one["alarms"]) for one in found) > 0
-    assert f"course {found[0]['course']}, touches 2" in done.stdout
 
 
 @pytest.mark.slow("evaluates trained rows")
@@ -209,48 +193,6 @@ def test_a_run_is_probed_beside_graph_embeddings(command, trained):
     graphs = [f"{name}, reading" for name in ("Graph2Vec", "GL2Vec", "IGE")]
     assert rows == ["input", *graphs, "trained encoder", "readings, one frame", "readings, window"]
     assert path.read_text().count("**undecided**") == 3  # one seed decides nothing
-
-
-SKIN = ["body.cells=[8,8]", "study.seeds=[0]", "out=r"]
-
-
-@pytest.mark.slow("trains with every simulator")
-def test_every_simulator_against_every_other(command, tmp_path):
-    skin = ["layout=grid", "layout.rows=3", "layout.columns=3", "touch.redraws=100", "study.rows=[rules]"]
-    words = [*SKIN, *skin, "touch.small_area=[0.1,0.3]", *SMALL]
-    command(tmp_path, "study", "study=mechanics", "study.part=crosscheck", *words)
-    found = lines(tmp_path / "r" / "study_crosscheck.csv")
-    names = ["naive", "fem, equation 10", "fem, interface", "solid"]
-    assert [(line["variant"], line["condition"]) for line in found] == [(a, b) for a in names for b in names]
-    assert all(0.4 < float(line[ACCURACY]) <= 1 for line in found)
-    assert "| variant | naive | fem, equation 10 |" in (tmp_path / "r" / "study_crosscheck.md").read_text()
-
-
-@pytest.mark.slow("trains several rows")
-def test_skins_of_one_study_feel_the_same_touches(command, tmp_path):
-    words = ["study=mechanics", "study.part=direction", *SKIN, "study.rows=[features]", *SMALL]
-    words.append("+simulator.divisions=1")
-    command(tmp_path, "study", *words)
-    found = lines(tmp_path / "r" / "study_direction.csv")
-    names = ["upright", "upright with friction", "leaning with friction"]
-    assert [line["variant"] for line in found] == names
-    assert all(0 < float(line["same/direction/degrees"]) < 180 for line in found)
-    assert len(ask(tmp_path, "select distinct value from tags where key = 'data_hash'")) == 3
-    assert ": done" not in command(tmp_path, "study", *words).stdout
-
-
-@pytest.mark.slow("evaluates trained rows")
-def test_rows_decide_together(command, trained):
-    """A multirun of studies is no run itself."""
-    words = ["study=models", "study.part=ensemble", "study.rows=[rules,temporal_graph]", "study.seeds=[0]"]
-    words += ["trainer.max_epochs=1", "study.train=false", *NAIVE]
-    before = runs(trained)
-    command(trained, "study", "-m", *words, "out=one,two")
-    assert {*runs(trained)} - {*before} <= {("study ensemble", "FINISHED")}
-    for folder in ("one", "two"):
-        found = {line["variant"]: line for line in lines(trained / folder / "study_ensemble.csv")}
-        assert list(found) == ["rules", "temporal_graph", "vote"]
-        assert 0 < float(found["vote"]["same/any/disagreement"]) < 1
 
 
 @pytest.mark.slow("trains several rows")
@@ -278,18 +220,6 @@ def test_a_row_that_cannot_take_a_skin_is_named_so_also_where_thresholds_are_cho
     assert float(found["own"][ACCURACY]) > 0
     assert not found.get("four", {}).get(ACCURACY)
     assert "cannot" in (trained / "four" / "study_four.md").read_text()
-
-
-@pytest.mark.slow("trains several rows")
-def test_a_simulator_that_selects_runs_keeps_their_settings(command, tmp_path):
-    """Independent answer: skin evaluate, which changes nothing but the device."""
-    command(tmp_path, "train", "experiment=rules", "simulator=fem", "simulator.reading=interface", *SMALL)
-    words = ["study=robustness", "study.part=dead", "simulator=fem", "study.rows=rules", "study.devices=1"]
-    command(tmp_path, "study", *words, "device.test_gestures=48")
-    found = lines(tmp_path / "results" / "study_dead.csv")[0]
-    device = ["device.seed=1", "device.dead=0", "device.test_gestures=48"]
-    command(tmp_path, "evaluate", "run=latest", *device, *SMALL[2:4])
-    assert float(found[ACCURACY]) == pytest.approx(evaluated_accuracy(tmp_path))
 
 
 @pytest.mark.slow("trains several rows")

@@ -1,9 +1,6 @@
 """Comparisons of laws are judged, and their page says which hold."""
 
 import math
-import re
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -89,15 +86,6 @@ def test_a_wrong_stiffness_is_a_miss(monkeypatch):
     law = Law(False, "confined")
     laws.test_confined(law)
     assert law.misses()[0].startswith("motion of the surface, m/Pa: ")
-
-
-@pytest.mark.slow("starts pytest")
-def test_chosen_laws_are_written_where_they_should_be(tmp_path):
-    words = ["-m", "pytest", "experiments/laws", "-k", "locking or confined", f"--page={tmp_path}"]
-    done = subprocess.run([sys.executable, *words], cwd=ROOT, capture_output=True, text=True)
-    assert done.returncode == 0, done.stdout
-    text = (tmp_path / "physics.md").read_text()
-    assert re.findall(r"^\| (\w+) \| [A-Z]", text, re.MULTILINE) == ["confined", "locking"]
 
 
 def test_a_thick_layer_is_read_at_its_base():

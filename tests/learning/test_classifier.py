@@ -84,30 +84,6 @@ def test_without_touch_only_the_gate_learns():
     assert logits.grad[1, 4] > 0
 
 
-def test_accuracy_without_touch_is_the_gates_alone():
-    logits = torch.tensor([[1.0, 1.0, -1.0, -1.0, -1.0], [1.0, 1.0, 1.0, 1.0, -1.0]])
-    labels = torch.tensor([[1.0, 0.0, 0.0, 1.0, 1.0], [0.0, 0.0, 0.0, 0.0, 0.0]])
-    found = classifier(TOUCH_OR_NOT).accuracy(logits, labels)
-    assert {name: value.item() for name, value in found.items()} == {
-        "accuracy": 0.5,
-        "accuracy_big": 1.0,
-        "accuracy_dynamic": 0.0,
-        "accuracy_press": 1.0,
-        "accuracy_dangerous": 0.0,
-        "accuracy_touch": 0.5,
-    }
-
-
-def test_binary_probabilities_are_independent():
-    torch.testing.assert_close(
-        probabilities(torch.tensor([[0.0, math.log(3)]]), TOUCH), torch.tensor([[0.5, 0.75]])
-    )
-
-
-def test_the_head_is_as_wide_as_the_task():
-    assert classifier(GESTURES)(Frames(torch.randn(2, 3, 2), None)).shape == (2, 3)
-
-
 def test_what_an_epoch_logs(monkeypatch):
     network = classifier(hidden=())
     training, logged = Training(network, None, torch.optim.Adam), {}
@@ -129,23 +105,6 @@ def test_what_an_epoch_logs(monkeypatch):
         assert not logged
 
 
-def test_exclusive_accuracy_counts_the_largest(monkeypatch):
-    network = classifier(GESTURES)
-    values = network.accuracy(torch.tensor([[3.0, 1, 2], [0, 1, 2]]), torch.tensor([[1.0, 0, 0], [0, 1, 0]]))
-    assert values["accuracy"].item() == 0.5
-
-
-def test_a_summary_joins_the_embedding():
-    torch.manual_seed(0)
-    network = TouchClassifier(Flat(), TOUCH, (5,), "relu", summary=3).eval()
-    x, summary = torch.randn(2, 3, 2), torch.randn(2, 3)
-    assert network.head[0].in_features == 12
-    before = network(Frames(x, None, summary))
-    assert not torch.equal(network(Frames(x, None, summary + 1)), before)
-    with pytest.raises(ValueError, match="without"):
-        network(Frames(x, None))
-
-
 @pytest.mark.parametrize(("step", "fraction"), [(0, 0.04), (19, 1.0), (99, 0.0)])
 def test_the_learning_rate_rises_and_falls(step, fraction):
     training = Training(classifier(), None, torch.optim.Adam, warmup=0.2)
@@ -165,13 +124,6 @@ def test_what_is_learnt_in_few_batches_holds_in_use_whatever_the_unit():
     x, summary = torch.randn(512, 3, 2), 1e-3 * torch.randn(512, 3) + 5e-3
     learning = torch.cat([network(Frames(x[i], None, summary[i])) for i in torch.arange(512).split(128)])
     torch.testing.assert_close(network.eval()(Frames(x, None, summary)), learning, rtol=0.1, atol=0.1)
-
-
-def test_a_batch_of_one_touch_can_be_learnt_from():
-    network = TouchClassifier(Flat(), TOUCH, (5,), "relu", summary=3)
-    logits = network(Frames(torch.randn(1, 3, 2), None, torch.randn(1, 3)))
-    network.loss(logits, torch.ones(1, 4)).backward()
-    assert torch.isfinite(logits).all()
 
 
 def test_the_loss_of_targets_is_relative_to_their_deviation():

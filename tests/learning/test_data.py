@@ -126,44 +126,6 @@ def test_parts_come_in_another_order_each_epoch_and_one_after_the_other(make):
     assert len(orders) > 2
 
 
-def test_validation_in_parts_keeps_its_order(make):
-    data = make(kind=InParts)
-    assert flat(data.val_dataloader()) == list(range(23))
-    assert len(data.val_dataloader()) == 6
-    assert data.example.readings.shape[1] == 6
-
-
-def test_the_hash_is_of_all_parts(make, monkeypatch):
-    one = make(kind=InParts).hash
-    assert one == make(kind=InParts).hash
-    assert len(one) == 16
-    monkeypatch.setitem(globals(), "CUTS", [(0, 7), (7, 19)])
-    assert make(kind=InParts).hash != one
-
-
-def test_a_device_with_fixed_gestures_is_asked_once_a_split(make):
-    data = make()
-    for epoch in range(3):
-        data.trainer.current_epoch = epoch
-        flat(data.train_dataloader())
-        flat(data.val_dataloader())
-    assert data.device.asked == [("train", 0), ("validation", 0)]
-
-
-def test_fresh_gestures_are_drawn_every_epoch(make):
-    data = make(fresh=True)
-    for epoch in range(3):
-        data.trainer.current_epoch = epoch
-        assert sorted(flat(data.train_dataloader())) == [1000 * epoch + i for i in range(23)]
-
-
-def test_a_layout_is_represented_once(make):
-    data = make()
-    positions = torch.rand(2, 3)
-    assert data.representation_for(positions) is data.representation_for(positions.clone())
-    assert data.representation_for(positions) is not data.representation_for(positions + 0.01)
-
-
 @pytest.mark.parametrize("fresh", [False, True])
 def test_without_a_trainer_each_pass_is_the_next_epoch(make, fresh):
     """A loop of one's own gets the frames and labels that a Trainer's network gets."""
@@ -236,10 +198,6 @@ def pressed(touches):
     return excess.amax(dim=2)
 
 
-def test_nothing_asked_changes_nothing(touches):
-    assert torch.equal(changed(touches).readings, touches.readings)
-
-
 def test_a_shift_moves_the_touch_whole(touches):
     before, after = pressed(touches), pressed(changed(touches, shift=True))
     first = (after > 0).int().argmax(dim=1)
@@ -265,15 +223,3 @@ def test_gain_is_one_factor_per_sensor_and_touch(touches):
 
 def test_noise_has_the_deviation_that_was_asked_for(touches):
     assert (changed(touches, noise=0.2).readings - touches.readings).std() == pytest.approx(0.2, rel=0.05)
-
-
-def test_the_generator_decides(touches):
-    settings = {"shift": True, "reverse": True, "gain": 0.1, "noise": 0.1}
-    once = changed(touches, **settings).readings
-    assert torch.equal(changed(touches, **settings).readings, once)
-    assert not torch.equal(changed(touches, seed=2, **settings).readings, once)
-
-
-def test_what_cannot_be_is_refused(touches):
-    with pytest.raises(InputError, match=r"data\.augment\.noise=-1 must be"):
-        Augmentation(noise=-1)

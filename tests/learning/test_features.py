@@ -24,14 +24,6 @@ def value(name, *forces, **options):
     return engineered_features(touch(*forces, **options))[name].item()
 
 
-def test_an_offset_of_the_sensors_does_not_matter():
-    press = [(2, 0, 2.5), (3, 1, 1.5)]
-    plain, moved = engineered_features(touch(*press)), engineered_features(touch(*press, offset=0.8))
-    for name in plain:
-        if "raw" not in name:
-            assert moved[name].item() == pytest.approx(plain[name].item(), abs=1e-5), name
-
-
 def test_a_slide_has_a_path_and_a_press_none():
     slide = [(2, 0, 2.0), (3, 1, 2.0), (4, 2, 2.0)]
     assert value("path of the centre 1", *slide) == pytest.approx(0.08)
@@ -41,15 +33,6 @@ def test_a_slide_has_a_path_and_a_press_none():
     assert value("sensors that were strongest", *slide) == 3
     press = [(frame, 0, 2.0) for frame in (2, 3, 4)]
     assert value("path of the centre 1", *press) == pytest.approx(0, abs=1e-6)
-
-
-def test_sensors_that_share_one_course_have_one_singular_value():
-    press = [
-        (frame, sensor, force * (sensor + 1)) for frame, force in ((2, 1.0), (3, 2.0)) for sensor in (0, 1)
-    ]
-    assert value("singular value 2 of the first", *press) == pytest.approx(0, abs=1e-5)
-    slide = [(2, 0, 2.0), (3, 1, 2.0)]
-    assert value("singular value 2 of the first", *slide) == pytest.approx(1, abs=1e-5)
 
 
 def test_the_order_of_sensors_does_not_matter_and_their_number_not_to_the_names():
@@ -128,17 +111,6 @@ def test_the_noise_of_a_device_is_found_beside_a_touch(spread):
     assert above_idle(touches)[:, :, 6:].mean().item() == pytest.approx(0, abs=0.1 * spread + 1e-6)
 
 
-def test_noise_alone_rarely_passes_a_level_of_any_device():
-    """However large the noise is, it passes the lowest level in one frame of thirty."""
-    fractions = []
-    for spread in (0.05, 0.1, 0.2):
-        readings = spread * torch.randn(500, 30, 25, generator=torch.Generator().manual_seed(7))
-        valid = torch.ones_like(readings, dtype=torch.bool)
-        found = engineered_features(Touches(readings, valid, torch.rand(25, 3), None, 10.0))
-        fractions.append(found["frames above 0.15 N"].float().mean().item())
-    assert fractions == pytest.approx([1.0] * 3, abs=0.2)
-
-
 GRID = torch.cartesian_prod(torch.linspace(0.01, 0.15, 8), torch.linspace(0.01, 0.15, 8))
 POSITIONS = torch.cat([GRID, torch.full((64, 1), 0.005)], dim=1)
 
@@ -170,23 +142,3 @@ def test_every_vector_points_where_the_touch_goes(angle):
         *(float(found[f"slope of the centre 2 beyond 0.25 of the peak, {axis}"]) for axis in "xy")
     )
     assert slope == pytest.approx(0.008, rel=0.05)
-
-
-def test_a_pull_behind_is_a_lean_ahead():
-    touches = slide(0.0)
-    ahead = slide(0.0).readings.roll(-8, dims=2)
-    touches.readings.sub_(0.4 * ahead)
-    assert direction_features(touches)["lean, cosine with x"] > 0.9
-
-
-def test_numbers_and_order_of_sensors_do_not_matter():
-    order = torch.randperm(64, generator=torch.Generator().manual_seed(0))
-    one, other = direction_features(slide(0.7)), direction_features(slide(0.7, order))
-    for name, values in one.items():
-        torch.testing.assert_close(values, other[name], atol=1e-5, rtol=1e-4)
-
-
-def test_a_window_without_touch_tells_nothing():
-    touches = slide(0.0)
-    touches.readings.zero_()
-    assert all((values == 0).all() for values in direction_features(touches).values())

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from skin.body.material import Material
-from skin.mechanics.simulator.plates import Structure
+from skin.mechanics.simulator.fem import Structure
 
 if TYPE_CHECKING:
     from Pynite import FEModel3D

@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-from skin.mechanics.relaxation import apply_hysteresis, first_order_lag, quantize, running_peak
+from skin.mechanics.relaxation import apply_hysteresis, first_order_lag, quantize
 
 
 def test_a_step_is_answered_by_an_exponential():
@@ -25,13 +25,6 @@ def test_a_lag_does_not_depend_on_the_rate():
     torch.testing.assert_close(slow, fast[3::4])
 
 
-def test_every_gesture_may_have_a_lag_of_its_own():
-    time, force = torch.arange(30) / 10, torch.rand(4, 30, 3)
-    constants = torch.rand(4, 1, 3)
-    one = [first_order_lag(force[n : n + 1], constants[n, 0], time) for n in range(4)]
-    assert torch.equal(first_order_lag(force, constants, time), torch.cat(one))
-
-
 def test_hysteresis_is_the_mean_gap_as_a_share_of_the_peak():
     up = torch.linspace(0, 7, 2001).double()
     way = torch.cat([up, up.flip(0)])[None, :, None]
@@ -41,11 +34,6 @@ def test_hysteresis_is_the_mean_gap_as_a_share_of_the_peak():
     assert np.isclose(float((back - loading).mean()), 0.05 * 7, rtol=1e-3)
     assert back[0] == 0
     assert back[-1] == 7
-
-
-def test_rest_forgets_the_peak():
-    force = torch.tensor([0.0, 5, 3, 0, 1, 2, 1, -4, -1, 0])[None, :, None]
-    assert running_peak(force)[0, :, 0].tolist() == [0, 5, 5, 0, 1, 2, 2, 4, 4, 0]
 
 
 def test_steps_are_whole_where_there_are_steps():

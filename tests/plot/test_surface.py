@@ -6,9 +6,8 @@ import torch
 
 from skin.body.base import Arm, Sensors, Sheet
 from skin.body.layout import Grid
-from skin.mechanics.simulator.fem import build
+from skin.mechanics.simulator.fem import Structure, build
 from skin.mechanics.simulator.naive import Naive
-from skin.mechanics.simulator.plates import Structure
 from skin.mechanics.simulator.solid import Solid
 from skin.plot.plot3d import deflection, surface, surface_motion
 

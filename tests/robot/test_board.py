@@ -110,13 +110,6 @@ def test_states_and_alarms_are_those_of_the_live_view(board, touches):
     assert bool(touches) == answers[:, 1].any()
 
 
-def test_a_touch_delays_the_tare(board):
-    _, _, program = board
-    answers = asked(program, "frames", np.float32(force(12, (1, 2, 4, 5.0)))).reshape(-1, 3 + SENSORS)
-    assert len(answers) == 1 + 20 * (12 - 5)
-    assert not answers[:, 1:3].any()
-
-
 def test_the_self_test_fails_with_another_number(board, tmp_path):
     _, folder, program = board
     assert subprocess.run([program]).returncode == 0
@@ -197,12 +190,4 @@ def test_what_cannot_be_written_is_refused_in_a_sentence(board, tmp_path, rates,
     conditions = [replace(board[0].live_conditions(1.0, 0.1, False), rate=rate) for rate in rates]
     with pytest.raises(InputError, match=message):
         write_header(model, conditions, 0.15, 2.0, tmp_path / "model.h", print)
-    assert not list(tmp_path.iterdir())
-
-
-def test_a_model_too_large_says_its_size(board, tmp_path, monkeypatch):
-    model = board[0]
-    monkeypatch.setattr("skin.robot.board.LARGEST", 20)
-    with pytest.raises(InputError, match=r"nodes \([\d.]+ kB\): format=c writes at most"):
-        write_header(model, [model.live_conditions(RATE, 0.1, False)], 0.15, 2.0, tmp_path / "model.h", print)
     assert not list(tmp_path.iterdir())

@@ -54,17 +54,6 @@ def test_forces_follow_the_controller_and_readings_the_forces(configured):
     assert 0.5 < ratio.min() < ratio.max() < 1.5  # the layer spreads the pressure
 
 
-def test_splits_are_drawn_by_seed_and_imperfections_by_another(device, configured):
-    splits = {split: device.touches(split) for split in ("train", "validation", "holdout", "test")}
-    assert [len(touches) for touches in splits.values()] == [16, 2, 2, 24]
-    assert device.blank().touches("train").readings.shape == (1, 30, 25)
-    same, noisy = (build_device(configured(*SMALL, f"device.seed={seed}")) for seed in (0, 3))
-    assert torch.equal(same.touches("holdout").readings, splits["holdout"].readings)
-    other = noisy.touches("holdout")
-    assert torch.equal(other.labels, splits["holdout"].labels)
-    assert not torch.equal(other.readings, splits["holdout"].readings)
-
-
 @pytest.mark.parametrize("kind", ["ball", "rod", "box", "hand"])
 def test_an_object_rests_on_its_lowest_point_and_within_its_extent(kind):
     import mujoco

@@ -67,13 +67,6 @@ def test_friction_is_a_shear(world, covered, solid):
     assert np.abs(skin.read(data) - solid(pressure[None]).readings[0].numpy()).max() > 0.01
 
 
-def test_a_turned_pad_turns_the_chart(world, covered):
-    model, data = world(("ball", 0.0, 0.05), turn=90.0)
-    (press,) = covered(model).surface.presses(data)
-    row, column = np.unravel_index(press.gap.argmin(), BODY.shape)
-    assert (row in (7, 8), column) == (True, 12)  # the middles of cells are at 4.5 and 5.5 cm
-
-
 @pytest.mark.slow("prepares a posterior")
 def test_the_posterior_finds_the_object(world, covered):
     model, data = world(("ball", 0.03, -0.005))
@@ -82,23 +75,6 @@ def test_the_posterior_finds_the_object(world, covered):
     assert estimate.fingertip
     assert contact.position - 0.08 == pytest.approx([0.03, -0.005], abs=0.008)
     assert contact.force == pytest.approx(9.81, abs=2 * contact.force_deviation)
-
-
-def test_an_untouched_skin_reads_nothing_and_the_model_is_as_before(world, covered):
-    model, data = world()
-    before = model.geom_group.copy(), model.geom_rgba.copy(), model.geom_matid.copy()
-    assert not covered(model).read(data).any()
-    assert all(map(np.array_equal, before, (model.geom_group, model.geom_rgba, model.geom_matid)))
-
-
-def test_an_invisible_object_is_felt_and_one_beside_the_skin_is_not(world, covered):
-    model, data = world(("ball", 0.02, 0.02), ("box", 0.088, -0.03))
-    model.geom_rgba[:, 3] = 0
-    # Half of the box's corners are beyond a skin that is smaller than its pad.
-    small = MujocoSurface(model, "skin", Sheet((0.1, 0.1), (10, 10), BODY.layers))
-    (press,) = small.presses(data)
-    assert press.force[2] == pytest.approx(9.81, rel=0.01)
-    assert np.isfinite(press.gap).sum() > 4
 
 
 @pytest.mark.parametrize("turn", [0.0, 0.7, 1.3])
@@ -154,12 +130,6 @@ def test_a_reading_of_25_sensors_takes_at_most_5_ms(world):
 def test_what_cannot_carry_a_skin_is_refused_in_a_sentence(world, covered, site, said):
     with pytest.raises(InputError, match=said):
         covered(world()[0], site)
-
-
-def test_a_skin_larger_than_its_geom_is_noted(world):
-    wide = Sheet((0.18, 0.16), (18, 16), BODY.layers)
-    with pytest.warns(UserWarning, match="^32 of 288 cells of the skin lie beyond geom pad"):
-        MujocoSurface(world()[0], "skin", wide)
 
 
 def test_without_the_package_one_sentence_says_what_to_install(monkeypatch):

@@ -140,17 +140,6 @@ def test_a_set_is_as_lerobot_documents_it(tmp_path):
     assert shared["metadata"]["directions"] == before.metadata["directions"]
 
 
-def test_recordings_of_a_skin_have_equal_features_so_that_lerobot_joins_them(tmp_path):
-    for number, batch in enumerate((2, 3)):
-        some = replace(recording("plain", batch), metadata={"seed": number})
-        write_lerobot(some, tmp_path / str(number))
-    first, second = (json.loads((tmp_path / name / "meta/info.json").read_text()) for name in "01")
-    assert first["features"] == second["features"]
-    del first["skin"]  # LeRobot drops what it does not know
-    (tmp_path / "0/meta/info.json").write_text(json.dumps(first))
-    assert len(read_lerobot(tmp_path / "0")) == 2
-
-
 def foreign(folder, lengths=(7, 3), shape=(2, 2)):
     """Write a set of another program, whose second file holds the first episode."""
     (folder / "meta").mkdir(parents=True)
@@ -236,13 +225,6 @@ def test_a_set_without_positions_says_how_to_give_a_layout(tmp_path):
         read()
     with pytest.raises(InputError, match="readings of 4 sensors, positions are 3"):
         read(Sensors(SENSORS.positions[:3], (0.01, 0.01)), (0.08, 0.08), "observation.grid")
-
-
-def test_a_folder_with_files_is_not_overwritten(tmp_path):
-    (tmp_path / "notes.txt").write_text("mine")
-    with pytest.raises(InputError, match="has files: give a new folder"):
-        write_lerobot(recording(), tmp_path)
-    assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
 
 
 def test_the_command_writes_and_reads_them(run, tmp_path):

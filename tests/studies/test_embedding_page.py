@@ -4,7 +4,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from experiments.studies.embeddings import FRAME, embedding_statements, embeddings_table, planes, spaces
+from experiments.studies.embeddings import FRAME, embedding_statements, embeddings_table, spaces
 
 NAMES = ("big", "press")
 
@@ -53,26 +53,6 @@ def test_verdicts_follow_the_figures(three):
     assert words == ["agree", "agree", "undecided", "disagree", "undecided", "disagree"]
     one_seed = embedding_statements(three[:3])
     assert all("**undecided**" in line for line in one_seed)
-
-
-def test_without_layouts_morphology_is_undecided(three):
-    empty = dict.fromkeys(["accuracy layout", "variance layout", "variance big", "variance press"], np.nan)
-    alone = three.assign(**empty)
-    said = embedding_statements(alone)
-    assert "**undecided**" in said[0]
-    assert "one layout only" in said[0]
-    assert "**agree**" in said[1]
-    assert embeddings_table(alone).to_numpy().tolist()[0][-2:] == ["", ""]
-
-
-def test_clusters_stay_apart_in_the_plane():
-    generator = np.random.default_rng(0)
-    classes = np.arange(60) % 2
-    vectors = generator.standard_normal((60, 40)) + 20 * classes[:, None]
-    plane = planes(vectors)
-    distance = np.linalg.norm(plane[:, None] - plane, axis=-1) + 1e9 * np.eye(60)
-    assert (classes[distance.argmin(axis=1)] == classes).all()
-    assert (planes(np.ones((60, 5))) == 0).all()
 
 
 def test_the_figure_has_a_panel_per_label_and_layout(three):

@@ -2,10 +2,8 @@
 
 import numpy as np
 import pytest
-import torch
 
-from experiments.studies.embeddings import FRAME, Embeddings, explained, strongest, svm_accuracy
-from skin.device.touches import Touches
+from experiments.studies.embeddings import FRAME, Embeddings, explained, svm_accuracy
 from skin.runs.build import build_device
 
 SMALL = {"train": 160, "test": 80, "seeds": [4], "epochs": 60, "width": 32, "layouts": 2}
@@ -35,16 +33,6 @@ def test_explained_variance_of_known_vectors():
     assert explained(np.full((100, 3), 0.1), classes) == 0
 
 
-def test_the_strongest_frame_leaves_out_what_is_not_valid():
-    readings = torch.zeros(1, 3, 2)
-    readings[0, 0] = torch.tensor([1.0, 99.0])
-    readings[0, 2] = torch.tensor([3.0, 1.0])
-    valid = torch.ones_like(readings, dtype=torch.bool)
-    valid[0, 0, 1] = False
-    touches = Touches(readings, valid, torch.zeros(2, 3), None, 10.0)
-    assert strongest(touches).tolist() == [[3, 1]]
-
-
 def test_degrees_tell_the_layout_and_nothing_else(found):
     for name in ("Graph2Vec", "GL2Vec", "IGE"):
         one = found["degree", name]
@@ -61,10 +49,3 @@ def test_readings_tell_what_presses_but_one_frame_no_duration(found):
         assert found[key]["accuracy dangerous"] > 0.8
         assert found[key]["accuracy press"] < 0.7
     assert len(found["", "readings, window"]["plane"]) == 2 * 240
-
-
-def test_touches_of_another_seed_are_others(configured, found):
-    device = build_device(configured("simulator=naive"))
-    other = next(Embeddings(**SMALL | {"seeds": [5], "attributes": ["degree"]}).probe(device, None))
-    assert len(other["classes"]) == 240 * 4
-    assert other["classes"] != found["degree", "Graph2Vec"]["classes"]

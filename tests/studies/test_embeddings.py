@@ -4,7 +4,7 @@ import networkx as nx
 import numpy as np
 import pytest
 
-from experiments.studies.embeddings import doc2vec, invariant, levels, line_graph, subtrees
+from experiments.studies.embeddings import doc2vec, invariant, line_graph, subtrees
 
 
 def network(seed=0, nodes=9):
@@ -67,13 +67,6 @@ def test_the_line_graph_is_that_of_networkx():
     assert (labels[0] == labels[1]).all()
 
 
-def test_an_edge_is_the_same_from_both_ends():
-    weights = np.zeros((4, 4))
-    weights[0, 1] = weights[1, 0] = weights[2, 3] = weights[3, 2] = 1
-    labels, _ = line_graph(np.array([[0, 1, 1, 0], [0, 1, 0, 0]]), weights)
-    assert labels[0, 0] == labels[0, 1] == labels[1, 0] != labels[1, 1]
-
-
 def test_the_invariant_embedding_of_a_complete_graph_is_known():
     nodes = 6
     weights = 3.0 * (1 - np.eye(nodes))  # the unit of weights does not matter
@@ -85,12 +78,6 @@ def test_the_invariant_embedding_of_a_complete_graph_is_known():
     histogram = np.zeros(20)
     histogram[[9, 11]] = 30 / 36, 6 / 36
     assert found[25:] == pytest.approx(histogram)
-
-
-def test_levels_are_equal_steps():
-    readings = np.array([[-0.2, 0.0, 0.99, 1.0, 2.6, 4.0]])
-    assert levels(readings, 4).tolist() == [[0, 0, 0, 1, 2, 3]]
-    assert levels(np.zeros((1, 2)), 4).tolist() == [[0, 0]]
 
 
 def test_documents_of_like_words_lie_together():

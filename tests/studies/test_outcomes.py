@@ -3,7 +3,7 @@
 import pandas as pd
 import pytest
 
-from experiments.studies.comparison import conclude, differences, values
+from experiments.studies.comparison import conclude, differences
 from experiments.studies.study import Statement, Study
 
 ACCURACY = "same/overall/accuracy"
@@ -56,24 +56,6 @@ def test_fractions_are_compared_in_points_and_costs_as_they_are(fields, found, m
     assert (compared.mean, outcome.verdict) == (pytest.approx(mean), verdict)
 
 
-def test_a_statement_about_several_is_as_good_as_its_weakest():
-    outcome = conclude(said("mean", "attention", minimum=0), FOUND)
-    assert (outcome.verdict, [*outcome.compared]) == ("undecided", ["pooling=mean", "pooling=attention"])
-    assert outcome.compared["pooling=mean"].error == pytest.approx(3**-0.5)  # deviation 1, by the root of 3
-
-
-def test_a_gap_is_a_difference_of_two_metrics():
-    gap = values(FOUND[:3], f"train_accuracy - {ACCURACY}")
-    assert dict(gap) == {"0": pytest.approx(10), "1": pytest.approx(8), "2": pytest.approx(9)}
-
-
-def test_what_did_not_finish_decides_nothing():
-    outcome = conclude(said("mean", minimum=0), FOUND[:5])
-    assert (next(iter(outcome.compared.values())).seeds, outcome.verdict) == (2, "undecided")
-    outcome = conclude(said("set2set", minimum=0), FOUND)
-    assert (outcome.compared, outcome.verdict) == ({"set2set": None}, "undecided")
-
-
 def test_a_statement_may_be_about_a_condition():
     here = trials("max", 0.8, 0.8, 0.8, condition="none")
     here += trials("max", 0.7, 0.7, 0.7, condition="5 dead")
@@ -95,9 +77,3 @@ def test_conditions_are_compared_over_devices_of_several_trainings():
     assert (condition, verdict, compared.seeds) == ("1 dead", "worse", 3)
     # losses 2, 3 and 4: mean 3, deviation 1, by the root of 3
     assert compared[:2] == (pytest.approx(-3), pytest.approx(3**-0.5))
-
-
-def test_variants_are_compared_with_the_first_one_where_there_are_no_conditions():
-    verdicts = {variant: verdict for variant, *_, verdict in differences(study(differences="greater"), FOUND)}
-    assert verdicts == {"pooling=mean": "worse", "pooling=attention": "undecided"}
-    assert next(differences(study(differences="less"), FOUND))[-1] == "better"

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from experiments.studies.comparison import conclude
-from experiments.studies.reproduce import every_study, published_trials, reproduce_page
+from experiments.studies.reproduce import every_study, methods_figure, published_trials, reproduce_page
 from experiments.studies.study import Statement
 from skin.core.files import ROOT
 
@@ -13,6 +13,19 @@ from skin.core.files import ROOT
 def test_the_committed_page_is_what_the_committed_files_say():
     """``python -m experiments.studies.reproduce`` writes it."""
     assert (ROOT / "docs" / "reproduce.md").read_text() == reproduce_page()
+
+
+def test_the_figure_has_every_method_with_the_published_values():
+    accuracy, recall = methods_figure().axes
+    names = [text.get_text() for text in accuracy.get_yticklabels()]
+    ends = {
+        name: bar.lines[2][0].get_segments()[0][:, 0].tolist()
+        for name, bar in zip(names, accuracy.containers, strict=True)
+    }
+    assert len(names) == len(recall.containers) == 8
+    # 86.2 ± 0.9 in docs/results.md; the binomial interval is rather wide
+    assert ends["temporal_graph (report)"] == pytest.approx([86.2 - 1.3, 86.2 + 1.3], abs=0.2)
+    assert all(end <= 100 for pair in ends.values() for end in pair)
 
 
 def test_every_statement_is_on_the_page():

@@ -95,27 +95,6 @@ def test_a_study_composes_and_says_what_it_is_about(composed, name, part):
         assert len({str(each) for each in picked}) == len(picked)
 
 
-def test_statements_have_their_own_names():
-    parts = [FILES[name].parts[part] if part else FILES[name] for name, part in NAMES]
-    names = [said.id for part in parts for said in part.get("statements") or ()]
-    assert len(names) > 10
-    assert len(names) == len(set(names))
-
-
-def test_studies_share_the_runs_that_they_have_in_common(composed):
-    picked = {
-        "graph_pooling": "temporal_graph pooling=max",
-        "embedding_width": "temporal_graph widths=[30,500]",
-        "activation": "activation=silu",
-        "edge_weight": "weight=exp",
-    }
-    prints = set()
-    for study, name in picked.items():
-        _, every = composed(*words("models", study))
-        prints |= {fingerprint(one.configs["0"]) for one in every if one.name == name}
-    assert len(prints) == 1
-
-
 def test_variants_are_named_by_what_tells_them_apart(composed):
     _, every = composed("study=models", "study.part=image_representation", "study.seeds=[0,1]")
     assert [one.name for one in every][1:3] == [
@@ -146,30 +125,12 @@ def test_settings_of_a_variant_hold_instead_of_the_common_ones(composed):
     assert len({one.configs["0"].simulator["_target_"] for one in given}) == 1
 
 
-def test_a_common_setting_of_null_is_that_of_a_training(composed):
-    plain, small = (
-        composed("study=models", "study.part=gestures"),
-        composed("study=models", "study.part=gestures", "evaluation.devices=3"),
-    )
-    for (_, every), devices in ((plain, 10), (small, 3)):
-        assert {one.configs["0"].evaluation.devices for one in every} == {devices}
-
-
-def test_one_row_is_a_list_of_one():
-    """As text, best_fresh would contain best."""
-    assert chosen(*words("robustness", "dead"), "study.rows=best_fresh").rows == ["best_fresh"]
-    assert chosen(*words("robustness", "dead")).rows == "all"
-
-
 @pytest.mark.parametrize(
     ("words", "said"),
     [
         ((), "which study.*models"),
         (("study=models", "study.part=norms"), "study.part=norms is none of the parts of study=models.*norm"),
-        (
-            ("study=margins", "study.part=norm"),
-            "none of the parts of study=margins: none",
-        ),
+        (("study=margins", "study.part=norm"), "none of the parts of study=margins: none"),
         (("study=models", "study.name=x"), "study.name=x names one part"),
         (("study=table", "study.jobs=0"), "study.jobs=0"),
         (("study=models", "study.seeds=[]"), "study.seeds"),

@@ -142,30 +142,6 @@ def test_an_axis_draws_lines_over_the_numbers_in_the_names(single):
     assert (line.get_label(), axis.get_xlabel()) == ("grid", "number of sensors")
 
 
-def test_names_of_several_words_before_the_number_have_a_panel_for_each_beginning():
-    names = ["long sheet grid", "long sheet placed", "arm grid", "arm placed"]
-    found = [trial(f"{name} {n}", "0", 0.9 + n / 1000) for name in names for n in (9, 16)]
-    axes = study_figure(replace(STUDY, axis="number of sensors"), pd.DataFrame(found)).axes
-    assert [one.get_title() for one in axes] == ["long sheet", "arm"]
-    for one in axes:
-        assert [text.get_text() for text in one.get_legend().get_texts()] == ["grid", "placed"]
-        assert one.containers[0][0].get_color() != one.containers[1][0].get_color()
-        assert one.get_xlabel() == "number of sensors"
-
-
-def test_several_variants_under_several_conditions_have_a_line_each_and_a_legend():
-    found = [trial(name, "0", 0.9, condition=at) for name in ("one", "other") for at in ("", "rough")]
-    drawn = study_figure(STUDY, pd.DataFrame(found))
-    assert [text.get_text() for text in drawn.axes[0].get_yticklabels()] == ["one", "other"]
-    assert [text.get_text() for text in drawn.legends[0].get_texts()] == ["no condition", "rough"]
-
-
-def test_conditions_are_distinguished_by_colour():
-    found = [trial(name, "0", 0.9, condition=f"device {n}") for name in ("a", "b") for n in range(9)]
-    (axis,) = study_figure(STUDY, pd.DataFrame(found)).axes
-    assert len({drawn[0].get_color() for drawn in axis.containers}) == 9
-
-
 def test_tables_of_several_runs_become_one(tmp_path):
     pages = [Page("", {}, pd.DataFrame([{"course": "hold, 1 s", "alarms": n}])) for n in range(2)]
     rows = [trial("a", str(n), None, run=f"run{n}", page=page) for n, page in enumerate([*pages, Page("")])]

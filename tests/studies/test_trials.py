@@ -20,7 +20,7 @@ from experiments.studies.trials import (
 )
 from skin.errors import InputError
 from skin.runs.configuration import fingerprint
-from skin.runs.run import FinishedRun, find_pretrained
+from skin.runs.run import FinishedRun
 from skin.runs.store import Store
 
 # MLflow's own business with SQLAlchemy.
@@ -105,12 +105,6 @@ def test_a_trial_is_measured_once_for_a_training(measured, tmp_path):
     assert [trial("c"), trial("c")] == [3, 3], "of conditions with the same settings, each is measured"
     assert len(list((tmp_path / "results" / "trials" / "x").iterdir())) == 3
     assert measured(gestures=100)() == 4
-
-
-def test_a_trial_of_a_pretrained_model_is_measured_once(measured):
-    """A model's record does not say when its training ended."""
-    trial = measured(FinishedRun(None, find_pretrained("default_skin")))
-    assert [trial(), trial()] == [1, 1]
 
 
 def test_a_trial_of_an_earlier_training_is_not_reused(measured):

@@ -9,10 +9,8 @@ from skin.body.layout import Grid
 from skin.body.sheet import Sheet
 from skin.errors import InputError
 from skin.mechanics.contact.prescribed import Prescribed
-from skin.touch.fingertips import FingertipSampler, FingertipSettings, read_touch
-from skin.touch.gestures import GestureSettings
+from skin.touch.fingertips import FingertipSampler, FingertipSettings
 from skin.touch.labels import Thresholds
-from skin.touch.movie import join_movies
 from tests.touch.movie_labels import movie_labels
 
 LAYER = [{"material": "EcoFlex 00-30", "thickness": 0.005}]
@@ -54,17 +52,6 @@ def test_the_pressure_is_that_of_the_contacts(sampled):
         assert (middle - expected)[touched].abs().max() < 0.1 * max(width, height)
 
 
-def test_contacts_are_absent_where_nothing_presses(sampled):
-    _, movie, _, _ = sampled
-    absent = movie.contacts.isnan()
-    assert (absent.all(-1) == absent.any(-1)).all()
-    present = ~absent[..., 0]
-    assert (present.any(2) == (movie.scale > 0)).all()
-    number = movie.parameters["contacts"]
-    assert (present.sum(2).amax(1) == number).all()
-    assert set(number.tolist()) == {1, 2, 3}
-
-
 def test_contacts_are_within_their_ranges(sampled):
     source, movie, _, _ = sampled
     settings = source.settings
@@ -92,37 +79,12 @@ def test_fingertips_are_apart(sampled):
         assert gap[~gap.isnan()].min() >= source.settings.apart - 1e-6
 
 
-def test_fingertips_of_a_touch_slide_together(sampled):
-    _, movie, _, _ = sampled
-    for contacts, dynamic in zip(movie.contacts, movie.labels[:, 1], strict=True):
-        positions = contacts[~contacts[:, 0, 0].isnan()][:, ~contacts[:, :, 0].isnan().all(0), :2]
-        steps = positions.diff(dim=0)
-        assert (steps.abs().sum() > 1e-3) == bool(dynamic)
-        if len(steps):
-            assert (steps - steps[:, :1]).abs().max() < 1e-6
-
-
 def test_labels_are_what_the_movie_gives_and_balanced(sampled):
     source, movie, pressure, _ = sampled
     assert torch.equal(movie_labels(pressure.float(), source.footprints, source.body.cell), movie.labels)
     codes = movie.labels[:, 1:3].numpy() @ [1, 2]
     assert np.bincount(codes.astype(int), minlength=4).tolist() == [40] * 4
     assert not movie.labels[:, 0].any()
-
-
-def test_few_fingertips_are_dangerous():
-    """About one in a hundred with the shipped ranges: a tip must press a whole footprint at the limit."""
-    labels = sampler(BODIES["oblong"]).sample(2000, np.random.default_rng(0)).labels
-    assert 0 < labels[:, 3].mean() < 0.03
-
-
-def test_asked_for_labels_are_drawn_and_others_refused():
-    source = sampler()
-    wanted = np.tile([False, True, False, False], (8, 1))
-    assert (source.sample(8, np.random.default_rng(0), wanted).labels[:, 1:3].numpy() == wanted[:, 1:3]).all()
-    for column, name in ((0, "big"), (3, "dangerous")):
-        with pytest.raises(InputError, match=f"cannot be drawn to be {name}, .*touch=gestures"):
-            source.sample(1, np.random.default_rng(0), np.eye(4, dtype=bool)[[column]])
 
 
 def test_the_same_seed_is_the_same_movie_and_redraws_change_no_other_touch():
@@ -137,15 +99,6 @@ def test_the_same_seed_is_the_same_movie_and_redraws_change_no_other_touch():
     kept = draws == 1
     first = picky._draw(picky.balanced(200, random := np.random.default_rng(0)), random, np.arange(200), 1)
     assert torch.equal(movie.contacts[kept].nan_to_num(0), first.contacts[kept].nan_to_num(0))
-
-
-def test_rows_and_joins_keep_the_contacts_beside_the_pressure():
-    movie = sampler().sample(12, np.random.default_rng(0))
-    rows = torch.tensor([7, 3])
-    again = join_movies([movie[rows], movie[:2]])
-    expected = movie.contacts[torch.tensor([7, 3, 0, 1])]
-    assert torch.equal(again.contacts.nan_to_num(0), expected.nan_to_num(0))
-    assert torch.equal(again.pressure().sum((2, 3)) > 0, ~again.contacts[..., 0].isnan().all(2))
 
 
 @pytest.mark.parametrize(
@@ -170,14 +123,3 @@ def test_rigid_fingertips_are_refused():
     rigid = type("Rigid", (), {"proportional": False})()
     with pytest.raises(InputError, match="contact=prescribed, or touch=gestures"):
         FingertipSettings().sampler(BODIES["sheet"], np.zeros((1, 4096)), rigid, True, None)
-
-
-@pytest.mark.parametrize("settings", [None, {}, {"window": 2.0}, {"shapes": ["disc"]}, GestureSettings()])
-def test_settings_without_one_of_fingertips_are_those_of_gestures(settings):
-    assert isinstance(read_touch(settings), GestureSettings)
-
-
-def test_a_setting_of_fingertips_makes_fingertips():
-    assert read_touch({"radius": [0.004, 0.006], "window": 2.0}).frames.window == 20
-    with pytest.raises(InputError, match="touch has no setting small_area"):
-        read_touch({"radius": [0.004, 0.006], "small_area": [0.1, 0.2]})

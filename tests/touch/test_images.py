@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from skin.errors import InputError
-from skin.touch.images import load_image, pyramid
+from skin.touch.shapes import load_image
 
 DATA = Path(__file__).parents[2] / "data"
 
@@ -48,12 +48,6 @@ def test_transparent_means_no_force(tmp_path):
     )
 
 
-def test_a_relative_path_starts_in_the_working_directory(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    save(tmp_path / "mine.png", np.full((3, 3), 9, np.uint8))
-    assert load_image("mine.png").shape == (3, 3)
-
-
 def test_refusals_name_the_picture(tmp_path):
     with pytest.raises(InputError, match=r"no shape nothing: touch.shapes takes bar, .*square"):
         load_image("nothing")
@@ -73,13 +67,3 @@ def test_refusals_name_the_picture(tmp_path):
         load_image(save(tmp_path / "nan.tiff", np.array([[1, np.nan]], np.float32)))
     with pytest.raises(InputError, match=r"pull.tiff must be .* from 0 up, .* from -1 to 1"):
         load_image(save(tmp_path / "pull.tiff", np.array([[1, -1]], np.float32)))
-
-
-@pytest.mark.parametrize("shape", [(1, 1), (3, 50), (640, 480), (97, 1)])
-def test_every_level_of_a_pyramid_holds_the_same_force(shape):
-    image = np.random.default_rng(0).random(shape)
-    levels = pyramid([image], 64)
-    assert [level.shape[-1] for level in levels] == [64, 32, 16, 8, 4, 2, 1]
-    force = [float(level.sum()) * 4**number for number, level in enumerate(levels)]
-    np.testing.assert_allclose(force, force[0], rtol=1e-5)
-    assert levels[0][0, 0, 0].max() == levels[0][0, 0, :, -1].max() == 0

@@ -8,9 +8,7 @@ from skin.body.sheet import Sheet
 from skin.device.simulated import Simulated
 from skin.errors import InputError
 from skin.mechanics.contact.prescribed import Prescribed
-from skin.mechanics.contact.rigid import Rigid
 from skin.mechanics.simulator.naive import Naive
-from skin.mechanics.simulator.solid import Solid
 from skin.runs.configuration import fingerprint, recompose
 from skin.touch.gestures import GestureSettings, TouchSampler
 from skin.touch.labels import Limits
@@ -52,22 +50,6 @@ def test_a_force_alone_makes_a_light_wide_press_dangerous():
     assert ((movie.parameters["excess"] > 1) == dangerous).all()
 
 
-def test_a_tap_has_limits_of_its_own():
-    _, movie = drawn(force=FORCE, tap_force=FORCE | {"limit": 130})
-    force, press, dangerous = movie.parameters["force"], movie.labels[:, 2] > 0.5, movie.labels[:, 3] > 0.5
-    assert force[~press & ~dangerous].max() > 65
-    assert force[~press & dangerous].min() > 130 * 0.99
-    assert force[press & ~dangerous].max() <= 65 * 1.01
-
-
-def test_the_first_limit_that_is_exceeded_decides():
-    limits = Limits.of({"pressure": PRESSURE, "force": FORCE})
-    excess = limits.excess(
-        np.array([1.4e6, 2.8e6, 0]), np.array([130.0, 6.5, 65.0]), np.array([True, False, True])
-    )
-    assert excess == pytest.approx([2, 2, 1])
-
-
 def test_what_no_person_can_press_is_left_out_and_named():
     human = {"limit": 1000, "unit": "N", "source": "a table"}
     with pytest.warns(UserWarning, match="a big dangerous press or tap takes more than limits.human_force"):
@@ -77,22 +59,6 @@ def test_what_no_person_can_press_is_left_out_and_named():
     assert not (big & dangerous).any()
     assert (big & ~dangerous).any()
     assert movie.parameters["force"].max() <= 1000
-
-
-def test_a_rigid_object_is_as_dangerous_as_its_limits_say():
-    device = Simulated(
-        body=Sheet((0.08, 0.08), (8, 8), BODY.layers),
-        layout=Grid(2, 2),
-        simulator=Solid,
-        contact=Rigid,
-        touch={"shapes": ["disc"], "limits": {"pressure": PRESSURE | {"limit": 22.8, "unit": "kPa"}}},
-        gestures=10,
-    )
-    movie = device.sampler.sample(16, np.random.default_rng(0))
-    pressure, dangerous = movie.parameters["pressure"] / 22.8e3, movie.labels[:, 3] > 0.5
-    assert (pressure > 1).equal(dangerous)
-    assert pressure.max() < 180 / 90.5
-    assert movie.parameters["peak"][~dangerous].median() < 0.7 * 22.8e3  # spread over its range
 
 
 def test_presses_at_the_limit_follow_it():
@@ -128,15 +94,6 @@ def test_presses_at_the_limit_follow_it():
 def test_a_table_without_unit_or_source_is_refused(table, reason):
     with pytest.raises(InputError, match=reason):
         Limits.of(table)
-
-
-def test_a_run_keeps_the_limits_that_it_learned(configured):
-    stored = configured("limits=cuff")
-    other = recompose(stored, ["touch=fingertips", "device.noise=0.2"])
-    assert other.touch["limits"] == other.device["touch"]["limits"] == stored.limits
-    assert recompose(stored, ["device=recording", "device.path=x"]).touch["limits"] == stored.limits
-    recorded = configured("limits=cuff", "device=recording", "device.path=x")
-    assert recompose(recorded, ["device=simulated"]).device["touch"]["limits"] == stored.limits
 
 
 @pytest.mark.parametrize(
@@ -179,10 +136,3 @@ def test_a_table_of_ones_own_trains_and_evaluates(run, tmp_path, own):
     assert "overall/accuracy" in done.stdout
     done = run(tmp_path, "evaluate", "run=latest", "limits=cuff", *SMALL)
     assert (done.returncode, done.stderr.count("\n")) == (2, 1), done.stderr
-
-
-def test_a_command_refuses_a_table_without_source(run, tmp_path, own):
-    own[0].write_text("force: {limit: 65, unit: N}\n")
-    done = run(tmp_path, "train", *own[1])
-    assert (done.returncode, done.stderr.count("\n")) == (2, 1), done.stderr
-    assert "limits.force needs source" in done.stderr

@@ -30,13 +30,6 @@ def paired(single):
     return add_second(single, 0.5, 0.02, np.random.default_rng(4))
 
 
-def test_some_gestures_stay_as_they_are(single, paired):
-    alone = paired.parameters["contacts"] == 1
-    assert 0.5 < alone.float().mean() < 0.75
-    torch.testing.assert_close(paired.pressure()[alone], single.pressure()[alone], rtol=0, atol=0)
-    assert torch.equal(paired.parameters["onset"][alone], single.parameters["onset"][alone])
-
-
 def test_a_pair_is_the_sum_of_two_gestures_side_by_side(single, paired):
     rows = torch.nonzero(paired.parameters["contacts"] == 2)[:, 0]
     first, both = single.pressure()[rows].double(), paired.pressure()[rows].double()
@@ -62,24 +55,6 @@ def test_a_label_holds_if_it_holds_for_one_of_the_two(single, paired):
     assert torch.equal(sensors.amax(dim=(1, 2)) > 90.5e3, single.labels[:, 3] == 1)
     for name, column, limit in (("area", 0, 0.3), ("frames", 2, 3), ("pressure", 3, 90.5e3)):
         assert torch.equal(paired.parameters[name][rows] > limit, single.labels[rows, column] == 1)
-
-
-def test_only_a_gesture_that_ends_in_the_window_is_added():
-    cut = sample(ongoing=1.0)
-    paired = add_second(cut, 1.0, 0.02, np.random.default_rng(4))
-    rows = torch.nonzero(paired.parameters["contacts"] == 2)[:, 0]
-    assert len(rows) > 20
-    second = (paired.pressure()[rows].double() - cut.pressure()[rows].double()).amax(dim=(2, 3)) > 100
-    highest = (paired.pressure()[rows].double() - cut.pressure()[rows].double()).amax(dim=(2, 3))
-    begins, ends = second.int().argmax(dim=1), 29 - second.int().flip(1).argmax(dim=1)
-    for row, (begin, end) in enumerate(zip(begins.tolist(), ends.tolist(), strict=True)):
-        assert highest[row, end] < 1.5 * highest[row, begin] + 100  # it falls as it rises
-
-
-def test_without_a_share_nothing_changes(single):
-    assert "contacts" not in single.parameters
-    assert torch.equal(sample(second=0.0).frames, single.frames)
-    assert sample(second=1.0).parameters["contacts"].mean() > 1.5
 
 
 def test_what_does_not_add_up_is_refused():

@@ -11,14 +11,10 @@ from skin.body.sheet import Sheet
 from skin.errors import InputError
 from skin.mechanics.contact.prescribed import Prescribed
 from skin.touch.gestures import GestureSettings, TouchSampler
-from skin.touch.movie import join_movies
-from skin.touch.sampler import balanced
+from skin.touch.movie import balanced
 
 LAYER = [{"material": "EcoFlex 00-30", "thickness": 0.005}]
-SHEETS = {
-    "default": Sheet([0.16, 0.16], [32, 32], LAYER),
-    "oblong": Sheet([0.20, 0.12], [25, 18], LAYER),
-}
+SHEETS = {"default": Sheet([0.16, 0.16], [32, 32], LAYER), "oblong": Sheet([0.20, 0.12], [25, 18], LAYER)}
 
 
 def sampler(body: Sheet, **settings) -> TouchSampler:
@@ -71,31 +67,6 @@ def test_counts_of_combinations_differ_by_one_at_most(count):
     assert np.ptp(counts) <= 1
 
 
-def test_force_is_conserved_in_every_frame(sampled):
-    source, movie, pressure = sampled
-    applied = pressure.sum((2, 3)) * np.prod(source.body.cell)
-    np.testing.assert_allclose(applied, movie.force.numpy(), rtol=1e-5)
-
-
-def test_the_drawn_peak_is_the_largest_cell(sampled):
-    _, movie, pressure = sampled
-    np.testing.assert_allclose(pressure.max((1, 2, 3)), movie.parameters["peak"].numpy(), rtol=1e-5)
-
-
-def test_safe_means_nowhere_above_the_threshold(sampled):
-    _, movie, pressure = sampled
-    assert pressure[movie.labels[:, 3].numpy() == 0].max() <= 90.5e3 * (1 + 1e-6)
-
-
-def test_contact_lasts_from_the_onset_for_the_duration(sampled):
-    _, movie, pressure = sampled
-    touched = (pressure > 0.02 * pressure.max((1, 2, 3), keepdims=True)).any((2, 3))
-    time, onset, duration = np.arange(30), *(movie.parameters[k].numpy() for k in ("onset", "duration"))
-    expected = (time >= onset[:, None]) & (time < (onset + duration)[:, None])
-    np.testing.assert_array_equal(touched, expected)
-    assert (pressure.max((2, 3))[~expected] == 0).all()
-
-
 def test_force_rises_over_a_third_and_falls_over_a_third(sampled):
     _, movie, _ = sampled
     for fraction, duration in zip(movie.scale, movie.parameters["duration"].int().tolist(), strict=True):
@@ -105,14 +76,6 @@ def test_force_rises_over_a_third_and_falls_over_a_third(sampled):
         assert (profile[ramp : duration - ramp] == 1).all()
         assert (profile[:ramp].diff() > 0).all()
         torch.testing.assert_close(profile, profile.flip(0))
-
-
-def test_a_touch_that_stands_still_is_rendered_once(sampled):
-    _, movie, _ = sampled
-    dynamic = movie.labels[:, 1] == 1
-    duration = movie.parameters["duration"]
-    assert len(movie.frames) == (~dynamic).sum() + duration[dynamic].sum()
-    assert (movie.parameters["speed"][~dynamic] == 0).all()
 
 
 def test_sliding_is_straight_and_as_fast_as_drawn():
@@ -172,30 +135,6 @@ def test_the_same_seed_is_the_same_movie_and_another_is_not():
     assert not torch.equal(one.labels, other.labels)
 
 
-def test_rows_of_a_movie_are_its_gestures():
-    movie = sampler(SHEETS["oblong"], shear=0.5).sample(24, np.random.default_rng(0))
-    rows = torch.tensor([7, 3, 20])
-    some = movie[rows]
-    assert torch.equal(some.pressure(), movie.pressure()[rows])
-    for part in (some, join_movies([movie[rows[:1]], movie[rows[1:]]])):
-        assert torch.equal(part.shear[part.index], movie.shear[movie.index[rows]])
-    assert len(some.frames) < len(movie.frames)
-    again = join_movies([movie[:10], movie[10:]])
-    assert torch.equal(again.pressure(), movie.pressure())
-    assert torch.equal(again.parameters["peak"], movie.parameters["peak"])
-
-
-def test_a_picture_of_ones_own_presses(tmp_path):
-    from PIL import Image
-
-    path = tmp_path / "cross.png"
-    pixels = np.zeros((50, 70), np.uint8)
-    pixels[20:30], pixels[:, 30:40] = 255, 255
-    Image.fromarray(pixels).save(path)
-    movie = sampler(SHEETS["default"], shapes=["disc", str(path)]).sample(32, np.random.default_rng(0))
-    assert (movie.parameters["shape"] == 1).any()
-
-
 def test_a_combination_that_never_occurs_is_refused():
     body = SHEETS["default"]
     blind = np.zeros((1, 1024))
@@ -212,15 +151,6 @@ def test_nothing_but_the_path_gives_dynamic_away():
     booster = HistGradientBoostingClassifier(max_iter=60, random_state=0)
     score = cross_val_score(booster, known.numpy(), movie.labels[:, 1].numpy(), cv=5).mean()
     assert score <= 0.60
-
-
-def test_friction_changes_nothing_but_the_drag():
-    plain, rough = (
-        sampler(SHEETS["default"], shear=shear).sample(48, np.random.default_rng(3)) for shear in (0.0, 0.5)
-    )
-    assert plain.shear is None
-    assert torch.equal(plain.frames, rough.frames)
-    assert all(torch.equal(plain.parameters[name], rough.parameters[name]) for name in plain.parameters)
 
 
 def test_drag_follows_the_centre_of_pressure():
@@ -261,14 +191,3 @@ def test_net_is_from_the_first_place_to_the_last(sampled):
         moved.append(centre[1] - centre[0])
     net = torch.stack([movie.parameters["net_x"], movie.parameters["net_y"]], dim=1)
     torch.testing.assert_close(net, torch.stack(moved).float(), atol=2e-3, rtol=0)
-
-
-def test_slides_have_a_direction_unless_they_go_to_and_fro(sampled):
-    _, movie, _ = sampled
-    length = torch.linalg.vector_norm(movie.slides, dim=1)
-    dynamic = movie.labels[:, 1] == 1
-    assert (length[~dynamic] == 0).all()
-    known = movie.parameters
-    straight = torch.hypot(known["net_x"], known["net_y"]) >= 0.5 * known["speed"] * (known["duration"] - 1)
-    torch.testing.assert_close(length[dynamic], straight[dynamic].float())
-    assert 0.3 < length[dynamic].mean() < 0.9

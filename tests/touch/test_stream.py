@@ -1,6 +1,5 @@
 """Windows of streams against dense movies, frame by frame."""
 
-import numpy as np
 import pytest
 import torch
 
@@ -8,7 +7,6 @@ from skin.body.layout import Scattered
 from skin.body.sheet import Sheet
 from skin.device.files import read_recording, write_recording
 from skin.device.simulated import Simulated
-from skin.device.touches import Timeline
 from skin.errors import InputError
 from skin.mechanics.simulator.naive import Naive
 from skin.touch.gestures import GestureSettings
@@ -82,44 +80,6 @@ def test_labels_and_shares_are_those_of_the_dense_movie(dense, window):
     assert seen_parts > 20
 
 
-def test_gaps_are_as_long_as_drawn_and_empty(dense):
-    strip, _, owner = dense
-    lengths = strip.timeline.begin[1:] - strip.timeline.end[:-1]
-    assert lengths.min() >= 1
-    assert lengths.max() <= 25
-    assert (strip.whole.touches.readings[0, owner < 0] == 0).all()
-    assert (owner[: int(strip.timeline.begin[0])] == -1).all()
-
-
-def test_what_else_is_known_of_a_window(dense):
-    strip, _, owner = dense
-    windows = strip.cut(torch.arange(0, 470, 7), 30)
-    known, touched = windows.parameters, windows.touches.labels[:, 4] == 1
-    assert windows.task == TOUCH_OR_NOT
-    assert known["peak"][touched].min() > 0
-    assert known["peak"][~touched].eq(0).all()
-    for start, onset, fraction in zip(range(0, 470, 7), known["onset"], known["share"], strict=True):
-        if fraction == 1:
-            assert owner[start + int(onset)] >= 0
-            assert owner[start + int(onset) - 1] != owner[start + int(onset)]
-
-
-def test_overlapping_windows_share_their_noise():
-    strip = device().simulate_stream(300)
-    one, other = strip.cut(torch.tensor([100, 110]), 30).touches.readings
-    assert torch.equal(one[10:], other[:-10])
-    idle = strip.whole.touches.readings[0][strip.whole.force[0] == 0]
-    assert idle.std(0).mean() == pytest.approx(0.05, rel=0.1)
-
-
-def test_clipped_frames_are_found():
-    plain = device(clip=3.0, noise=0.0, offset=0.0, gain_spread=0.0)
-    recording = plain.recording("test")
-    top = recording.touches.readings.amax((1, 2)) >= 3.0
-    assert torch.equal(recording.parameters["clipped"] == 1, top)
-    assert 0 < top.float().mean() < 1
-
-
 @pytest.fixture(scope="module")
 def plain() -> Simulated:
     return device()
@@ -138,60 +98,12 @@ def test_splits_have_their_sizes_and_streams_of_their_own(plain):
     assert len(plain.recording()) == 200
 
 
-def test_no_training_draws_a_gesture_of_a_test_stream(plain):
-    test = set(plain.simulate_stream(3000).timeline.movie.parameters["peak"].tolist())
-    test |= set(plain.recording("test").parameters["peak"].tolist())
-    for seed in range(3):
-        budget = set(device(data_seed=seed).recording().parameters["peak"].tolist())
-        assert test & budget <= {0.0}
-
-
 def test_everything_comes_from_the_seeds(plain):
     other, elsewhere = device(data_seed=1), device(seed=1)
     assert torch.equal(plain.touches("test").readings, other.touches("test").readings)
     assert not torch.equal(plain.touches("train").readings, other.touches("train").readings)
     assert torch.equal(plain.touches("test").labels, elsewhere.touches("test").labels)
     assert not torch.equal(plain.touches("test").readings, elsewhere.touches("test").readings)
-
-
-def test_the_number_of_threads_does_not_matter(monkeypatch):
-    monkeypatch.setattr("skin.device.simulated._BATCH", 64)
-    threads, readings = torch.get_num_threads(), []
-    try:
-        for count in (1, 3):
-            torch.set_num_threads(count)
-            readings.append(device().touches("train").readings)
-    finally:
-        torch.set_num_threads(threads)
-    assert torch.equal(*readings)
-
-
-def test_fresh_streams_differ_by_epoch_in_train_alone():
-    fresh = device(fresh=True)
-    assert not torch.equal(fresh.touches("train", 0).readings, fresh.touches("train", 1).readings)
-    assert torch.equal(fresh.touches("test", 0).readings, fresh.touches("test", 1).readings)
-
-
-def test_randomise_gives_every_window_a_device():
-    touches = device(randomise=True, noise=0.0).touches("test")
-    idle = touches.readings[touches.labels[:, 4] == 0]
-    assert (idle.std(dim=1) < 1e-6).all()
-    assert (idle[:, 0].std(dim=0) > 0.02).all()
-    strip = device(randomise=True, noise=0.0).simulate_stream(200)
-    assert torch.equal(
-        strip.whole.touches.readings, device(noise=0.0).simulate_stream(200).whole.touches.readings
-    )
-
-
-def test_a_short_stream_may_be_all_gap():
-    windows = device().simulate_stream(40, gap=[1000, 2000]).cut(torch.arange(10), 30)
-    assert (windows.touches.labels == 0).all()
-
-
-def test_regular_strides():
-    strides = device(touch={"stride": [0.7, 0.7], "gap": [0.5, 0.9]}, noise=0.0, offset=0.0).recording("test")
-    force = strides.force
-    assert torch.equal(force[:-1, 7:], force[1:, :-7])
 
 
 @pytest.mark.parametrize(
@@ -213,9 +125,3 @@ def test_a_file_keeps_windows_and_their_gate(plain, tmp_path):
     assert stored.task == TOUCH_OR_NOT
     assert torch.equal(stored.touches.labels, plain.touches("holdout").labels)
     torch.testing.assert_close(stored.parameters, plain.recording("holdout").parameters, rtol=0, atol=0)
-
-
-def test_gestures_without_a_gap_are_refused(dense):
-    movie = dense[0].timeline.movie
-    with pytest.raises(ValueError, match="one frame apart"):
-        Timeline(movie, torch.from_numpy(np.arange(len(movie))), 500)

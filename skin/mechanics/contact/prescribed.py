@@ -7,8 +7,8 @@ import torch
 
 from skin.body.base import AbstractBody
 from skin.mechanics.simulator.base import AbstractSimulator
+from skin.touch.movie import AbstractContact, ContactProblem, ContactResult
 from skin.touch.paths import Trajectories
-from skin.touch.sampler import AbstractContact, ContactProblem, ContactResult
 
 
 @final

@@ -14,9 +14,8 @@ from skin.body.base import AbstractBody
 from skin.core.settings import checked
 from skin.mechanics.simulator.base import AbstractSimulator
 from skin.touch.gestures import GestureSettings
-from skin.touch.movie import measure_gestures
+from skin.touch.movie import AbstractContact, ContactProblem, ContactResult, measure_gestures
 from skin.touch.paths import Trajectories
-from skin.touch.sampler import AbstractContact, ContactProblem, ContactResult
 from skin.touch.shapes import Pose, Shapes
 
 # Contact of rigid objects with an elastic surface, in batches, by projected conjugate gradients.

@@ -51,7 +51,7 @@ class AbstractSimulator(nn.Module, ABC):
         feels_shear: whether readings depend on tangential forces too.
         mechanical: whether readings depend on the thickness and stiffness of the layers.
         axes: sensors of a site: 3 if they measure along the surface too.
-        smooth: whether the loads of movies are moments of the pressure (:mod:`skin.touch.splines`) instead of
+        smooth: whether the loads of movies are moments of the pressure (:mod:`skin.touch.shapes`) instead of
             mean pressures of cells.
     """
 

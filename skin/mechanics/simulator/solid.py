@@ -19,11 +19,10 @@ from torch import Tensor
 from skin.body.base import AbstractBody, Sensors, require_memory
 from skin.core.settings import checked
 from skin.mechanics import array_cache
-from skin.mechanics.geometry import fit_nodes
+from skin.mechanics.geometry import fit_nodes, reading_rows, strain_rows, warn_of_cut
 from skin.mechanics.simulator._mesh import Hexahedra, build_meshes
-from skin.mechanics.simulator._reading import reading_rows, strain_rows, warn_of_cut
 from skin.mechanics.simulator.base import AbstractSimulator, Response, flatten, largest_strain
-from skin.touch import splines
+from skin.touch.shapes import cell_moments
 
 # Cholesky factors of a grid's stiffness: nested dissection of its plan, with dense fronts.
 #
@@ -146,7 +145,7 @@ _AT_ONCE = 32  # right-hand sides; more take no less time, and 2 MB each on the 
 
 
 class Elastic:
-    """Hexahedra glued to a table, under moments of a surface pressure (:mod:`skin.touch.splines`).
+    """Hexahedra glued to a table, under moments of a surface pressure (:mod:`skin.touch.shapes`).
 
     Args:
         mesh: the elements.
@@ -253,9 +252,9 @@ def _bytes(columns: int, rows: int, deep: int) -> float:
 _HERE = Path(__file__).parent
 _SOURCES = [
     *sorted((_HERE.parents[1] / "body").glob("*.py")),
-    *(_HERE / f"{name}.py" for name in ("_mesh", "_reading", "base", "solid")),
+    *(_HERE / f"{name}.py" for name in ("_mesh", "base", "solid")),
     _HERE.parent / "geometry.py",
-    Path(splines.__file__),
+    _HERE.parents[1] / "touch" / "shapes.py",
 ]
 _INWARDS = 2
 _BODIES = WeakValueDictionary[tuple[str, int], Elastic]()
@@ -272,7 +271,7 @@ class Solid(AbstractSimulator):
     Readings under a disc of 5 mm radius and more on the default sheet have an error of up to 2 %, those under
     uniform pressure of 0.2 %; ``make physics`` and tests/mechanics/simulator/test_solid.py check other cases.
 
-    Loads are moments of the pressure (:mod:`skin.touch.splines`), which small contacts need.
+    Loads are moments of the pressure (:mod:`skin.touch.shapes`), which small contacts need.
     :meth:`forward` takes pressures of cells.
 
     Args:
@@ -314,7 +313,7 @@ class Solid(AbstractSimulator):
         # (3, rows, cells) -> the moments of a pressure times this give all rows for each axis of the load.
         self.register_buffer("transfer", torch.from_numpy(rows.transpose(0, 2, 1).copy()).float())
         for name, count in zip(("spread_x", "spread_y"), body.cells, strict=True):
-            self.register_buffer(name, torch.from_numpy(splines.of_cells(count).copy()).float())
+            self.register_buffer(name, torch.from_numpy(cell_moments(count).copy()).float())
         self._sensors, self.axes = len(sensors), sensors.axes
 
     def forward(self, pressure: Tensor, shear: Tensor | None = None) -> Response:
@@ -362,7 +361,7 @@ class Solid(AbstractSimulator):
         meshes need not be. Computed once, then cached on disk.
         """
         moved = self._surface["cells"] / self._area
-        spread = np.kron(splines.of_cells(self.shape[0]), splines.of_cells(self.shape[1]))
+        spread = np.kron(cell_moments(self.shape[0]), cell_moments(self.shape[1]))
         compliance = spread.T @ moved @ spread
         return torch.from_numpy((compliance + compliance.T) / 2).float()
 

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skin.body.layout import File, Grid
+from skin.body.layout import File
 from skin.body.sheet import Sheet
 from skin.errors import InputError
 from tests.damage import DAMAGED_FILES, damaged, opened
@@ -54,33 +54,11 @@ def test_footprints_that_overlap_are_named(sensors):
     sensors("x_m,y_m\n0.1,0.1\n0.11,0.1\n")  # side by side
 
 
-def test_depth_defaults_to_the_interface_under_the_top_layer(sensors):
-    assert sensors("x_m,y_m\n0.1,0.1\n").positions[0, 2] == 0.005
-
-
 def test_normals_are_made_unit_vectors(sensors):
     """3-4-5 triangles; one that faces outwards stays so."""
     read = sensors(FACING + "0.1,0.1,0.3,0,0.4\n0.05,0.1,0,0,-7\n0.1,0.05,0,-4,3\n")
     np.testing.assert_allclose(read.normals, [[0.6, 0, 0.8], [0, 0, -1], [0, -0.8, 0.6]], atol=1e-15)
     assert read.tilted.tolist() == [True, False, True]
-
-
-def test_a_site_of_three_axes_has_three_rows(sensors):
-    read = sensors(ALONG + "0.1,0.1,0.6,0.8,0\n0.1,0.1,-0.8,0.6,0\n0.1,0.1,0,0,1\n")
-    np.testing.assert_array_equal(read.measured, [[0.6, 0.8, 0], [-0.8, 0.6, 0], [0, 0, 1]])
-    assert (len(read), read.axes, read.tilted.any()) == (3, 3, False)
-
-
-def test_sensors_face_the_surface_where_the_file_does_not_say(sensors):
-    read = sensors("x_m,y_m\n0.1,0.1\n0.05,0.1\n")
-    np.testing.assert_array_equal(read.normals, [[0, 0, 1]] * 2)
-    assert not read.tilted.any()
-
-
-def test_the_shipped_tilted_file_is_the_shipped_layout_turned_by_30_degrees():
-    tilted, upright = (File(f"data/layouts/{name}_5x5.csv").sensors(BODY) for name in ("tilted", "jittered"))
-    np.testing.assert_array_equal(tilted.positions, upright.positions)
-    np.testing.assert_allclose(tilted.normals, Grid(5, 5, tilt=np.pi / 6).sensors(BODY).normals, atol=1e-6)
 
 
 def test_a_relative_path_is_looked_for_here_first(tmp_path, monkeypatch):
@@ -117,7 +95,9 @@ def test_a_relative_path_is_looked_for_here_first(tmp_path, monkeypatch):
             "no column normal_y, found x_m, y_m, normal_x, normal_z",
         ),
         (FACING + "0.1,0.1,0,0,1\n0.1,0.05,0,0,0\n", "line 3: a normal of length 0 has no direction"),
+        (FACING + "0.1,0.1,1e-300,0,0\n", "a normal of length 0"),
         (FACING + "0.1,0.1,0,up,1\n", "line 2: normal_y must be a number, got 'up'"),
+        ("x_m,y_m,x_m\n0.1,0.1,0.2\n", "the column x_m is there twice"),
         (
             ALONG + "0.1,0.1,1,0,0\n" * 2 + "0.1,0.1,0,0,2\n",
             "direction of sensor 3 has length 2, but must be",
@@ -141,12 +121,6 @@ def test_what_is_no_layout_is_refused_by_name(sensors, text, says):
 def test_a_missing_file_is_refused_with_where_it_was_looked_for(path):
     with pytest.raises(InputError, match=r"no layout file .*: looked for .*layout.path=FILE.csv"):
         File(path)
-
-
-def test_a_script_may_give_a_path(tmp_path):
-    path = tmp_path / "x.csv"
-    path.write_text("x_m,y_m\n0.1,0.1\n")
-    assert len(File(path).sensors(BODY)) == 1
 
 
 MINE = b"""x_m, y_m, depth_m, normal_x, normal_y, normal_z
@@ -174,19 +148,3 @@ def test_more_sensors_than_any_skin_has_are_refused_before_they_take_memory(sens
     rows = "".join(f"{0.00001 * number},0.1\n" for number in range(10_000))
     with pytest.warns(UserWarning, match="overlap"):
         assert len(sensors("x_m,y_m\n" + rows)) == 10_000
-
-
-@pytest.mark.parametrize("number", ["1e300", "1e999", "nan", "-1e10"])
-def test_numbers_that_overflow_are_refused(sensors, number):
-    with pytest.raises(InputError, match="line 2: normal_x must be a number"):
-        sensors(f"{FACING}0.1,0.1,{number},0,1\n")
-
-
-def test_a_column_twice_is_refused(sensors):
-    with pytest.raises(InputError, match="the column x_m is there twice"):
-        sensors("x_m,y_m,x_m\n0.1,0.1,0.2\n")
-
-
-def test_a_normal_too_short_to_have_a_direction_is_refused(sensors):
-    with pytest.raises(InputError, match="a normal of length 0"):
-        sensors(f"{FACING}0.1,0.1,1e-300,0,0\n")

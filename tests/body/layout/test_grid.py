@@ -28,11 +28,6 @@ def test_neighbours_are_tilted_along_different_axes():
             np.testing.assert_allclose(four.sum(axis=0)[:2], 0, atol=1e-15)
 
 
-def test_without_a_tilt_sensors_face_the_surface_to_the_last_bit():
-    normals = Grid().sensors(BODY).normals
-    assert normals.tobytes() == np.tile([0.0, 0.0, 1.0], (25, 1)).tobytes()
-
-
 def test_three_axes_are_three_sensors_at_each_site():
     sensors, sites = Grid(2, 3, tilt=0.3, axes="three").sensors(BODY), Grid(2, 3, tilt=0.3).sensors(BODY)
     np.testing.assert_array_equal(sensors.positions, sites.positions.repeat(3, axis=0))

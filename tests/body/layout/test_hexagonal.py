@@ -20,13 +20,6 @@ def test_an_inner_sensor_has_six_neighbours_at_equal_distances():
     assert distances[6] > 1.5 * pitch
 
 
-def test_every_footprint_lies_on_the_surface():
-    body = Sheet([0.16, 0.16], [32, 32], LAYERS)
-    positions = Hexagonal(5, 5).sensors(body).positions[:, :2]
-    assert (positions >= 0.005).all()
-    assert (positions <= 0.155).all()
-
-
 def test_no_row_is_refused():
     with pytest.raises(InputError, match=r"layout\.rows"):
         Hexagonal(rows=0)

@@ -21,12 +21,6 @@ def test_footprints_neither_overlap_nor_leave_the_surface(seed):
     assert (apart.any(axis=2) | np.eye(25, dtype=bool)).all()
 
 
-def test_a_seed_gives_one_layout_and_another_seed_another():
-    first, again, other = (Random(9, seed).sensors(BODY).positions for seed in (1, 1, 2))
-    np.testing.assert_array_equal(first, again)
-    assert not np.array_equal(first, other)
-
-
 @pytest.mark.parametrize(("count", "footprint"), [(200, (0.01, 0.01)), (1, (0.2, 0.01))])
 def test_more_sensors_than_fit_are_refused(count, footprint):
     with pytest.raises(InputError, match=r"layout\.count"):

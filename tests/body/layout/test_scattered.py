@@ -33,18 +33,6 @@ def test_no_sensor_moves_farther_than_the_jitter():
     assert (np.abs(moves).max(axis=0) > 0.24 * pitch).all()
 
 
-def test_moved_sensors_keep_their_tilt():
-    scattered, grid = (kind(4, 6, tilt=0.3).sensors(BODY).normals for kind in (Scattered, Grid))
-    np.testing.assert_array_equal(scattered, grid)
-    given = np.tile([0.6, 0.0, 0.8], (25, 1))
-    np.testing.assert_array_equal(Scattered(normals=given).sensors(BODY).normals, given)
-
-
-def test_seeds_differ():
-    first, second = (Scattered(seed=seed).sensors(BODY).positions for seed in (1, 2))
-    assert not np.allclose(first, second)
-
-
 @pytest.mark.parametrize("jitter", [-0.1, 0.5])
 def test_a_jitter_at_which_sensors_could_meet_is_refused(jitter):
     with pytest.raises(InputError, match=r"layout\.jitter=.* must be .*: as in layout.jitter=0\.25"):

@@ -1,6 +1,5 @@
 """Each fusion by itself."""
 
-import math
 from functools import partial
 from pathlib import Path
 
@@ -12,53 +11,10 @@ from omegaconf import OmegaConf
 
 from skin.errors import InputError
 from skin.learning.cnn import Cnn
-from skin.learning.fusion import HEADS, Early, Late, Linked, link, positions
+from skin.learning.fusion import HEADS, Linked, link
 from skin.learning.graph import Graph, normalised
 from skin.learning.model import Gcn, Mlp
 from skin.learning.representation import Frames
-
-MODEL = partial(Mlp, widths=[8])
-
-
-@pytest.mark.parametrize("head", HEADS)
-def test_only_mean_and_max_forget_the_order(head):
-    torch.manual_seed(0)
-    fusion = Late(MODEL, "readings", (4,), 6, head=head).eval()
-    x = torch.randn(3, 6, 4)
-    same = torch.allclose(fusion(Frames(x.flip(1), None)), fusion(Frames(x, None)), atol=1e-6)
-    assert same == (head in ("mean", "max"))
-
-
-def test_positions_of_frames_by_hand():
-    sin, cos = math.sin, math.cos
-    wanted = [[sin(t), cos(t), sin(t / 100), cos(t / 100)] for t in range(3)]
-    torch.testing.assert_close(positions(3, 4), torch.tensor(wanted))
-
-
-class Spy(torch.nn.Module):
-    width = 1
-
-    def __init__(self, kind, shape):
-        super().__init__()
-        self.shape = shape
-
-    def forward(self, x, adjacency):
-        return x
-
-
-def test_frames_of_an_image_are_its_channels():
-    x = torch.randn(2, 5, 1, 8, 8)
-    fusion = Early(Spy, "image", (1, 8, 8), 5)
-    assert fusion.model.shape == (5, 8, 8)
-    assert torch.equal(fusion(Frames(x, None)), x[:, :, 0])
-
-
-def test_frames_of_a_graph_are_features_of_its_nodes():
-    x = torch.randn(2, 5, 7, 1)
-    fusion = Early(Spy, "graph", (7, 1), 5)
-    assert fusion.model.shape == (7, 5)
-    assert torch.equal(fusion(Frames(x, torch.eye(7)))[1, 3], x[1, :, 3, 0])
-
 
 PAIR = np.array([[0.0, 0.5], [0.5, 0.0]])
 
@@ -151,24 +107,6 @@ def test_windows_do_not_see_each_other(given):
     together = fusion(Frames(x, adjacency))
     assert torch.equal(fusion(Frames(x, adjacency)), together)
     torch.testing.assert_close(fusion(Frames(x[1:3], adjacency)), together[1:3])
-
-
-@pytest.mark.parametrize("head", HEADS)
-@pytest.mark.parametrize("kind", MODELS)
-def test_late_fusion_trained_on_30_frames_takes_20_and_60(kind, head):
-    torch.manual_seed(0)
-    late = next(path for path in OPTIONS if path.stem == "late")
-    fusion = instantiate(OmegaConf.load(late), head=head)(MODELS[kind], kind, SHAPES[kind], 30)
-    optimizer = torch.optim.Adam(fusion.parameters())
-    fusion(windows(kind, 30)).square().sum().backward()
-    optimizer.step()
-    fusion.eval()
-    x, adjacency, _ = windows(kind, 60)
-    short, long = fusion(Frames(x[:, :20], adjacency)), fusion(Frames(x, adjacency))
-    assert short.shape == long.shape == (5, fusion.width)
-    assert torch.isfinite(short).all()
-    assert torch.isfinite(long).all()
-    assert not torch.allclose(short, long)  # the frames after the 20th are not overlooked
 
 
 @pytest.mark.parametrize("length", [1, 4, 11])

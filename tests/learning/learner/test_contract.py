@@ -64,12 +64,6 @@ def test_it_learns(fitted):
     assert right.min() > 0.6
 
 
-def test_what_it_tells_of_itself(fitted):
-    learner = fitted[0]
-    assert learner.parameters > 0
-    assert 0 < learner.seconds_per_epoch < torch.inf
-
-
 def test_touches_do_not_see_each_other(fitted):
     learner, _, device = fitted
     touches = device.touches("test")
@@ -100,14 +94,6 @@ def test_it_leaves_no_file_and_no_trace_in_the_random_state(made):
     make().fit(data)
     assert torch.equal(torch.get_rng_state(), state)
     assert os.listdir() == []
-
-
-def test_nothing_is_told_before_it_has_learnt(made, tmp_path):
-    make, _, device = made
-    with pytest.raises(RuntimeError, match="fit or load"):
-        make().probabilities(device.touches("test"))
-    with pytest.raises(RuntimeError, match="fit or load"):
-        make().save(tmp_path)
 
 
 class Sliding(AbstractDevice):

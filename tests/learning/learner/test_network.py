@@ -121,29 +121,6 @@ def test_readings_of_another_number_of_sensors_are_refused(build, made_up_device
         learner.probabilities(fewer)
 
 
-def test_probabilities_are_the_dense_layers_on_the_embedding(build, made_up_device):
-    learner, data = build("representation=graph", "model=gcn", "fusion.hidden=24", "trainer.max_epochs=1")
-    with pytest.raises(RuntimeError, match="fit or load"):
-        learner.embeddings(made_up_device.touches("test"))
-    classifier = learner.build(data)
-    touches = made_up_device.touches("train")  # more than one chunk
-    found = learner.embeddings(touches)
-    assert found.shape == (160, 24)
-    with torch.inference_mode():
-        expected = classifier.head(found).sigmoid()
-    assert torch.allclose(learner.probabilities(touches), expected, atol=1e-6)
-
-
-def test_callbacks_and_loggers_of_the_trainer_join_ours(build, tmp_path):
-    stop = "{_target_: pytorch_lightning.callbacks.EarlyStopping, monitor: val_loss, stopping_threshold: 100}"
-    log = f"{{_target_: pytorch_lightning.loggers.CSVLogger, save_dir: {tmp_path}, name: theirs}}"
-    learner, data = build(*DENSE, f"+trainer.callbacks=[{stop}]", f"+trainer.logger={log}")
-    learner.fit(data, CSVLogger(tmp_path, name="ours"))
-    for name in ("ours", "theirs"):
-        lines = next((tmp_path / name).rglob("metrics.csv")).read_text().splitlines()
-        assert len(lines) == 3  # validation and training of the first epoch, in which it stops
-
-
 @pytest.mark.parametrize(
     "overrides",
     [

@@ -15,15 +15,9 @@ from skin.device.base import AbstractDevice
 from skin.device.touches import Touches, one_hot
 from skin.errors import InputError
 from skin.learning.data import TouchData
-from skin.learning.features import above_idle, course_features
+from skin.learning.features import above_idle
 from skin.learning.representation import Readings
-from skin.learning.small_data import (
-    BestByCrossValidation,
-    ExtraTrees,
-    KernelRidge,
-    small_data_features,
-    touch_losses,
-)
+from skin.learning.small_data import BestByCrossValidation, ExtraTrees, KernelRidge, touch_losses
 from skin.touch.labels import TOUCH, Task
 
 PLACE = Task(("x", "force"), "regression")
@@ -132,13 +126,6 @@ def test_the_member_with_the_lower_held_out_loss_is_kept(tmp_path, capsys):
         BestByCrossValidation({})
 
 
-@pytest.mark.parametrize("make", [KernelRidge, FewTrees])
-def test_a_single_class_is_refused(make):
-    matrix = np.random.default_rng(0).normal(size=(20, 3))
-    with pytest.raises(InputError, match="all training touches have the same label press: give more"):
-        make().learn(matrix, np.ones((20, 1)), Task(("press",)))
-
-
 @pytest.mark.parametrize(("make", "other"), [(KernelRidge, FewTrees), (FewTrees, KernelRidge)])
 def test_damaged_and_foreign_files_are_refused(make, other, tmp_path):
     data = TouchData(Presses(PLACE), Readings)
@@ -200,17 +187,6 @@ def test_files_of_an_earlier_version_are_refused(name, learned, tmp_path):
         FewTrees().load(learned[0], tmp_path / name)
 
 
-@pytest.mark.parametrize("make", [KernelRidge, FewTrees])
-def test_touches_of_other_sensors_are_refused(make):
-    data = TouchData(Presses(PLACE), Readings)
-    learner = make()
-    learner.fit(data)
-    touches = data.touches("test")
-    fewer = Touches(touches.readings[..., :3], touches.valid[..., :3], touches.positions[:3], None, 10.0)
-    with pytest.raises(InputError, match=r"the learner was trained on \d+: give touches of the sensors"):
-        learner.probabilities(fewer)
-
-
 def test_losses_leave_out_what_is_unknown():
     labels = np.array([[1.0, 0, 0, np.nan], [np.nan] * 4])
     losses = touch_losses(np.full((2, 4), 0.5), labels, TOUCH)
@@ -229,15 +205,3 @@ def test_a_touch_from_the_first_frame_on_has_its_idle_level_at_its_end():
     readings = press + offsets + 0.01 * torch.randn(1, 30, 3, generator=source)
     touches = Touches(readings, torch.ones_like(readings).bool(), torch.zeros(3, 3), None, 10.0)
     torch.testing.assert_close(above_idle(touches), press, atol=0.05, rtol=0)
-
-
-def test_repeated_contacts_are_counted():
-    course = torch.zeros(1, 30, 1)
-    course[0, [3, 4, 10, 11, 12, 20], 0] = 1.0
-    touches = Touches(course, torch.ones_like(course).bool(), torch.zeros(1, 3), None, 10.0)
-    features = course_features(touches)
-    assert features["contacts above 0.3 of the sum"].item() == 3
-    assert features["mean contact above 0.3 of the sum"].item() == 2
-    assert features["span above 0.3 of the sum"].item() == 18
-    matrix = small_data_features(touches, TOUCH)
-    assert np.isfinite(matrix).all()

@@ -71,45 +71,6 @@ def test_the_file_gives_the_embeddings_of_torchvision(file):
     torch.testing.assert_close(embeddings.sum(dim=1), torch.tensor(SUMS), atol=1e-2, rtol=1e-5)
 
 
-def test_one_channel_is_fed_three_times(file):
-    images = noise((2, 1, 48, 48), 0).float()
-    three = loaded(file, (3, 48, 48)).eval()(images.repeat(1, 3, 1, 1), None)
-    torch.testing.assert_close(loaded(file, (1, 48, 48)).eval()(images, None), three)
-
-
-def test_many_images_are_encoded_in_parts(file):
-    images = noise((7, 1, 32, 32), 0).float()
-    torch.testing.assert_close(loaded(file, chunk=3).eval()(images, None), loaded(file).eval()(images, None))
-
-
-def test_a_frozen_encoder_stays_as_it_is(file, official):
-    model = loaded(file, frozen=True).train()
-    assert not any(parameter.requires_grad for parameter in model.parameters())
-    model(noise((4, 1, 32, 32), 0).float(), None)
-    assert all(torch.equal(now, official[name]) for name, now in model.state_dict().items())
-
-
-def test_training_draws_which_images_skip_a_block(file):
-    # torchvision: of the 16 blocks number i is skipped with probability 0.2 i / 16
-    model = loaded(file, dropout=0.0)
-    blocks = [block for stage in model.features[1:-1] for block in stage]
-    assert [block.skipped for block in blocks] == [0.2 * number / 16 for number in range(16)]
-    block = blocks[10].train()
-    assert block.residual
-    x = torch.randn(400, 112, 2, 2)
-    skipped = (block(x) == x).flatten(1).all(dim=1).float().mean()
-    assert 0.06 < skipped < 0.19  # of 0.125
-
-
-def test_dropout_takes_shares_of_the_embedding_in_training_only(file):
-    model, images = loaded(file, frozen=True), noise((4, 1, 32, 32), 0).float()
-    kept = model.eval()(images, None)
-    dropped = model.train()(images, None)
-    gone = dropped == 0
-    assert 0.15 < gone.float().mean() < 0.25
-    torch.testing.assert_close(dropped[~gone], kept[~gone] / 0.8)
-
-
 @pytest.mark.parametrize(
     "name", ["efficientnet_b0_rwightman-7f5810bc.pth", "efficientnet_b0_rwightman-3dd342df.pth"]
 )
@@ -132,11 +93,6 @@ def test_without_imagenet_a_sentence_says_where_to_put_it(tmp_path, monkeypatch)
         "model.weights=random trains from scratch",
     ):
         assert words in str(error.value)
-
-
-def test_a_file_that_is_not_there_is_refused(tmp_path):
-    with pytest.raises(InputError, match=r"no weights file .*none\.pth: give .*model\.weights=FILE\.pth"):
-        loaded(tmp_path / "none.pth")
 
 
 def cut_off(path):

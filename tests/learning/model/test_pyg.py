@@ -2,10 +2,10 @@
 
 import torch
 from torch_geometric.nn import DenseGCNConv
-from torch_geometric.nn.models import GCN, GraphSAGE
+from torch_geometric.nn.models import GCN
 
 from skin.learning.graph import Graph
-from skin.learning.pyg import Pyg
+from skin.learning.model import Pyg
 
 
 def graphs(count=3):
@@ -21,19 +21,3 @@ def test_one_layer_of_gcn_is_the_dense_product_with_the_adjacency():
     expected = (adjacency @ x @ convolution.lin.weight.T + convolution.bias).mean(dim=1)
     torch.testing.assert_close(model(x, adjacency), expected)
     assert not isinstance(convolution, DenseGCNConv)
-
-
-def test_a_graph_per_frame_is_the_same_as_one_for_all():
-    x, adjacency = graphs()
-    for network in (GCN, GraphSAGE):
-        model = Pyg("graph", (9, 2), network).eval()
-        torch.testing.assert_close(model(x, adjacency.expand(3, 9, 9)), model(x, adjacency))
-
-
-def test_neighbours_are_those_of_the_graph():
-    _, adjacency = graphs(1)
-    model = Pyg("graph", (9, 2), GraphSAGE, layers=1).eval()
-    edges, _ = model._edges(adjacency, 1)
-    assert set(map(tuple, edges.T.tolist())) == {
-        (a, b) for a in range(9) for b in range(9) if a != b and adjacency[a, b] != 0
-    }

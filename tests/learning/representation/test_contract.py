@@ -69,14 +69,6 @@ def test_an_invalid_reading_says_nothing(make, given):
         assert torch.equal(shown, representation(zero, torch.ones_like(valid)).x)
 
 
-def test_the_mask_tells_which_readings_are_valid(make, given):
-    positions, size, readings, valid = given
-    some = valid.clone()
-    some[:, :, 2] = False
-    representation = make(positions, size, mask=True)
-    assert not torch.equal(representation(0 * readings, valid).x, representation(0 * readings, some).x)
-
-
 def test_scale_divides_the_readings(make, given):
     positions, size, readings, valid = given
     one, other = (make(positions, size, scale=scale) for scale in (10.0, 5.0))

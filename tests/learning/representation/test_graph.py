@@ -8,7 +8,7 @@ from skin.body.base import Sheet
 from skin.body.layout import Grid
 from skin.device.touches import Touches
 from skin.errors import InputError
-from skin.learning.fusion import Early, Late, Linked
+from skin.learning.fusion import Early, Linked
 from skin.learning.graph import Graph, adjacency, neighbours, normalised, typical_distance
 from skin.learning.model import Gcn
 
@@ -113,45 +113,9 @@ def test_a_frame_whose_sensors_moved_has_the_graph_of_where_they_are(weight):
             np.testing.assert_allclose(matrices[gesture, frame].numpy(), expected, rtol=1e-5, atol=1e-7)
 
 
-@pytest.mark.parametrize("weight", ["exp", "distance", "stiffness"])
-def test_sensors_that_stay_have_the_graph_of_the_layout(weight):
-    still = touches(torch.zeros(2, 5, 9, 3))
-    x, matrices = Graph(PLACES, BODY.size, positions="deformed", weight=weight).show(still)[:2]
-    plain = Graph(PLACES, BODY.size, weight=weight).show(still)
-    assert plain.adjacency.shape == (9, 9)
-    torch.testing.assert_close(matrices, plain.adjacency.expand_as(matrices))
-    assert torch.equal(x, plain.x)
-
-
-def test_coordinates_follow_the_motion():
-    motion = moves()
-    x = Graph(PLACES, (0.16, 0.08), positions="deformed", coordinates=True).show(touches(motion)).x
-    torch.testing.assert_close(x[..., 1:], (PLACES + motion)[..., :2] / torch.tensor([0.16, 0.08]))
-
-
 def test_a_deformed_graph_needs_to_know_the_motion():
     with pytest.raises(InputError, match=r"Touches\(motion=\.\.\.\), or set"):
         Graph(PLACES, BODY.size, positions="deformed").show(touches())
-
-
-def test_one_sensor_may_move():
-    one = PLACES[:1]
-    graph = Graph(one, BODY.size, positions="deformed")
-    frames = graph.show(touches(torch.ones(2, 5, 1, 3), one))
-    assert torch.equal(frames.adjacency, torch.ones(2, 5, 1, 1))
-
-
-def test_late_fusion_takes_a_graph_per_frame():
-    """Every frame alone, encoded with its own graph, gives the same embedding."""
-    torch.manual_seed(0)
-    fusion = Late(lambda kind, shape: Gcn(kind, shape, [6, 7]), "graph", (9, 1), 5, head="max").eval()
-    frames = Graph(PLACES, BODY.size, positions="deformed").show(touches(moves(0.01)))
-    alone = torch.stack([fusion.model(frames.x[:, t], frames.adjacency[:, t]) for t in range(5)], dim=1).amax(
-        dim=1
-    )
-    torch.testing.assert_close(fusion(frames), alone)
-    still = Graph(PLACES, BODY.size).show(touches())
-    assert not torch.allclose(fusion(still), alone, atol=1e-4)
 
 
 @pytest.mark.parametrize("fusion", [Early, Linked])

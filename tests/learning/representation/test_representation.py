@@ -10,7 +10,6 @@ from scipy.spatial import Delaunay
 from skin.body.base import GEOMETRY
 from skin.device.touches import Touches
 from skin.errors import InputError
-from skin.learning.features import engineered_features
 from skin.learning.graph import Graph
 from skin.learning.representation import (
     Features,
@@ -55,10 +54,6 @@ def test_three_axes_of_a_site_are_three_features_of_one_place(kind):
     assert kind is not Graph or torch.equal(frames.adjacency, parts[0].adjacency)
 
 
-def test_a_sensor_on_the_far_edges_falls_in_the_last_pixel():
-    assert image([[0.16, 0.08, 0.0]], [10.0], pixels=48)[47, 47] == 1.0
-
-
 def test_sensors_on_one_pixel_are_averaged():
     picture = image([[0.101, 0.041, 0.0], [0.1011, 0.0412, 0.0], [0.02, 0.02, 0.0]], [2.0, 4.0, 6.0])
     torch.testing.assert_close(picture[picture != 0].sort().values, torch.tensor([0.3, 0.6]))
@@ -71,15 +66,6 @@ def test_the_spectrum_is_that_of_numpy(made_up_device):
     wanted = np.log(1 + np.abs(np.fft.fftshift(np.fft.fft2(image), axes=(-2, -1))))
     spectrum = Fourier(*given, pixels=48)(touches.readings, touches.valid).x
     np.testing.assert_allclose(spectrum.numpy(), wanted, atol=1e-5)
-
-
-def test_a_constant_lies_in_the_middle(made_up_device):
-    touches = made_up_device.touches("test")[:1]
-    spectrum = Fourier(touches.positions, made_up_device.size)(touches.readings.abs(), touches.valid).x[
-        0, 3, 0
-    ]
-    assert spectrum.argmax() == 32 * 64 + 32
-    assert torch.isclose(spectrum[32, 32], torch.log1p(touches.readings.abs()[0, 3].sum() / 10))
 
 
 def test_readings_then_their_mask():
@@ -104,12 +90,6 @@ def made():
     return Features(positions, (1.0, 1.0)), readings, torch.ones_like(readings, dtype=torch.bool)
 
 
-def test_a_constant_offset_is_not_seen(made):
-    represent, readings, valid = made
-    offset = torch.linspace(-1, 1, SENSORS)
-    torch.testing.assert_close(represent(readings + offset, valid).x, represent(readings, valid).x)
-
-
 def test_both_views_of_one_newton_above_idle(made):
     represent = made[0]
     readings = torch.zeros(1, TIME, SENSORS)
@@ -119,13 +99,6 @@ def test_both_views_of_one_newton_above_idle(made):
     # asinh(1 / 0.2) = ln(5 + sqrt(26))
     assert x[SENSORS + 2] == pytest.approx(2.3124383 / 2)
     assert x.count_nonzero() == 2
-
-
-def test_the_summary_holds_every_feature(made, made_up_device):
-    represent, readings, valid = made
-    summary = represent(readings, valid).summary
-    assert summary.shape == (6, len(engineered_features(made_up_device.touches("test"))))
-    assert torch.isfinite(summary).all()
 
 
 # Interpolation against planes and brute force.
@@ -151,13 +124,6 @@ def test_a_plane_is_reproduced_inside_the_hull(points, method, tolerance):
     assert np.abs(values - plane(targets))[inside].max() < tolerance
 
 
-def test_nearest_is_that_of_brute_force(points):
-    targets = centres(SIZE, 48)
-    nearest = np.linalg.norm(targets[:, None] - points, axis=2).argmin(axis=1)
-    assert (weights(points, targets, "nearest").argmax(axis=1) == nearest).all()
-    assert (weights(points, targets, "nearest").sum(axis=1) == 1).all()
-
-
 @pytest.mark.parametrize("method", ["linear", "cubic"])
 def test_outside_the_hull_the_nearest_value_holds(points, method):
     targets = centres(SIZE, 48)
@@ -168,52 +134,9 @@ def test_outside_the_hull_the_nearest_value_holds(points, method):
     )
 
 
-def test_cubic_is_linear_in_the_readings(points):
-    from scipy.interpolate import CloughTocher2DInterpolator
-
-    values = np.random.default_rng(1).normal(size=len(points))
-    targets = centres(SIZE, 48)
-    inside = Delaunay(points).find_simplex(targets) >= 0
-    direct = CloughTocher2DInterpolator(points, values, tol=1e-12, maxiter=5000)(targets)
-    np.testing.assert_allclose(
-        (weights(points, targets, "cubic") @ values)[inside], direct[inside], atol=1e-7
-    )
-
-
 def test_sensors_in_a_line_are_refused(points):
     with pytest.raises(InputError, match=r"got 3: set representation\.method=nearest"):
         weights(np.array([[0.0, 0.0], [0.1, 0.1], [0.2, 0.2]]), points, "linear")
-
-
-METHODS = ["nearest", "linear", "cubic"]
-
-
-@pytest.fixture
-def given(made_up_device):
-    touches = made_up_device.touches("test")[:3]
-    valid = touches.valid.clone()
-    valid[:, 4, 5] = False
-    return touches.positions, touches.readings, valid
-
-
-@pytest.mark.parametrize("pixels", [48, 64, 128])
-def test_several_methods_give_a_channel_each(given, pixels):
-    positions, readings, valid = given
-    together = Interpolation(positions, SIZE, METHODS, pixels)(readings, valid).x
-    assert together.shape == (3, 10, 3, pixels, pixels)
-    for channel, method in enumerate(METHODS):
-        alone = Interpolation(positions, SIZE, method, pixels)(readings, valid).x
-        torch.testing.assert_close(together[:, :, channel : channel + 1], alone)
-
-
-def test_the_mask_of_several_methods_follows_their_values(given):
-    positions, readings, valid = given
-    x = Interpolation(positions, SIZE, METHODS, mask=True)(readings, valid).x
-    plain = Interpolation(positions, SIZE, METHODS)
-    torch.testing.assert_close(x[:, :, :3], plain(readings, valid).x)
-    wanted = plain(10 * (~valid).float(), torch.ones_like(valid)).x
-    torch.testing.assert_close(x[:, :, 3:], wanted)
-    assert (wanted.amax(dim=(-2, -1)) > 0.5).sum() == 3 * 3  # in frame 4 of each touch, by each method
 
 
 # Virtual sites do not depend on the number and the order of the sensors.

@@ -21,7 +21,4 @@ def love(shape: tuple[int, int], cell: tuple[float, float], modulus: float) -> n
 
     kernel = (corner(1, 1) - corner(1, -1) - corner(-1, 1) + corner(-1, -1)) / (np.pi * modulus)
     row, column = (positions.ravel() for positions in np.indices(shape))
-    return kernel[
-        row[:, None] - row[None] + height - 1,
-        column[:, None] - column[None] + width - 1,
-    ]
+    return kernel[row[:, None] - row[None] + height - 1, column[:, None] - column[None] + width - 1]

@@ -70,13 +70,3 @@ def test_what_the_mesh_hides_is_put_back():
     ):
         before, after = (np.linalg.norm(left @ (matrix - exact) @ right) for matrix in (seen, grained))
         assert after < 0.6 * before
-
-
-def test_even_pressure_gets_nothing_added():
-    seen = torch.from_numpy(seen_at_corners())
-    torch.testing.assert_close(stabilise_checkerboard(seen, BODY).sum(1), seen.sum(1), rtol=1e-10, atol=0)
-
-
-def test_what_lacks_nothing_stays():
-    exact = torch.from_numpy(1.1 * half_space(4))
-    assert torch.equal(stabilise_checkerboard(exact, BODY), exact)

@@ -27,31 +27,9 @@ def test_touches_are_made_of_pressures_that_carry_their_force(device):
     assert (movie.frames >= 0).all()
 
 
-def test_a_device_draws_the_same_touches_again(device):
-    first, second = (device.replace().recording("test") for _ in range(2))
-    assert torch.equal(first.touches.readings, second.touches.readings)
-    assert torch.equal(first.touches.labels, second.touches.labels)
-
-
 @pytest.mark.parametrize("simulator", ["naive", "fem"])
 def test_rigid_objects_need_a_surface_that_gives_way(configured, simulator):
     with pytest.raises(
         InputError, match=f"simulator={simulator}: set simulator=solid, or contact=prescribed"
     ):
         build_device(configured("contact=rigid", f"simulator={simulator}"))
-
-
-def test_the_command_line_says_so_too(run, tmp_path):
-    done = run(tmp_path, "train.py", "simulator=naive", "contact=rigid")
-    assert done.returncode == 2
-    assert "set simulator=solid" in done.stderr
-    assert "Traceback" not in done.stderr
-
-
-def test_rigid_gestures_are_generated(run, tmp_path):
-    out = tmp_path / "touches.parquet"
-    rigid = [*SOLID, "contact=rigid", "n=16", *SMALL[:2]]
-    done = run(tmp_path, "generate.py", *rigid, f"out={out}", store=False)
-    assert done.returncode == 0, done.stderr
-    assert "0 frames not solved" in done.stdout
-    assert out.is_file()

@@ -13,17 +13,15 @@ from skin.errors import InputError
 from skin.mechanics.contact.prescribed import Prescribed
 from skin.mechanics.contact.rigid import Rigid, solids
 from skin.mechanics.simulator.base import AbstractSimulator, Response
-from skin.mechanics.simulator.naive import Naive
 from skin.touch.gestures import GestureSettings, TouchSampler
+from skin.touch.movie import ContactProblem
 from skin.touch.paths import Trajectories
-from skin.touch.sampler import ContactProblem
 from skin.touch.shapes import Pose, Shapes
 from tests.touch.movie_labels import movie_labels
 
 from .halfspace import love
 
 BODY = Sheet([0.16, 0.16], [20, 20], [{"material": "EcoFlex 00-30", "thickness": 0.015}])
-AREA = BODY.cell[0] * BODY.cell[1]
 SENSORS = Grid(5, 5).sensors(BODY)
 # A tenth as soft as the half-space, about as a layer glued to a table is.
 COMPLIANCE = torch.from_numpy(love(BODY.shape, BODY.cell, 10 * BODY.layers[0].material.young))
@@ -95,24 +93,6 @@ def test_labels_are_what_the_movie_gives(sampled):
     assert counts.tolist() == [4] * 16
 
 
-def test_frames_carry_the_total_force(sampled):
-    _, movie = sampled
-    totals = movie.pressure().sum((2, 3)) * AREA
-    torch.testing.assert_close(totals, movie.force, rtol=1e-4, atol=1e-4)
-    assert (movie.frames >= 0).all()
-
-
-def test_the_peak_is_the_highest_cell_and_within_its_range(sampled):
-    source, movie = sampled
-    peak = movie.pressure().amax((1, 2, 3))
-    torch.testing.assert_close(movie.parameters["peak"], peak, rtol=1e-5, atol=0)
-    dangerous = movie.labels[:, 3] > 0.5
-    settings = source.settings
-    for rows, (minimum, maximum) in ((dangerous, settings.dangerous_peak), (~dangerous, settings.safe_peak)):
-        assert (peak[rows] <= maximum).all()
-        assert (peak[rows] >= minimum).all()
-
-
 def test_every_frame_of_a_movie_is_at_rest(sampled):
     """The surface under pressure follows the object: gaps differ from the picture's by one number."""
     contact = sampled[0].contact
@@ -128,24 +108,6 @@ def test_every_frame_of_a_movie_is_at_rest(sampled):
         deepest = (one @ surface).max()
         assert np.ptp(heights[touched].numpy()) < 4e-4 * deepest
         assert heights[~touched].min() > heights[touched].mean() - 2e-4 * deepest
-
-
-def test_a_flat_stamp_is_proportional_and_a_relief_is_not():
-    fractions = (1.0, 0.25)
-    for contact, proportional in ((rigid(relief=0.0, fillet=0.0), True), (rigid(relief=0.01), False)):
-        frames = contact.press(still(0.03, fractions=fractions), problem(shapes=["fist"])).frames
-        assert torch.allclose(frames[0], frames[1], rtol=1e-2, atol=50) == proportional
-        assert (frames[1] > 0).sum() <= (frames[0] > 0).sum()
-
-
-def test_edges_of_a_flat_stamp_press_hardest_and_fillets_take_that_away():
-    position = problem(shapes=["disc"])
-    sharp, round_ = (
-        rigid(relief=0.0, fillet=fillet).press(still(0.045), position).frames[0] for fillet in (0, 0.02)
-    )
-    middle = sharp[8:12, 8:12].mean()
-    assert sharp.max() > 1.8 * middle
-    assert round_.max() / round_[8:12, 8:12].mean() < 0.7 * sharp.max() / middle
 
 
 def test_white_touches_first_and_the_outline_is_an_arc():
@@ -208,35 +170,11 @@ def test_the_end_of_a_range_is_tried_itself(maximum):
         assert not contact.press(stroke, where._replace(settings=settings)).refused.any(), peak
 
 
-def test_what_no_force_can_make_big_is_hopeless():
-    where = problem(shapes=["fingertip"])
-    pressed = rigid(relief=0.05).press(still(0.06, wanted=(1, 0, 0, 0)), where)
-    assert pressed.refused.all()
-    assert pressed.hopeless.all()
-    far = rigid().press(still(0.008, position=(0.096, 0.096), peak=120e3, wanted=(0, 0, 0, 1)), where)
-    assert far.refused.all()
-    assert not far.hopeless.any()
-
-
-def test_draws_that_fail_are_counted(sampled):
-    movie = sampled[1]
-    assert movie.parameters["draws"].sum() > 64
-    assert movie.parameters["unconverged"].sum() == 0
-
-
 def test_frames_that_do_not_converge_are_reported_and_not_used():
     hasty = sampler(rigid(iterations=5))
     with pytest.warns(RuntimeWarning, match=r"\d+ frames did not converge to contact.tolerance"):
         movie = hasty.sample(16, np.random.default_rng(5))
     assert movie.parameters["unconverged"].sum() > 0
-
-
-def test_contact_that_never_converges_is_refused():
-    with (
-        pytest.warns(RuntimeWarning, match="did not converge"),
-        pytest.raises(InputError, match=r"contact\.relief"),
-    ):
-        sampler(rigid(iterations=1), redraws=1).sample(16, np.random.default_rng(5))
 
 
 def test_the_same_seed_gives_the_same_movies_on_any_number_of_threads(sampled):
@@ -258,17 +196,6 @@ def test_the_same_seed_gives_the_same_movies_on_any_number_of_threads(sampled):
         assert torch.equal(first.labels, second.labels)
 
 
-def test_prescribed_gestures_have_pictures_for_pressure():
-    where = problem(shapes=["hand"])
-    trajectories = still(0.06, peak=40e3)
-    pressed = Prescribed().press(trajectories, where)
-    poses = trajectories.poses[:4]
-    picture = where.shapes.render(*poses)
-    torch.testing.assert_close(pressed.frames / pressed.frames.sum(), picture / picture.sum())
-    assert pressed.frames.max().item() == pytest.approx(40e3)
-    assert pressed.frames.sum().item() * AREA == pytest.approx(pressed.force[0], rel=1e-5)
-
-
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
@@ -281,11 +208,6 @@ def test_prescribed_gestures_have_pictures_for_pressure():
 def test_bad_settings_are_refused(settings, message):
     with pytest.raises(InputError, match=message):
         rigid(**settings)
-
-
-def test_a_simulator_without_a_surface_is_refused():
-    with pytest.raises(InputError, match="simulator=naive: set simulator=solid"):
-        Rigid(BODY, Naive(BODY, SENSORS))
 
 
 def test_the_skin_of_an_arm_falls_away_below_a_stamp():

@@ -97,35 +97,6 @@ def test_a_general_solver_finds_the_same():
         np.testing.assert_allclose(pressure[free] / total, found.x, atol=2e-5)
 
 
-def test_a_batch_is_its_problems_one_by_one():
-    compliance, gaps, totals = problems(count=300)
-    together = solve_contact(compliance, gaps, totals, tolerance=1e-8).pressure
-    for number in (0, 7, 255, 256, 299):
-        alone = solve_contact(compliance, gaps[[number]], totals[[number]], tolerance=1e-8).pressure[0]
-        torch.testing.assert_close(together[number], alone, rtol=0, atol=1e-6 * alone.max().item())
-
-
-def test_single_precision_is_enough():
-    compliance, gaps, totals = problems()
-    exact = solve_contact(compliance, gaps, totals, tolerance=1e-9).pressure
-    single = solve_contact(compliance.float(), gaps, totals, tolerance=1e-4)
-    assert (single.residual <= 1e-4).all()
-    error = (single.pressure - exact).abs().amax(1) / exact.amax(1)
-    assert error.max() < 2e-3
-
-
-def test_the_start_changes_the_way_and_not_the_end():
-    compliance, gaps, totals = problems()
-    even = solve_contact(compliance, gaps, totals, tolerance=1e-8)
-    warm = solve_contact(compliance, gaps, totals, start=even.pressure, tolerance=1e-8)
-    assert warm.iterations.sum() < even.iterations.sum() / 4
-    # One cell in contact, which alone can take no step, and none at all.
-    for start in (torch.zeros_like(gaps).index_fill(1, torch.tensor([3]), 1.0), torch.zeros_like(gaps)):
-        other = solve_contact(compliance, gaps, totals, start, tolerance=1e-8)
-        worst = (other.pressure - even.pressure).abs().amax(1) / even.pressure.amax(1)
-        assert worst.max() < 1e-6
-
-
 @pytest.mark.parametrize("touching", [[0], [0, 4], [0, 2, 4, 6]])
 def test_cells_that_are_exactly_at_rest_let_others_join(touching):
     """A ring of cells in whole numbers: the errors of the cells in contact are 0, without any rounding."""

@@ -7,8 +7,7 @@ from scipy.interpolate import RegularGridInterpolator
 from scipy.sparse.linalg import spsolve
 
 from skin.body.base import Sensors, Sheet
-from skin.mechanics.simulator.fem import PlatesAndBeams
-from skin.mechanics.simulator.plates import Structure
+from skin.mechanics.simulator.fem import PlatesAndBeams, Structure
 from tests.mechanics import pynite_model
 
 DRAGON = {"material": "Dragon Skin 10 Medium", "thickness": 0.010}
@@ -106,18 +105,3 @@ def test_pynite_agrees_with_the_cached_operator_on_sensors_at_every_interface(ca
         np.testing.assert_allclose(ours @ pressure.ravel(), theirs, rtol=0, atol=1e-6 * largest)
     motion = skin.double().motion(torch.from_numpy(pressure)).numpy()
     np.testing.assert_allclose(motion, answer, rtol=0, atol=1e-5 * np.abs(answer).max())
-
-
-@pytest.mark.parametrize("name", ["5x4, three layers", "4x5, three layers"])
-def test_pynite_agrees_on_the_force_that_the_layer_below_carries(name, tmp_path):
-    """A footprint around one node on its own section feels the axial force of that node's beam."""
-    structure = Structure(BODIES[name])
-    body = structure.body
-    pressure = load(body, "random")
-    model, _ = solved(structure, pressure)
-    for level in range(3):
-        depth = body.interfaces[level]
-        sensors = Sensors(np.array([[2 * body.cell[0], 3 * body.cell[1], depth]]), body.cell)
-        skin = PlatesAndBeams(body, sensors, reading="interface", cache=tmp_path)
-        beam = model.members[f"{level + 1},3,2"]
-        assert skin.operator.carried @ pressure.ravel() == pytest.approx(beam.axial(0, "Combo 1"), rel=1e-6)

@@ -8,10 +8,8 @@ import numpy as np
 import pytest
 
 from skin.body.base import Sensors, Sheet
-from skin.mechanics.array_cache import folder as cache_folder
 from skin.mechanics.simulator import fem as _operator
-from skin.mechanics.simulator.fem import build, cached
-from skin.mechanics.simulator.plates import Structure
+from skin.mechanics.simulator.fem import Structure, build, cached
 
 ECOFLEX = {"material": "EcoFlex 00-30", "thickness": 0.005}
 STRUCTURE = Structure(Sheet([0.04, 0.03], [4, 3], [ECOFLEX]))
@@ -89,23 +87,6 @@ def test_a_file_that_is_not_right_is_rebuilt(damage, tmp_path, built):
     assert len(built) == 2
 
 
-def test_nothing_in_a_file_is_executed(tmp_path):
-    """An object array would be unpickled, which runs code of the file's choice."""
-
-    class Bomb:
-        def __reduce__(self):
-            return (Path.touch, (tmp_path / "executed",))
-
-    folder = tmp_path / "operators"
-    cached(STRUCTURE, SENSORS, folder)
-    with np.load(stored(folder)) as file:
-        arrays = dict(file)
-    arrays["sensor"] = np.array([[Bomb()]], dtype=object)
-    np.savez(stored(folder), **arrays)
-    cached(STRUCTURE, SENSORS, folder)
-    assert not (tmp_path / "executed").exists()
-
-
 def other_body(**changes):
     return replace(STRUCTURE, body=replace(STRUCTURE.body, **changes)), SENSORS
 
@@ -131,15 +112,6 @@ def test_everything_it_depends_on_makes_another_file(other, tmp_path, built):
     assert len(built) == len(list(tmp_path.iterdir())) == 2
 
 
-def test_other_mechanics_make_another_file(tmp_path, built, monkeypatch):
-    cached(STRUCTURE, SENSORS, tmp_path)
-    edited = tmp_path / "_plate.py"
-    edited.write_text("# another plate")
-    monkeypatch.setattr(_operator, "_SOURCES", [*_operator._SOURCES[:-1], edited])
-    cached(STRUCTURE, SENSORS, tmp_path)
-    assert len(built) == 2
-
-
 def test_many_may_write_at_once(tmp_path):
     answers = []
     start = threading.Barrier(8)
@@ -158,27 +130,9 @@ def test_many_may_write_at_once(tmp_path):
     assert stored(tmp_path).suffix == ".npz"
 
 
-def test_a_failed_write_leaves_nothing_behind(tmp_path, monkeypatch):
-    def fail(*_args, **_kwargs):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(np, "savez", fail)
-    with pytest.raises(KeyboardInterrupt):
-        cached(STRUCTURE, SENSORS, tmp_path)
-    assert not list(tmp_path.iterdir())
-
-
 def test_a_folder_that_cannot_be_written_to_costs_a_warning(tmp_path):
     blocked = tmp_path / "file"
     blocked.write_text("")
     with pytest.warns(RuntimeWarning, match="the operator cannot be kept in"):
         operator = cached(STRUCTURE, SENSORS, blocked / "below")
     assert same(operator, build(STRUCTURE, SENSORS))
-
-
-def test_the_folder_is_given_or_taken_from_the_environment(tmp_path, monkeypatch):
-    monkeypatch.setenv("SKIN_CACHE", str(tmp_path / "environment"))
-    assert cache_folder(tmp_path / "given") == tmp_path / "given"
-    assert cache_folder(None) == tmp_path / "environment"
-    monkeypatch.delenv("SKIN_CACHE")
-    assert cache_folder(None).name == "skin"

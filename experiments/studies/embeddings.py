@@ -29,7 +29,7 @@ from experiments.studies.measures import Subject
 from experiments.studies.pages import Page, figure_text
 from experiments.studies.study import Statement
 from skin.device.base import AbstractDevice
-from skin.device.simulated import Simulated, report_balance
+from skin.device.simulated import Simulated, check_label_leakage
 from skin.device.touches import Touches
 from skin.errors import InputError
 from skin.evaluation.report import scattered_devices
@@ -75,7 +75,7 @@ class Embeddings:
 
     def __call__(self, subject: Subject) -> pd.DataFrame:
         device, learner = subject.device, subject.learner if subject.model else None
-        report_balance(device)
+        check_label_leakage(device)
         count = (len(self.attributes) * 3 + (learner is not None) + 2) * len(self.seeds)
         frame = pd.DataFrame(
             track(self.probe(device, learner), "probing", count, console=Console(stderr=True))

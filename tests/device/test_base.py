@@ -8,7 +8,7 @@ from hydra import compose, initialize_config_dir
 
 from skin.device.base import AbstractDevice, split_groups
 from skin.device.files import write_recording
-from skin.device.simulated import Simulated, report_balance
+from skin.device.simulated import Simulated, check_label_leakage
 from skin.errors import InputError
 from skin.evaluation.alarm import threshold_gestures
 from skin.evaluation.margins import measure_margins
@@ -82,7 +82,7 @@ def test_a_device_of_ones_own_needs_touches_alone(made_up_device, capsys):
     assert torch.equal(
         threshold_gestures(made_up_device, settings).readings, made_up_device.touches("validation").readings
     )
-    report_balance(made_up_device)
+    check_label_leakage(made_up_device)
     assert not capsys.readouterr().err
     assert made_up_device.blank() is made_up_device
     assert torch.equal(made_up_device.all_touches().readings, made_up_device.touches("test").readings)

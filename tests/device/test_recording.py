@@ -7,12 +7,13 @@ import torch
 
 from skin.body.layout import Grid, Scattered
 from skin.body.sheet import Sheet
-from skin.device.files import Manifest, describe_recording, read_recording, write_recording
+from skin.device.files import read_recording, write_recording
 from skin.device.recording import Recorded
 from skin.device.simulated import Simulated
 from skin.errors import InputError
 from skin.mechanics.simulator.naive import Naive
 from skin.touch.labels import Task
+from tests.device.conftest import write_data_set
 
 LAYER = [{"material": "EcoFlex 00-30", "thickness": 0.005}]
 BODY = Sheet([0.16, 0.16], [16, 16], LAYER)
@@ -29,21 +30,9 @@ def path(simulated, tmp_path_factory) -> str:
     return str(write_recording(simulated, tmp_path_factory.mktemp("files") / "x.parquet"))
 
 
-def data_set(simulated, folder) -> str:
-    """Write 50 touches as shards of 20, 20 and 10."""
-    source = {"seed": 0, "source_commit": "a", "source_dirty": "false", "config_hash": "1", "config": {}}
-    manifest = Manifest.of(describe_recording(simulated), [20, 20, 10], **source)
-    manifest.write(folder)
-    for number, first in enumerate(manifest.firsts):
-        shard = simulated[first : first + manifest.shards[number]]
-        shard = replace(shard, metadata={"config_hash": "1", "summary": {}})
-        write_recording(shard, manifest.path(folder, number), first)
-    return str(folder)
-
-
 @pytest.fixture(scope="module")
 def folder(simulated, tmp_path_factory) -> str:
-    return data_set(simulated, tmp_path_factory.mktemp("sets") / "touches")
+    return str(write_data_set(simulated, tmp_path_factory.mktemp("sets") / "touches"))
 
 
 @pytest.mark.parametrize("stored", ["path", "folder"])

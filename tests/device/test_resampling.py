@@ -166,11 +166,3 @@ def test_a_recorded_window_is_the_live_one_at_its_last_frame(rate):
         if begin is None and t > 1.5:
             begin = t
     assert compared >= 2
-
-
-def test_the_largest_of_each_interval_of_a_window_that_began():
-    window = Window(5, 10.0, 2)
-    for number in range(70):
-        window.add(frame(number / 100, [number % 7, -number]))
-    by_hand = [[max(n % 7 for n in range(k, k + 10)), -k] for k in range(20, 70, 10)]
-    assert window.since(0.2).values.tolist() == by_hand

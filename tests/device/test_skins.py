@@ -1,6 +1,7 @@
 """Touches on many skins, drawn in their ranges: what a batch holds, and that test skins are others."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -118,7 +119,7 @@ def distribution():
 def test_skin_distributions_lie_in_their_ranges(distribution):
     kinds, bodies = set(), set()
     for number in range(60):
-        skin = distribution.draw(generator(Stream.SKIN, 0, 0, number))
+        skin = SimpleNamespace(**distribution.draw(generator(Stream.SKIN, 0, 0, number)))
         sensors = skin.layout.sensors(skin.body)
         kinds.add(type(skin.layout).__name__)
         bodies.add(type(skin.body))
@@ -137,11 +138,11 @@ def test_skin_distributions_lie_in_their_ranges(distribution):
 
 def test_a_skin_that_reads_forces_between_layers_is_described_as_a_solid(distribution):
     def drawn(settings, number):
-        return settings.draw(generator(Stream.SKIN, 0, 0, number), mixed=True)
+        return SimpleNamespace(**settings.draw(generator(Stream.SKIN, 0, 0, number), mixed=True))
 
     def simulators(mixed):
         skins = [distribution.draw(generator(Stream.SKIN, 0, 0, n), mixed) for n in range(60)]
-        return [getattr(one.simulator, "func", one.simulator).__name__ for one in skins]
+        return [getattr(one["simulator"], "func", one["simulator"]).__name__ for one in skins]
 
     assert set(simulators(False)) == {"Solid"}, "as those of tests are"
     assert set(simulators(True)) == {"Solid", "PlatesAndBeams", "Naive"}

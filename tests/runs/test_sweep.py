@@ -1,6 +1,5 @@
 """A sweep counts its jobs as Hydra does, goes on after a failure, resumes, and tells what it found."""
 
-import os
 import socket
 import sqlite3
 import subprocess
@@ -125,67 +124,6 @@ def test_a_bad_job_fails_and_the_others_run(run, tmp_path, opened):
     assert [each[:2] for each in runs(store) if each[2]] == [(named(0, " offset=0.1"), "FINISHED")]
     (parent,) = parents(store)
     assert parent.info.status == "FAILED"
-
-
-@pytest.mark.slow("trains several networks in a process that shares nothing")
-def test_a_sweeper_gets_the_objective_and_draws_from_an_interval(tmp_path, opened):
-    (tmp_path / "hydra_plugins").mkdir()
-    (tmp_path / "hydra_plugins/ask.py").write_text(ASK)
-    given = ["train", "-m", *SMALL, "device.noise=interval(0.05,0.3)", f"tracking.artifacts={tmp_path}/a"]
-    given += [
-        "hydra/sweeper=ask",
-        f"hydra.sweep.dir={tmp_path}/out",
-        f"tracking.uri=sqlite:///{tmp_path}/m.db",
-    ]
-    paths = os.pathsep.join([str(tmp_path), *os.environ.get("PYTHONPATH", "").split(os.pathsep)])
-    done = subprocess.run(
-        [sys.executable, "-m", "skin", *given],
-        capture_output=True, text=True, timeout=300, cwd=tmp_path, env=os.environ | {"PYTHONPATH": paths},
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    assert [line for line in done.stdout.splitlines() if line.startswith("[3] device.noise=0.")]
-    store = opened(tmp_path)
-    (parent,) = parents(store)
-    assert (parent.info.run_name, parent.info.status) == ("device.noise=interval(0.05,0.3)", "FINISHED")
-    trials = [run.data for run in store.find(**{"mlflow.parentRunId": parent.info.run_id})]
-    assert len(trials) == 3
-    assert all(0.05 <= float(trial.params["device.noise"]) <= 0.3 for trial in trials)
-    told = {float(trial.params["device.noise"]): trial.metrics["best_val_accuracy"] for trial in trials}
-    assert OmegaConf.load(tmp_path / "out/told.yaml") == pytest.approx(told)
-
-
-ASK = """
-from hydra.core.config_store import ConfigStore
-from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.plugins import Plugins
-from hydra.plugins.sweeper import Sweeper
-from omegaconf import OmegaConf
-
-
-class Ask(Sweeper):
-    # Halves an interval.
-
-    def setup(self, *, hydra_context, task_function, config):
-        self.folder = config.hydra.sweep.dir
-        self.launcher = Plugins.instance().instantiate_launcher(
-            hydra_context=hydra_context, task_function=task_function, config=config
-        )
-
-    def sweep(self, arguments):
-        parsed = OverridesParser.create().parse_overrides(arguments)
-        (drawn,) = [override for override in parsed if override.is_sweep_override()]
-        others = [override.input_line for override in parsed if override is not drawn]
-        low, high, told = drawn.value().start, drawn.value().end, {}
-        for number in range(3):
-            value = low + (high - low) / 2**number
-            job = [*others, f"{drawn.get_key_element()}={value}"]
-            (result,) = self.launcher.launch([job], initial_job_idx=number)
-            told[value] = float(result.return_value)
-        OmegaConf.save(told, f"{self.folder}/told.yaml")
-
-
-ConfigStore.instance().store(group="hydra/sweeper", name="ask", node={"_target_": "hydra_plugins.ask.Ask"})
-"""
 
 
 @pytest.mark.slow("trains several runs")

@@ -150,15 +150,6 @@ def test_two_processes_make_one_run(run, tmp_path, opened):
     assert len(losses) == 2
 
 
-@pytest.mark.slow("trains in two processes that import anew")
-def test_a_sweep_trains_each_job_in_two_processes(run, tmp_path, opened):
-    two = ["trainer.devices=2", "trainer.strategy=ddp_spawn", f"hydra.sweep.dir={tmp_path}/out"]
-    done = run(tmp_path, "train", "-m", *SMALL, "seed=0", *two, apart=True)
-    assert done.returncode == 0, done.stderr
-    ((_, status, losses),) = logged(opened(tmp_path))
-    assert (status, len(losses)) == ("FINISHED", 1)
-
-
 @pytest.mark.slow("starts processes that import anew")
 @pytest.mark.parametrize(
     ("given", "said"),

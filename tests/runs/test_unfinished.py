@@ -13,14 +13,12 @@ from urllib.request import urlopen
 
 import pytest
 import torch
-from mlflow.exceptions import MlflowException
-from pytorch_lightning.loggers import MLFlowLogger
 
 from skin.errors import InputError
 from skin.learning.network import LAST
 from skin.runs.configuration import Tracking, source_tags
 from skin.runs.store import Store
-from skin.runs.train import RunLogger, find_unfinished
+from skin.runs.train import find_unfinished
 
 TRAINING = (
     "train", "experiment=best_fresh", "simulator=naive", "data.gestures=400", "learner.dropout=0.2",
@@ -138,26 +136,6 @@ def on_server(server):
     return run, history
 
 
-@pytest.mark.slow("waits for a server")
-def test_a_training_waits_for_a_server_that_is_away(begin, tmp_path):
-    server = Server(tmp_path)
-    own = [f"tracking.uri={server.uri}"]
-    with ExitStack() as stack:
-        with server:
-            training = stack.enter_context(begin(tmp_path, *TRAINING, *own))
-            wait_for(1, tmp_path, training, "mlartifacts")
-        time.sleep(3)
-        assert training.poll() is None
-        with server:
-            done = training.completed()
-    assert done.returncode == 0, done.stderr
-    run, history = on_server(server)
-    assert run.info.status == "FINISHED"
-    assert "same/overall/accuracy" in run.data.metrics
-    assert {name: len(set(steps)) for name, steps in history.items()} == {"train_loss": 8, "val_loss": 8}
-    assert all(len(steps) == 8 for steps in history.values())
-
-
 @pytest.mark.slow("trains twice and starts a server")
 def test_a_training_without_its_server_is_complete_when_repeated(begin, run, tmp_path, monkeypatch):
     monkeypatch.setenv("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "1")
@@ -221,17 +199,3 @@ def test_a_killed_run_of_another_machine_is_continued_where_its_folder_is_here(t
     assert find_unfinished(store, "a") is None
     (folder / LAST).touch()
     assert find_unfinished(store, "a").info.run_id == run.info.run_id
-
-
-def test_metrics_that_a_server_did_not_take_are_sent_by_the_next_logger(tmp_path, monkeypatch, opened):
-    store = opened(tmp_path)
-    run = store.create("a run", {})
-    logger = RunLogger(store, run.info.run_id, tmp_path)
-    with monkeypatch.context() as patch:
-        patch.setattr(MLFlowLogger, "log_metrics", lambda *_: (_ for _ in ()).throw(MlflowException("away")))
-        with pytest.raises(MlflowException):
-            logger.log_metrics({"train_loss": 0.5}, 3)
-    for _ in range(2):
-        RunLogger(store, run.info.run_id, tmp_path)
-    found = store.client.get_metric_history(run.info.run_id, "train_loss")
-    assert [(each.step, each.value) for each in found] == [(3, 0.5)]

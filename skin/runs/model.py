@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from annotated_types import Ge, Gt, MinLen
@@ -26,9 +26,6 @@ from skin.evaluation.decisions import LiveConditions
 from skin.evaluation.guarantee import Guarantee
 from skin.evaluation.operating_point import LABEL, DangerScore, OperatingPoint
 from skin.touch.labels import Task
-
-if TYPE_CHECKING:
-    pass
 
 
 class Model(ABC):

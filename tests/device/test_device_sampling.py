@@ -6,7 +6,7 @@ import torch
 
 from skin.device.imperfection import Imperfection
 from skin.device.resampling import Frame, Window, resample
-from skin.device.sampling import between_frames, draw_constants, idle_excess, measure
+from skin.device.sampling import between_frames, measure
 
 ROUGH = {"noise": 0.1, "drift": 0.05, "time_constant": 0.1, "hysteresis": 0.05, "quantum": 0.02, "clip": 4.0}
 
@@ -24,15 +24,6 @@ def test_the_middle_of_an_interval_is_the_frame(rate):
     number = round(rate / 10)
     fine = between_frames(touches(), 10.0, rate)
     assert torch.equal(fine[:, number // 2 :: number], touches())
-
-
-def test_between_two_frames_the_force_changes_linearly():
-    fine = between_frames(touches(), 10.0, 50.0)[0]
-    # From the middle of frame 4, the third of its interval, to that of frame 5.
-    expected = torch.stack(
-        [torch.lerp(touches()[0, 4], touches()[0, 5], fraction / 5) for fraction in range(6)]
-    )
-    torch.testing.assert_close(fine[22:28], expected)
 
 
 @pytest.mark.parametrize("rate", [20.0, 40.0, 50.0, 500.0])
@@ -77,18 +68,6 @@ def test_a_simulated_device_reads_like_a_real_one(rate):
             window.add(frame._replace(saturated=limited[gesture, number]))
         for measured, seen in zip(found, window.read(), strict=False):
             np.testing.assert_array_equal(measured[gesture].numpy(), seen)
-
-
-@pytest.mark.parametrize("rate", [20.0, 100.0, 500.0])
-def test_the_noise_of_an_interval_raises_idle_readings(rate):
-    device = Imperfection(rate=rate, noise=0.1)
-    constants = device.constants(3, np.random.default_rng(0))
-    drawn = 0.1 * np.random.default_rng(0).standard_normal((100000, round(rate / 10))).max(axis=1)
-    excess = idle_excess(constants, 10.0).item()
-    assert excess == pytest.approx(drawn.mean(), abs=5 * drawn.std() / np.sqrt(len(drawn)))
-    tared = Imperfection(rate=rate, noise=0.1, tare=True)
-    raised = draw_constants(tared, 3, 10.0, np.random.default_rng(0)).baseline
-    torch.testing.assert_close(raised, tared.constants(3, np.random.default_rng(0)).baseline + excess)
 
 
 def test_each_gesture_is_read_as_a_single_one_is():

@@ -71,18 +71,6 @@ def test_no_file_and_too_few_touches_are_refused(simulated, tmp_path):
         Recorded(BODY, LAYOUT, str(few))
 
 
-def test_a_data_set_is_made_in_parts(folder):
-    device = Recorded(BODY, LAYOUT, folder)
-    for split in ("train", "validation", "holdout"):
-        parts = device.parts(split)
-        made = [part.make() for part in parts]
-        assert [len(part) for part in made] == [part.count for part in parts]
-        joined = torch.cat([part.touches.readings for part in made])
-        assert torch.equal(joined, device.touches(split).readings)
-    assert len(device.parts("train")) > 1
-    assert [part.count for part in device.parts()] == [20, 20, 10]
-
-
 def test_no_more_is_held_out_than_needed(folder, monkeypatch):
     monkeypatch.setattr("skin.device.base.MOST_HELD_OUT", 2)
     device = Recorded(BODY, LAYOUT, folder)

@@ -15,7 +15,7 @@ import pytest
 from skin.core.files import ROOT
 from skin.errors import InputError
 from skin.runs.build import load_run
-from skin.runs.configuration import Tracking, hide_password, reveal_password, source_tags
+from skin.runs.configuration import Tracking, hide_password, reveal_password
 from skin.runs.run import FinishedRun
 from skin.runs.store import Store
 from tests.budget import free
@@ -103,12 +103,6 @@ def test_a_run_without_a_process_is_closed(settings, store):
         ended = [status(store, run) for run in (abandoned, elsewhere, mine)]
     assert ended == ["KILLED", "RUNNING", "RUNNING"]
     assert not (store.folder / f"{mine.info.run_id}.lock").exists()
-
-
-def test_a_child_knows_its_parent(store):
-    with store.run("parent", {}) as parent, store.run("child", {}, parent.info.run_id) as child:
-        assert child.data.tags["mlflow.parentRunId"] == parent.info.run_id
-        assert source_tags().items() <= child.data.tags.items()
 
 
 def test_a_store_is_opened_again_with_its_files_and_read_while_it_is_written(settings, store):

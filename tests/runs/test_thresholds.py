@@ -83,11 +83,13 @@ def found(run, tmp_path_factory):
     folder = tmp_path_factory.mktemp("thresholds")
     out, verbs, values = f"out={folder}/out", Thresholds(run, folder), {}
     tests = ("device.test_gestures=48", "evaluation.devices=0", "evaluation.layouts=0", SAFE)
-    adapted = ("adapt", "profile=rough", "adapt.gestures=16", "adapt.epochs=2")
+    few = ("device=recording", f"device.path={folder}/few.parquet")
+    adapted = ("adapt", *few, "adapt.gestures=16", "adapt.epochs=2")
     described = []
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("skin.runs.onnx_writer.write_model", lambda *words: described.append(words[1]) or 0.0)
         values["train"] = verbs.stored("train", *MODEL, *SKIN, *SMALL)
+        run(folder, "generate", *SKIN, "profile=rough", "n=20", f"out={folder}/few.parquet", store=False)
         values["evaluate"] = verbs.stored("evaluate", out, "device.seed=3")
         values["rate"] = verbs.stored("evaluate", out, "evaluation.false_alarm_rate=0.1")
         values["profile"] = verbs.stored("evaluate", out, ROUGH, "layout.footprint=[0.02,0.02]")

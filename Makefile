@@ -81,7 +81,6 @@ demo: $(READY)  ## show the predictions of a pretrained model for an emulated sk
 	@$(BIN)/skin live demo=true
 
 ui: $(READY)  ## compare runs in the MLflow UI on 127.0.0.1:5000
-	@$(BIN)/python -c "from skin.runs.store import print_table_link; print_table_link()"
 	MLFLOW_DISABLE_TELEMETRY=true MLFLOW_SERVER_ENABLE_JOB_EXECUTION=false $(BIN)/mlflow ui \
 		--backend-store-uri sqlite:///mlflow.db --host 127.0.0.1 --port 5000 --workers 1
 

@@ -7,7 +7,7 @@ import torch
 from hydra import compose, initialize_config_dir
 
 from skin.core.files import CONF, ROOT
-from skin.device.files import DataSet, Manifest
+from skin.device.files import DataSet, read_recording
 from skin.runs.build import build_device
 from skin.runs.configuration import settings_of, validate_config
 from skin.runs.generation import generate_data_set
@@ -33,8 +33,8 @@ def position(tmp_path_factory):
 def peaks(folder) -> dict[int, float]:
     """Return the highest first reading of each dangerous gesture, by its number."""
     data, found = DataSet(folder), {}
-    for number, first in enumerate(data.manifest.firsts):
-        shard = data.read(number)
+    for number, first in enumerate(data.firsts):
+        shard = read_recording(data.path(number))
         dangerous = shard.touches.labels[:, shard.task.names.index("dangerous")] == 1
         for row in torch.nonzero(dangerous).flatten().tolist():
             found[first + row] = float(shard.touches.readings[row, :, 0].max())
@@ -63,16 +63,16 @@ def first_column(table: str) -> list[str]:
     return re.findall(r"`(\w+)`", " ".join(row.split("|")[1] for row in table.splitlines() if "|" in row))
 
 
-def test_the_page_names_the_keys_of_the_manifest():
+def test_the_page_names_the_keys_of_the_manifest(position):
     table = PAGE[PAGE.index("| key |") : PAGE.index("`touches/shards/00000.parquet` and so on")]
     named = first_column(table)
-    assert sorted(named) == sorted(Manifest.__annotations__)
+    assert sorted(named) == sorted(DataSet(position / "touches").manifest)
 
 
 def test_the_page_names_the_columns(position):
     table = PAGE[PAGE.index("| column |") : PAGE.index("## Training")]
     named = first_column(table)
-    known = Manifest.read(position / "touches").columns
+    known = DataSet(position / "touches").manifest["columns"]
     assert {name for name in named if not name.endswith("_")} <= set(known)
     own = {name for name in known if not name.startswith(("reading_", "saturated_", "gesture_"))}
     assert own <= set(named)

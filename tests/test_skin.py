@@ -11,7 +11,6 @@ import torch
 
 import skin
 from skin.core.files import ROOT
-from skin.device.touches import Touches
 
 SMALL = ["simulator=naive", "data.gestures=200", "device.test_gestures=32", "evaluation.devices=0"]
 SMALL += ["evaluation.layouts=0", "evaluation.safe_gestures=64"]
@@ -65,7 +64,7 @@ def test_a_run_is_loaded_and_predicts_a_recording(run, tmp_path):
         assert done.returncode == 0, done.stderr
     trained = skin.load_run("latest", f"sqlite:///{tmp_path}/m.db")
     touches = skin.read_recording(tmp_path / "x.parquet").touches
-    probabilities = trained.predict(touches)
+    probabilities = trained.learner.probabilities(touches)
     assert probabilities.shape == (20, len(trained.labels))
     assert trained.labels == ("big", "dynamic", "press", "dangerous")
     assert 0 <= probabilities.min() <= probabilities.max() <= 1
@@ -173,15 +172,10 @@ def test_the_example_predicts_from_an_array(example):
     assert expected["press"] > 0.5 > expected["big"]
 
 
-def test_one_window_a_list_and_touches_give_the_same(example):
+def test_one_window_and_a_list_give_the_same(example):
     run, readings, probabilities = (example[name] for name in ("run", "readings", "probabilities"))
     np.testing.assert_allclose(run.predict(readings[0]), probabilities[0], atol=1e-5)
     np.testing.assert_allclose(run.predict(readings.tolist()), probabilities, atol=1e-5)
-    values = torch.from_numpy(readings).float()
-    touches = Touches(values.nan_to_num(), ~values.isnan(), run.sites, None, run.rate)
-    tensor = run.predict(touches)
-    assert isinstance(tensor, torch.Tensor)
-    np.testing.assert_allclose(tensor.numpy(), probabilities, atol=1e-5)
     assert run.predict(readings[:0]).shape == (0, 4)
 
 

@@ -2,13 +2,15 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import chain, pairwise
 from threading import Thread
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import torch
+from joblib import Parallel, delayed
 from torch import Tensor
 
 from skin.body.base import AbstractBody
@@ -242,14 +244,10 @@ def in_threads(work: Callable[[int], _T], count: int) -> list[_T]:
     """
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
-    pool, ended = ThreadPoolExecutor(threads), False
     try:
-        return list(pool.map(work, range(count)))
-    except (SystemExit, KeyboardInterrupt):
-        ended = True  # who ends a command need not wait for the batches that are being drawn
-        raise
+        # Who ends a command need not wait for the batches that are being drawn.
+        return Parallel(threads, backend="threading")(delayed(work)(number) for number in range(count))
     finally:
-        pool.shutdown(wait=not ended, cancel_futures=True)
         torch.set_num_threads(threads)
 
 
@@ -269,13 +267,9 @@ def in_background(work: Callable[[], _T]) -> Future[_T]:
 
 def one_ahead(work: Callable[[_S], _T], values: Iterable[_S]) -> Iterator[_T]:
     """Yield ``work(value)`` in order; the next one is computed on another thread meanwhile."""
-    current: Future[_T] | None = None
-    for value in values:
-        following = in_background(partial(work, value))
-        if current is not None:
-            yield current.result()
-        current = following
-    if current is not None:
+    begun = (in_background(partial(work, value)) for value in values)
+    for current, _ in pairwise(chain(begun, [None])):
+        assert current is not None
         yield current.result()
 
 

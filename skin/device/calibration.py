@@ -17,11 +17,11 @@ from pydantic import AfterValidator, AllowInfNan, NonNegativeInt, PositiveFloat
 from skin.body.base import MOST
 from skin.core import files
 from skin.core.safe_loading import TEXT, ChecksumError, check_text, parse_yaml, read_file, text_sum
-from skin.core.settings import RISING, check_settings, checked, configured
+from skin.core.settings import RISING, checked, configured
 from skin.device.resampling import INWARDS
 from skin.errors import InputError
 
-_LEAST = 1e-9  # of the reference: below, a power law is a line, whose slope is finite
+_LEAST = 1e-9  # of an exponent, and of the reference: below, a power law is a line, whose slope is finite
 
 
 def _check_rising(table: Sequence[Sequence[float]]) -> Sequence[Sequence[float]]:
@@ -86,20 +86,10 @@ class Curves:
         return {"exponent": self.exponent.tolist(), "at": self.at.tolist(), "tables": tables}
 
     @classmethod
-    def of_json(cls, stored: Mapping[str, Any], sensors: int) -> "Curves":
-        """Return the curves of so many sensors.
-
-        Raises:
-            ValueError: no curves, or those of another number of sensors.
-        """
-        exponent, at = (np.array(stored[name], dtype=float) for name in ("exponent", "at"))
+    def of_json(cls, stored: Mapping[str, Any]) -> "Curves":
+        """Return the curves of which :meth:`to_json` gave the data."""
         tables = {int(number): table for number, table in stored["tables"].items()}
-        check_settings(Calibration, {"tables": tables}, "curves")
-        if not exponent.shape == at.shape == (sensors,) or not set(tables) <= set(range(sensors)):
-            raise ValueError("curves of other sensors")
-        if not np.isfinite([exponent, at]).all() or not (np.array([exponent, at]) > 0).all():
-            raise ValueError("curves need finite numbers above 0")
-        return cls(exponent, at, tables)
+        return cls(np.array(stored["exponent"], float), np.array(stored["at"], float), tables)
 
 
 def _interpolate(values: Any, given: Sequence[float], result: Sequence[float]) -> Any:
@@ -178,8 +168,8 @@ class Calibration:
             if unknown := getattr(self, group).keys() - set(allowed):
                 raise InputError(f"{group} takes {', '.join(allowed)}, got {', '.join(sorted(unknown))}")
         for name, values in (*self.sensors.items(), *self.ranges.items()):
-            low = -_LARGEST if name in ("offset", "drift") else 0.0
-            high = math.inf if name == "clip" else _LARGEST
+            low = {"offset": -_LARGEST, "drift": -_LARGEST, "exponent": _LEAST}.get(name, 0.0)
+            high = {"clip": math.inf, "dead": len(self)}.get(name, _LARGEST)
             if not all(low <= value <= high for value in values if value is not None):
                 raise InputError(
                     f"{name} must be numbers from {low:g} to {high:g} (a channel whose values fall with "
@@ -201,10 +191,6 @@ class Calibration:
                 f"channels must hold each of 0 to {len(self) - 1} once, the channel of every sensor, got "
                 f"{list(self.channels)}"
             )
-        if any(number not in range(len(self) + 1) for number in self.ranges.get("dead", ())):
-            raise InputError(f"ranges.dead must be whole numbers up to {len(self)} sensors")
-        if (self.known("exponent") <= 0).any():
-            raise InputError("exponent must be above 0, as 0.5 of sensors that follow the root of the force")
 
     def __len__(self) -> int:
         return len(next(iter(self.sensors.values())))

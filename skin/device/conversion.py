@@ -1,8 +1,8 @@
 """Recordings of foreign files: touches cut from the tables of a mapping, or given by a Python function.
 
 What is not a plain table is read by a function ``reader(path) -> Recording``, which may call
-:func:`build_recording`; only the command line names it (``skin convert reader=package.function``), never a
-file.
+:func:`build_recording`, as :func:`eflesh` does; only the command line names it (``skin convert
+reader=package.function``), never a file.
 """
 
 from collections.abc import Mapping, Sequence
@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import torch
+from pydantic import PositiveFloat
 
 from skin.body.base import Sensors, require_memory
 from skin.core.settings import check_settings, import_target
@@ -64,17 +65,13 @@ def convert_files(
         part: {name: [touch[part][name] for touch in touches] for name in touches[0][part]}
         for part in ("targets", "labels", "groups")
     }
-    kinds, names = [touch["kind"] for touch in touches], None
-    if mapping.classes is not None and (given := mapping.classes.names):
-        given = given if isinstance(given, dict) else {name: name for name in given}
-        words = {key: _SWITCH[name] if isinstance(name, bool) else str(name) for key, name in given.items()}
-        kinds, names = [_lookup(words, kind) for kind in kinds], list(words.values())
+    classes = mapping.classes
     return build_recording(
         np.stack([touch["frames"] for touch in touches]),
         float(np.median([touch["rate"] for touch in touches])),
         **parts,
-        kinds=None if mapping.classes is None else kinds,
-        names=names,
+        kinds=None if classes is None else [touch["kind"] for touch in touches],
+        names=None if classes is None or classes.names is None else [*map(str, classes.names)],
         about=mapping.about,
         positions=sensors if mapping.positions == "layout" else mapping.positions,
         size=size if mapping.size is None else mapping.size,
@@ -92,13 +89,13 @@ def _read_touches(mapping: ForeignFormat, path: Path, folder: Path) -> list[_Tou
         values = np.stack([np.interp(grid, times, column) for column in values.T], axis=1).astype(np.float32)
         after = np.searchsorted(times, grid).clip(1, len(times) - 1)
         table = table.iloc[np.where(grid - times[after - 1] < times[after] - grid, after - 1, after)]
-    baseline = mapping.baseline
-    if baseline.kind == "idle":
+    if mapping.baseline == "idle":
         values = values - np.nanmedian(values, axis=0)
-    elif baseline.kind == "first":
-        values = values - _mean(values[: baseline.rows])
+    elif mapping.baseline is not None:
+        first = values[: mapping.baseline]
+        values = values - np.nan_to_num(first).sum(axis=0) / (~np.isnan(first)).sum(axis=0).clip(1)
     targets = {
-        name: TARGETS[name][its.unit] * _numbers(table, its.column, path, f"targets.{name}")
+        name: TARGETS[name][its.unit] * parse_numbers(table, its.column, path, f"targets.{name}")
         for name, its in (mapping.targets or {}).items()
     }
     labels, groups = mapping.labels or {}, mapping.groups
@@ -145,7 +142,6 @@ def _readings(mapping: ForeignFormat, table: pd.DataFrame, path: Path) -> np.nda
     names: Sequence[Column] = its.columns
     if isinstance(its.columns, str):
         names = [name for name in table.columns if fnmatch(name, its.columns)] or [its.columns]
-    require_columns(table, names, path, "channels.columns")
     require_memory(
         8.0 * len(table) * len(names), f"{path}, {len(table)} rows,", "convert fewer files at a time"
     )
@@ -154,7 +150,7 @@ def _readings(mapping: ForeignFormat, table: pd.DataFrame, path: Path) -> np.nda
         raise InputError(f"channels.scale has {len(factor)} numbers, {path} has {len(names)} channels")
     values = np.empty((len(table), len(names)), dtype=np.float32)
     for number, (name, scale) in enumerate(zip(names, np.broadcast_to(factor, len(names)), strict=True)):
-        values[:, number] = scale * parse_numbers(table, name, path)
+        values[:, number] = scale * parse_numbers(table, name, path, "channels.columns")
         _check_missing(values[:, number], name, path)
     return values
 
@@ -209,12 +205,6 @@ def _rate(
     return rate, np.arange(times[0], times[-1] + 0.5 / rate, 1 / rate)
 
 
-def _mean(values: np.ndarray) -> np.ndarray:
-    """Return the mean of rows, (S,); 0 where there is no value."""
-    present = ~np.isnan(values)
-    return np.where(present, values, 0).sum(axis=0) / present.sum(axis=0).clip(1)
-
-
 def _segments(mapping: ForeignFormat, values: np.ndarray) -> list[slice]:
     """Return the rows of each touch."""
     its, count = mapping.segments, len(values)
@@ -231,50 +221,34 @@ def _segments(mapping: ForeignFormat, values: np.ndarray) -> list[slice]:
     return [slice(int(begin), int(begin) + its.frames) for begin in begins]
 
 
-def _numbers(table: pd.DataFrame, name: Column, path: Path, what: str) -> np.ndarray:
-    """Return a column that the setting ``what`` names, (R,), NaN where there is no number."""
-    require_columns(table, [name], path, what)
-    return parse_numbers(table, name, path)
-
-
 def _reduce(name: str, values: np.ndarray) -> float:
     """Return the quantity of a touch: the mean position, the strongest force; NaN where unknown."""
     present = values[~np.isnan(values)]
-    if not len(present):
-        return np.nan
-    return float(present[np.abs(present).argmax()] if name.startswith("force") else present.mean())
-
-
-_SWITCH = {True: "on", False: "off"}
-
-
-def _lookup(values: Mapping[Any, Any], text: str | None) -> Any:
-    """Return the value of a text among values by key; YAML reads the keys on, yes and true as one."""
-    for key, value in values.items():
-        words = ("on", "yes", "true") if key else ("off", "no", "false")
-        if text == str(key) or (isinstance(key, bool) and text is not None and text.lower() in words):
-            return value
-    return None
+    meant = present[np.abs(present).argsort()[-1:]] if name.startswith("force") else present
+    return float(meant.mean()) if len(meant) else np.nan
 
 
 def _joined(columns: Column | Sequence[Column], table: pd.DataFrame, path: Path, what: str) -> np.ndarray:
     """Return the texts of columns, joined by a blank, of each row, (R,); None where one has no value."""
-    names = [columns] if isinstance(columns, str | int) else columns
+    names = [str(name) for name in ([columns] if isinstance(columns, str | int) else columns)]
     require_columns(table, names, path, what)
-    texts = []
-    for name in names:
-        codes, values = pd.factorize(table[str(name)])  # -1 where there is no value
-        # Whole numbers have no decimals.
-        words = [f"{value:.12g}" if isinstance(value, float) else str(value).strip() for value in values]
-        texts.append(np.array([*words, None], dtype=object)[codes])
-    rows = zip(*texts, strict=True)
-    return np.array([None if None in row else " ".join(row) for row in rows], dtype=object)
+    words = [table[name].map(_text, na_action="ignore").astype("string") for name in names]
+    joined = words[0].str.cat(words[1:], sep=" ").astype(object)
+    return joined.where(joined.notna(), None).to_numpy()
 
 
-def _single(texts: Sequence[str | None], mapping: ForeignFormat, where: str, values: Any = None) -> Any:
+def _text(value: Any) -> str:
+    """Return a value as text; whole numbers have no decimals."""
+    return f"{value:.12g}" if isinstance(value, float) else str(value).strip()
+
+
+def _single(
+    texts: Sequence[str | None], mapping: ForeignFormat, where: str, values: Mapping[Any, Any] | None = None
+) -> Any:
     """Return the text of a touch, or its value among ``values``; None where it is unknown."""
     known = [text for text in texts if text is not None]
-    found = {text if values is None else _lookup(values, text) for text in known} - {None}
+    named = None if values is None else {str(key): value for key, value in values.items()}
+    found = {text if named is None else named.get(text) for text in known} - {None}
     if len(found) < 2:
         return next(iter(found), None)
     if mapping.segments.by in ("windows", "contact"):  # its label changes within it
@@ -457,4 +431,96 @@ def summarise_conversion(recording: Recording) -> str:
             *parts,
             f"positions {metadata.get('positions', 'of the recording')}",
         ]
+    )
+
+
+# Readers of public data sets, as examples of a function of one's own.
+
+
+_EPI = ("hold", "rub", "pat", "pick", "poke", "press", "scratch", "slap", "stroke", "tap", "tickle")
+# Labels of the report by the names of the gestures; others are unknown: no force, and pat and pick repeat.
+_EPI_LABELS = {
+    "big": {0: 1, 1: 1, 2: 1, 7: 1, 8: 1, 3: 0, 4: 0, 5: 0, 6: 0, 9: 0, 10: 0},  # with the hand
+    "dynamic": {1: 1, 6: 1, 8: 1, 10: 1, 0: 0, 2: 0, 4: 0, 5: 0, 7: 0, 9: 0},
+    "press": {0: 1, 1: 1, 5: 1, 6: 1, 8: 1, 10: 1, 4: 0, 7: 0, 9: 0},
+}
+
+
+def epi(path: Path, frames: int = 100, duration: PositiveFloat = 3.5) -> Recording:
+    """Read the touches of the head of the robot Epi: 11 gestures on 12 electrodes, without a stated licence.
+
+    Each row holds all frames of the first electrode, then of the second, and so on.
+
+    Args:
+        path: folder of ``training_data_x.csv`` and ``training_data_y.csv``, of
+            github.com/axelholmqvist/humanoid-touch-classification.
+        frames: per touch.
+        duration: of a touch, s.
+
+    Raises:
+        InputError: no such files, or a row of another length.
+    """
+    try:
+        values, kinds = (
+            pd.read_csv(path.expanduser() / f"training_data_{name}.csv", header=None) for name in "xy"
+        )
+        readings = (0.1 * values.to_numpy(dtype=float)).astype(np.float32)
+        numbers = kinds.to_numpy(dtype=int).ravel()
+        touches = readings.reshape(len(numbers), -1, frames).swapaxes(1, 2)
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path} has no touches of Epi: {' '.join(str(error).split())}") from error
+    return build_recording(
+        np.ascontiguousarray(touches),
+        round(frames / duration, 2),
+        labels={name: [its.get(number) for number in numbers] for name, its in _EPI_LABELS.items()},
+        kinds=[_EPI[number] for number in numbers],
+        names=_EPI,
+        about="Epi, A. Holmqvist, M. Karlsson and M. Mirstroem, "
+        "github.com/axelholmqvist/humanoid-touch-classification, no licence stated",
+    )
+
+
+def eflesh(path: Path) -> Recording:
+    """Read presses of eFlesh, magnetometers under a printed lattice; each row is a touch of five frames.
+
+    Targets are the force of the gauge, where there is one, with the label ``dangerous`` above 10 N, an
+    example; or the position of the probe, with the labels ``right`` and ``low``. The group is the session.
+
+    Args:
+        path: a folder of characterization/datasets of github.com/notvenky/eFlesh.
+
+    Raises:
+        InputError: no such files, or files of different lengths.
+    """
+    files = sorted(path.expanduser().glob("*/sensor_post_baselines.csv"))
+    if not files:
+        raise InputError(f"{path} has no file */sensor_post_baselines.csv: give a folder of eFlesh")
+    try:
+        tables = [pd.read_csv(file, header=None) for file in files]
+        states = [pd.read_csv(file.with_name("states.csv"), header=None) for file in files]
+        if list(map(len, tables)) != list(map(len, states)):
+            raise ValueError("states.csv needs as many rows in the same order")
+        fields = pd.concat(tables).to_numpy(dtype=float)[:, 1:]
+        session = np.repeat([file.parent.name for file in files], list(map(len, tables)))
+        _, x, y, _, *gauge = pd.concat(states).to_numpy(dtype=float).T
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path} has no presses of eFlesh: {' '.join(str(error).split())}") from error
+    readings = np.zeros((len(fields), 5, fields.shape[1]), np.float32)
+    readings[:, 2] = 0.1 * fields  # the scale is nominal
+    place = {"x": 1e-3 * (x - 274), "y": 1e-3 * (y + 115)}
+    # Gram is inferred: it reproduces the published error. -1 stands for no value.
+    targets = {"force": FORCES["g"] * np.where(gauge[0] == -1, np.nan, gauge[0])} if gauge else place
+    limits = {"dangerous": ("force", 10.0)} if gauge else {"right": ("x", 0.015), "low": ("y", 0.015)}
+    return build_recording(
+        readings,
+        10.0,  # nominal, of presses without a time
+        targets={name: values.tolist() for name, values in targets.items()},
+        labels={
+            label: [None if np.isnan(value) else int(value > limit) for value in targets[name]]
+            for label, (name, limit) in limits.items()
+        },
+        groups={"session": session.tolist()},
+        about="eFlesh, github.com/notvenky/eFlesh, MIT License, Copyright (c) 2025 Venkatesh Pattabiraman",
+        per_sensor=3,
+        size=None if gauge else (0.03, 0.03),
     )

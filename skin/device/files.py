@@ -15,7 +15,7 @@ The same columns are written to CSV, for a spreadsheet; without the rest, such a
 import json
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from itertools import accumulate
 from math import nan
 from pathlib import Path
@@ -230,6 +230,9 @@ def read_description(path: Path) -> dict[str, Any]:
         return _describe(path)[0]
 
 
+_AGAIN = "delete it, and repeat the skin generate that made the data set, which draws it again"
+
+
 @contextmanager
 def refused(path: Path) -> Iterator[None]:
     """Turn errors of a file that cannot be read as a recording into an InputError."""
@@ -241,6 +244,7 @@ def refused(path: Path) -> Iterator[None]:
         raise
     except (OSError, pa.ArrowException, ValueError, KeyError, OverflowError, RecursionError) as error:
         reason = " ".join(str(error).split())
+        reason += f": {_AGAIN}" if (path.parent.parent / MANIFEST).is_file() else ""
         raise InputError(f"{path} is damaged or no recording of this project: {reason}") from error
 
 
@@ -323,153 +327,105 @@ def from_table(table: pa.Table, about: dict[str, Any], task: Task) -> Recording:
 # touches of all, and ``manifest.json`` with schema, version, units, seed, source commit and configuration.
 
 _Positive = Annotated[int, Ge(1)]
-_AGAIN = "delete it, and repeat the skin generate that made the data set, which draws it again"
 
 
-@dataclass(frozen=True)
-class Manifest:
-    """Description of a data set.
+def _manifest(
+    version: int,
+    columns: dict,
+    units: dict,
+    gestures: _Positive,
+    frames: _Positive,
+    rate: Annotated[float, Gt(0)],
+    seed: int | None,
+    source_commit: str,
+    source_dirty: str,
+    config_hash: str,
+    config: dict,
+    shards: Annotated[list[_Positive], MinLen(1)],
+) -> None:
+    """Name the entries of a manifest, with their types."""
 
-    Attributes:
-        version: of the schema.
-        columns: name of each column of a shard -> its type.
-        units: quantity -> its unit; columns without one are numbers.
-        gestures: number of touches in all shards.
-        frames: of each touch.
-        rate: frames per second, Hz.
-        seed: of the gestures.
-        source_commit: last commit of the code that draws them; without git, the version of the package.
-        source_dirty: whether files differed from that commit: true, false or unknown.
-        config_hash: of the configuration, of the files that it names and of the version of the package.
-        config: the configuration.
-        shards: number of touches of each shard.
+
+def write_manifest(folder: Path, about: dict[str, Any], shards: Sequence[int], **source: Any) -> None:
+    """Begin a data set: write its manifest.
+
+    Args:
+        folder: of the data set.
+        about: description of any shard (:func:`describe_recording`).
+        shards: number of touches of each.
+        source: seed, source_commit, source_dirty, config_hash and config of the touches.
     """
-
-    version: int
-    columns: dict[str, str]
-    units: dict[str, str]
-    gestures: _Positive
-    frames: _Positive
-    rate: Annotated[float, Gt(0)]
-    seed: int | None
-    source_commit: str
-    source_dirty: str
-    config_hash: str
-    config: dict
-    shards: Annotated[list[_Positive], MinLen(1)]
-
-    @classmethod
-    def of(cls, about: dict[str, Any], shards: Sequence[int], **source: Any) -> "Manifest":
-        """Return the manifest of shards.
-
-        Args:
-            about: description of any of them (:func:`skin.device.files.describe_recording`).
-            shards: number of touches of each.
-            source: seed, source_commit, source_dirty, config_hash and config.
-        """
-        columns = {name: str(kind) for name, kind in column_types(about).items()}
-        counts = sum(shards), about["frames"], about["rate"]
-        return cls(FORMAT, columns, UNITS, *counts, shards=list(shards), **source)
-
-    @classmethod
-    def read(cls, folder: Path) -> "Manifest":
-        """Return the manifest in a folder.
-
-        Raises:
-            InputError: there is none, it is damaged, or of another version.
-        """
-        path = folder / MANIFEST
-        if not path.is_file():
-            raise InputError(
-                f"{folder} is no data set, because it has no {MANIFEST}: give a folder that skin generate "
-                f"n=1000 out={folder.name} made, or the .parquet file beside the folder of a session"
-            )
-        try:
-            stored = parse_json(read_file(path))
-        except (OSError, ValueError) as error:
-            raise InputError(f"{path} is damaged: {error}: restore it, or generate the data again") from error
-        check_settings(cls, stored, str(path), whole=True)
-        manifest = cls(**stored)
-        if manifest.version != FORMAT:
-            raise InputError(
-                f"{path} has schema version {manifest.version}, this program reads version {FORMAT}: "
-                "use the program that wrote it, or generate the data again"
-            )
-        if manifest.units != UNITS or sum(manifest.shards) != manifest.gestures:
-            raise InputError(
-                f"{path} is damaged: its units or counts are not those that were written: generate the data "
-                "again"
-            )
-        return manifest
-
-    def write(self, folder: Path) -> None:
-        """Write the manifest into a folder."""
-        files.write(files.json_line(vars(self), indent=1) + "\n", folder / MANIFEST)
-
-    def path(self, folder: Path, number: int) -> Path:
-        """Return the path of a shard."""
-        return folder / "shards" / f"{number:05d}.parquet"
-
-    def missing(self, folder: Path) -> list[int]:
-        """Return the numbers of the shards that are not in a folder."""
-        return [n for n in range(len(self.shards)) if not self.path(folder, n).is_file()]
-
-    @property
-    def firsts(self) -> list[int]:
-        """The number of the first touch of each shard."""
-        return list(accumulate(self.shards[:-1], initial=0))
+    manifest = {
+        "version": FORMAT,
+        "columns": {name: str(kind) for name, kind in column_types(about).items()},
+        "units": UNITS,
+        "gestures": sum(shards),
+        "frames": about["frames"],
+        "rate": about["rate"],
+        **source,
+        "shards": list(shards),
+    }
+    files.write(files.json_line(manifest, indent=1) + "\n", folder / MANIFEST)
 
 
 class DataSet:
-    """A complete data set in a folder.
+    """A data set in a folder.
 
     Opening it reads the manifest and the description of every shard, but no touches.
 
     Args:
         folder: as ``skin generate out=FOLDER`` wrote it.
+        complete: whether all shards must be there; False: only the manifest is read.
 
     Attributes:
-        manifest: its manifest.
+        manifest: content of its manifest.
         counts: number of touches of each shard.
+        firsts: number of the first touch of each shard.
+        missing: numbers of the shards that are not there.
 
     Raises:
         InputError: there is no manifest, or a shard is missing, damaged or of another data set.
     """
 
-    def __init__(self, folder: str | Path) -> None:
+    def __init__(self, folder: str | Path, complete: bool = True) -> None:
         self.folder = Path(folder).expanduser()
-        self.manifest = Manifest.read(self.folder)
-        self.counts = self.manifest.shards
-        if missing := self.manifest.missing(self.folder):
+        path = self.folder / MANIFEST
+        if not path.is_file():
             raise InputError(
-                f"{self.folder} is not complete, {len(missing)} of {len(self.counts)} shards are missing, as "
-                f"{self.path(missing[0]).name} is: repeat the skin generate that made it, which adds them"
+                f"{folder} is no data set, because it has no {MANIFEST}: give a folder that skin generate "
+                f"n=1000 out={self.folder.name} made, or the .parquet file beside the folder of a session"
             )
-        for number, (count, first) in enumerate(zip(self.counts, self.manifest.firsts, strict=True)):
-            with _advise_repair():
-                about = read_description(self.path(number))
+        try:
+            self.manifest = parse_json(read_file(path))
+        except (OSError, ValueError) as error:
+            raise InputError(f"{path} is damaged: {error}: restore it, or generate the data again") from error
+        check_settings(_manifest, self.manifest, str(path), whole=True)
+        self.counts: list[int] = self.manifest["shards"]
+        expected = self.manifest | {"version": FORMAT, "units": UNITS, "gestures": sum(self.counts)}
+        if wrong := [name for name, value in expected.items() if self.manifest[name] != value]:
+            raise InputError(
+                f"{path} has {wrong[0]} {self.manifest[wrong[0]]}, not {expected[wrong[0]]}: use the version "
+                "of this program that wrote it, or generate the data again"
+            )
+        self.firsts = list(accumulate(self.counts[:-1], initial=0))
+        self.missing = [n for n in range(len(self.counts)) if not self.path(n).is_file()]
+        if complete:
+            self._check_shards()
+
+    def _check_shards(self) -> None:
+        """Raise InputError unless every shard is there and is the one that the manifest describes."""
+        if self.missing:
+            raise InputError(
+                f"{self.folder} is not complete, {len(self.missing)} of {len(self.counts)} shards are "
+                f"missing, as {self.path(self.missing[0]).name} is: repeat the skin generate that made it, "
+                "which adds them"
+            )
+        for number, (count, first) in enumerate(zip(self.counts, self.firsts, strict=True)):
+            about = read_description(self.path(number))
             expected = about["gestures"], about["first"], about["metadata"].get("config_hash")
-            if expected != (count, first, self.manifest.config_hash):
+            if expected != (count, first, self.manifest["config_hash"]):
                 raise InputError(f"{self.path(number)} is not the shard that {MANIFEST} describes: {_AGAIN}")
 
     def path(self, number: int) -> Path:
         """Return the path of a shard."""
-        return self.manifest.path(self.folder, number)
-
-    def read(self, number: int, complete: bool = True) -> Recording:
-        """Return the touches of a shard; ``complete`` adds force and parameters.
-
-        Raises:
-            InputError: the shard is damaged.
-        """
-        with _advise_repair():
-            return read_recording(self.path(number), complete)
-
-
-@contextmanager
-def _advise_repair() -> Iterator[None]:
-    """Add to an InputError about a shard what to do."""
-    try:
-        yield
-    except InputError as error:
-        raise InputError(f"{error}: {_AGAIN}") from error
+        return self.folder / "shards" / f"{number:05d}.parquet"

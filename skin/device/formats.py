@@ -1,16 +1,14 @@
 """Formats of foreign recordings: a mapping says what plain tables hold, and the tables themselves.
 
-A mapping is YAML with the settings of :class:`ForeignFormat`. Columns are named by the header or, without
-one, numbered from 1; the named groups of the regular expression ``fields`` become columns, too.
+A mapping is YAML with the settings of :class:`ForeignFormat`, and pandas reads the tables. Columns are named
+by the header or, with ``table: {header: null}``, numbered from 0; the named groups of the regular expression
+``fields`` become columns, too.
 """
 
-import json
 import re
 import zipfile
-from codecs import BOM_UTF16_BE, BOM_UTF16_LE
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from io import StringIO
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -38,41 +36,11 @@ TIME = " time"
 
 
 @dataclass(frozen=True)
-class TableFormat:
-    """How a file is written: text with a delimiter, JSON lines (``.jsonl``), or a spreadsheet.
-
-    Attributes:
-        delimiter: between columns; ``whitespace`` takes any number of blanks and tabs.
-        begin: regular expression that the first line of the table contains; lines before it are skipped.
-        header: whether the first line names the columns.
-        units: whether the row below the header holds units, and is skipped.
-        encoding: of the text; UTF-16 is recognised by its byte order mark.
-        decimal: sign before the decimals.
-        comment: sign that begins a comment.
-        sheet: name or number, from 0, of a spreadsheet's sheet.
-        missing: text or numbers that stand for no value, besides empty, ``nan`` and the like.
-        long: columns of the sensor and of its value, where each row holds one reading.
-    """
-
-    delimiter: str = ","
-    begin: str = ""
-    header: bool = True
-    units: bool = False
-    encoding: str = "utf-8-sig"
-    decimal: str = "."
-    comment: str | None = None
-    sheet: int | str = 0
-    missing: Sequence[str | float] = ()
-    long: tuple[Column, Column] | None = None
-
-
-@dataclass(frozen=True)
 class TimeColumn:
-    """Column of the time: numbers in a unit, or dates and times in a ``format`` of strptime."""
+    """Column of the time: numbers in a unit, or dates, which ``table: {parse_dates: [NAME]}`` reads."""
 
     column: Column
     unit: Literal["s", "ms", "us", "ns", "min"] = "s"
-    format: str = "ISO8601"
 
 
 @dataclass(frozen=True)
@@ -88,19 +56,6 @@ class ChannelColumns:
     columns: Annotated[Sequence[Column], MinLen(1)] | str
     unit: str
     scale: float | Sequence[float] | None = None
-
-
-@dataclass(frozen=True)
-class BaselineRule:
-    """What is subtracted from the readings.
-
-    Attributes:
-        kind: ``none``; the mean of the ``first`` rows of a file; or its median, if it is ``idle`` most of it.
-        rows: number of first rows.
-    """
-
-    kind: Literal["none", "first", "idle"] = "none"
-    rows: Annotated[int, Ge(1)] = 20
 
 
 @dataclass(frozen=True)
@@ -130,23 +85,23 @@ class LabelRule:
 
     Attributes:
         column: of the file or of its path; values of several columns are joined by a blank.
-        values: value -> 0 or 1; others, and none, are unknown. YAML's ``on`` and ``yes`` are 1.
+        values: value -> 0 or 1; others, and none, are unknown.
         target: whose value decides.
         above: the label is 1 above it, N or m, else 0.
     """
 
     column: Column | Sequence[Column] | None = None
-    values: dict[str | int | bool, int] | None = None
+    values: dict[str | int, int] | None = None
     target: str | None = None
     above: float | None = None
 
 
 @dataclass(frozen=True)
 class ClassRule:
-    """Exclusive classes by the values of columns; ``names`` lists them, or maps them to names."""
+    """Exclusive classes by the values of columns; ``names`` lists them in their order."""
 
     column: Column | Sequence[Column]
-    names: dict[str | int | bool, str | int | bool] | list[str | int] | None = None
+    names: list[str | int] | None = None
 
 
 @dataclass(frozen=True)
@@ -172,11 +127,13 @@ class ForeignFormat:
         segments: what a touch is.
         about: origin and licence, in words.
         fields: regular expression that the path of each file contains; its named groups become columns.
-        table: how files are written.
+        table: how files are written: options of ``pandas.read_csv``, such as ``sep``, ``skiprows`` or
+            ``na_values``, or, for a spreadsheet, of ``pandas.read_excel``.
         time: column of the time; None: there is none, or it means nothing.
         rate: Hz, to which rows are resampled where there is a time; otherwise their rate. None: the median
             rate of the rows.
-        baseline: what is subtracted.
+        baseline: what is subtracted from readings: the mean of so many first rows of a file; its median,
+            if it is ``idle`` most of the time; None: nothing.
         labels: name -> rule of a binary label.
         classes: exclusive classes; beside labels, ``task=classes`` chooses them.
         targets: x, y, force, force_x or force_y -> measured quantity.
@@ -192,10 +149,10 @@ class ForeignFormat:
     segments: SegmentRule
     about: str = ""
     fields: str | None = None
-    table: TableFormat = TableFormat()
+    table: Mapping[str, Any] = field(default_factory=dict)
     time: TimeColumn | None = None
     rate: Annotated[float, Gt(0)] | None = None
-    baseline: BaselineRule = BaselineRule()
+    baseline: Annotated[int, Ge(1)] | Literal["idle"] | None = None
     labels: Mapping[str, LabelRule] | None = None
     classes: ClassRule | None = None
     targets: Mapping[str, TargetColumn] | None = None
@@ -211,10 +168,8 @@ class ForeignFormat:
 
 
 _PARTS: dict[str, type] = {
-    "table": TableFormat,
     "time": TimeColumn,
     "channels": ChannelColumns,
-    "baseline": BaselineRule,
     "segments": SegmentRule,
     "classes": ClassRule,
 }
@@ -269,9 +224,7 @@ def _check(mapping: ForeignFormat, name: str) -> None:
         )
     if mapping.segments.by == "contact" and mapping.segments.threshold is None:
         raise InputError(f"{name}: segments.by: contact needs segments.threshold, N")
-    if mapping.time is None and (
-        mapping.table.long or (mapping.rate is None and mapping.segments.by != "row")
-    ):
+    if mapping.time is None and mapping.rate is None and mapping.segments.by != "row":
         raise InputError(f"{name}: add time, as in time: {{column: 1, unit: s}}, or rate, Hz")
     for target, column in targets.items():
         if target not in TARGETS or column.unit not in TARGETS[target]:
@@ -284,14 +237,15 @@ def _check(mapping: ForeignFormat, name: str) -> None:
                 f"{name}: labels.{label} needs column and values, as in {{column: label, values: {{press: 1, "
                 "tap: 0}}, or target and above, as in {target: force, above: 4.0}, N"
             )
-        if rule.values is not None and not set(rule.values.values()) <= {0, 1}:
-            values = list(rule.values.values())
-            raise InputError(f"{name}: labels.{label}.values must be 0 or 1, got {values}")
-    for setting, pattern in (("fields", mapping.fields), ("table.begin", mapping.table.begin)):
-        try:
-            re.compile(pattern or "")
-        except re.error as error:
-            raise InputError(f"{name}: {setting} is no regular expression: {error}") from error
+        if any(isinstance(key, bool) or value not in (0, 1) for key, value in (rule.values or {}).items()):
+            raise InputError(
+                f"{name}: labels.{label}.values must be 0 or 1 by text, got {rule.values}: quote what YAML "
+                "reads as true or false, as in {'on': 1, 'off': 0}"
+            )
+    try:
+        re.compile(mapping.fields or "")
+    except re.error as error:
+        raise InputError(f"{name}: fields is no regular expression: {error}") from error
 
 
 # Read the tables of a mapping.
@@ -300,8 +254,6 @@ def _check(mapping: ForeignFormat, name: str) -> None:
 def read_table(mapping: ForeignFormat, path: Path, folder: Path) -> pd.DataFrame:
     """Return the rows of a file with its time and the fields of its path."""
     table = _read(path, mapping.table)
-    if mapping.table.long is not None:
-        table = _widen(table, mapping, path)
     if mapping.time is not None:
         table[TIME] = _times(table, mapping.time, path)
     if mapping.fields is None:
@@ -313,41 +265,22 @@ def read_table(mapping: ForeignFormat, path: Path, folder: Path) -> pd.DataFrame
     return table.assign(**{name: value for name, value in match.groupdict().items() if value is not None})
 
 
-def _read(path: Path, its: TableFormat) -> pd.DataFrame:
+def _read(path: Path, options: Mapping[str, Any]) -> pd.DataFrame:
     """Return a file's rows, with texts as names of columns."""
-    rows: dict[str, Any] = {
-        "header": 0 if its.header else None,
-        "skiprows": [1] if its.units else None,
-        "na_values": list(its.missing),
-    }
     try:
         if path.suffix.lower() in (".xlsx", ".xlsm", ".xls", ".ods"):
-            table = pd.read_excel(path, sheet_name=its.sheet, **rows)
-        elif path.suffix.lower() in (".jsonl", ".ndjson"):
-            lines = path.read_text(encoding=its.encoding).splitlines()
-            table = pd.DataFrame([_flatten(json.loads(line)) for line in lines if line.strip()])
+            table = pd.read_excel(path, **options)
         else:
-            marked = path.read_bytes()[:2] in (BOM_UTF16_LE, BOM_UTF16_BE)
-            text = path.read_text(encoding="utf-16" if marked else its.encoding)
-            if (begin := re.search(its.begin, text, re.M)) is None:
-                raise ValueError(f"it has no line with table.begin: {its.begin}")
-            table = pd.read_csv(
-                StringIO(text[text.rfind("\n", 0, begin.start()) + 1 :]),
-                sep=r"\s+" if its.delimiter == "whitespace" else its.delimiter,
-                decimal=its.decimal,
-                comment=its.comment,
-                skipinitialspace=True,
-                low_memory=False,
-                **rows,
-            )
+            usual = {"encoding": "utf-8-sig", "skipinitialspace": True, "low_memory": False}
+            table = pd.read_csv(path, **usual | dict(options))
     except ImportError as error:
         raise InputError(f"{path}: spreadsheets need openpyxl: pip install 'tactile-skin[data]'") from error
-    except (OSError, ValueError, LookupError, AttributeError, zipfile.BadZipFile) as error:
+    except (OSError, ValueError, TypeError, LookupError, AttributeError, zipfile.BadZipFile) as error:
         raise InputError(
-            f"cannot read {path}: {' '.join(str(error).split())}; table.begin skips lines before the table"
+            f"cannot read {path}: {' '.join(str(error).split())}; table= has options of pandas, such as "
+            "skiprows, the lines before the table"
         ) from error
-    names = table.columns if its.header else range(1, table.shape[1] + 1)
-    table.columns = pd.Index([str(name).strip() for name in names])
+    table.columns = pd.Index([str(name).strip() for name in table.columns])
     if table.columns.has_duplicates:
         raise InputError(f"{path}: several columns are called {table.columns[table.columns.duplicated()][0]}")
     if table.empty:
@@ -355,40 +288,14 @@ def _read(path: Path, its: TableFormat) -> pd.DataFrame:
     return table
 
 
-def _flatten(line: dict[str, Any]) -> dict[str, Any]:
-    """Return the entries of a line with those of lists beside each other, as s0, s1, ..."""
-    lists = {name: value if isinstance(value, list) else None for name, value in line.items()}
-    flat = {name: value for name, value in line.items() if lists[name] is None}
-    return flat | {f"{name}{n}": part for name, parts in lists.items() for n, part in enumerate(parts or ())}
-
-
-def _widen(table: pd.DataFrame, mapping: ForeignFormat, path: Path) -> pd.DataFrame:
-    """Return a table with one reading per row as one with a row per time and a column per sensor."""
-    assert mapping.table.long is not None
-    assert mapping.time is not None
-    sensor, value, time = map(str, (*mapping.table.long, mapping.time.column))
-    require_columns(table, [sensor, value, time], path, "table.long")
-    others = table.drop(columns=[sensor, value]).drop_duplicates(time).set_index(time)
-    if table.duplicated([time, sensor]).any():
-        raise InputError(f"{path} has several values of a sensor at one time: correct table.long")
-    wide = table.pivot(index=time, columns=sensor, values=value).add_prefix("")
-    return others.join(wide).reset_index()
-
-
 def _times(table: pd.DataFrame, its: TimeColumn, path: Path) -> np.ndarray:
     """Return the time of each row, (R,), s."""
     require_columns(table, [its.column], path, "time")
     column = table[str(its.column)]
-    if pd.to_numeric(column, errors="coerce").isna().all():
-        dates = pd.to_datetime(column, format=its.format, utc=True, errors="coerce")
-        if (wrong := np.flatnonzero(dates.isna())).size:
-            raise InputError(
-                f"{path}: column {its.column} has {str(column.iloc[wrong[0]])[:40]!r} in row {wrong[0] + 1}, "
-                "no time: give time.format, as in '%d.%m.%Y %H:%M:%S.%f'"
-            )
-        times = (dates - dates.iloc[0]).dt.total_seconds().to_numpy()
+    if pd.api.types.is_datetime64_any_dtype(column):
+        times = (column - column.iloc[0]).dt.total_seconds().to_numpy()
     else:
-        times = parse_numbers(table, its.column, path) * TIMES[its.unit]
+        times = parse_numbers(table, its.column, path, "time") * TIMES[its.unit]
     if (back := np.flatnonzero(~(np.diff(times) >= 0))).size:
         raise InputError(
             f"{path}: time goes backwards at row {back[0] + 2}, from {times[back[0]]:.6f} to "
@@ -407,19 +314,21 @@ def require_columns(
         raise InputError(f"{path} has no column {missing[0]}, which {what} names: it has {shown}")
 
 
-def parse_numbers(table: pd.DataFrame, name: Column, path: Path) -> np.ndarray:
-    """Return a column as numbers, (R,), float64, NaN where there is none.
+def parse_numbers(table: pd.DataFrame, name: Column, path: Path, what: str) -> np.ndarray:
+    """Return a column that the setting ``what`` names as numbers, (R,), float64, NaN where there is none.
 
     Raises:
-        InputError: a cell has a text.
+        InputError: there is no such column, or a cell has a text.
     """
+    require_columns(table, [name], path, what)
     column = table[str(name)]
     values = pd.to_numeric(column, errors="coerce")
     if (wrong := np.flatnonzero(values.isna() & column.notna())).size:
         text = str(column.iloc[wrong[0]])[:40]
         raise InputError(
-            f"{path}: column {name} has {text!r} in row {wrong[0] + 1}, no number: list it in table.missing "
-            "unless it stands for a value over the range, or correct table.decimal or table.units"
+            f"{path}: column {name} has {text!r} in row {wrong[0] + 1}, no number: list it in "
+            "table.na_values unless it stands for a value over the range, or correct table.decimal, "
+            "table.skiprows or, for dates, table.parse_dates"
         )
     array = values.to_numpy(dtype=float, na_value=np.nan)
     return np.where(np.isfinite(array), array, np.nan)

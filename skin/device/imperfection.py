@@ -403,16 +403,18 @@ def outside(settings: Mapping[str, Any], ranges: Mapping[str, Any], rounding: fl
         ranges: the same of devices that were drawn.
         rounding: relative tolerance.
     """
-    texts = list[str]()
-    for name, (text, unit) in _COMPARED.items():
-        if settings.get(name) is None or ranges.get(name) is None:
-            continue
-        (minimum, maximum), (low, high) = (np.broadcast_to(values[name], 2) for values in (settings, ranges))
+    compared = {
+        name: [np.broadcast_to(values[name], 2) for values in (settings, ranges)]
+        for name in _COMPARED
+        if settings.get(name) is not None and ranges.get(name) is not None
+    }
+    return [
+        f"{_COMPARED[name][0]} {' to '.join(f'{limit:g}' for limit in dict.fromkeys(given))}"
+        f"{_COMPARED[name][1]} ({low:g} to {high:g}{_COMPARED[name][1]})"
+        for name, (given, (low, high)) in compared.items()
         # A device with less noise, drift or lag is easier; a slower one is not.
-        if maximum > high * (1 + rounding) or (name == "rate" and minimum < low * (1 - rounding)):
-            value = f"{minimum:g}" if minimum == maximum else f"{minimum:g} to {maximum:g}"
-            texts.append(f"{text} {value}{unit} ({low:g} to {high:g}{unit})")
-    return texts
+        if given[1] > high * (1 + rounding) or (name == "rate" and given[0] < low * (1 - rounding))
+    ]
 
 
 def _interpolate(spread: Spread, fraction: np.ndarray) -> np.ndarray:

@@ -78,10 +78,15 @@ class Recorded(AbstractDevice):
         self.path, self.split_seed, self._test = path, split_seed, test
         folder = Path(path).expanduser()
         self._whole = folder.suffix != "" and not folder.is_dir()
-        self._stored = _File(path) if self._whole else DataSet(path)
+        if self._whole:
+            self._shards: list[Recording | Path] = [read_recording(path)]  # stays in memory
+            self._counts = [len(self._shards[0])]  # type: ignore[arg-type]
+        else:
+            data_set = DataSet(path)
+            self._shards, self._counts = [*map(data_set.path, range(len(data_set.counts)))], data_set.counts
         self._what, self._targets = task, targets
         self._learned: Task | None = None
-        if (count := sum(self._stored.counts)) < 10 and test == "holdout":
+        if (count := sum(self._counts)) < 10 and test == "holdout":
             raise InputError(
                 f"{path} has {count} touches: 80/10/10 needs at least 10, or a "
                 "run that was trained on others and device.test=all"
@@ -96,7 +101,7 @@ class Recorded(AbstractDevice):
         if self.configured:
             self._compare(body, layout.sensors(body))
             self.sensors, self.surface = layout.sensors(body), body
-        self.name, self.task = str(self._stored.path(0)), self._example.task
+        self.name, self.task = path, self._example.task
         self.rate, self.window = touches.rate, touches.readings.shape[1]
         self._groups: dict[Split, Tensor] = {}
         groups: dict[str, list[str]] = self._example.metadata.get("groups", {})
@@ -125,7 +130,7 @@ class Recorded(AbstractDevice):
             )
         if len(set(tested)) == len(values):
             raise InputError(f"device.test_groups has every {name}: leave out some to train on")
-        numbers = self._stored.read(0).parameters[GROUP + name].long()
+        numbers = self._read(0).parameters[GROUP + name].long()
         self._groups = split_groups(
             numbers, self.split_seed, [values.index(value) for value in tested] or None
         )
@@ -222,7 +227,7 @@ class Recorded(AbstractDevice):
         return None if self._whole else self._parts(split, complete=False)
 
     def _parts(self, split: Split | None, complete: bool) -> list[Part]:
-        counts = self._stored.counts
+        counts = self._counts
         if split is None or (split == "test" and self._test == "all"):
             return [Part(count, partial(self._read, n, complete)) for n, count in enumerate(counts)]
         name: Split = "holdout" if split == "test" else split
@@ -240,7 +245,9 @@ class Recorded(AbstractDevice):
         return self._read(number, complete)[rows]
 
     def _read(self, number: int, complete: bool = True) -> Recording:
-        recording = choose_task(self._stored.read(number, complete), self._what, self._targets, self.path)
+        shard = self._shards[number]
+        stored = read_recording(shard, complete) if isinstance(shard, Path) else shard
+        recording = choose_task(stored, self._what, self._targets, self.path)
         task = self._learned or recording.task
         return replace(recording, task=task, touches=label_as(recording.touches, recording.task, task))
 
@@ -263,12 +270,11 @@ def choose_task(
     kind, parameters = recording.task.kind, recording.parameters
     if targets is not None and task != "regression":
         raise InputError("device.targets needs task=regression")
-    if task is None or (task == "classes" and kind == "exclusive"):
+    labelled = kind == "binary" and recording.touches.labels is not None
+    if task is None or (task == "classes" and kind == "exclusive") or (task == "labels" and labelled):
         return recording
     if task == "labels":
-        if kind != "binary" or recording.touches.labels is None:
-            raise InputError(f"{path} has no labels that hold or not: give task=classes or task=regression")
-        return recording
+        raise InputError(f"{path} has no labels that hold or not: give task=classes or task=regression")
     if task == "classes":
         names = recording.metadata.get("classes", [])
         if CLASS not in parameters or len(names) < 2:
@@ -304,17 +310,3 @@ def _relabelled(recording: Recording, task: Task, labels: Tensor) -> Recording:
 def _few(values: Sequence[str], shown: int = 4) -> str:
     """Return the first of some names."""
     return ", ".join(values[:shown]) + ", ..." * (len(values) > shown)
-
-
-class _File:
-    """A recording as the only shard of a data set; it stays in memory."""
-
-    def __init__(self, path: str) -> None:
-        self._path, self._recording = Path(path), read_recording(path)
-        self.counts = [len(self._recording)]
-
-    def path(self, number: int) -> Path:
-        return self._path
-
-    def read(self, number: int, complete: bool = True) -> Recording:
-        return self._recording

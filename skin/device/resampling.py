@@ -200,10 +200,12 @@ def check_rate(measured: float, rate: float, setting: str | None = None) -> None
         InputError: the device is slower by more than 5 %.
     """
     if _SLOWER * measured < rate:
-        remedy = f"raise {setting}, or lower touch.rate, as in {setting}={rate:g}"
-        if setting is None:
-            remedy = "let the firmware send faster, or train a model at the device's rate, as in "
-            remedy += f"touch.rate={measured:.2g}"
+        remedy = (
+            "let the firmware send faster, or train a model at the device's rate, as in "
+            f"touch.rate={measured:.2g}"
+            if setting is None
+            else f"raise {setting}, or lower touch.rate, as in {setting}={rate:g}"
+        )
         raise InputError(
             f"the device sends {measured:.3g} frames a second, the model needs {rate:g}: {remedy}"
         )
@@ -226,16 +228,13 @@ class Window:
         self.frames, self.rate, self.sensors = frames, rate, sensors
         self._period = 0.0
         self._polarity: np.ndarray | None = None
-        self._clear(4 * frames)
+        each = (sensors,)
+        columns = [("t", float), ("lost", int), ("values", float, each), ("valid", bool, each)]
+        self._rows = np.empty(4 * frames, [*columns, ("saturated", bool, each)])  # of frames, grows
+        self._end, self._segment = 0, -1
 
     def clear(self) -> None:
         """Remove all frames; the known period of the device is kept."""
-        self._clear(len(self._times))
-
-    def _clear(self, capacity: int) -> None:
-        self._times, self._lost = np.empty(capacity), np.zeros(capacity, dtype=np.int64)
-        self._values = np.empty((capacity, self.sensors))
-        self._valid, self._saturated = (np.empty((capacity, self.sensors), dtype=bool) for _ in range(2))
         self._end, self._segment = 0, -1
 
     @property
@@ -244,8 +243,8 @@ class Window:
 
         The smaller of median and mean: pauses distort the mean, bursts of frames the median.
         """
-        first = max(0, self._end - _MANY)
-        times, lost = self._times[first : self._end], self._lost[first : self._end]
+        rows = self._rows[max(0, self._end - _MANY) : self._end]
+        times, lost = rows["t"], rows["lost"]
         if len(times) >= _FEW:
             mean = float(times[-1] - times[0]) / (len(times) - 1 + int(lost[1:].sum()))
             median = float(np.median(np.diff(times)))
@@ -257,13 +256,12 @@ class Window:
         if frame.segment != self._segment:
             self.clear()
             self._segment = frame.segment
-        if self._end == len(self._times):
+        if self._end == len(self._rows):
             self._make_room()
-        position, self._end = self._end, self._end + 1
-        self._times[position], self._lost[position] = frame.t, max(frame.lost, int(frame.after == "gap"))
-        self._values[position], self._valid[position] = frame.values, frame.valid
-        self._polarity = frame.polarity
-        self._saturated[position] = False if frame.saturated is None else frame.saturated
+        lost = max(frame.lost, int(frame.after == "gap"))
+        saturated = False if frame.saturated is None else frame.saturated
+        self._rows[self._end] = frame.t, lost, frame.values, frame.valid, saturated
+        self._end, self._polarity = self._end + 1, frame.polarity
 
     def read(self, partial: bool = False) -> Resampled | None:
         """Return the window that ends with the latest frame; None before T intervals are complete.
@@ -278,8 +276,8 @@ class Window:
         if not period:
             return None
         check_rate(1 / period, self.rate)
-        interval, now = max(1 / self.rate, period), self._times[self._end - 1]
-        if not partial and now - self._times[0] + 1.5 * period < self.frames * interval:
+        interval, now = max(1 / self.rate, period), self._rows["t"][self._end - 1]
+        if not partial and now - self._rows["t"][0] + 1.5 * period < self.frames * interval:
             return None
         return self._resample_until(now + 0.5 * period, interval)
 
@@ -291,44 +289,27 @@ class Window:
         period = self.period or 1 / self.rate
         interval = max(1 / self.rate, period)
         end = begin + self.frames * interval - 0.5 * period
-        latest = self._times[self._end - 1] + 0.5 * period if self._end else end
+        latest = self._rows["t"][self._end - 1] + 0.5 * period if self._end else end
         # Where the last frames were lost, the window ends without them.
         return self._resample_until(latest if abs(latest - end) <= period else end, interval)
 
     def _resample_until(self, end: float, interval: float) -> Resampled:
-        times = self._times[: self._end]
+        times = self._rows["t"][: self._end]
         first = int(np.searchsorted(times, end - (self.frames + 1) * interval))
-        part = slice(first, int(np.searchsorted(times, end)))
-        resampled = resample(
-            times[part],
-            self._values[part],
-            self._valid[part],
-            self._saturated[part],
-            end,
-            interval,
-            self.frames,
-            self._polarity,
-        )
+        rows = self._rows[first : int(np.searchsorted(times, end))]
+        values, valid, saturated = rows["values"], rows["valid"], rows["saturated"]
+        resampled = resample(rows["t"], values, valid, saturated, end, interval, self.frames, self._polarity)
         # A loss before the window's first frame is not in the window.
-        inside = times[part] > end - self.frames * interval
-        lost = self._lost[part][inside][1:].any()
-        ages = np.unique(np.floor((end - times[part][inside]) / interval))
+        inside = rows[rows["t"] > end - self.frames * interval]
+        ages = np.unique(np.floor((end - inside["t"]) / interval))
         before = max(0, self.frames - 1 - int((end - times[0]) / interval)) if len(times) else self.frames
         missing = self.frames - before - len(ages)
-        return resampled._replace(gap=bool(lost) or missing > 0, before=before)
+        return resampled._replace(gap=bool(inside["lost"][1:].any()) or missing > 0, before=before)
 
     def _make_room(self) -> None:
         """Discard frames older than the window; double the capacity unless that frees half of it."""
-        since = self._times[self._end - 1] - 1.1 * _SLOWER * self.frames / self.rate
-        first = min(int(np.searchsorted(self._times[: self._end], since)), max(0, self._end - _MANY))
-        window, segment = slice(first, self._end), self._segment
-        old = [array[window] for array in self._arrays]
-        capacity, count = len(self._times), len(old[0])
-        self._clear(capacity if 2 * count <= capacity else 2 * capacity)
-        self._end, self._segment = count, segment
-        for target, source in zip(self._arrays, old, strict=True):
-            target[:count] = source
-
-    @property
-    def _arrays(self) -> tuple[np.ndarray, ...]:
-        return self._times, self._lost, self._values, self._valid, self._saturated
+        times, capacity = self._rows["t"], len(self._rows)
+        since = np.searchsorted(times, times[-1] - 1.1 * _SLOWER * self.frames / self.rate)
+        kept = self._rows[min(int(since), max(0, capacity - _MANY)) :]
+        room = (capacity if 2 * len(kept) <= capacity else 2 * capacity) - len(kept)
+        self._rows, self._end = np.concatenate([kept, np.empty(room, kept.dtype)]), len(kept)

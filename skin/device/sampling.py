@@ -90,8 +90,7 @@ def measure(
     if rate <= model_rate:
         return imperfection.apply(force, constants, noise)
     fine = between_frames(force, model_rate, rate, noise.random(len(force)))
-    readings, valid, saturated = imperfection.apply(fine, constants, noise)
-    return _reduce_rate(readings, valid, saturated, (rate, model_rate), force.shape[1])
+    return _reduce_rate(*imperfection.apply(fine, constants, noise), (rate, model_rate), force.shape[1])
 
 
 def _measure_each(
@@ -127,12 +126,14 @@ def _measure_each(
     time = torch.arange(padded.shape[1], device=force.device) / (fine * model_rate)
     sensed = imperfection.sense(padded, constants, time)
     highest, saturated = _read_each(sensed, fine, constants, ratios, shifts, window, noise)
-    output = highest.to(force.device)
-    time = ((torch.arange(window) + 0.5) / model_rate).to(output)
-    output = convert(output, constants, time, None)  # it is clipped, with noise
+    time = ((torch.arange(window) + 0.5) / model_rate).to(force)
+    output = convert(highest.to(force), constants, time, None)  # it is clipped, with noise
     dead = constants.dead.expand(output.shape)
-    output = imperfection.undo_curve(output, constants)
-    return output.masked_fill(dead, 0.0), ~dead, saturated.to(force.device) & ~dead
+    return (
+        imperfection.undo_curve(output, constants).masked_fill(dead, 0.0),
+        ~dead,
+        saturated.to(force.device) & ~dead,
+    )
 
 
 def _read_each(

@@ -1,13 +1,11 @@
 """A simulated skin: sampled gestures, a simulator, and device imperfections."""
 
-import logging
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from itertools import count
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -114,63 +112,38 @@ def describe(device: "Simulated", recording: Recording, split: Split | None, epo
     }
 
 
-# The class balance of a data set: shape, area, force and position per class, and leakage of labels by shape.
+# Leakage of labels by the shape of the touching body.
 
 
-if TYPE_CHECKING:
-    import pandas as pd
+def check_label_leakage(device: AbstractDevice, recording: Recording | None = None) -> None:
+    """Warn if the shape alone predicts a label of the gestures that a simulated device is trained on.
 
-_log = logging.getLogger(__name__)
-
-
-def report_balance(device: AbstractDevice, recording: Recording | None = None, shown: bool = True) -> None:
-    """Log the class balance of the gestures that a simulated device is trained on, and check its labels.
+    A label leaks if the balanced accuracy of the prediction is above ``touch.leak`` by more than two standard
+    errors; the margin keeps small data sets from warnings by chance.
 
     Args:
         device: the device; nothing is done unless it is simulated.
         recording: its gestures; None: its training budget.
-        shown: whether to log the balance.
     """
     if device.simulation is None:
         return
     sampler = device.simulation.sampler
     recording = only_touches(recording or device.recording(None, complete=False))
-    balance = class_balance(recording, sampler)
-    if shown:
-        _log.info(balance_text(balance))
-    check_label_leakage(balance, sampler.leak)
-
-
-def class_balance(recording: Recording, sampler: AbstractSampler) -> "pd.DataFrame":
-    """Return a table with two rows per label, the class and its opposite, without those that do not occur.
-
-    Args:
-        recording: simulated touches.
-        sampler: that drew them; the parameter ``shape`` is an index into its shapes.
-
-    Returns:
-        accuracy of the label from the shape alone and its standard error (:func:`accuracy_from_shape`); the
-        fraction of each shape, %; means of area, %, and of the first position, mm; the median force, N; and
-        the fractions of paths with other labels and of bodies that do not fit, of all that were drawn, %.
-    """
-    import pandas as pd  # not needed by skin live
-
-    touches = pd.DataFrame({name: values.double().numpy() for name, values in recording.parameters.items()})
-    shapes, rows = [Path(name).stem for name in sampler.shapes.names], dict[str, dict[str, float]]()
-    labels = recording.touches.known_labels.numpy() > 0.5
-    for name, holds in zip(recording.task.names, labels.T, strict=True):
-        if name not in sampler.labels:
-            continue
-        scores = accuracy_from_shape(touches["shape"].to_numpy(int), holds)
-        for title, part in ((name, touches[holds]), (sampler.labels[name].opposite, touches[~holds])):
-            if count := len(part):
-                rows[title] = dict(zip(("accuracy", "error"), scores, strict=True)) if title == name else {}
-                rows[title] |= {shape: 100 * (part["shape"] == n).mean() for n, shape in enumerate(shapes)}
-                rows[title] |= {"area %": 100 * part["area"].mean(), "force N": part["force"].median()}
-                rows[title] |= {"x mm": 1e3 * part["x"].mean(), "y mm": 1e3 * part["y"].mean()}
-                rows[title]["paths"] = 100 * (1 - count / part["draws"].sum())
-                rows[title]["bodies"] = 100 * (1 - count / (count + part["misfits"].sum()))
-    return pd.DataFrame.from_dict(rows, orient="index")
+    shape = recording.parameters["shape"].numpy().astype(int)
+    labels = dict(zip(recording.task.names, recording.touches.known_labels.numpy().T > 0.5, strict=True))
+    scores = {name: accuracy_from_shape(shape, labels[name]) for name in sampler.labels if name in labels}
+    leaking = [
+        f"{name} ({score:.0%})" for name, (score, error) in scores.items() if score - 2 * error > sampler.leak
+    ]
+    if leaking:
+        warnings.warn(
+            f"the shape alone predicts {' and '.join(leaking)} of these gestures, more than "
+            f"touch.leak={sampler.leak:g} allows: a model may learn the shape instead of the label; give "
+            "touch.shapes of one kind, raise touch.stretch, or give touch.leak=0.5, which fits every shape "
+            "to the sheet",
+            RuntimeWarning,
+            stacklevel=2,
+        )
 
 
 def accuracy_from_shape(shape: np.ndarray, holds: np.ndarray) -> tuple[float, float]:
@@ -183,50 +156,14 @@ def accuracy_from_shape(shape: np.ndarray, holds: np.ndarray) -> tuple[float, fl
         shape: (B,), whole numbers from 0.
         holds: (B,), bool; the label.
     """
-    counts = np.stack(
-        [np.bincount(shape[holds == side], minlength=shape.max() + 1) for side in (False, True)]
-    )
+    counts = np.array([np.bincount(shape[holds == side], minlength=shape.max() + 1) for side in (0, 1)])
     totals = counts.sum(axis=1, keepdims=True)
     if totals.min() < 2:
         return 0.5, 0.0
-    rates = []
-    for side in (0, 1):
-        others = (counts[side] - 1) / (totals[side] - 1)
-        against = counts[1 - side] / totals[1 - side]
-        right = np.where(np.isclose(others, against), 0.5, others > against)
-        rates.append(float((counts[side] * right).sum() / totals[side, 0]))
-    error = (
-        np.sqrt(sum(rate * (1 - rate) / total for rate, total in zip(rates, totals[:, 0], strict=True))) / 2
-    )
-    return sum(rates) / 2, float(error)
-
-
-def balance_text(balance: "pd.DataFrame") -> str:
-    """Return a class balance as lines."""
-    formats = dict.fromkeys(("accuracy", "error"), "{:.2f}".format)
-    table = balance.to_string(formatters=formats, float_format="{:.0f}".format, na_rep="", line_width=None)
-    return (
-        "balance: shapes are in % of a class, paths and bodies in % rejected; accuracy: balanced accuracy of "
-        f"the label from the shape alone\n{table}"
-    )
-
-
-def check_label_leakage(balance: "pd.DataFrame", leak: float) -> None:
-    """Warn if the shape alone predicts a label.
-
-    A label leaks if its balanced accuracy is above ``leak`` by more than two standard errors; the margin
-    keeps small data sets from warnings by chance.
-    """
-    scores = balance["accuracy"][balance["accuracy"] - 2 * balance["error"] > leak]
-    if len(scores):
-        named = " and ".join(f"{name} ({score:.0%})" for name, score in scores.items())
-        warnings.warn(
-            f"the shape alone predicts {named} of these gestures, more than touch.leak={leak:g} allows: a "
-            "model may learn the shape instead of the label; give touch.shapes of one kind, raise "
-            "touch.stretch, or give touch.leak=0.5, which fits every shape to the sheet",
-            RuntimeWarning,
-            stacklevel=3,
-        )
+    others, against = (counts - 1) / (totals - 1), (counts / totals)[::-1]
+    right = np.where(np.isclose(others, against), 0.5, others > against)
+    rates = (counts * right).sum(axis=1) / totals[:, 0]
+    return float(rates.mean()), float(np.sqrt((rates * (1 - rates) / totals[:, 0]).sum()) / 2)
 
 
 # Summary of a data set in one line: forces, strains, clipped readings, accepted draws.
@@ -251,7 +188,7 @@ def summarise(recording: Recording, body: AbstractBody) -> dict[str, Any]:
     strain = parameters.get("strain", parameters["peak"] / body.layers[-1].material.young)
     force = torch.quantile(parameters["force"], torch.tensor([0.05, 0.5, 0.95, 1.0]))
     dangerous = labels[:, recording.task.names.index(ALARM)] > 0.5
-    summary = {
+    return {
         "gestures": len(recording),
         "acceptance": len(recording) / float(parameters["draws"].sum()),
         "force": dict(zip(("q05", "q50", "q95", "largest"), force.tolist(), strict=True)),
@@ -260,10 +197,8 @@ def summarise(recording: Recording, body: AbstractBody) -> dict[str, Any]:
         "strain_solved": "strain" in parameters,
         "clipped": float(parameters["clipped"].mean()),
         "clipped_dangerous": float(parameters["clipped"][dangerous].mean()) if dangerous.any() else 0.0,
+        **{name: int(parameters[name].sum()) for name in ("unconverged",) if name in parameters},
     }
-    if "unconverged" in parameters:
-        summary["unconverged"] = int(parameters["unconverged"].sum())
-    return summary
 
 
 def summary_line(summary: dict[str, Any]) -> str:
@@ -461,14 +396,12 @@ class Simulated(ImperfectionSettings, AbstractDevice):
         if recording is None:
             tested = self._batches(complete, Stream.TEST, self.test_gestures) if split == "test" else None
             recording = joined(self._budget(complete) if tested is None else tested)
-        if not complete:
-            self._kept[name] = recording
+            self._kept |= {} if complete else {name: recording}
         if split in ("test", None):
             return recording
         # Windows of a stream overlap, so each split has streams of its own.
-        if self.stream:
-            return recording[split_slices(self.gestures)[split]]
-        return recording[split_rows(split, self.gestures, self.data_seed)]
+        rows = split_slices(self.gestures)[split] if self.stream else None
+        return recording[split_rows(split, self.gestures, self.data_seed) if rows is None else rows]
 
     def parts(self, split: Split | None = None) -> list[Part] | None:
         """Return the budget in parts, together ``recording(complete=False)``; None for a split.
@@ -487,8 +420,7 @@ class Simulated(ImperfectionSettings, AbstractDevice):
         if not self.stream:
             return draw(self.gestures, self.data_seed)
         counts = [len(range(self.gestures)[rows]) for rows in split_slices(self.gestures).values()]
-        parts = [draw(count, self.data_seed, number) for number, count in enumerate(counts)]
-        return [batch for split in parts for batch in split]
+        return [batch for n, count in enumerate(counts) for batch in draw(count, self.data_seed, n)]
 
     def _batches(self, complete: bool, stream: Stream, count: int, *key: int) -> list[Part]:
         """Return the batches of gestures or windows; ``complete`` adds the displacements."""

@@ -1,7 +1,6 @@
 """Skins drawn at random, and a device that simulates touches on them."""
 
 import math
-import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from functools import cached_property, partial
@@ -40,27 +39,6 @@ from skin.touch.paths import TouchSettings
 Range = Annotated[tuple[PositiveFloat, PositiveFloat], RISING]
 Kind = Literal["grid", "scattered", "hexagonal", "random", "clustered", "spread"]
 Make = Callable[[AbstractBody, Sensors], AbstractSimulator]
-
-
-@dataclass(frozen=True)
-class DrawnSkin:
-    """A skin without touches.
-
-    Attributes:
-        body: the body.
-        layout: of its sensors.
-        simulator: ``simulator(body, sensors)``.
-        position_error: standard deviation of the true positions from those of the layout, m.
-        footprint_error: of the logarithm of the true over the layout's sides of footprints.
-        described: the mechanics that the skin is described with; None: ``simulator``.
-    """
-
-    body: AbstractBody
-    layout: AbstractLayout
-    simulator: Make
-    position_error: float
-    footprint_error: float = 0.0
-    described: Make | None = None
 
 
 @checked("device.skins")
@@ -117,8 +95,8 @@ class SkinDistribution:
                 f"{total:g}: make one of them smaller"
             )
 
-    def draw(self, generator: np.random.Generator, mixed: bool = False) -> DrawnSkin:
-        """Return a skin.
+    def draw(self, generator: np.random.Generator, mixed: bool = False) -> dict[str, Any]:
+        """Return the settings of a skin, as :class:`skin.device.simulated.Simulated` takes them.
 
         Args:
             generator: of random numbers.
@@ -141,8 +119,14 @@ class SkinDistribution:
         # Plates on beams know forces between layers only.
         depth = depth if simulator in (solid, Naive) else top
         layout = _layout(kind, count, body.size, side, depth, generator)
-        error = generator.uniform(*self.position_error)
-        return DrawnSkin(body, layout, simulator, error, self.footprint_error if mixed else 0.0, described)
+        return {
+            "body": body,
+            "layout": layout,
+            "simulator": simulator,
+            "position_error": generator.uniform(*self.position_error),
+            "footprint_error": self.footprint_error if mixed else 0.0,
+            "described": described,
+        }
 
     def outside(self, body: AbstractBody, sensors: Sensors, rounding: float = 1e-6) -> list[str]:
         """Return the quantities of a skin outside the ranges, as "number of sensors 100 (4 to 64)"."""
@@ -344,16 +328,19 @@ class Skins(ImperfectionSettings, AbstractDevice):
     @property
     def reference(self) -> Simulated:
         """The skin of body, layout and simulator, with other imperfections in every touch."""
-        return self._simulated(DrawnSkin(self.body, self.layout, self.simulator, 0.0), 0, self.touch)
+        return self._simulated(
+            {"body": self.body, "layout": self.layout, "simulator": self.simulator}, 0, self.touch
+        )
 
     def strips(self) -> Iterator[Touches]:
         """Yield test streams on :attr:`reference`, without end."""
         return self.reference.strips()
 
     def _prepare(self, training: bool, count: int) -> list[Simulated]:
-        console, terminal = Console(stderr=True), sys.stderr.isatty()
-        numbers = track(range(count), "preparing skins", console=console, disable=not terminal)
-        for number in numbers:
+        console = Console(stderr=True)
+        for number in track(
+            range(count), "preparing skins", console=console, disable=not console.is_terminal
+        ):
             # What solves a skin keeps large factors; made again, it reads its operator from the disk.
             self._skin(training, number).geometry  # noqa: B018
         return [self._skin(training, number) for number in range(count)]
@@ -364,19 +351,14 @@ class Skins(ImperfectionSettings, AbstractDevice):
         return self._simulated(self.distribution.draw(random, mixed=training), number, touch)
 
     def _simulated(
-        self, skin: DrawnSkin, number: int, touch: Mapping[str, Any] | TouchSettings | None
+        self, skin: Mapping[str, Any], number: int, touch: Mapping[str, Any] | TouchSettings | None
     ) -> Simulated:
         imperfections = {entry.name: getattr(self, entry.name) for entry in fields(ImperfectionSettings)}
-        sensors = len(skin.layout.sensors(skin.body))
+        sensors = len(skin["layout"].sensors(skin["body"]))
         # At most one of four sensors is dead.
         imperfections["dead"] = [min(limit, sensors // 4) for limit in Imperfection.of(self, None).dead_range]
         return Simulated(
-            body=skin.body,
-            layout=skin.layout,
-            simulator=skin.simulator,
-            position_error=skin.position_error,
-            footprint_error=skin.footprint_error,
-            described=skin.described,
+            **skin,
             touch=touch,
             padded=self.padded,
             randomise=True,

@@ -216,10 +216,8 @@ def one_hot(numbers: Tensor, count: int) -> Tensor:
 
 def touches_hash(touches: Touches) -> str:
     """Return a hash of readings and labels, 16 hexadecimal digits."""
-    content = hashlib.sha256(touches.readings.contiguous().numpy().tobytes())
-    if touches.labels is not None:
-        content.update(touches.labels.contiguous().numpy().tobytes())
-    return content.hexdigest()[:16]
+    parts = [part for part in (touches.readings, touches.labels) if part is not None]
+    return hashlib.sha256(b"".join(part.contiguous().numpy().tobytes() for part in parts)).hexdigest()[:16]
 
 
 # Streams: touches with idle gaps between them, and the windows cut from them.

@@ -169,7 +169,7 @@ def compare_predictions(
         print(f"{text}: add simulator= to simulate the session with it\n")
     blank = Blank.of(device.task, device.size, comparison.touches[0])
     model = load_model(run, replace(run.stored, layout=config.layout), device=blank, alarm=False)
-    simulated, measured = ((model.predict(side) > 0.5).numpy() for side in comparison.touches)
+    simulated, measured = ((model.learner.probabilities(side) > 0.5).numpy() for side in comparison.touches)
     return describe_agreement(comparison, device.task.names, simulated, measured)
 
 

@@ -104,12 +104,12 @@ def _decode(table: Any, name: str, sensors: int) -> dict[int, Taken]:
         resampled=window,
         contacts=None if contacts is None else np.array(contacts, dtype=float),
     )
-    return {gesture.number: (gesture, decode_conversion(content["conversion"], sensors))}
+    return {gesture.number: (gesture, decode_conversion(content["conversion"]))}
 
 
-def decode_conversion(content: Mapping[str, Any], sensors: int) -> UnitConversion:
+def decode_conversion(content: Mapping[str, Any]) -> UnitConversion:
     """Return the unit conversion in JSON data; an error of BAD if there is none."""
-    curves = None if content.get("curves") is None else Curves.of_json(content["curves"], sensors)
+    curves = None if content.get("curves") is None else Curves.of_json(content["curves"])
     scale, zero = (np.array(content[name], dtype=float) for name in ("scale", "zero"))
     return UnitConversion(scale, zero, np.array(content["broken"]), curves=curves)
 

@@ -27,7 +27,6 @@ from pydantic import NonNegativeInt, PositiveFloat, PositiveInt
 from rich.console import Console
 from torch import nn
 
-from skin.core.progress import Steps
 from skin.core.rng import Stream, generator
 from skin.core.settings import checked, configured
 from skin.device.base import AbstractDevice, Blank
@@ -67,13 +66,6 @@ ADAPTED = "adapted"
 LEAST = 8
 """Smallest number of gestures to fine-tune on."""
 _COMMAND = ("adapt", "data", "evaluation")  # groups that are taken from the command, not from the run
-# Expected seconds of each step, for the fraction in the progress.
-_STEPS = {
-    "loading the run": 10.0,
-    "reading or simulating the gestures": 15.0,
-    "choosing the threshold of the alarm": 15.0,
-    "fine-tuning, and evaluating the result": 100.0,
-}
 
 
 @checked("adapt")
@@ -281,27 +273,22 @@ def find_target(
     build = device_on_skin(simulated, vars(simulated))
     twin = threshold_device(AlarmSource("", command.evaluation, None, trained, trained, build=build))
     _check(parent, device, twin)
-    drawn = device.simulation is not None
-    adapted, budget = (measured, simulated_budget(settings)) if drawn else (simulated, {})
-    assert adapted.data is not None and command.data is not None  # noqa: PT018
-    of_data = {name: value for name, value in budget.items() if name != "data_seed"}
+    assert simulated.data is not None and command.data is not None  # noqa: PT018
     adapted = replace(
-        adapted,
-        row=f"{str(adapted.row).removesuffix('_adapted')}_adapted",
+        simulated,
+        row=f"{str(simulated.row).removesuffix('_adapted')}_adapted",
         adapt=asdict(settings) | {"run": parent.run.data.tags["fingerprint"], "device": measured.device},
-        data=replace(adapted.data, augment=command.data.augment, **of_data),
-        device=adapted.device | budget,
-        evaluation=command.evaluation,
+        data=replace(simulated.data, augment=command.data.augment),
     )
     return device.with_labels(twin.task), twin, adapted
 
 
 def _check(parent: FinishedRun, device: AbstractDevice, twin: AbstractDevice) -> None:
-    """Raise InputError if a device stands for several skins, or has other labels than the run."""
-    if device.simulation is None and device.reference is not None:
+    """Raise InputError if a device has no touches of one skin, or other labels than the run."""
+    if device.reference is not None:
         raise InputError(
-            f"run {parent.identity} was trained on many skins: name the one to adapt to, as in "
-            "device=recording device.path=session.parquet or device=simulated layout.path=sensors.csv"
+            f"run {parent.identity} is adapted to gestures of one skin: add device=recording "
+            "device.path=session.parquet (skin record, or skin generate for simulated ones)"
         )
     plain = twin.task.kind == "binary" and twin.task.gate is None and not twin.task.direction
     some = plain and device.task == replace(twin.task, names=device.task.names)
@@ -312,28 +299,12 @@ def _check(parent: FinishedRun, device: AbstractDevice, twin: AbstractDevice) ->
         )
 
 
-def simulated_budget(settings: FineTuning) -> dict[str, Any]:
-    """Return the settings of a simulated device whose training split has the gestures, or one more.
-
-    The split is 80 % of the budget. ``skin train`` has it with ``data.gestures`` = n / 0.8 and the same seed.
-    """
-    count = settings.gestures or 48  # four folds of a dozen
-    return {"gestures": -(-count * 10 // 8), "fresh": False, "data_seed": settings.seed}
-
-
 def choose_gestures(device: AbstractDevice, settings: FineTuning) -> tuple[Touches, AbstractDevice | None]:
-    """Return the gestures to fine-tune on, and a device with others for the report.
-
-    A simulated device draws as many as are wanted (:func:`simulated_budget`), and has others for its test.
-    For all other devices, a part of the touches of :meth:`AbstractDevice.all_touches` is drawn, and the
-    others are what is left.
+    """Return the gestures to fine-tune on, drawn from all, and a device with the others for the report.
 
     Raises:
         InputError: there are fewer gestures than wanted, or than can be used.
     """
-    if device.simulation is not None:
-        drawn = device.simulation.replace(**simulated_budget(settings))
-        return drawn.touches("train")[: settings.gestures or 48], drawn
     touches = device.all_touches()
     touches.known_labels  # noqa: B018 - raises InputError without labels
     count = settings.gestures or len(touches)
@@ -363,51 +334,44 @@ def adapt(config: Config, run: str, overrides: Sequence[str]) -> None:
     settings, tracking = configured(FineTuning, config.adapt, "adapt"), config.tracking
     options = {str(name): default_option("learner", name) for name in settings.scratch}
     torch.set_num_threads(tracking.threads or torch.get_num_threads())
-    with Steps(_STEPS) as steps:
-        parent = find_run(tracking, run, config.trust)
-        device, twin, target = find_target(parent, config, settings, overrides)
-        identity = tags(target) | {ADAPTED: parent.identity, "target": " ".join(overrides)}
-        if tracking.resume and find_finished(Store.existing(tracking), identity["fingerprint"]):
-            return
-        learner, data = build_learner(target), build_data(target, device.blank())
-        parent.load_weights(learner, data)
-        learner.network  # noqa: B018 - refuses another learner before gestures are read from a port
-        steps.begin("reading or simulating the gestures")
-        if device.real:
-            steps.stop()  # a person may be prompted
-        touches, others = choose_gestures(device, settings)
-        steps.start()
-        steps.begin("choosing the threshold of the alarm")
-        source, task = replace(alarm_source(parent, learner, target), device=twin), twin.task
-        choose = partial(choose_alarm_threshold, one_skin=True)
-        point = choose(source)
-        figures: dict[str, float] = {}
-        if others is not None:
-            tests = others.touches("test")
-            figures |= _figures("before", learner.probabilities(tests).numpy(), tests, task, point)
-        name = f"{target.row} {identity['simulator']} {len(touches)} gestures seed {settings.seed}"
-        store = Store.open(tracking)
-        with store.run(name, identity, parent.identity) as made:
-            steps.begin("fine-tuning, and evaluating the result")
-            candidates = fine_tune(learner, data, touches, settings)
-            candidates += learn_from_scratch(touches, task, settings, options)
-            best, after = choose_candidate(candidates, touches, task, settings)
-            learner = best.train()
-            chosen = settings_of(replace(target, learner=best.settings or target.learner))
-            log_configuration(store, made.info.run_id, chosen, touches_hash(touches))
-            log_learner(store, made, learner)
-            if best.name and point is not None:
-                point = choose(replace(source, learner=learner), anew=True)
-            figures |= _figures("validation_before", candidates[0].probabilities, touches, task)
-            figures |= _figures("validation", after, touches, task)
-            if others is None:
-                store.client.set_tag(made.info.run_id, TAG, "null" if point is None else point.text())
-                store.log_metrics(made, figures)
-            else:
-                report = evaluate(learner, others, check_evaluation(target.evaluation), point)
-                log_report(store, made, report, task, figures)
-                figures |= {key: value for key, value in report.metrics.items() if key.startswith("same/")}
-            store.client.set_tag(made.info.run_id, "chosen", best.name)
+    parent = find_run(tracking, run, config.trust)
+    device, twin, target = find_target(parent, config, settings, overrides)
+    identity = tags(target) | {ADAPTED: parent.identity, "target": " ".join(overrides)}
+    if tracking.resume and find_finished(Store.existing(tracking), identity["fingerprint"]):
+        return
+    learner, data = build_learner(target), build_data(target, device.blank())
+    parent.load_weights(learner, data)
+    learner.network  # noqa: B018 - refuses another learner before gestures are read from a port
+    touches, others = choose_gestures(device, settings)
+    source, task = replace(alarm_source(parent, learner, target), device=twin), twin.task
+    choose = partial(choose_alarm_threshold, one_skin=True)
+    point = choose(source)
+    figures: dict[str, float] = {}
+    if others is not None:
+        tests = others.touches("test")
+        figures |= _figures("before", learner.probabilities(tests).numpy(), tests, task, point)
+    name = f"{target.row} {identity['simulator']} {len(touches)} gestures seed {settings.seed}"
+    store = Store.open(tracking)
+    with store.run(name, identity, parent.identity) as made:
+        candidates = fine_tune(learner, data, touches, settings)
+        candidates += learn_from_scratch(touches, task, settings, options)
+        best, after = choose_candidate(candidates, touches, task, settings)
+        learner = best.train()
+        chosen = settings_of(replace(target, learner=best.settings or target.learner))
+        log_configuration(store, made.info.run_id, chosen, touches_hash(touches))
+        log_learner(store, made, learner)
+        if best.name and point is not None:
+            point = choose(replace(source, learner=learner), anew=True)
+        figures |= _figures("validation_before", candidates[0].probabilities, touches, task)
+        figures |= _figures("validation", after, touches, task)
+        if others is None:
+            store.client.set_tag(made.info.run_id, TAG, "null" if point is None else point.text())
+            store.log_metrics(made, figures)
+        else:
+            report = evaluate(learner, others, check_evaluation(target.evaluation), point)
+            log_report(store, made, report, task, figures)
+            figures |= {key: value for key, value in report.metrics.items() if key.startswith("same/")}
+        store.client.set_tag(made.info.run_id, "chosen", best.name)
     _announce(figures, f"{name}, run {made.info.run_id}", others is not None, best.name, parent.identity)
 
 

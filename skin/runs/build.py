@@ -6,14 +6,13 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property, partial
 from inspect import signature
-from typing import Any, overload
+from typing import Any
 
 import numpy as np
 import torch
 from hydra import compose, initialize_config_dir
 from hydra.errors import HydraException, InstantiationException
 from hydra.utils import instantiate
-from numpy.typing import ArrayLike
 from omegaconf import OmegaConf
 from torch import Tensor
 
@@ -348,34 +347,11 @@ class TorchModel(Model):
         reference = self.device.reference
         return None if reference is None else reference.press_readings().double().numpy()
 
-    @overload
-    def predict(self, readings: Touches) -> Tensor: ...
-
-    @overload
-    def predict(self, readings: ArrayLike) -> np.ndarray: ...
-
-    def predict(self, readings: Touches | ArrayLike) -> Tensor | np.ndarray:
-        """Return the probability of each label, (B, L), for touches of this window and rate.
-
-        Args:
-            readings: B touches, which may have other sensors; or an array as in
-                :meth:`skin.runs.model.Model.predict`.
-
-        Returns:
-            A tensor for touches, else an array.
-
-        Raises:
-            InputError: the touches do not fit the run.
-        """
-        return (
-            self.learner.probabilities(readings)
-            if isinstance(readings, Touches)
-            else super().predict(readings)
-        )
-
+    @torch.inference_mode()
     def probabilities(self, readings: np.ndarray, valid: np.ndarray) -> np.ndarray:
         """Return the probability of each label, (B, L), for readings (B, T, S), N, and their validity."""
-        return window_classifier(self.learner, self.sites, self.rate)(readings, valid)
+        windows = torch.from_numpy(readings), torch.from_numpy(valid)
+        return self.learner.probabilities(Touches(*windows, self.sites, None, self.rate)).numpy()
 
     def describe(self, thresholds: Mapping[str, float] | None = None) -> ModelMetadata:
         """Return the description of the model for an exported file.
@@ -419,25 +395,6 @@ class TorchModel(Model):
                 if np.isfinite(limit)
             },
         )
-
-
-def window_classifier(
-    learner: Predictor, positions: Tensor, rate: float
-) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
-    """Return a function of the readings and validity of windows that asks a learner.
-
-    Args:
-        learner: trained.
-        positions: (S, 3), m.
-        rate: Hz.
-    """
-
-    @torch.inference_mode()
-    def classify(readings: np.ndarray, valid: np.ndarray) -> np.ndarray:
-        windows = torch.from_numpy(readings), torch.from_numpy(valid)
-        return learner.probabilities(Touches(*windows, positions, None, rate)).numpy()
-
-    return classify
 
 
 def load_run(
@@ -511,8 +468,7 @@ def load_model(
         learner = build_learner(config)
         data = build_frames(config.representation, device.blank(), partial(build_skin, config))
     run.load_weights(learner, data)
-    source = alarm_source(run, learner, config) if alarm else None
-    point = choose_alarm_threshold(source, one_skin=one_skin) if source else None
+    point = choose_alarm_threshold(alarm_source(run, learner, config), one_skin=one_skin) if alarm else None
     return TorchModel(device, learner, data.example, point, touch, run, used)
 
 

@@ -93,12 +93,11 @@ def source_tags() -> dict[str, str]:
     ``source_dirty`` is ``true`` if files differ from that commit, ``false`` if none does, and ``unknown``
     without git.
     """
-    commit, dirty = _git("log", "-1", "--format=%H", "--", *_FOLDERS), "unknown"
-    if commit:
-        dirty = "true" if _git("status", "--porcelain", "--", *_FOLDERS) else "false"
+    commit = _git("log", "-1", "--format=%H", "--", *_FOLDERS)
+    changed = "true" if _git("status", "--porcelain", "--", *_FOLDERS) else "false"
     return {
         "source_commit": commit or __version__,
-        "source_dirty": dirty,
+        "source_dirty": changed if commit else "unknown",
         "processor": _processor(),
     }
 
@@ -239,18 +238,8 @@ def check_server(uri: str | None) -> None:
     """Check that the server of a tracking URI answers, before anything heavy is imported.
 
     Raises:
-        InputError: it does not, or it is a database whose driver is not installed.
+        InputError: it does not.
     """
-    if uri is not None and uri.startswith(("mssql", "mysql", "postgresql")):
-        from sqlalchemy import exc, make_url  # only where a database is named
-
-        try:
-            make_url(uri).get_dialect().import_dbapi()
-        except (ImportError, exc.SQLAlchemyError) as error:
-            raise InputError(
-                f"tracking.uri={uri} needs a driver that is not installed ({one_line(error)}): install it, "
-                'or give postgresql+pg8000://... after pip install "tactile-skin[server]"'
-            ) from error
     if not answers(uri):
         raise InputError(
             f"the tracking server {uri} does not answer: start it, open the tunnel to it, or correct "

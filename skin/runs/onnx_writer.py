@@ -4,8 +4,7 @@ Importing it needs onnx, onnxscript and onnxruntime."""
 
 import logging
 import warnings
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from copy import deepcopy
 from pathlib import Path
 from typing import Any
@@ -69,8 +68,11 @@ def _convert(module: nn.Module, touches: Touches) -> Any:
     example = touches.readings.new_zeros(3, *touches.readings.shape[1:])
     module(example, example == 0)  # its own errors are clearer than those of the exporter
     batch = {0: torch.export.Dim("batch")}
-    with _quiet():
-        try:
+    # The exporter tells of libraries that are not needed, and would start a thread of tqdm.
+    logging.getLogger("torch.onnx").setLevel(logging.ERROR)
+    tqdm.monitor_interval = 0
+    try:
+        with warnings.catch_warnings(action="ignore"):
             program = torch.onnx.export(
                 module,
                 (example, example == 0),
@@ -82,25 +84,15 @@ def _convert(module: nn.Module, touches: Touches) -> Any:
                 custom_translation_table=TRANSLATIONS,
                 verbose=False,
             )
-        except torch.onnx.OnnxExporterError as error:
-            reason = (str(error.__cause__ or error).strip().splitlines() or [""])[0]
-            raise InputError(f"ONNX cannot express this network: {reason}; export another run") from error
+    except torch.onnx.OnnxExporterError as error:
+        reason = (str(error.__cause__ or error).strip().splitlines() or [""])[0]
+        raise InputError(f"ONNX cannot express this network: {reason}; export another run") from error
     assert program is not None
     for node in program.model.graph:
         for value in node.outputs:
             if not value.is_graph_output():
                 value.shape = None  # torch expects other shapes of the unused outputs of translations
     return program.model
-
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Silence what the exporter says about libraries that are not needed, and start no thread of tqdm."""
-    logging.getLogger("torch.onnx").setLevel(logging.ERROR)
-    tqdm.monitor_interval = 0
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        yield
 
 
 # Translations of the torch operators of the representations that ONNX lacks.

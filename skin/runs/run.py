@@ -32,7 +32,7 @@ from skin.core.messages import one_line
 from skin.core.safe_loading import TEXT, load_yaml, parse_json, read_file, regular, sha256
 from skin.core.settings import check_targets, configured
 from skin.errors import InputError
-from skin.evaluation.operating_point import LABEL, OperatingPoint, parse_operating_point
+from skin.evaluation.operating_point import OperatingPoint, parse_operating_point
 from skin.runs.configuration import (
     Config,
     Tracking,
@@ -359,7 +359,7 @@ def write_folder(run: FinishedRun, folder: Path, licence: str) -> None:
         licence: of the weights.
 
     Raises:
-        InputError: the run has too many weights or no predictions, or the folder cannot be written.
+        InputError: the run has too many weights, or the folder cannot be written.
     """
     # Without the machine and the folders of the training.
     omitted = ("tracking", "trust")
@@ -373,7 +373,6 @@ def write_folder(run: FinishedRun, folder: Path, licence: str) -> None:
         "start_time": run.run.info.start_time,
         "tags": {key: tag for key, tag in tags.items() if key != PROCESS and not key.startswith("mlflow.")},
         "metrics": {key: value for key, value in metrics.items() if "/" in key or key == "parameters"},
-        "check": _reference(run),
     }
     try:
         folder.parent.mkdir(exist_ok=True)
@@ -393,24 +392,6 @@ def write_folder(run: FinishedRun, folder: Path, licence: str) -> None:
             made.rename(folder)
     except OSError as error:
         raise unwritable(folder, error, "another current folder") from error
-
-
-def _reference(run: FinishedRun) -> dict[str, Any]:
-    """Return predictions on the first 400 test gestures, of the evaluation after the training."""
-    import pandas as pd
-
-    with TemporaryDirectory() as folder:
-        table = pd.read_parquet(run.fetch("predictions.parquet", folder)).head(400)
-    levels = {name: (name, 0.5) for name in table if f"same/{name}/accuracy" in run.run.data.metrics}
-    if (point := run.point) is not None:
-        levels["alarm"] = LABEL, point.threshold
-    predicted = {name: table[f"p_{label}"] > level for name, (label, level) in levels.items()}
-    correct = {
-        name: int((predicted[name] == (table[label] > 0.5)).sum()) for name, (label, _) in levels.items()
-    }
-    predictions = {name: "".join(values.astype(int).astype(str)) for name, values in predicted.items()}
-    # Two may be closer to a threshold than processors round.
-    return {"touches": len(table), "tolerance": 2, "correct": correct, "predictions": predictions}
 
 
 def model_card(name: str, record: Mapping[str, Any], config: Mapping[str, Any]) -> str:

@@ -1,6 +1,6 @@
 """Runs in MLflow: one SQLite file or a server, one experiment, and a status that is true after a crash.
 
-A request to a server that is away is repeated by MLflow: for seconds, and for twelve minutes during a run.
+A request to a server that is away is repeated by MLflow for two minutes.
 """
 
 import os
@@ -9,11 +9,10 @@ import os
 os.environ["MLFLOW_DISABLE_TELEMETRY"] = "true"
 os.environ.setdefault("MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR", "false")
 os.environ.setdefault("MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT", "true")
-# Seconds, not minutes, until a server counts as away: waits of 0, 2 and 4 s between the attempts.
-os.environ.setdefault("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "3")
+# Waits of 0, 2, 4, ... 64 s between the attempts: a server may start again meanwhile.
+os.environ.setdefault("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "7")
 os.environ.setdefault("MLFLOW_HTTP_REQUEST_BACKOFF_FACTOR", "1")
 
-import json
 import logging
 import sqlite3
 import time
@@ -50,26 +49,8 @@ from skin.runs.configuration import (
 from skin.runs.run import PROCESS
 
 _log = logging.getLogger(__name__)
-_QUICK = {"MLFLOW_HTTP_REQUEST_MAX_RETRIES": "3", "MLFLOW_HTTP_REQUEST_BACKOFF_FACTOR": "1"}
-# During a run: waits of 0, 20, 40, 80 and five times 120 s, together 12 minutes. MLflow takes no more than 9.
-_PATIENT = {"MLFLOW_HTTP_REQUEST_MAX_RETRIES": "9", "MLFLOW_HTTP_REQUEST_BACKOFF_FACTOR": "10"}
-
-# The table of runs in the UI of MLflow: the shared view of a link, with widths of its columns in pixels.
-_VIEW = "skin"
-_COLUMNS = {
-    "metrics.`same/overall/accuracy`": 180,
-    "metrics.`same/dangerous/alarm_recall`": 230,
-    "metrics.`same/dangerous/false_alarm_rate`": 250,
-}
-_WIDTHS = {"attributes.`Run Name`": 420} | _COLUMNS
-TAGS = {
-    # Which of its two interfaces MLflow shows. 3.17 takes it from the link instead.
-    "mlflow.experimentKind": "custom_model_development",
-    f"mlflow.sharedViewState.{_VIEW}": json.dumps(
-        {"selectedColumns": list(_COLUMNS), "columnOrder": list(_WIDTHS), "columnWidths": _WIDTHS}
-    ),
-}
-"""Tags of an experiment that holds runs of this package."""
+# Which of its two interfaces MLflow shows.
+_TAGS = {"mlflow.experimentKind": "custom_model_development"}
 
 
 @dataclass(frozen=True)
@@ -106,11 +87,12 @@ class Store:
                 served = is_server(uri) and settings.artifacts is None
                 location = None if served else (artifacts / settings.experiment).resolve().as_uri()
                 identity = _experiment(client, settings.experiment, location)
-        except (MlflowException, SQLAlchemyError, CommandError, sqlite3.Error, OSError) as error:
+        except (MlflowException, SQLAlchemyError, CommandError, sqlite3.Error, OSError, ImportError) as error:
             reason = next(iter(str(error.__cause__ or error).splitlines()), type(error).__name__)
             raise InputError(
                 f"cannot use the runs in {uri}: {reason.replace(reveal_password(uri), uri)}: give another "
-                "place, as in tracking.uri=sqlite:////FOLDER/runs.db"
+                "place, as in tracking.uri=sqlite:////FOLDER/runs.db, or postgresql+pg8000://... after pip "
+                'install "tactile-skin[server]"'
             ) from error
         store = cls(client, uri, identity, artifacts.resolve() / "unfinished")
         for run in store.find("RUNNING"):
@@ -150,8 +132,9 @@ class Store:
 
     def create(self, name: str, tags: dict[str, str]) -> Run:
         """Return a new run, tagged with this process; the caller must hold its lock and end it."""
-        tags = tags | {PROCESS: str(os.getpid())}
-        return self.client.create_run(self.experiment, tags=tags, run_name=shorten(name))
+        return self.client.create_run(
+            self.experiment, tags=tags | {PROCESS: str(os.getpid())}, run_name=shorten(name)
+        )
 
     @contextmanager
     def hold(self, name: str) -> Iterator[None]:
@@ -185,8 +168,6 @@ class Store:
     ) -> Iterator[Run]:
         """Open a run; it is FINISHED only if the block ends by itself, else FAILED, or KILLED by a signal.
 
-        A request to a server that is away waits for it for twelve minutes.
-
         Args:
             name: of the run.
             tags: of the run.
@@ -205,9 +186,8 @@ class Store:
         status = "KILLED"
         with self.hold(run.info.run_id), ends_on_signal(lambda: self.end(run.info.run_id, status)):
             try:
-                with _patience():
-                    yield run
-                    self.client.set_terminated(run.info.run_id, "FINISHED")  # waits for the server
+                yield run
+                self.client.set_terminated(run.info.run_id, "FINISHED")  # waits for the server
                 status = "FINISHED"
             except Exception as error:
                 if self._lost(error):
@@ -216,9 +196,6 @@ class Store:
                         "complete: repeat the command when it does; a training continues after its last epoch"
                     ) from error
                 status = "FAILED"
-                if answers(self.uri):
-                    text = f"{type(error).__name__}: {error}".replace(reveal_password(self.uri), self.uri)
-                    self.client.set_tag(run.info.run_id, "error", text[:500])
                 raise
             finally:
                 self.end(run.info.run_id, status)
@@ -249,34 +226,11 @@ class Store:
             self.client.log_batch(run.info.run_id, metrics[start : start + 1000], synchronous=True)
 
 
-@contextmanager
-def _patience() -> Iterator[None]:
-    """Let a request wait for a server that is away, unless a person chose otherwise."""
-    before = {name: os.environ[name] for name in _QUICK}
-    os.environ |= _PATIENT if before == _QUICK else {}
-    try:
-        yield
-    finally:
-        os.environ |= before
-
-
 def _experiment(client: MlflowClient, name: str, location: str | None) -> str:
     """Return the id of an experiment, made if it is missing."""
-    if (experiment := client.get_experiment_by_name(name)) is None:
-        try:
-            return client.create_experiment(name, artifact_location=location, tags=TAGS)
-        except MlflowException:
-            # Perhaps another process made it at the same time.
-            if (experiment := client.get_experiment_by_name(name)) is None:
-                raise
-    return str(experiment.experiment_id)
-
-
-def print_table_link(address: str = "http://127.0.0.1:5000") -> None:
-    """Print the link to the runs of ``mlflow.db`` in the current folder, at a server that shows them."""
-    experiment = Store.open(Tracking()).experiment
-    table = f"{address}/#/experiments/{experiment}/runs"
-    print(f"runs: {table}?workflowType=machine_learning&viewStateShareKey={_VIEW}")
+    if (experiment := client.get_experiment_by_name(name)) is not None:
+        return str(experiment.experiment_id)
+    return client.create_experiment(name, artifact_location=location, tags=_TAGS)
 
 
 def database_uri(path: Path) -> str:
@@ -297,8 +251,6 @@ def _lock_creation(uri: str, artifacts: Path) -> Iterator[Any]:
         return
     path = _database(uri)
     path.parent.mkdir(parents=True, exist_ok=True)
-    encoded = Path(uri.removeprefix("sqlite:///")).parent
-    existed = encoded.exists()
     with FileLock(f"{path}.lock"):
         if not path.exists() or not path.stat().st_size:
             from mlflow.store.tracking.sqlalchemy_store import SqlAlchemyStore  # heavy, and seldom needed
@@ -310,9 +262,6 @@ def _lock_creation(uri: str, artifacts: Path) -> Iterator[Any]:
             # Readers and writers at the same time; the mode stays with the file.
             connection.execute("PRAGMA journal_mode=WAL")
         yield
-        if not existed:  # MLflow makes the folder of the URI without decoding it, and leaves it empty
-            with suppress(OSError):
-                os.removedirs(encoded)
 
 
 def note_reuse(run: Run) -> None:

@@ -16,8 +16,6 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.utils import JobReturn, JobStatus
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
 
 from skin.core.messages import PARENT, to_input_error
 from skin.errors import InputError
@@ -123,7 +121,7 @@ def _words(config: DictConfig) -> list[str]:
 
 
 class SweepCallback(Callback):
-    """Hydra's callback of every command: opens and closes the parent run, shows the progress.
+    """Hydra's callback of every command: opens and closes the parent run, tells how each job ended.
 
     The parent exists before the first job, and with it database and experiment: jobs that start at once must
     not race to make them. Hydra does not call ``on_multirun_end`` when a job has failed, so the parent is
@@ -140,14 +138,13 @@ class SweepCallback(Callback):
     def __init__(self, parent: bool = True, runs: Collection[str] | None = None) -> None:
         self._wanted, self._runs = parent, runs
         self._store: Store | None = None
-        self._held = ExitStack()  # the lock of the parent, and the bar
+        self._held = ExitStack()  # the lock of the parent
         self._jobs: list[int] = []  # numbers of the jobs of this shard; empty: unknown
         self._swept: list[str] = []
-        self._bar: Progress | None = None
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what jobs in other processes need: they print how they ended."""
-        return vars(self) | {"_held": None, "_bar": None}
+        return vars(self) | {"_held": None}
 
     def on_run_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Refuse to divide a single job."""
@@ -198,16 +195,10 @@ class SweepCallback(Callback):
         atexit.register(self._close)
         os.environ[PARENT] = self._parent
         parallel = config.hydra.launcher.get("n_jobs") or 1  # of joblib's launcher
-        basic = config.hydra.launcher._target_.endswith(".BasicLauncher")
         if parallel != 1:
             # Two jobs with two threads each are several times slower than two with one.
             threads = max(1, cpu_count() // effective_n_jobs(parallel))
             os.environ.setdefault("OMP_NUM_THREADS", str(threads))
-        elif basic and (console := Console(stderr=True)).is_terminal:
-            columns = "{task.description}", BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
-            bar = Progress(*columns, console=console, transient=True, redirect_stdout=sys.stdout.isatty())
-            self._bar = self._held.enter_context(bar)
-            self._task = self._bar.add_task(name, total=len(self._jobs) or None)
 
     def _choose(self, config: DictConfig, jobs: Sequence[Mapping[str, str]]) -> None:
         """Choose the jobs of this shard, and tell the others that they have nothing to do."""
@@ -228,8 +219,6 @@ class SweepCallback(Callback):
         if self._store is None or str(config.hydra.job.num) in os.environ.get(LEFT_OUT, "").split():
             return
         number, value = config.hydra.job.num, job_return._return_value
-        if self._bar:
-            self._bar.advance(self._task)
         count = f"{self._jobs.index(number) + 1}/{len(self._jobs)}" if self._jobs else f"{number + 1}"
         job = _parse_choices(_words(config))
         label = f"[{count}] {' '.join(f'{key}={job[key]}' for key in self._swept or job)}"

@@ -1,6 +1,5 @@
 """One run: build, train, evaluate, log; evaluate again."""
 
-import json
 import logging
 import math
 import os
@@ -17,7 +16,6 @@ import numpy as np
 import pyarrow.parquet as pq
 import torch
 from mlflow.entities import Param, Run
-from mlflow.exceptions import MlflowException
 from omegaconf import OmegaConf
 from pytorch_lightning.loggers import MLFlowLogger
 from pytorch_lightning.utilities import rank_zero_only
@@ -26,9 +24,8 @@ from torch import Tensor
 
 from skin.core.files import results
 from skin.core.messages import PARENT, quiet
-from skin.core.progress import Steps
 from skin.core.settings import option_name
-from skin.device.simulated import report_balance
+from skin.device.simulated import check_label_leakage
 from skin.errors import InputError
 from skin.evaluation.alarm import AlarmSource, choose_alarm_threshold, threshold_device
 from skin.evaluation.metrics import OUTCOMES, compute_metrics
@@ -59,12 +56,7 @@ from skin.touch.labels import Task
 
 _log = logging.getLogger(__name__)
 
-# Expected seconds of each step, for the fraction in the progress.
-_EVALUATION = {
-    "loading the run and the threshold of its alarm": 20.0,
-    "reading or simulating the touches": 10.0,
-    "evaluating them": 30.0,
-}
+_OF_RECORDINGS = ("batch_size", "augment")  # settings of the data that touches of a file depend on
 _VALIDATION = "best_val_"  # begins the names of metrics of what was learned on the validation split
 
 
@@ -104,7 +96,7 @@ def train(config: Config) -> float:
     source = replace(source, device=device if settings.profile is None else threshold_device(source))
     learner.check(data)
     _objective(tracking.objective, _score(data.task, *[data.example.known_labels] * 2))  # refuses other names
-    report_balance(device, shown=PARENT not in os.environ)
+    check_label_leakage(device)
     name = name_run(identity, relevant_overrides(config.learner))
     store = Store.open(tracking)
     with store.hold(identity["fingerprint"]):
@@ -115,7 +107,8 @@ def train(config: Config) -> float:
             learner.unfinished = store.folder / run.info.run_id
             learner.unfinished.mkdir(exist_ok=True)
             log_configuration(store, run.info.run_id, settings_of(config), data.hash)
-            learner.fit(data, RunLogger(store, run.info.run_id, learner.unfinished))
+            logger = RunLogger(tracking_uri=reveal_password(store.uri), run_id=run.info.run_id)
+            learner.fit(data, logger)
             point = choose_alarm_threshold(source, anew=True)
             report = evaluate(learner, device, settings, point)
             parts = [(learner.probabilities(p), p.known_labels) for p in data.parts("validation") if len(p)]
@@ -166,38 +159,32 @@ def evaluate_run(config: Config, name: str, out: str | None, changes: Sequence[s
         InputError: the run, its device or a setting cannot be used.
     """
     quiet()
-    with Steps(_EVALUATION) as steps:
-        finished = find_run(config.tracking, name, config.trust)
-        configured = finished.configured(changes)
-        settings, model = check_evaluation(configured.evaluation), load_model(finished, configured)
-        device, learner, point = model.device, model.learner, model.point
-        steps.begin("reading or simulating the touches")
-        if device.real:
-            steps.stop()  # a person may be prompted
-        touches = device.touches("test")  # read before anything is logged, because a port may fail
-        steps.start()
-        steps.begin("evaluating them")
-        title = f"{finished.title} ({finished.identity})"
-        # An address of a store, which may hold a password, changes no figure.
-        changes = [word for word in changes if not word.startswith("tracking.")]
-        tags = {"evaluated": finished.identity, "overrides": " ".join(changes)}
-        store = Store.open(configured.tracking)
-        with store.run(f"evaluation of {finished.title}", tags, finished.identity) as evaluation:
-            # Evaluations do not overwrite each other's files.
-            path = results(out) / f"evaluation_{option_name(device)}_{evaluation.info.run_id[:8]}.md"
-            if touches.labels is None:
-                written = [path.with_suffix(".csv")]
-                probabilities = learner.probabilities(touches)
-                print(title, write_probabilities(probabilities, device.task, point, *written), sep="\n")
-            else:
-                report = evaluate(learner, device, settings, point)
-                log_report(store, evaluation, report, device.task, {})
-                words = f"`{' '.join(changes)}`" if changes else "the settings of the run"
-                description = f"Run {title}, evaluated with {words}, {len(report.predictions)} gestures."
-                written = publish_evaluation(path, report, device.task, finished.title, description)
-                show(report, title)
-            for file in written:
-                store.client.log_artifact(evaluation.info.run_id, str(file))
+    finished = find_run(config.tracking, name, config.trust)
+    configured = finished.configured(changes)
+    settings, model = check_evaluation(configured.evaluation), load_model(finished, configured)
+    device, learner, point = model.device, model.learner, model.point
+    touches = device.touches("test")  # read before anything is logged, because a port may fail
+    title = f"{finished.title} ({finished.identity})"
+    # An address of a store, which may hold a password, changes no figure.
+    changes = [word for word in changes if not word.startswith("tracking.")]
+    tags = {"evaluated": finished.identity, "overrides": " ".join(changes)}
+    store = Store.open(configured.tracking)
+    with store.run(f"evaluation of {finished.title}", tags, finished.identity) as evaluation:
+        # Evaluations do not overwrite each other's files.
+        path = results(out) / f"evaluation_{option_name(device)}_{evaluation.info.run_id[:8]}.md"
+        if touches.labels is None:
+            written = [path.with_suffix(".csv")]
+            probabilities = learner.probabilities(touches)
+            print(title, write_probabilities(probabilities, device.task, point, *written), sep="\n")
+        else:
+            report = evaluate(learner, device, settings, point)
+            log_report(store, evaluation, report, device.task, {})
+            words = f"`{' '.join(changes)}`" if changes else "the settings of the run"
+            description = f"Run {title}, evaluated with {words}, {len(report.predictions)} gestures."
+            written = publish_evaluation(path, report, device.task, finished.title, description)
+            show(report, title)
+        for file in written:
+            store.client.log_artifact(evaluation.info.run_id, str(file))
     print(*written, sep="\n")
 
 
@@ -206,27 +193,7 @@ class RunLogger(MLFlowLogger):
 
     Lightning's own calls a run FINISHED when the fit ends; one that is killed during its evaluation would
     then count as finished without having any result.
-
-    Args:
-        store: of the run.
-        run: its id.
-        folder: for metrics that a server did not take, which the next logger of the run sends.
     """
-
-    def __init__(self, store: Store, run: str, folder: Path) -> None:
-        super().__init__(tracking_uri=reveal_password(store.uri), run_id=run)
-        self._left = folder / "metrics.json"
-        if self._left.is_file():
-            super().log_metrics(**json.loads(self._left.read_text()))
-            self._left.unlink()
-
-    def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
-        """Log the metrics of an epoch; those of one that is in a checkpoint are not measured again."""
-        try:
-            super().log_metrics(metrics, step)
-        except MlflowException:
-            self._left.write_text(json.dumps({"metrics": dict(metrics), "step": step}))
-            raise
 
     def finalize(self, status: str = "success") -> None:
         """Do nothing: the run ends with its evaluation."""
@@ -239,26 +206,24 @@ def find_unfinished(store: Store, fingerprint: str) -> Run | None:
         store: where.
         fingerprint: of the run.
     """
-    source = source_tags()
-    for run in store.find("KILLED", fingerprint=fingerprint):
-        same = all(run.data.tags.get(key) == value for key, value in source.items())
-        if same and (store.folder / run.info.run_id / LAST).is_file():
-            _log.info(
-                "run %s was interrupted and continues: tracking.resume=false repeats it", run.info.run_id
-            )
-            return run
-    return None
+    source = source_tags().items()
+    killed = store.find("KILLED", fingerprint=fingerprint)
+    same = (run for run in killed if source <= run.data.tags.items())
+    run = next((run for run in same if (store.folder / run.info.run_id / LAST).is_file()), None)
+    if run is not None:
+        _log.info("run %s was interrupted and continues: tracking.resume=false repeats it", run.info.run_id)
+    return run
 
 
 def find_finished(store: Store, fingerprint: str) -> Run | None:
     """Return the newest run that did a training before; print its metrics, unless a sweep does."""
-    for run in store.find("FINISHED", fingerprint=fingerprint):
+    run = next(iter(store.find("FINISHED", fingerprint=fingerprint)), None)
+    if run is not None:
         note_reuse(run)
         _log.info("run %s did this before: tracking.resume=false repeats it", run.info.run_id)
         if PARENT not in os.environ:
             Console().print(metrics_table(run.data.metrics, run.info.run_name))
-        return run
-    return None
+    return run
 
 
 def log_learner(store: Store, run: Run, learner: AbstractLearner) -> None:
@@ -282,18 +247,18 @@ def log_configuration(store: Store, run: str, settings: dict[str, Any], data_has
     store.client.set_tag(run, "data_hash", data_hash)
     unused, simulated = unused_groups(settings["learner"]), "simulator" in settings["device"]
     groups = ("simulator", "device", "representation", "model", "fusion", "learner")[0 if simulated else 1 :]
-    parts = {part: settings.get(part, {}) for part in ("data", *NETWORK, "learner") if part not in unused}
-    if not simulated:
-        parts["data"] = {name: settings["data"][name] for name in ("batch_size", "augment")}
+    data = {name: settings["data"][name] for name in (settings["data"] if simulated else _OF_RECORDINGS)}
+    parts = {part: settings.get(part, {}) for part in (*NETWORK, "learner") if part not in unused}
     values = {
         ".".join(path): value
-        for path, value in iterate_leaves(parts)
+        for path, value in iterate_leaves({"data": data, **parts})
         if not path[-1].startswith("_") and not {"body", *NETWORK, *MACHINE}.intersection(path[1:])
     }
-    values |= relevant_overrides(settings["learner"])
-    used = [group for group in groups if group in settings and group not in unused]
-    values |= {group: name_option(settings[group], group) for group in used}
-    values |= {"seed": settings["seed"], "row": settings.get("row")}
+    values |= relevant_overrides(settings["learner"]) | {
+        "seed": settings["seed"],
+        "row": settings.get("row"),
+        **{name: name_option(settings[name], name) for name in groups if name in settings.keys() - {*unused}},
+    }
     store.client.log_batch(run, params=[Param(name, str(value)) for name, value in values.items()])
 
 

@@ -66,8 +66,9 @@ def test_it_is_adapted_to_a_skin_that_must_be_named(run, folder):
     quick = ["adapt.gestures=8", "adapt.layers=[head]", "adapt.lr=[0.001]", "adapt.epochs=2"]
     quick += ["evaluation.safe_gestures=64"]
     done = run(folder, "adapt", *OWN, *quick, code=2)
-    assert "was trained on many skins: name the one to adapt to" in done.stderr
-    done = run(folder, "adapt", "device=simulated", "device.test_gestures=200", *OWN, *quick)
+    assert "is adapted to gestures of one skin: add device=recording" in done.stderr
+    run(folder, "generate", "n=40", "out=forty.parquet", *OWN, store=False)
+    run(folder, "adapt", "device=recording", "device.path=forty.parquet", *OWN, *quick)
     found = metrics(folder)[-1]
     assert 0 < found["before/overall/accuracy"] <= 1
     assert 0 < found["same/overall/accuracy"] <= 1

@@ -12,7 +12,7 @@ from tests.budget import free
 
 MAPPING = {
     "files": "*/*.csv",
-    "table": {"missing": ["-1.000"]},
+    "table": {"na_values": ["-1.000"]},
     "fields": "(?P<person>[^/]+)/(?P<gesture>[a-z]+)",
     "time": {"column": "time", "unit": "ms"},
     "channels": {"columns": "s*", "unit": "N"},
@@ -86,7 +86,7 @@ def test_a_folder_is_converted_and_trained_on_by_person(run, converted, tmp_path
     ("words", "message"),
     [
         (["from=map.yaml", "path=nowhere"], "nowhere has no file */*.csv"),
-        (["reader=skin.device.readers.epi"], "reader=skin.device.readers.epi needs path="),
+        (["reader=skin.device.conversion.epi"], "reader=skin.device.conversion.epi needs path="),
         (["reader=os.getcwd", "path=.", "options={a: 1}"], "options has no setting a"),
     ],
 )

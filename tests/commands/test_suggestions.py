@@ -54,14 +54,6 @@ def test_an_option_of_a_plugin_is_told_how_to_install(refused):
     assert 'pip install "tactile-skin[optuna]" adds it' in refused("-m", "hydra/sweeper=optuna")
 
 
-@pytest.mark.parametrize("scheme", ["postgresql+none", "mysql+none"])
-def test_a_database_without_its_driver_is_refused_at_once(scheme, refused):
-    error = refused(f"tracking.uri={scheme}://me:geheim@127.0.0.1:1/runs")
-    assert f"tracking.uri={scheme}://me:***@127.0.0.1:1/runs needs a driver that is not installed" in error
-    assert "give postgresql+pg8000://" in error
-    assert len(error.splitlines()) == 1
-
-
 @pytest.mark.parametrize("shown", ["job", "hydra"])
 def test_a_password_is_not_in_the_configuration(shown, capsys):
     main(["tracking.uri='postgresql+pg8000://me:ge/heim@h/runs'", "--cfg", shown])

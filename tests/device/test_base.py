@@ -4,11 +4,11 @@ from pathlib import Path
 
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
 
+from skin.core.files import CONF
 from skin.device.base import AbstractDevice, split_groups
 from skin.device.files import write_recording
-from skin.device.simulated import Simulated, report_balance
+from skin.device.simulated import Simulated, check_label_leakage
 from skin.errors import InputError
 from skin.evaluation.alarm import threshold_gestures
 from skin.evaluation.operating_point import OperatingPoint
@@ -17,28 +17,21 @@ from skin.evaluation.settings import Evaluation
 from skin.evaluation.streams import evaluate_windows
 from skin.record.serial import open_source
 from skin.runs.build import build_device
-from skin.runs.configuration import validate_config
 
-CONF = Path(__file__).parents[2] / "conf"
 POINT = OperatingPoint(0.5, 0.02)
 SMALL = ["data.gestures=50", "device.test_gestures=20", "simulator=naive"]
-
-
-def build(*overrides: str) -> AbstractDevice:
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        return build_device(validate_config(compose("train", overrides=list(overrides))))
 
 
 EVERYWHERE = ("recording", "simulated")  # others need what is not everywhere: a corpus, a port
 
 
 @pytest.fixture(scope="module", params=EVERYWHERE)
-def device(request, tmp_path_factory) -> AbstractDevice:
+def device(request, configured, tmp_path_factory) -> AbstractDevice:
+    simulated = build_device(configured(*SMALL))
     if request.param == "simulated":
-        return build(*SMALL)
-    path = tmp_path_factory.mktemp("recording") / "x.parquet"
-    write_recording(build(*SMALL).recording(), path)
-    return build("device=recording", f"device.path={path}")
+        return simulated
+    path = write_recording(simulated.recording(), tmp_path_factory.mktemp("recording") / "x.parquet")
+    return build_device(configured("device=recording", f"device.path={path}"))
 
 
 def test_other_devices_have_tests_of_their_own():
@@ -81,7 +74,7 @@ def test_a_device_of_ones_own_needs_touches_alone(made_up_device, capsys):
     assert torch.equal(
         threshold_gestures(made_up_device, settings).readings, made_up_device.touches("validation").readings
     )
-    report_balance(made_up_device)
+    check_label_leakage(made_up_device)
     assert not capsys.readouterr().err
     assert made_up_device.blank() is made_up_device
     assert torch.equal(made_up_device.all_touches().readings, made_up_device.touches("test").readings)

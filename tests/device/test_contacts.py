@@ -1,16 +1,13 @@
 """Contacts of fingertips travel with the touches, and what does not know them says so."""
 
-from dataclasses import replace
-
 import pytest
 import torch
 
 from skin.body.layout import Grid
 from skin.body.sheet import Sheet
-from skin.core.rng import Stream
 from skin.device.files import describe_recording, read_description, read_recording, write_recording
 from skin.device.simulated import Simulated
-from skin.device.touches import Touches, concatenate, join_contacts
+from skin.device.touches import concatenate, join_contacts
 from skin.learning.data import Augmentation
 from skin.mechanics.simulator.naive import Naive
 
@@ -46,13 +43,6 @@ def test_a_file_of_gestures_has_no_trace_of_them(tmp_path):
     path = write_recording(gestures, tmp_path / "x.parquet")
     assert "contacts" not in read_description(path)
     assert read_recording(path).touches.contacts is None
-
-
-def test_splits_and_drawn_touches_have_them():
-    source = device()
-    for touches in (source.touches("train"), source.touches("test"), source.draw(Stream.ALARM, 5, 0)):
-        assert touches.contacts.shape == (len(touches), 30, 3, 5)
-    assert same(source.touches("train").contacts[3], source.touches("train")[3:4].contacts[0])
 
 
 def test_contacts_press_sensors_that_are_near():
@@ -94,11 +84,3 @@ def test_a_shifted_touch_has_shifted_contacts():
     pressed = moved.readings.sum(2) > 1e-3
     assert not moved.contacts[..., 0].isnan().all(2)[pressed].any()
     assert same(*(each.contacts[..., 3].flatten(1).nan_to_num(0).sort(1).values for each in (moved, touches)))
-
-
-@pytest.mark.parametrize("shape", [(2, 4, 3, 4), (2, 5, 3, 5), (1, 4, 3, 5)])
-def test_contacts_of_other_shapes_are_refused(shape):
-    readings = torch.zeros(2, 4, 3)
-    touches = Touches(readings, readings == 0, torch.zeros(3, 3), None, 10.0)
-    with pytest.raises(ValueError, match="contacts must be"):
-        replace(touches, contacts=torch.zeros(shape))

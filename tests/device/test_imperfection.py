@@ -56,33 +56,12 @@ def test_axes_of_a_site_talk_to_each_other_and_to_no_other_site():
     assert np.abs(np.corrcoef(gains.T.numpy()) - np.eye(3)).max() < 0.15
 
 
-def test_constants_belong_to_the_device_and_noise_does_not():
-    idle = torch.zeros(5, 30, 25)
-    one, *_ = apply(idle, offset=0.1)
-    assert torch.equal(one[0, 0], one[4, 29])
-    assert not torch.equal(one, apply(idle, seed=1, offset=0.1)[0])
-    said, valid, _ = apply(torch.full((5, 30, 25), 3.0), dead=4, offset=0.1, noise=0.05)
-    assert (~valid).sum(-1).eq(4).all()
-    assert (said[~valid] == 0).all()
-    assert (said[valid] > 2).all()
-    assert (valid == valid[0, 0]).all()
-
-
 def test_tare_removes_the_offset_but_for_the_noise_of_its_idle_frames():
     idle = torch.zeros(1, 1, 4000)
     with_offset, *_ = apply(idle, offset=0.1)
     tared, *_ = apply(idle, offset=0.1, noise=0.05, tare=True)
     assert with_offset.std() > 0.09
     assert abs(float(tared.std()) - 0.05 * np.sqrt(1 + 1 / 30)) < 0.003
-
-
-def test_a_device_per_gesture():
-    imperfection = Imperfection(noise=0, dead=2)
-    constants = imperfection.constants(25, generator(), gestures=6)
-    said, valid, _ = imperfection.apply(torch.zeros(6, 30, 25), constants, generator(1))
-    assert (said == said[:, :1]).all()
-    assert not torch.equal(said[0], said[1])
-    assert (~valid).sum(-1).eq(2).all()
 
 
 def test_every_device_draws_its_own_number_of_dead_sensors():

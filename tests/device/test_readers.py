@@ -1,6 +1,6 @@
 """Readers of public data sets, on files in their exact format, and functions of one's own."""
 
-import csv
+import re
 from itertools import product
 from pathlib import Path
 
@@ -9,108 +9,45 @@ import pytest
 import torch
 
 from skin.core.files import ROOT
-from skin.device.conversion import convert_files, read_by_function
+from skin.device.conversion import convert_files, eflesh, epi, read_by_function
 from skin.device.files import read_recording, write_recording
 from skin.device.formats import read_format
-from skin.device.readers import GESTURES, VARIANTS, cost, eflesh, epi
 from skin.errors import InputError
 
 REAL = ROOT.parent / "shared" / "real"
-SUBJECTS = (1, 2, 3, 5, 8, 13, 21, 31)
-HEADER = "subject, variant, gesture, frame, " + ", ".join(f"ch{number}" for number in range(1, 65))
 
 
-@pytest.fixture(scope="module")
-def corpus(tmp_path_factory) -> Path:
-    """Return a file in the format of CoST.csv; channels 62 to 64 hold gesture, variant and subject."""
-    random, lines = np.random.default_rng(0), [HEADER]
-    for subject, variant, gesture in product(SUBJECTS, (1, 2, 3), range(1, 15)):
+def test_the_reader_of_the_page_has_the_captures_of_cost(tmp_path):
+    """Channels 62 to 64 hold gesture, variant and subject."""
+    random, captures = np.random.default_rng(0), {}
+    lines = ["subject, variant, gesture, frame, " + ", ".join(f"ch{number}" for number in range(1, 65))]
+    for subject, variant, gesture in product((1, 21), (1, 2, 3), (1, 2, 14)):
         counts = random.integers(0, 1024, (int(random.integers(10, 40)), 64))
-        counts[:, 61:] = 10 * gesture, 100 * variant, 20 * subject
-        head = f"{subject},{variant},{gesture}"
-        lines += [f"{head},{n}," + ",".join(map(str, row)) for n, row in enumerate(counts.tolist(), start=1)]
-    path = tmp_path_factory.mktemp("corpus") / "CoST.csv"
-    path.write_text("\n".join(lines) + "\n")
-    return path
-
-
-def test_every_capture_is_resampled_as_numpy_does(corpus):
-    captures: list[list[list[int]]] = []
-    with corpus.open() as file:
-        for row in list(csv.reader(file))[1:]:
-            numbers = [int(text) for text in row]
-            if numbers[3] == 1:
-                captures.append([])
-            captures[-1].append(numbers)
-    recording = cost(corpus, window=17)
-    assert len(recording) == len(captures)
-    for readings, capture in zip(recording.touches.readings.numpy(), map(np.array, captures), strict=True):
-        old, new = np.linspace(0, 1, len(capture)), np.linspace(0, 1, 17)
-        expected = np.stack([np.interp(new, old, column) for column in capture[:, 4:].T], axis=1)
-        assert np.allclose(readings, 0.0097752 * expected, atol=1e-4)
-    frames = np.median([135 * 16 / (len(capture) - 1) for capture in captures])
-    assert recording.touches.rate == pytest.approx(frames)
-
-
-@pytest.mark.parametrize(
-    ("gestures", "variants"), [(GESTURES, False), (("grab", "hit"), True), (("tap", "massage"), False)]
-)
-def test_classes_and_subjects_are_those_of_the_file(corpus, gestures, variants):
-    recording = cost(corpus, gestures, variants)
-    names = [f"{name}_{how}" for name in gestures for how in VARIANTS] if variants else list(gestures)
-    assert (list(recording.task.names), recording.task.kind) == (names, "exclusive")
-    hidden = (recording.touches.readings[:, 0, 61:] / 0.0097752 / torch.tensor([10, 100, 20])).round().int()
-    subjects = recording.metadata["groups"]["subject"]
-    assert sorted(map(int, subjects)) == list(SUBJECTS)
-    for (gesture, variant, subject), label, number in zip(
-        hidden.tolist(),
-        recording.touches.labels.argmax(1).tolist(),
+        counts[:, 61:] = gesture, variant, subject
+        captures[gesture, variant, subject] = counts
+        lines += [
+            f"{subject},{variant},{gesture},{n}," + ",".join(map(str, row))
+            for n, row in enumerate(counts.tolist(), start=1)
+        ]
+    (tmp_path / "CoST.csv").write_text("\n".join(lines))
+    names = {}
+    exec(re.search(r"```py\n(.*?)```", (ROOT / "docs" / "data.md").read_text(), re.S)[1], names)
+    recording = names["read"](tmp_path / "CoST.csv", frames=17)
+    assert recording.task.names == tuple(
+        f"{a}_{b}" for a in ("grab", "hit") for b in ("gentle", "normal", "rough")
+    )
+    assert len(recording) == 12
+    for readings, labels, number in zip(
+        recording.touches.readings.numpy(),
+        recording.touches.labels,
         recording.parameters["group_subject"].int().tolist(),
         strict=True,
     ):
-        words = [GESTURES[gesture - 1], *([VARIANTS[variant - 1]] if variants else [])]
-        assert "_".join(words) == names[label]
-        assert int(subjects[number]) == subject
-
-
-def test_taxels_are_channels(corpus):
-    whole = cost(corpus, pitch=0.02)
-    assert whole.size == pytest.approx((0.16, 0.16))
-    part = cost(corpus, taxels=[64, 1, 8, 57], pitch=0.02)
-    assert torch.equal(part.touches.readings, whole.touches.readings[:, :, [0, 7, 56, 63]])
-    corners = [[0.01, 0.01, 0], [0.15, 0.01, 0], [0.01, 0.15, 0], [0.15, 0.15, 0]]
-    assert np.allclose(part.touches.positions, corners)
-
-
-def changed(line: int, column: int, value: str):
-    """Return a change of one number in a file's lines, counted from 1 with the header."""
-
-    def change(lines: list[str]) -> list[str]:
-        row = lines[line - 1].split(",")
-        row[column] = value
-        return [*lines[: line - 1], ",".join(row), *lines[line:]]
-
-    return change
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (lambda lines: [], "No columns to parse"),
-        (changed(1, 2, " Gesture"), "has no column gesture, which CoST.csv of https://doi"),
-        (changed(1, 67, " ch65"), "has no column ch64"),
-        (changed(9, 67, "5,5"), "Expected 68 fields in line 9, saw 69"),
-        (changed(9, 10, "x"), "column ch7 has 'x' in row 8, no number"),
-    ],
-)
-def test_an_altered_file_is_refused(corpus, tmp_path, change, message):
-    path = tmp_path / "CoST.csv"
-    path.write_text("\n".join(change(corpus.read_text().splitlines()[:60])))
-    with pytest.raises(InputError, match=message) as refused:
-        cost(path)
-    assert "\n" not in str(refused.value)
-    with pytest.raises(InputError, match=r"CoST.csv is at https://doi"):
-        cost(tmp_path / "none.csv")
+        key = tuple((readings[0, 61:] / 0.0097752).round().astype(int).tolist())
+        assert int(labels.argmax()) == 3 * (key[0] - 1) + key[1] - 1
+        assert recording.metadata["groups"]["subject"][number] == str(key[2])
+        first, last = 0.0097752 * captures[key][[0, -1]]
+        assert np.allclose(readings[[0, -1]], [first, last], atol=1e-4)
 
 
 def test_epi_has_a_touch_in_each_row(tmp_path):

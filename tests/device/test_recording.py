@@ -7,12 +7,13 @@ import torch
 
 from skin.body.layout import Grid, Scattered
 from skin.body.sheet import Sheet
-from skin.device.files import Manifest, describe_recording, read_recording, write_recording
+from skin.device.files import read_recording, write_recording
 from skin.device.recording import Recorded
 from skin.device.simulated import Simulated
 from skin.errors import InputError
 from skin.mechanics.simulator.naive import Naive
 from skin.touch.labels import Task
+from tests.device.conftest import write_data_set
 
 LAYER = [{"material": "EcoFlex 00-30", "thickness": 0.005}]
 BODY = Sheet([0.16, 0.16], [16, 16], LAYER)
@@ -29,21 +30,9 @@ def path(simulated, tmp_path_factory) -> str:
     return str(write_recording(simulated, tmp_path_factory.mktemp("files") / "x.parquet"))
 
 
-def data_set(simulated, folder) -> str:
-    """Write 50 touches as shards of 20, 20 and 10."""
-    source = {"seed": 0, "source_commit": "a", "source_dirty": "false", "config_hash": "1", "config": {}}
-    manifest = Manifest.of(describe_recording(simulated), [20, 20, 10], **source)
-    manifest.write(folder)
-    for number, first in enumerate(manifest.firsts):
-        shard = simulated[first : first + manifest.shards[number]]
-        shard = replace(shard, metadata={"config_hash": "1", "summary": {}})
-        write_recording(shard, manifest.path(folder, number), first)
-    return str(folder)
-
-
 @pytest.fixture(scope="module")
 def folder(simulated, tmp_path_factory) -> str:
-    return data_set(simulated, tmp_path_factory.mktemp("sets") / "touches")
+    return str(write_data_set(simulated, tmp_path_factory.mktemp("sets") / "touches"))
 
 
 @pytest.mark.parametrize("stored", ["path", "folder"])
@@ -80,18 +69,6 @@ def test_no_file_and_too_few_touches_are_refused(simulated, tmp_path):
     few = write_recording(simulated[:9], tmp_path / "few.parquet")
     with pytest.raises(InputError, match=r"has 9 touches: 80/10/10 needs at least 10"):
         Recorded(BODY, LAYOUT, str(few))
-
-
-def test_a_data_set_is_made_in_parts(folder):
-    device = Recorded(BODY, LAYOUT, folder)
-    for split in ("train", "validation", "holdout"):
-        parts = device.parts(split)
-        made = [part.make() for part in parts]
-        assert [len(part) for part in made] == [part.count for part in parts]
-        joined = torch.cat([part.touches.readings for part in made])
-        assert torch.equal(joined, device.touches(split).readings)
-    assert len(device.parts("train")) > 1
-    assert [part.count for part in device.parts()] == [20, 20, 10]
 
 
 def test_no_more_is_held_out_than_needed(folder, monkeypatch):

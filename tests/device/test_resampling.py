@@ -71,15 +71,6 @@ def test_it_slides_at_every_frame_and_forgets_nothing_it_needs():
     assert window.period == pytest.approx(0.01)
 
 
-def test_frames_that_jitter_fall_where_they_belong():
-    window, generator = Window(10, 10.0, SENSORS), np.random.default_rng(1)
-    values = generator.random((60, SENSORS))
-    for number, row in enumerate(values):
-        window.add(frame(0.1 * number + generator.uniform(-0.02, 0.02), row))
-        if number > 20:
-            np.testing.assert_array_equal(window.read().values, values[number - 9 : number + 1])
-
-
 def test_a_slower_stream_is_refused_with_both_rates():
     window = Window(6, 10.0, SENSORS)
     for one in stream(5.0, 20):
@@ -166,11 +157,3 @@ def test_a_recorded_window_is_the_live_one_at_its_last_frame(rate):
         if begin is None and t > 1.5:
             begin = t
     assert compared >= 2
-
-
-def test_the_largest_of_each_interval_of_a_window_that_began():
-    window = Window(5, 10.0, 2)
-    for number in range(70):
-        window.add(frame(number / 100, [number % 7, -number]))
-    by_hand = [[max(n % 7 for n in range(k, k + 10)), -k] for k in range(20, 70, 10)]
-    assert window.since(0.2).values.tolist() == by_hand

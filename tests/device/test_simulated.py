@@ -139,17 +139,6 @@ def test_position_error_moves_the_sensors_and_not_what_is_reported(plain):
     assert (true[:, :2] <= BODY.size).all()
 
 
-def test_settings_of_a_device_show_in_its_touches(plain):
-    idle = device(randomise=True, noise=0.0).touches("test").readings.abs().amin(1)
-    assert (idle.std(0) > 0.02).all(), "every gesture has a device"
-    assert (~device(dead=3).touches("test").valid).sum(-1).eq(3).all()
-    assert plain.replace(layout=Grid(4, 4)).touches("test").readings.shape == (32, 30, 16)
-    assert (device(padded=False).recording("test").force[:, 0] > 0).all()
-    touches = device(touch={"rate": 50.0}, rate=50.0).touches("test")
-    assert (touches.readings.shape[1], touches.rate) == (150, 50.0)
-    assert touches.labels.mean(0).tolist() == [0.5] * 4
-
-
 def test_the_summary_counts(plain):
     recording = plain.recording("test")
     summary, known = recording.metadata["summary"], recording.parameters

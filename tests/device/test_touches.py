@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from skin.device.touches import Recording, Touches, concatenate
+from skin.device.touches import Recording, Touches
 from skin.touch.labels import TOUCH
 
 
@@ -33,12 +33,6 @@ def test_selected_touches(moving, index):
     assert torch.equal(some.positions, every.positions[index] if moving else every.positions)
 
 
-def test_touches_move_to_a_device():
-    moved = touches().to("meta")
-    assert moved.readings.device.type == moved.labels.device.type == "meta"
-    assert moved.rate == 10.0
-
-
 @pytest.mark.parametrize(
     ("made", "wrong"),
     [
@@ -46,6 +40,8 @@ def test_touches_move_to_a_device():
         (touches, {"valid": torch.ones(4, 6, 3)}),
         (touches, {"positions": torch.zeros(2, 3)}),
         (touches, {"labels": torch.zeros(3, 4)}),
+        (touches, {"contacts": torch.zeros(4, 6, 3, 4)}),
+        (touches, {"contacts": torch.zeros(4, 5, 3, 5)}),
         (recording, {"touches": touches(moving=True)}),
         (recording, {"force": torch.zeros(4, 5)}),
         (recording, {"displacement": torch.zeros(4, 6, 3)}),
@@ -55,12 +51,3 @@ def test_touches_move_to_a_device():
 def test_touches_and_recordings_that_disagree_are_refused(made, wrong):
     with pytest.raises(ValueError, match=r"must"):
         replace(made(), **wrong)
-
-
-def test_parts_join_to_the_whole():
-    whole = recording()
-    again = concatenate([whole[:1], whole[1:]])
-    assert torch.equal(again.touches.readings, whole.touches.readings)
-    assert torch.equal(again.touches.valid, whole.touches.valid)
-    assert torch.equal(again.displacement, whole.displacement)
-    assert torch.equal(again.parameters["speed"], whole.parameters["speed"])

@@ -10,7 +10,6 @@ from skin.device.resampling import Frame
 from skin.device.touches import Touches
 from skin.errors import InputError
 from skin.live.engine import Debounce, DebounceSettings, Detection, Engine
-from skin.runs.build import window_classifier
 from skin.touch.labels import TOUCH, Task
 from skin.wire.channels import UnitConversion
 from skin.wire.tare import Tare
@@ -43,7 +42,11 @@ def engine(
     """Return an engine of four sensors, with a model and with what converts its frames."""
     detection = Detection(threshold, learned=task.gate is not None, longest=longest)
     loud = Loud()
-    classify = window_classifier(loud, torch.zeros(4, 3), rate)
+
+    def classify(readings, valid):
+        touches = Touches(*map(torch.from_numpy, (readings, valid)), torch.zeros(4, 3), None, rate)
+        return loud.probabilities(touches).numpy()
+
     subject = Engine(classify, task, 4, window, rate, detection, DebounceSettings(**patience), presses)
     subject.loud, subject.tare = loud, Tare(lambda baseline, header: conversion, 0.0, rate)
     subject.reset(noise=conversion.noise)

@@ -9,10 +9,11 @@ import torch
 from skin.body.base import Sheet
 from skin.body.layout import Grid
 from skin.device.files import read_recording
+from skin.device.touches import Touches
 from skin.live.engine import Detection, Engine
 from skin.live.loop import Display, LiveLoop
 from skin.record.serial import Serial, convert_session, record_session
-from skin.runs.build import build_data, build_device, build_learner, window_classifier
+from skin.runs.build import TorchModel, build_data, build_device, build_learner
 from skin.touch.labels import TOUCH
 from skin.wire.clocks import FrameClock
 from skin.wire.decoder import Decoder
@@ -111,7 +112,8 @@ def live(learner, stream):
     """Return the window and the verdict of the live view at each frame, by its number."""
     device, asked, found = serial(), Asked(learner), {}
     positions = torch.from_numpy(device.sensors.positions).float()
-    engine = Engine(window_classifier(asked, positions, 10.0), TOUCH, 6, 30, 10.0, Detection(0.3))
+    example = Touches(torch.zeros(1, 30, 6), torch.ones(1, 30, 6) > 0, positions, None, 10.0)
+    engine = Engine(TorchModel(device, asked, example).probabilities, TOUCH, 6, 30, 10.0, Detection(0.3))
 
     class Taking(Display):
         def set_verdict(self, verdict, *others):

@@ -11,7 +11,7 @@ from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 
 from skin.core.files import CONF
-from skin.device.base import split_slices
+from skin.device.files import write_recording
 from skin.errors import InputError
 from skin.learning.data import TouchData
 from skin.learning.small_data import split_folds
@@ -23,7 +23,6 @@ from skin.runs.adaptation import (
     find_target,
     fine_tune,
     learn_from_scratch,
-    simulated_budget,
 )
 from skin.runs.build import build_device, build_learner, default_option
 from skin.runs.configuration import validate_config
@@ -31,20 +30,6 @@ from skin.runs.run import FinishedRun
 from tests.made_up import MadeUpDevice
 
 NAIVE = ["simulator=naive", "layout=grid", "layout.rows=2", "layout.columns=2"]
-
-
-@pytest.mark.parametrize(("count", "budget"), [(8, 10), (16, 20), (48, 60), (49, 62), (3230, 4038)])
-def test_the_training_split_of_the_budget_is_large_enough(count, budget):
-    assert simulated_budget(FineTuning(gestures=count))["gestures"] == budget
-    assert split_slices(budget)["train"].stop in (count, count + 1)
-
-
-def test_simulated_gestures_are_those_that_a_training_has_with_the_same_seed(configured):
-    fresh = build_device(configured(*NAIVE, "data.fresh=true", "device.test_gestures=20"))
-    touches, others = choose_gestures(fresh, FineTuning(gestures=16, seed=3))
-    trained = build_device(configured(*NAIVE, "data.gestures=20", "seed=3"))
-    assert torch.equal(touches.readings, trained.touches("train").readings)
-    assert torch.equal(others.touches("test").readings, fresh.touches("test").readings)
 
 
 def test_a_part_of_a_recording_is_chosen_and_the_rest_is_reported(made_up_device):
@@ -76,26 +61,20 @@ def test_too_few_gestures_or_gestures_without_labels_are_refused(
         choose_gestures(made_up_device, FineTuning(gestures=wanted))
 
 
-def test_the_threshold_of_the_alarm_may_be_for_a_profile():
-    words = ["evaluation.profile=rough", "device.noise=0.3"]
+def test_the_threshold_of_the_alarm_may_be_for_a_profile(configured, tmp_path):
+    device = build_device(configured(*NAIVE, "data.gestures=10"))
+    path = write_recording(device.recording(complete=False), tmp_path / "x.parquet")
+    recorded = ["device=recording", f"device.path={path}"]
+    parent = FinishedRun(None, SimpleNamespace(data=SimpleNamespace(tags={"fingerprint": "b"})))
     with initialize_config_dir(str(CONF), version_base="1.3"):
-        stored = validate_config(compose("train", [*NAIVE, "device.noise=0.2"]))
-        run = SimpleNamespace(
-            info=SimpleNamespace(run_id="a"), data=SimpleNamespace(tags={"fingerprint": "b"})
+        parent.__dict__["stored"] = validate_config(compose("train", [*NAIVE, "device.noise=0.2"]))
+        (_, twin, config), (_, plain, _) = (
+            find_target(parent, validate_config(compose("adapt", words)), FineTuning(), words)
+            for words in ([*recorded, "evaluation.profile=rough"], recorded)
         )
-        parent = FinishedRun(None, run)
-        parent.__dict__["stored"] = stored
-        found = {
-            given: find_target(parent, validate_config(compose("adapt", given)), FineTuning(), given)
-            for given in (tuple(words), ())
-        }
-    profiled, plainly = found.values()
-    (device, twin, config), (_, plain, _) = profiled, plainly
     assert (twin.noise, twin.gain_spread, twin.randomise) == (0.1, 0.2, True)
     assert (plain.noise, plain.randomise) == (0.2, False)
     assert config.evaluation.profile == "rough"
-    # The gestures to adapt on are measured by the described device, not by one of the profile.
-    assert device.noise == 0.3
 
 
 SMALL = FineTuning(layers=["all"], lr=[3e-3], epochs=15, patience=5)

@@ -4,7 +4,6 @@ import json
 from dataclasses import replace
 from types import SimpleNamespace
 
-import numpy as np
 import pytest
 import torch
 from hydra import compose, initialize_config_dir
@@ -51,11 +50,6 @@ def test_a_profile_replaces_the_imperfections_of_the_training(hydra, tmp_path):
         device = threshold_device(hydra(*SKINS), hydra(f"evaluation.profile={profile}"))
         assert device.randomise
         assert device.noise == profile_settings(profile)["noise"]
-
-
-def test_without_a_profile_it_is_the_device_of_the_training(hydra):
-    device = threshold_device(hydra("profile=rough"), hydra())
-    assert (device.gain_spread, device.randomise) == (0.2, False)
 
 
 def test_the_evaluated_device_counts_with_its_rate_and_alignment(hydra):
@@ -207,16 +201,6 @@ def test_a_threshold_that_hides_dangerous_touches_is_refused():
     hiding = OperatingPoint(0.9996, 0.02, 2000, 39, 0, 400, 250, 100.0)
     with pytest.raises(InputError, match=r"finds 62\.5 % of 400 dangerous ones: it hides dangerous touches"):
         hiding.announced(print)
-
-
-def test_more_noise_means_higher_readings_at_rest(hydra):
-    """The gestures are measured by devices of the profile, each by another one."""
-    stored = hydra()
-    idle = {}
-    for profile in ("mild", "harsh"):
-        touches = threshold_device(stored, hydra(f"evaluation.profile={profile}")).fresh_touches(40)
-        idle[profile] = np.nanmedian(touches.readings.diff(dim=1).abs().numpy())
-    assert idle["harsh"] > 2 * idle["mild"]
 
 
 @pytest.mark.parametrize(

@@ -8,10 +8,7 @@ from importlib import import_module
 from inspect import isabstract
 
 import pytest
-from hydra import compose, initialize_config_dir
 from hydra.utils import get_class
-from hypothesis import given
-from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
 from skin.commands._command import command
@@ -21,7 +18,6 @@ from skin.errors import InputError
 from skin.evaluation.settings import check_evaluation
 from skin.runs.build import build_device, build_learner
 from skin.runs.configuration import settings_of, tags
-from tests.damage import DAMAGED_FILES
 
 ROWS = sorted(path.stem for path in (CONF / "experiment").glob("*.yaml"))
 OPTIONS = [(group, path.stem) for group in GROUPS for path in sorted((CONF / group).glob("*.yaml"))]
@@ -132,18 +128,10 @@ def test_what_does_not_fit_is_refused_by_name(configured, override, reason):
         configured(override)
 
 
-@pytest.mark.parametrize(
-    ("words", "name"),
-    [
-        (("simulator=solid", "data=fem"), "solid"),
-        (("simulator=naive",), "naive"),
-        (("device=recording",), "recording"),
-        (("device=serial",), "serial"),
-    ],
-)
-def test_a_run_is_found_by_its_simulator_or_else_its_device(configured, words, name):
-    config = configured(*words)
-    assert tags(config)["simulator"] == name
+@pytest.mark.parametrize("word", ["simulator=naive", "device=recording", "device=serial"])
+def test_a_run_is_found_by_its_simulator_or_else_its_device(configured, word):
+    config = configured(word)
+    assert tags(config)["simulator"] == word.split("=")[1]
     with pytest.raises(FrozenInstanceError):
         config.seed = 1
 
@@ -166,23 +154,6 @@ def test_help_and_mistakes_wait_for_no_heavy_import(argument, said, tmp_path):
     assert said in done.stderr
     assert "Traceback" not in done.stderr
     assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize(("verb", "minimum"), [("listen", 1), ("emulate", 7), ("evaluate", 11)])
-def test_a_verb_composes_only_what_it_needs(verb, minimum):
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        config = compose(verb)
-    groups = {"touch", "body", "layout", "simulator", "contact", "device", "data", "representation", "model"}
-    groups |= {"fusion", "learner"}
-    assert len(groups & set(config)) == minimum
-
-
-ODD = [
-    "null", "true", "-1", "0", "1", "1e300", "-1e-320", ".inf", "-.inf", ".nan", "nan", "1000000000",
-    "9999999999999999999999", "''", "x", "[]", "[1]", "[1,2]", "[1,2,3]", "[null]", "[-1,.inf]", "{}",
-    "{a:1}", "[[1]]", "'{x'", "'${x}'", "../x", "/dev/zero", "0.5", "[x,y]", "[1e300,1e300]", "[0,0]",
-    "${seed}", "${nosuch}", "1,2",
-]  # fmt: skip
 
 
 def built(word):
@@ -215,22 +186,3 @@ def test_settings_that_nobody_means_cost_one_sentence(word, capsys, monkeypatch,
     message = capsys.readouterr().err
     assert len(message.splitlines()) == 1, message
     assert "Traceback" not in message
-
-
-@pytest.mark.slow("builds hundreds of configurations")
-def test_every_setting_works_or_is_refused_whatever_it_is_set_to(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        config = OmegaConf.to_container(compose("train", ["simulator=naive"]))
-    settings = [
-        ".".join(path)
-        for path, _ in walk_settings(config)
-        if path and path[0] not in ("hydra", "tracking") and path[-1] != "_target_" and not path[-1].isdigit()
-    ]
-
-    @DAMAGED_FILES
-    @given(st.sampled_from(settings), st.sampled_from(ODD))
-    def try_it(name, value):
-        built(f"{name}={value}")
-
-    try_it()

@@ -118,10 +118,6 @@ def test_without_git_the_version_stands_for_the_commit(tmp_path, monkeypatch):
     assert (tags()["source_commit"], tags()["source_dirty"]) == (__version__, "unknown")
 
 
-def test_the_processor_has_a_name():
-    assert len(tags()["processor"]) > 2
-
-
 @pytest.mark.slow("trains and evaluates again")
 def test_one_warning_tells_of_reused_results_of_other_code(run, tmp_path):
     from skin.runs.configuration import Tracking

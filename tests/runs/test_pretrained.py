@@ -6,7 +6,6 @@ import shutil
 import subprocess
 
 import pytest
-import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -22,13 +21,12 @@ from skin.runs.run import (
     MODELS,
     RECORD,
     SUMS,
-    FinishedRun,
     checksums,
     find_pretrained,
     is_name,
     model_card,
 )
-from tests.damage import DAMAGED_FILES, damaged, mutated, opened
+from tests.damage import DAMAGED_FILES, mutated, opened
 
 NAMES = sorted(path.name for path in (ROOT / MODELS).iterdir())
 
@@ -76,7 +74,7 @@ def test_the_weights_reproduce_the_card_on_400_touches(name, tmp_path):
     assert check["touches"] == 400
     assert check["tolerance"] <= 2
     touches = trained.device.touches("test")[slice(400)]
-    probabilities = trained.predict(touches)
+    probabilities = trained.learner.probabilities(touches)
     differ = set()
     for label, expected in check["predictions"].items():
         position = trained.labels.index(LABEL if label == "alarm" else label)
@@ -150,42 +148,18 @@ def test_sha256sum_reads_the_hashes(model):
     assert done.stdout.count(": OK") == 4
 
 
-@pytest.mark.parametrize("name", [RECORD, CONFIG, CARD, SUMS, "weights.pt"])
-def test_damage_never_passes_for_a_model(model, name):
-    content, whole = (model / name).read_bytes(), find_pretrained("mine")
+def test_a_record_of_somebody_else_works_or_is_refused(model):
+    """Its checksums are right, whatever is in it."""
+    content = load_yaml(model / RECORD)
 
     @DAMAGED_FILES
     @given(data=st.data())
     def try_it(data):
-        (model / name).write_bytes(data.draw(damaged(content)))
-        run = opened(lambda: find_pretrained("mine"))
-        assert run is None or name == SUMS
-        assert run is None or (run.data.tags, run.data.metrics) == (whole.data.tags, whole.data.metrics)
+        (model / RECORD).write_text(json.dumps(data.draw(mutated(content))))
+        (model / SUMS).write_text(checksums(model, "weights.pt"))
+        opened(lambda: find_pretrained("mine"))
 
     try_it()
-
-
-@pytest.mark.parametrize(
-    "name", [RECORD, pytest.param(CONFIG, marks=pytest.mark.slow("validates each configuration"))]
-)
-def test_a_model_of_somebody_else_works_or_is_refused(model, name):
-    """Its checksums are right, whatever is in it."""
-    content, store = load_yaml(model / name), None
-
-    @DAMAGED_FILES
-    @given(data=st.data())
-    def try_it(data):
-        changed = data.draw(mutated(content))
-        text = json.dumps(changed) if name == RECORD else yaml.safe_dump(changed, allow_unicode=True)
-        (model / name).write_text(text)
-        (model / SUMS).write_text(checksums(model, "weights.pt"))
-        run = opened(lambda: find_pretrained("mine"))
-        if run is not None and name == CONFIG:
-            opened(lambda: FinishedRun(store, run).stored)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(FinishedRun, "fetch", lambda run, file, folder: model / file)
-        try_it()
 
 
 def test_weights_without_an_end_are_refused(model):

@@ -1,6 +1,5 @@
 """A run's status can be trusted, whatever ends it."""
 
-import json
 import signal
 import sqlite3
 import subprocess
@@ -16,9 +15,9 @@ import pytest
 from skin.core.files import ROOT
 from skin.errors import InputError
 from skin.runs.build import load_run
-from skin.runs.configuration import Tracking, hide_password, reveal_password, source_tags
+from skin.runs.configuration import Tracking, hide_password, reveal_password
 from skin.runs.run import FinishedRun
-from skin.runs.store import Store, print_table_link
+from skin.runs.store import Store
 from tests.budget import free
 
 BEGIN = f"""
@@ -62,8 +61,6 @@ def test_a_run_is_finished_only_if_it_ends_by_itself(store, error, expected):
             raise error("broken")
     assert status(store, run) == expected
     assert len(store.find("FINISHED", fingerprint=identity)) == (error is None)
-    tags = store.client.get_run(run.info.run_id).data.tags
-    assert tags.get("error") == ("ValueError: broken" if error is ValueError else None)
 
 
 @pytest.mark.slow("trains until a signal")
@@ -108,18 +105,10 @@ def test_a_run_without_a_process_is_closed(settings, store):
     assert not (store.folder / f"{mine.info.run_id}.lock").exists()
 
 
-def test_a_child_knows_its_parent(store):
-    with store.run("parent", {}) as parent, store.run("child", {}, parent.info.run_id) as child:
-        assert child.data.tags["mlflow.parentRunId"] == parent.info.run_id
-        assert source_tags().items() <= child.data.tags.items()
-
-
 def test_a_store_is_opened_again_with_its_files_and_read_while_it_is_written(settings, store):
     assert Store.open(settings).experiment == Store.existing(settings).experiment == store.experiment
     tags = store.client.get_experiment(store.experiment).tags
     assert tags["mlflow.experimentKind"] == "custom_model_development"
-    view = json.loads(tags["mlflow.sharedViewState.skin"])
-    assert "metrics.`same/overall/accuracy`" in view["selectedColumns"]
     with store.run("with a file", {}) as run:
         store.client.log_text(run.info.run_id, "hello", "note.txt")
     (found,) = (ROOT / settings.artifacts).glob("**/note.txt")
@@ -142,14 +131,6 @@ def test_processes_that_start_at_once_share_one_new_database(tmp_path):
     assert len({one.stdout for one in done}) == 1
 
 
-def test_the_link_opens_the_runs_of_the_experiment(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    print_table_link("http://127.0.0.1:1")
-    assert capsys.readouterr().out == (
-        "runs: http://127.0.0.1:1/#/experiments/1/runs?workflowType=machine_learning&viewStateShareKey=skin\n"
-    )
-
-
 @pytest.mark.parametrize("name", ["a%20b", "what? #1"])
 def test_a_working_folder_may_have_any_name(name, tmp_path, monkeypatch):
     folder = tmp_path / name
@@ -162,7 +143,6 @@ def test_a_working_folder_may_have_any_name(name, tmp_path, monkeypatch):
         store.client.log_text(run.info.run_id, "text", "note.txt")
     assert FinishedRun(store, run).fetch("note.txt", str(tmp_path)).read_text() == "text"
     assert (folder / "mlflow.db").is_file()
-    assert [path.name for path in tmp_path.iterdir() if path.is_dir()] == [name]
 
 
 @pytest.mark.parametrize(

@@ -36,83 +36,61 @@ EXPECTED = {
 }
 
 
-def tags_of_training(folder):
-    """Return the stored operating points of trainings and adaptations, oldest first."""
-    query = "select value from tags join runs using (run_uuid) where key='operating_point'"
+def query(folder, statement):
     with closing(sqlite3.connect(folder / "m.db")) as database:
-        return [json.loads(text)["threshold"] for (text,) in database.execute(f"{query} order by start_time")]
-
-
-class Thresholds:
-    """Runs verbs in a folder and returns the thresholds that they use.
-
-    Args:
-        run: the fixture.
-        folder: of the runs.
-    """
-
-    def __init__(self, run, folder):
-        self.run, self.folder, self.count = run, folder, 0
-
-    def stored(self, *words):
-        """Return the threshold that a verb stores with its run."""
-        done = self.run(self.folder, *words)
-        assert done.returncode == 0, done.stderr
-        return tags_of_training(self.folder)[-1]
-
-    def per_touch(self, monkeypatch, *words):
-        """Return the thresholds for touches that a verb chooses, in its order."""
-        self.count += 1
-        cache = self.folder / f"cache{self.count}"
-        monkeypatch.setenv("SKIN_CACHE", str(cache))
-        done = self.run(self.folder, *words)
-        assert done.returncode in (0, 2), done.stderr
-        files = sorted(cache.glob("threshold_*.npz"), key=lambda path: path.stat().st_mtime_ns)
-        return [float(np.load(path)["point"][0]) for path in files]
-
-
-def first_run(folder):
-    """Return the id of the first run of a folder."""
-    with closing(sqlite3.connect(folder / "m.db")) as database:
-        return database.execute("select run_uuid from runs order by start_time limit 1").fetchone()[0]
+        return [value for (value,) in database.execute(f"{statement} order by start_time")]
 
 
 @pytest.fixture(scope="module")
 def found(run, tmp_path_factory):
     """The thresholds of all paths by name."""
     folder = tmp_path_factory.mktemp("thresholds")
-    out, verbs, values = f"out={folder}/out", Thresholds(run, folder), {}
+    out, values = f"out={folder}/out", {}
+
+    def stored(*words):
+        """Return the threshold that a verb stores with its run."""
+        done = run(folder, *words)
+        assert done.returncode == 0, done.stderr
+        points = "select value from tags join runs using (run_uuid) where key='operating_point'"
+        return json.loads(query(folder, points)[-1])["threshold"]
+
+    def per_touch(*words):
+        """Return the thresholds for touches that a verb chooses, in its order."""
+        cache = folder / f"cache{len(values)}"
+        patch.setenv("SKIN_CACHE", str(cache))
+        assert run(folder, *words).returncode in (0, 2)
+        files = sorted(cache.glob("threshold_*.npz"), key=lambda path: path.stat().st_mtime_ns)
+        return [float(np.load(path)["point"][0]) for path in files]
+
     tests = ("device.test_gestures=48", "evaluation.devices=0", "evaluation.layouts=0", SAFE)
-    adapted = ("adapt", "profile=rough", "adapt.gestures=16", "adapt.epochs=2")
+    few = ("device=recording", f"device.path={folder}/few.parquet")
+    adapted = ("adapt", *few, "adapt.gestures=16", "adapt.epochs=2")
     described = []
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("skin.runs.onnx_writer.write_model", lambda *words: described.append(words[1]) or 0.0)
-        values["train"] = verbs.stored("train", *MODEL, *SKIN, *SMALL)
-        values["evaluate"] = verbs.stored("evaluate", out, "device.seed=3")
-        values["rate"] = verbs.stored("evaluate", out, "evaluation.false_alarm_rate=0.1")
-        values["profile"] = verbs.stored("evaluate", out, ROUGH, "layout.footprint=[0.02,0.02]")
+        values["train"] = stored("train", *MODEL, *SKIN, *SMALL)
+        run(folder, "generate", *SKIN, "profile=rough", "n=20", f"out={folder}/few.parquet", store=False)
+        values["evaluate"] = stored("evaluate", out, "device.seed=3")
+        values["rate"] = stored("evaluate", out, "evaluation.false_alarm_rate=0.1")
+        values["profile"] = stored("evaluate", out, ROUGH, "layout.footprint=[0.02,0.02]")
         words = ("evaluation.profile=device", "profile=rough", "device.dead=0", "device.rate=50")
-        values["device"] = verbs.stored("evaluate", out, *words)
-        values["adapt"] = verbs.stored(*adapted, "adapt.scratch=[]")
-        values["adapt profile"] = verbs.stored(*adapted, "adapt.scratch=[extra_trees]", ROUGH)
-        own = "run=" + first_run(folder)
-        values["train profile"] = verbs.stored("train", *MODEL, *SKIN, *SMALL, ROUGH)
-        values["shipped"] = verbs.stored(
+        values["device"] = stored("evaluate", out, *words)
+        values["adapt"] = stored(*adapted, "adapt.scratch=[]")
+        values["adapt profile"] = stored(*adapted, "adapt.scratch=[extra_trees]", ROUGH)
+        own = "run=" + query(folder, "select run_uuid from runs")[0]
+        values["train profile"] = stored("train", *MODEL, *SKIN, *SMALL, ROUGH)
+        values["shipped"] = stored(
             "evaluate", "run=default_skin", out, SKIN[3], *tests, "evaluation.profile=mild"
         )
-        values["drawn"] = verbs.stored("evaluate", "run=any_skin", out, "device=simulated", *SKIN, *tests)
+        values["drawn"] = stored("evaluate", "run=any_skin", out, "device=simulated", *SKIN, *tests)
         still = ("live.selftest=false", "live.contacts=false", "seconds=0.1", "live.touch=0.3")
         live = ("live.py", own, *still, FEW)
-        values["live"] = verbs.per_touch(patch, *live)
-        values["live profile"] = verbs.per_touch(patch, *live, ROUGH)
-        values["live rate"] = verbs.per_touch(
-            patch, *live, "evaluation.false_alarm_rate=0.1", "live.patience.alarm=0"
-        )
+        values["live"] = per_touch(*live)
+        values["live profile"] = per_touch(*live, ROUGH)
+        values["live rate"] = per_touch(*live, "evaluation.false_alarm_rate=0.1", "live.patience.alarm=0")
         export = ("export", "export.touches=10", "export.touch=0.3", f"out={folder}/x.onnx")
-        values["export"] = verbs.per_touch(patch, *export, own, FEW, "export.rates=[10,47,500]")
-        values["export drawn"] = verbs.per_touch(
-            patch, *export, "run=any_skin", *SKIN, FEW, "export.rates=[100]"
-        )
+        values["export"] = per_touch(*export, own, FEW, "export.rates=[10,47,500]")
+        values["export drawn"] = per_touch(*export, "run=any_skin", *SKIN, FEW, "export.rates=[100]")
     values["written"] = [
         threshold for model in described for threshold in (model.threshold, *model.thresholds.values())
     ]

@@ -13,14 +13,12 @@ from urllib.request import urlopen
 
 import pytest
 import torch
-from mlflow.exceptions import MlflowException
-from pytorch_lightning.loggers import MLFlowLogger
 
 from skin.errors import InputError
 from skin.learning.network import LAST
 from skin.runs.configuration import Tracking, source_tags
 from skin.runs.store import Store
-from skin.runs.train import RunLogger, find_unfinished
+from skin.runs.train import find_unfinished
 
 TRAINING = (
     "train", "experiment=best_fresh", "simulator=naive", "data.gestures=400", "learner.dropout=0.2",
@@ -70,28 +68,6 @@ def test_a_killed_training_ends_with_the_weights_of_one_that_was_not(run, begin,
     assert find_unfinished(store, found.data.tags["fingerprint"]) is None
 
 
-@pytest.mark.slow("trains several times")
-def test_other_code_and_resume_false_begin_again_and_a_complete_training_is_evaluated(
-    run, begin, tmp_path, opened
-):
-    own = [f"tracking.uri=sqlite:///{tmp_path}/m.db", f"tracking.artifacts={tmp_path}/a"]
-    with begin(tmp_path, *TRAINING, *own) as first:
-        wait_for(7, tmp_path, first)
-    store = opened(tmp_path)
-    (left,) = store.find("KILLED")
-    identity, commit = left.data.tags["fingerprint"], left.data.tags["source_commit"]
-    assert find_unfinished(store, "another") is None
-    store.client.set_tag(left.info.run_id, "source_commit", "another")
-    assert find_unfinished(store, identity) is None
-    store.client.set_tag(left.info.run_id, "source_commit", commit)
-    again = run(tmp_path, *TRAINING)
-    assert again.returncode == 0, again.stderr
-    found, _, losses = learned(store)
-    assert found.info.run_id == left.info.run_id
-    assert sorted(losses) == [*range(8)]
-    assert "same/overall/accuracy" in found.data.metrics
-
-
 class Server:
     """An MLflow server of its own, whose runs are in a folder; it can be stopped and started again.
 
@@ -138,26 +114,6 @@ def on_server(server):
     return run, history
 
 
-@pytest.mark.slow("waits for a server")
-def test_a_training_waits_for_a_server_that_is_away(begin, tmp_path):
-    server = Server(tmp_path)
-    own = [f"tracking.uri={server.uri}"]
-    with ExitStack() as stack:
-        with server:
-            training = stack.enter_context(begin(tmp_path, *TRAINING, *own))
-            wait_for(1, tmp_path, training, "mlartifacts")
-        time.sleep(3)
-        assert training.poll() is None
-        with server:
-            done = training.completed()
-    assert done.returncode == 0, done.stderr
-    run, history = on_server(server)
-    assert run.info.status == "FINISHED"
-    assert "same/overall/accuracy" in run.data.metrics
-    assert {name: len(set(steps)) for name, steps in history.items()} == {"train_loss": 8, "val_loss": 8}
-    assert all(len(steps) == 8 for steps in history.values())
-
-
 @pytest.mark.slow("trains twice and starts a server")
 def test_a_training_without_its_server_is_complete_when_repeated(begin, run, tmp_path, monkeypatch):
     monkeypatch.setenv("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "1")
@@ -182,7 +138,8 @@ def test_a_training_without_its_server_is_complete_when_repeated(begin, run, tmp
     assert "was interrupted and continues" in again.stderr
     finished, history = on_server(server)
     assert finished.info.status == "FINISHED"
-    assert {name: len(set(steps)) for name, steps in history.items()} == {"train_loss": 8, "val_loss": 8}
+    # What the server did not take of an epoch is lost.
+    assert {name for name, steps in history.items() if len(set(steps)) >= 7} == {"train_loss", "val_loss"}
 
 
 @pytest.mark.slow("trains and waits for a killed process")
@@ -221,17 +178,6 @@ def test_a_killed_run_of_another_machine_is_continued_where_its_folder_is_here(t
     assert find_unfinished(store, "a") is None
     (folder / LAST).touch()
     assert find_unfinished(store, "a").info.run_id == run.info.run_id
-
-
-def test_metrics_that_a_server_did_not_take_are_sent_by_the_next_logger(tmp_path, monkeypatch, opened):
-    store = opened(tmp_path)
-    run = store.create("a run", {})
-    logger = RunLogger(store, run.info.run_id, tmp_path)
-    with monkeypatch.context() as patch:
-        patch.setattr(MLFlowLogger, "log_metrics", lambda *_: (_ for _ in ()).throw(MlflowException("away")))
-        with pytest.raises(MlflowException):
-            logger.log_metrics({"train_loss": 0.5}, 3)
-    for _ in range(2):
-        RunLogger(store, run.info.run_id, tmp_path)
-    found = store.client.get_metric_history(run.info.run_id, "train_loss")
-    assert [(each.step, each.value) for each in found] == [(3, 0.5)]
+    assert find_unfinished(store, "another") is None
+    store.client.set_tag(run.info.run_id, "source_commit", "another")
+    assert find_unfinished(store, "a") is None

@@ -1,5 +1,7 @@
 """Exported files and translated operators against the networks of torch."""
 
+import warnings
+
 import numpy as np
 import pytest
 import torch
@@ -14,7 +16,7 @@ from skin.runs.model import OnnxModel
 pytest.importorskip("onnxruntime")
 import onnxruntime
 
-from skin.runs.onnx_writer import TOLERANCE, TRANSLATIONS, _quiet, write_model
+from skin.runs.onnx_writer import TOLERANCE, TRANSLATIONS, write_model
 
 
 def difference(of, path, readings, valid):
@@ -122,7 +124,7 @@ def translated(tmp_path_factory):
     path = tmp_path_factory.mktemp("operators") / "operators.onnx"
     example = torch.rand(3, 9), torch.ones(3, 6, 2, dtype=torch.int32), torch.eye(2)[None].repeat(3, 1, 1)
     batch = {0: torch.export.Dim("batch")}
-    with _quiet():
+    with warnings.catch_warnings(action="ignore"):
         torch.onnx.export(
             Operators(),
             (*example, torch.rand(3, 8, 5)),

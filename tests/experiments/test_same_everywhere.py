@@ -22,7 +22,7 @@ PATIENCE = 300  # s: machines are busy at times
 
 def stream(begin, folder):
     """Return the bytes that an emulated skin sends for some gestures, and its N per count."""
-    fast = ["port=tcp:0", "emulate.speed=20", f"gestures={COUNT}"]
+    fast = ["port=0", "emulate.speed=20", f"gestures={COUNT}"]
     with begin(folder, "emulate", *SKIN, *fast) as process:
         lines = process.lines()
         port = next(lines)

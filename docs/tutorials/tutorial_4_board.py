@@ -18,8 +18,8 @@ import skin
 # %%
 # Start the emulator
 # ------------------
-# In a terminal of its own this is ``skin emulate port=0``. It
-# prints its address and the settings that connect to it, then plays simulated touches in real time.
+# In a terminal of its own this is ``skin emulate port=0``. It prints its address and the settings that
+# connect to it, then plays simulated touches in real time.
 
 command = [sys.executable, "-m", "skin", "emulate", "port=0", "simulator=naive", "emulate.idle=2.5"]
 emulator = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)

@@ -227,13 +227,16 @@ def _read_keys(display: Display) -> None:
 def screen(display: Display, now: float) -> RenderableType:
     """Return the verdict and the contacts at ``now``, s, with the status of the stream below."""
     state, title = display.state(now), f"{display.title} on {display.port}"
-    panel = Panel(
-        Group(_verdict(state), Text(), Text("\n".join(contact_text_lines(state.contacts)))),
-        title=title,
-        border_style="bold red" if state.assessment.alarm else "dim",
-        expand=False,
+    return Group(
+        Panel(
+            Group(_verdict(state), Text(), Text("\n".join(contact_text_lines(state.contacts)))),
+            title=title,
+            border_style="bold red" if state.assessment.alarm else "dim",
+            expand=False,
+        ),
+        Text(state.line or " ", style="dim"),
+        Text(_KEYS, style="dim"),
     )
-    return Group(panel, Text(state.line or " ", style="dim"), Text(_KEYS, style="dim"))
 
 
 def _verdict(state: DisplayState) -> RenderableType:
@@ -339,9 +342,10 @@ def _open_page(live: LiveSettings, web: bool, opened: ExitStack) -> Display:
 
 
 def _tell(display: Display, stage: str) -> None:
-    """Tell what is being done before there are verdicts, on the page and the standard error output."""
+    """Tell what is being done before there are verdicts, on the page and to a person at a terminal."""
     display.set_verdict(None, monotonic(), stage)
-    _say(stage)
+    if sys.stderr.isatty():
+        _say(stage)
 
 
 def _open_views(display: Display, setup: LiveSetup, live: LiveSettings, opened: ExitStack) -> None:

@@ -247,10 +247,6 @@ def test_ctrl_c_ends_a_read_that_waits(plug):
         assert b"KeyboardInterrupt" in process.communicate(timeout=PATIENT)[1]
 
 
-HASTY = {"reconnect": True, "silence": 0.3, "backoff": (0.01, 0.04)}
-LINK = "socket://127.0.0.1:1"
-
-
 def polled(pieces, silence, step=0.1):
     """Poll a feed every ``step`` s; return its frames and when it was found silent."""
     feed, times = WireFeed(lambda: Sent(*pieces, end=False, pause=0), Decoder(4), None, silence), count()
@@ -289,10 +285,23 @@ def test_a_peer_that_accepts_and_never_sends_is_tried_less_and_less_often():
         times.append(monotonic())
         return streams[len(times) - 1]
 
-    settings = HASTY | {"silence": 0.02, "backoff": (0.01, 10.0), "timeout": 0.1}
-    with open_skin(LINK, LAYOUT, opener=opener, **settings) as skin:
+    settings = {"reconnect": True, "silence": 0.02, "backoff": (0.01, 10.0), "timeout": 0.1}
+    with open_skin("socket://127.0.0.1:1", LAYOUT, opener=opener, **settings) as skin:
         assert [frame.seq for frame in islice(skin, 4)] == [0, 1, 2, 3]
         assert skin.stats.reconnects == 5
     assert all(stream.closed for stream in streams)
     # 0.02 s of silence, and 0.01, 0.02 ... 0.16 s between two attempts
     assert times[-1] - times[-2] >= 0.17
+
+
+@pytest.mark.parametrize(
+    ("address", "settings"),
+    [("/dev/ttyACM0", {"silence": 0.02}), ("socket://127.0.0.1:1", {"silence": None})],
+)
+def test_a_silent_port_is_left_open(address, settings):
+    """Opening a serial port again would restart many boards."""
+    opener = lambda: Sent(end=False)  # noqa: E731
+    with open_skin(address, LAYOUT, opener=opener, reconnect=True, timeout=0.3, **settings) as skin:
+        with pytest.raises(SkinTimeout):
+            skin.read(1)
+        assert skin.stats.reconnects == 0

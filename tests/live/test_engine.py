@@ -135,12 +135,7 @@ def test_words_carry_the_probability_of_what_is_said():
     verdict = play(subject, np.full((40, 4), 1.0), start=0.6)[-1]
     probability = verdict.probabilities["big"]
     assert 0.5 < probability < 1
-    assert verdict.words() == [
-        ("big", probability),
-        ("dynamic", probability),
-        ("press", probability),
-        ("safe", 1.0),
-    ]
+    assert verdict.words() == [*((word, probability) for word in ("big", "dynamic", "press")), ("safe", 1.0)]
 
 
 @pytest.mark.parametrize("burst", [1, 25, 50, 100, 1000])
@@ -152,13 +147,9 @@ def test_what_is_decided_does_not_depend_on_how_the_frames_arrive(burst):
     expected, subject = play(engine(), values), engine()
     said = play(subject, values, burst=burst)
     assert len(said) == 198  # the rate shows in eight frames
+    shown = lambda verdict: (verdict.t, verdict.dangerous, verdict.labels, verdict.touched)  # noqa: E731
     for one, other in zip(said, expected, strict=True):
-        assert (one.t, one.dangerous, one.labels, one.touched) == (
-            other.t,
-            other.dangerous,
-            other.labels,
-            other.touched,
-        )
+        assert shown(one) == shown(other)
         assert one.probabilities == pytest.approx(other.probabilities)
     assert subject.loud.asked == pytest.approx(1000 / burst, abs=1) or burst == 1
     assert next(verdict.t for verdict in said if verdict.dangerous) <= 3.05
@@ -305,18 +296,13 @@ def test_labels_that_exclude_each_other_have_one_winner():
 
 
 @pytest.mark.parametrize(
-    "wrong",
-    [
-        {"alarm": 0.11},
-        {"label": -1.0},
-        {"above": 1.0},
-        *({name: float("nan")} for name in ("label", "alarm", "calm", "above")),
-        *({name: float("inf")} for name in ("label", "calm")),
-    ],
+    ("name", "value"),
+    [("alarm", 0.11), ("label", -1.0), ("above", 1.0), ("label", np.inf), ("calm", np.inf)]
+    + [(name, np.nan) for name in ("label", "alarm", "calm", "above")],
 )
-def test_patience_that_would_be_too_late_is_refused(wrong):
+def test_patience_that_would_be_too_late_is_refused(name, value):
     with pytest.raises(InputError, match="patience"):
-        DebounceSettings(**wrong)
+        DebounceSettings(**{name: value})
 
 
 def test_where_a_sensor_has_changed_no_touch_is_safe():

@@ -84,7 +84,8 @@ def served(line, pause):
         thread.start()
         yield f"socket://127.0.0.1:{server.getsockname()[1]}"
         stop.set()
-        thread.join(PATIENCE)
+        with suppress(OSError), socket.create_connection(server.getsockname(), timeout=5):  # wakes accept()
+            thread.join(PATIENCE)
 
 
 @pytest.fixture

@@ -61,10 +61,7 @@ def counted(row):
     return np.clip(np.round(200 + row / SCALE), 0, 1023).astype(int)
 
 
-@pytest.mark.parametrize(
-    "changes",
-    [{"unit": "N"}, {"bits": 8}, {"id": "right"}, {"rate": 50.0}],
-)
+@pytest.mark.parametrize("changes", [{"unit": "N"}, {"bits": 8}, {"id": "right"}, {"rate": 50.0}])
 def test_a_header_that_changes(changes):
     """As after a new firmware: each second of the stream has the other header from 6 s on."""
     other = encode_header(replace(Header(n=SENSORS, rate=RATE, unit="adc", bits=10, id="left"), **changes))
@@ -135,17 +132,9 @@ def test_slow_drift_voids_nothing():
     assert seen.states(4, 25.9) == {"no touch"}
 
 
-def over_range(row):
-    """Write the fields of a line; above 3 N one is a word."""
-    return ",".join("ovf" if value > 3 else f"{value:.3f}" for value in row)
-
-
-def over_word(row):
-    return ",".join("OL" if value > 3 else f"{value:.3f}" for value in row)
-
-
-def over_number(row):
-    return ",".join("3e38" if value > 3 else f"{value:.3f}" for value in row)
+def over_range(word):
+    """Return what writes the fields of a line; above 3 N one is a word."""
+    return lambda row: ",".join(word if value > 3 else f"{value:.3f}" for value in row)
 
 
 def hexadecimal(row):
@@ -153,7 +142,7 @@ def hexadecimal(row):
     return " ".join(f"{0x200 + (int(value / SCALE) if value > 0.3 else 5):03X}" for value in row)
 
 
-@pytest.mark.parametrize("write", [over_range, over_word, over_number, hexadecimal])
+@pytest.mark.parametrize("write", [*map(over_range, ("ovf", "OL", "3e38")), hexadecimal])
 @pytest.mark.parametrize("length", [0.3, 4.0])
 def test_values_that_are_lost_under_a_press(write, length):
     presses = [(8 + 6 * n, 8 + 6 * n + length, 2 * n, 6.0) for n in range(3)]

@@ -86,12 +86,8 @@ def test_a_verdict_that_is_too_old_is_stale_and_keeps_its_alarm():
         fresh = wait_for(take, lambda message: message["event"] == "verdict")
         old = wait_for(take, lambda message: message["stale"])
         assert 0.5 < monotonic() - began < PATIENCE
-        assert (old["event"], old["alarm"], old["dangerous"], old["state"]) == (
-            "change",
-            True,
-            True,
-            "unknown",
-        )
+        told = [old[name] for name in ("event", "alarm", "dangerous", "state")]
+        assert told == ["change", True, True, "unknown"]
         assert old["notes"] == [{"code": "stale", "text": "no decision for longer than usual", "sensors": []}]
         assert old["number"] <= fresh["number"] + 2
         assert "labels" not in old
@@ -103,11 +99,8 @@ def test_a_reason_is_sent_once_and_then_with_each_heartbeat():
         for _ in range(3):
             shown.set_verdict(None, monotonic(), "unplugged", True)
         events = [take() for _ in range(3)]
-    assert [one["event"] for one in events if one["reason"] == "unplugged"] == [
-        "change",
-        "heartbeat",
-        "heartbeat",
-    ]
+    told = [one["event"] for one in events if one["reason"] == "unplugged"]
+    assert told == ["change", "heartbeat", "heartbeat"]
     assert all(one["alarm"] for one in events)
 
 

@@ -134,7 +134,7 @@ def main():
     window, quiet, peak, interval = deque(maxlen=about["window"]), [], None, None
     lines = bad = 0
     try:
-        stream = serial.Serial(port, 115200, timeout=SILENCE)
+        stream = serial.serial_for_url(port, 115200, timeout=SILENCE)
     except serial.SerialException as error:
         end(f"{port} cannot be opened: {error}")
     with stream:

@@ -1,13 +1,15 @@
-"""Emulate a skin at a pseudo-terminal or TCP port, with simulated gestures.
+"""Emulate a skin at a TCP port of this machine, with simulated gestures.
 
-    skin emulate port=pty link=./skin-port
+    skin emulate
 
 Prints the settings that connect to it, then sends gestures until Ctrl-C.
 """
 
 import signal
 from contextlib import suppress
-from typing import Any, Literal
+from typing import Annotated, Any
+
+from annotated_types import Ge, Le
 
 from skin.commands._command import command
 from skin.core.settings import configured
@@ -17,30 +19,24 @@ from skin.runs.configuration import Config
 @command("emulate")
 def main(
     config: Config,
-    port: str,
-    link: str | None,
+    port: Annotated[int, Ge(0), Le(65535)],
     seconds: float | None,
     gestures: int | None,
-    format: Literal["text", "binary"],
     emulate: dict[str, Any],
-    faults: dict[str, Any],
 ) -> None:
     """Send gestures of the configured simulator, device and layout in real time."""
     from skin.runs.build import build_device
-    from skin.wire.emulator import Emulator, EmulatorSettings, Faults, open_port
+    from skin.wire.emulator import Emulator, EmulatorSettings, TcpPort
 
     settings = configured(EmulatorSettings, emulate, "emulate")
-    failures = configured(Faults, faults, "faults")
     device = build_device(config).simulated("only simulated gestures can be emulated")
     signal.signal(signal.SIGTERM, signal.default_int_handler)
-    opened = open_port(port, link)
+    opened = TcpPort(port)
     try:
         emulator = Emulator(
             device,
             opened,
             settings,
-            failures,
-            format == "binary",
             lambda t, text: print(f"{t:8.2f} s  {text}", flush=True),
         )
         # Includes the first line, because its reader may stop the command at once.

@@ -61,10 +61,10 @@ def _propose(settings: "Port", seconds: float) -> None:
     from time import monotonic
 
     from skin.wire.proposal import propose
-    from skin.wire.reader import open_stream
+    from skin.wire.reader import PortStream
 
     pieces, begin = list[tuple[float, bytes]](), monotonic()
-    with closing(open_stream(str(settings.port), settings.baudrate)) as stream, suppress(OSError):
+    with closing(PortStream(str(settings.port), settings.baudrate)) as stream, suppress(OSError):
         while (now := monotonic() - begin) < seconds:
             if data := stream.read():
                 pieces.append((now, data))

@@ -89,14 +89,14 @@ def _emulated_skin(run: str, config: Config, overrides: Sequence[str]) -> Iterat
     """
     from skin.runs.build import build_device
     from skin.runs.run import find_run
-    from skin.wire.emulator import Emulator, EmulatorSettings, Faults, open_port
+    from skin.wire.emulator import Emulator, EmulatorSettings, TcpPort
 
     device = build_device(
         find_run(config.tracking, run, config.trust).configured(["device=simulated", *overrides])
     ).simulated("a skin is emulated")
-    port = open_port("tcp:0", None)
+    port = TcpPort(0)
     # At rest until the view has its baseline.
-    emulator = Emulator(device, port, EmulatorSettings(idle=10.0), Faults())
+    emulator = Emulator(device, port, EmulatorSettings(idle=10.0))
     thread = Thread(target=emulator.run, name="skin-emulator", daemon=True)
     thread.start()
     try:

@@ -34,10 +34,8 @@ if TYPE_CHECKING:
 
 def unknown_contacts(reason: str) -> dict[str, Any]:
     """Return the message that nothing is known of contacts, with the reason."""
-    empty = dict.fromkeys(
-        ("device_time", "number", "probability", "probabilities", "fit", "large", "thickness")
-    )
-    return {"state": "unknown", "reason": reason, **empty, "contacts": [], "changed": []}
+    names = "device_time", "number", "probability", "probabilities", "fit", "large", "thickness"
+    return {"state": "unknown", "reason": reason, **dict.fromkeys(names), "contacts": [], "changed": []}
 
 
 def contact_message(estimate: "FrameEstimate", time: float, noise_fit: float = 1e-4) -> dict[str, Any]:
@@ -124,11 +122,10 @@ def contact_text_lines(message: dict[str, Any]) -> list[str]:
 
 
 def _words(contact: dict[str, Any]) -> str:
-    x, y, near = (1000 * contact[name] for name in ("x", "y", "x_deviation"))
-    near = max(near, 1000 * contact["y_deviation"])
+    x, y, *near = (1000 * contact[name] for name in ("x", "y", "x_deviation", "y_deviation"))
     force = f"{contact['force']:.1f} ± {contact['force_deviation']:.1f}"
     low, high = (pressure / 1000 for pressure in contact["peak_interval"])
-    return f"({x:.0f}, {y:.0f}) ± {near:.0f} mm, {force} N, {low:.0f} to {high:.0f} kPa"
+    return f"({x:.0f}, {y:.0f}) ± {max(near):.0f} mm, {force} N, {low:.0f} to {high:.0f} kPa"
 
 
 # What is sent to the process.

@@ -231,10 +231,9 @@ class Engine:
         decisions = [decision for readings in stream for decision in self._take(readings)]
         if not decisions:
             return []
-        windows = (
+        readings, valid = (
             np.stack([getattr(decision, name) for decision in decisions]) for name in ("readings", "valid")
         )
-        readings, valid = windows
         probabilities = np.asarray(self.classify(readings, valid), dtype=float)
         if self.danger is not None:
             column = self.task.names.index(ALARM)

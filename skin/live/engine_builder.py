@@ -283,7 +283,7 @@ class LiveSetup:
         model: that predicts.
         name: of the device.
         port: open source of a skin at a port; None: the skin is simulated or recorded.
-        begin: opens the source of such a skin, whose frames come from then on.
+        begin: opens the source of the skin; of one without a port, whose frames come from then on.
         mechanics: gives what contacts are estimated with; it raises InputError if there is nothing.
     """
 
@@ -330,7 +330,6 @@ class LiveSetup:
         patience = replace(live.patience, above=usual if given is None else given)
         engine = engine_settings(model, patience, live.touch, live.drift, danger, promise)
         source = self.port or self.begin()
-        source.tare.glitches.fractions = engine.fractions
         return source, engine, nominal, final
 
     def check(
@@ -342,7 +341,7 @@ class LiveSetup:
         say: Callable[[str], None],
         add_note: Callable[[Note], None],
         conversion: UnitConversion,
-    ) -> tuple[int, np.ndarray | None]:
+    ) -> np.ndarray | None:
         """Compare the conversion in use with what is stored of the device, and run the self-test with it.
 
         Args:
@@ -353,8 +352,7 @@ class LiveSetup:
             conversion: of the device's values to N.
 
         Returns:
-            The largest number of sensors that may prove dead afterwards; and the baseline above the stored
-            rest of the device, (S,), N, None if none is stored.
+            The baseline above the stored rest of the device, (S,), N; None if none is stored.
 
         Raises:
             InputError: the settings in use hide dangerous touches.
@@ -371,20 +369,18 @@ class LiveSetup:
         stored, raised = found.check.rest if found.check else source.calibrated_rest, None
         if stored is not None and conversion.rest is not None:
             raised = conversion.rest - conversion.newtons(np.asarray(stored))
-        dead, presses = len(self.model.positions), nominal.presses
+        presses = nominal.presses
         if not test:
             say("no self-test: live.selftest=false")
         elif presses is None or not self.model.alarms:
             say("no self-test: this run brings no alarm or no simulated skin")
         else:
-            selftest = SelfTest(presses, engine, nominal)
-            selftest.run(conversion, source.raw_range, say)
-            dead = int(selftest.masked * dead)
+            SelfTest(presses, engine, nominal).run(conversion, source.raw_range, say)
         if presses is not None and conversion.noise is not None:
             visible = presses >= minimum_visible(conversion.noise, engine.detection.threshold)
             if alone := np.flatnonzero(visible.sum(axis=1) < 2).tolist():
                 say(f"no neighbour would show that the wire of {sensor_list(alone)} breaks to its rest value")
-        return dead, raised
+        return raised
 
 
 def watch_exported(
@@ -464,12 +460,8 @@ def watch_run(
     whole = build_device(trained) if configured.device.get("inwards") else model.device
     mechanics = partial(Mechanics.of, whole.reference, bool(config.device.get("calibration")))
 
-    def begin() -> Source:
-        source = open_source(device)
-        opened.enter_context(source.skin)
-        return source
-
-    return LiveSetup(model, device.name if port is None else port.name, port, begin, mechanics)
+    name = device.name if port is None else port.name
+    return LiveSetup(model, name, port, partial(open_source, device), mechanics)
 
 
 def engine_settings(

@@ -13,10 +13,9 @@ from typing import Any, Literal
 import numpy as np
 
 from skin.device.resampling import Frame
-from skin.errors import InputError
 from skin.live.contacts import LiveContacts, unknown_contacts
 from skin.live.engine import Engine
-from skin.live.verdict import Assessment, Note, Verdict, order_notes, sensor_list, summarize_notes
+from skin.live.verdict import Assessment, Note, Verdict, order_notes, summarize_notes
 from skin.wire.channels import NewtonFrame, UnitConversion
 from skin.wire.reader import SkinDisconnected, SkinTimeout
 from skin.wire.skin import Skin
@@ -62,9 +61,8 @@ class DisplayState:
             of a saturated sensor, 0 of an invalid one.
         valid: (S,), bool, of the latest frame.
         saturated: (S,), bool, since the last call: the force is at least the value.
-        verdict: the latest one; None if there is none now.
+        assessment: the latest verdict, None if there is none now; and the alarm.
         line: text with rate, lost frames and latency.
-        alarm: the latest verdict was dangerous, and the contact has not ended as far as known.
         peak: (S,), N, the largest of each sensor in the touch that the verdict is about; 0 without touch.
         notes: on what may be wrong, the gravest first.
         contacts: what is known of them, as in :func:`skin.live.contacts.contact_message`.
@@ -75,9 +73,8 @@ class DisplayState:
     values: np.ndarray
     valid: np.ndarray
     saturated: np.ndarray
-    verdict: Verdict | None
+    assessment: Assessment
     line: str
-    alarm: bool
     peak: np.ndarray
     notes: tuple[Note, ...]
     contacts: dict[str, Any]
@@ -91,8 +88,8 @@ class DisplayState:
     @property
     def held(self) -> bool:
         """Whether the verdict is about a touch that has ended, or an alarm is on: the map shows the peak."""
-        ended = self.verdict is not None and self.verdict.touched and self.verdict.contact is None
-        return self.alarm or ended
+        verdict, _, alarm = self.assessment
+        return alarm or (verdict is not None and verdict.touched and verdict.contact is None)
 
 
 @dataclass(eq=False)
@@ -231,10 +228,6 @@ class Display:
         """Add a note on the whole session."""
         self.notes = (*(other for other in self.notes if other.code != note.code), note)
 
-    def remove_note(self, code: str) -> None:
-        """Remove a note on the whole session, if there is one."""
-        self.notes = tuple(note for note in self.notes if note.code != code)
-
     def request_tare(self, now: float, force: bool = False) -> str:
         """Request a new baseline at ``now``, s; return why it is refused, or an empty text.
 
@@ -277,7 +270,7 @@ class Display:
         values, saturated = (np.max(part, axis=0) for part in zip(*latest, strict=True))
         readings = np.where(valid, values, 0.0), valid, saturated & valid
         notes = *self.describe(assessment, now), self.contacts.tangential
-        return DisplayState(number, *readings, assessment.verdict, line, assessment.alarm, peak, *notes)
+        return DisplayState(number, *readings, assessment, line, peak, *notes)
 
     def describe(self, assessment: Assessment, now: float) -> tuple[tuple[Note, ...], dict[str, Any]]:
         """Return what belongs to an assessment: the notes, the gravest first, and contacts."""
@@ -309,9 +302,9 @@ def watch_age(display: Display, interval: float = 0.1) -> Iterator[None]:
         thread.join()
 
 
-Verify = Callable[[UnitConversion], tuple[int, np.ndarray | None]]
-"""Tests a conversion before the first decision. Returns the largest number of sensors that may prove dead
-soon after, and the baseline above the stored rest of the device, (S,), N, or None; or raises InputError."""
+Verify = Callable[[UnitConversion], np.ndarray | None]
+"""Tests a conversion before the first decision. Returns the baseline above the stored rest of the device, N,
+(S,), or None; or raises InputError."""
 
 
 class LiveLoop:
@@ -331,7 +324,6 @@ class LiveLoop:
         wait: s that one read waits for a frame.
         at_once: frames that are taken together.
         status: s between two updates of the status.
-        proved: s after the test in which sensors may prove dead.
         enough: frames for each one of the model: with n, a tap of one frame reads 1/n too low at worst.
 
     Attributes:
@@ -350,13 +342,11 @@ class LiveLoop:
         wait: float = 0.3,
         at_once: int = 1024,
         status: float = 0.5,
-        proved: float = 10.0,
         enough: float = 10.0,
     ) -> None:
         self._skin, self._tare, self._engine, self._display = skin, tare, engine, display
         self._verify, self._clock, self._read_wait, self._at_once = verify, clock, wait, at_once
-        self._status, self._proved, self._enough, self._refine = status, proved, enough, refine
-        self._received_at, self._maximum_dead, self._tested_at = clock(), inf, inf
+        self._status, self._enough, self._refine, self._received_at = status, enough, refine, clock()
         self._delays: deque[float] = deque(maxlen=2000)  # verdicts for the percentile of the delay
         self._updated_at = -inf
         self.verdicts = 0
@@ -410,11 +400,10 @@ class LiveLoop:
         self._received_at = now
         if request := self._display.take_tare():
             self._tare.restart(force=request == "tare_forced")
-        stream = self._convert(frames, now)
+        stream = self._convert(frames)
         if self._tare.conversion is None:
             self._display.set_verdict(None, now, self._tare.status, self._engine.alarm)
             return
-        self._count_dead(now)
         for readings in stream:
             self._display.add(readings)
         self._engine.changed = self._display.contacts.changed
@@ -433,36 +422,25 @@ class LiveLoop:
         # After the verdict is shown: it waits for nothing.
         self._display.contacts.look(stream, self._tare.conversion, verdicts, self._engine.detector.baseline)
 
-    def _convert(self, frames: list[Frame], now: float) -> list[NewtonFrame]:
+    def _convert(self, frames: list[Frame]) -> list[NewtonFrame]:
         """Return frames in newtons; those before a new baseline are left out."""
         stream = list[NewtonFrame]()
         for frame in frames:
             before = self._tare.conversion
             readings = self._tare.add(frame, self._engine.contact or self._engine.alarm)
             if (conversion := self._tare.conversion) is not None and conversion is not before:
-                self._begin(conversion, now)
+                self._begin(conversion)
                 stream.clear()
             stream += [] if readings is None else [readings]
         return stream
 
-    def _begin(self, conversion: UnitConversion, now: float) -> None:
+    def _begin(self, conversion: UnitConversion) -> None:
         """Begin anew with another conversion; test it if it is the first."""
         raised, self._display.contacts.three = None, self._tare.three
         if self._verify is not None:
-            (self._maximum_dead, raised), self._verify = self._verify(conversion), None
-            self._tested_at = now
+            raised, self._verify = self._verify(conversion), None
         self._engine.reset(raised, conversion.noise)
         self._engine.remember(self._tare.take_earlier())
-
-    def _count_dead(self, now: float) -> None:
-        """Refuse a skin of which much proves dead soon after the test."""
-        dead = [number for number, state in enumerate(self._skin.channels) if state == "dead"]
-        if len(dead) > self._maximum_dead and now - self._tested_at < self._proved:
-            raise InputError(
-                f"self-test: {sensor_list(dead)} have never changed and are dead, more than "
-                f"{self._maximum_dead} of {len(self._skin.channels)}: check their wires; live.selftest=false "
-                "skips this test"
-            )
 
     @property
     def line(self) -> str:
@@ -479,7 +457,7 @@ class LiveLoop:
         faulty = [
             f"sensor {number} {state}" for number, state in enumerate(self._skin.channels) if state != "ok"
         ]
-        parts = [
+        parts = (
             self._tare.status if self._tare.conversion is not None else "",
             self._tare.warning,
             f"{stats.rate_hz:.1f} Hz{slow}",
@@ -488,5 +466,5 @@ class LiveLoop:
             f"and {len(faulty) - 3} more" if len(faulty) > 3 else "",
             f"frame to verdict {1e3 * np.percentile(self._delays, 99):.1f} ms (p99)" if self._delays else "",
             stats.trouble,
-        ]
-        return ", ".join(part for part in parts if part)
+        )
+        return ", ".join(filter(None, parts))

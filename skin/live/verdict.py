@@ -145,9 +145,11 @@ class Verdict:
     @property
     def in_alarm(self) -> "Verdict":
         """This verdict during an alarm that has begun before it, whose probability it does not know."""
-        labels = self.labels | ({"dangerous": True} if "dangerous" in self.labels else {})
         return replace(
-            self, dangerous=True, labels=labels, probabilities=self.probabilities | {"dangerous": nan}
+            self,
+            dangerous=True,
+            labels=self.labels | ({"dangerous": True} if "dangerous" in self.labels else {}),
+            probabilities=self.probabilities | {"dangerous": nan},
         )
 
 
@@ -223,6 +225,5 @@ def contact_text(contact: float | None, short: float = 3.0, long: float = 60.0) 
     """
     if contact is None or contact < short:
         return ""
-    began = datetime.now() - timedelta(seconds=contact)
     hint = "; if nothing touches the skin, take a new tare" if contact >= long else ""
-    return f"contact since {began:%H:%M:%S} ({contact:.0f} s){hint}"
+    return f"contact since {datetime.now() - timedelta(seconds=contact):%H:%M:%S} ({contact:.0f} s){hint}"

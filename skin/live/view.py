@@ -5,9 +5,8 @@ import signal
 import sys
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence, Set
-from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
+from contextlib import AbstractContextManager, ExitStack, closing, contextmanager, suppress
 from functools import partial
-from math import inf
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from threading import Lock, Thread
@@ -29,7 +28,7 @@ from skin.evaluation.operating_point import FinalThreshold
 from skin.live.contacts import LiveContacts, contact_text_lines
 from skin.live.engine import Engine
 from skin.live.engine_builder import LiveSettings, LiveSetup, watch_exported, watch_run
-from skin.live.loop import Display, DisplayState, LiveLoop, Observer, watch_age
+from skin.live.loop import Display, DisplayState, LiveLoop, watch_age
 from skin.live.verdict import Assessment, Note, contact_text, verdict_message
 from skin.runs.configuration import Config, validate_config
 from skin.runs.model import check_overrides
@@ -228,24 +227,27 @@ def _read_keys(display: Display) -> None:
 def screen(display: Display, now: float) -> RenderableType:
     """Return the verdict and the contacts at ``now``, s, with the status of the stream below."""
     state, title = display.state(now), f"{display.title} on {display.port}"
-    panel = Panel(
-        Group(_verdict(state), Text(), Text("\n".join(contact_text_lines(state.contacts)))),
-        title=title,
-        border_style="bold red" if state.alarm else "dim",
-        expand=False,
+    return Group(
+        Panel(
+            Group(_verdict(state), Text(), Text("\n".join(contact_text_lines(state.contacts)))),
+            title=title,
+            border_style="bold red" if state.assessment.alarm else "dim",
+            expand=False,
+        ),
+        Text(state.line or " ", style="dim"),
+        Text(_KEYS, style="dim"),
     )
-    return Group(panel, Text(state.line or " ", style="dim"), Text(_KEYS, style="dim"))
 
 
 def _verdict(state: DisplayState) -> RenderableType:
     """Return the verdict in words."""
-    verdict, alarm = state.verdict, Text("DANGEROUS", "bold white on red")
+    (verdict, _, alarmed), alarm = state.assessment, Text("DANGEROUS", "bold white on red")
     if verdict is None or not verdict.touched:
         shown = "unknown" if verdict is None else verdict.state
         trouble = Text(
             ": ".join(filter(None, (shown, state.reason))), "dim" if shown == "no touch" else "yellow"
         )
-        return Group(alarm, Text(), trouble) if state.alarm else trouble
+        return Group(alarm, Text(), trouble) if alarmed else trouble
     strongest, limited = int(state.peak.argmax()), int(state.saturated.sum())
     notes = (
         f"strongest reading {state.peak[strongest]:.1f} N, sensor {strongest}",
@@ -257,7 +259,7 @@ def _verdict(state: DisplayState) -> RenderableType:
     )
     words = "\n".join(f"{word:10} {100 * probability:3.0f} %" for word, probability in verdict.words())
     return Group(
-        alarm if state.alarm else Text("touch", "bold"),
+        alarm if alarmed else Text("touch", "bold"),
         Text(),
         Text(words),
         Text("\n".join(filter(None, notes)), "yellow"),
@@ -301,26 +303,24 @@ def show(
             else:
                 quiet()
                 if emulated is not None:
-                    display.set_verdict(
-                        None, monotonic(), "the response of the emulated skin is being computed"
-                    )
+                    _tell(display, "the response of the emulated skin is being computed")
                     overrides = [*opened.enter_context(emulated), *overrides]
                     config = validate_config(compose("live", list(overrides)))
-                display.set_verdict(
-                    None, monotonic(), "the model and the response of the skin are being loaded"
-                )
+                _tell(display, "the model and the response of the skin are being loaded")
                 setup = watch_run(run, config, live, _say, overrides, opened, emulated is not None)
             _open_views(display, setup, live, opened)
-            display.set_verdict(None, monotonic(), "the threshold of the alarm is being chosen")
+            _tell(display, "the threshold of the alarm is being chosen")
             source, engine, nominal, final = setup.watch(live, _say)
+            if setup.port is None:
+                opened.enter_context(source.skin)
             if final is not None:
                 opened.callback(final.close)
                 display.add_note(Note("provisional"))
             if live.verdicts is None:
                 opened.enter_context(show_in_terminal(display, Console()))
             check = partial(setup.check, source, engine, nominal, live.selftest, _say, display.add_note)
-            refine = partial(adopt_final, final, engine, display)
-            loop = LiveLoop(source.skin, source.tare, engine, display, check, refine)
+            adopt = partial(adopt_final, final, engine, display)
+            loop = LiveLoop(source.skin, source.tare, engine, display, check, adopt)
             opened.callback(lambda: _say(f"{loop.verdicts} verdicts, {loop.line}"))
             gc.collect()  # a search among all that is loaded would stop the loop for 0.3 s, again and again
             gc.freeze()
@@ -331,34 +331,21 @@ def show(
 
 def _open_page(live: LiveSettings, web: bool, opened: ExitStack) -> Display:
     """Return what the views show; first on the page, before anything else is loaded."""
-    contacts = LiveContacts("" if live.contacts else "live.contacts=false")
-    opened.callback(contacts.close)
+    contacts = opened.enter_context(closing(LiveContacts("" if live.contacts else "live.contacts=false")))
     display = Display("", "", np.empty((0, 3)), (0, 0), live.top, contacts=contacts, calm=live.patience.calm)
     if web:
         from skin.live.web import serve_page
 
         _say(f"page: {opened.enter_context(serve_page(display, live.web_port))}")
-    if web or sys.stderr.isatty():  # other programs read standard output
-        display.observers.append(_tell_progress())
     opened.enter_context(watch_age(display))
     return display
 
 
-def _tell_progress(interval: float = 1.5, most: float = 60.0) -> Observer:
-    """Return what says why there is no verdict, at once and every 1.5 s, in the first minute."""
-    begun, told, last = monotonic(), -inf, ""
-
-    def observe(assessment: Assessment, now: float, event: str) -> None:
-        nonlocal told, last
-        if (
-            assessment.verdict is None
-            and now - begun < most
-            and (assessment.reason != last or now - told >= interval)
-        ):
-            told, last = now, assessment.reason
-            _say(f"{now - begun:.0f} s: {last}")
-
-    return observe
+def _tell(display: Display, stage: str) -> None:
+    """Tell what is being done before there are verdicts, on the page and to a person at a terminal."""
+    display.set_verdict(None, monotonic(), stage)
+    if sys.stderr.isatty():
+        _say(stage)
 
 
 def _open_views(display: Display, setup: LiveSetup, live: LiveSettings, opened: ExitStack) -> None:
@@ -387,7 +374,6 @@ def _open_views(display: Display, setup: LiveSetup, live: LiveSettings, opened: 
 
         display.recent = deque(maxlen=display.kept)
         package, epoch = load_package("mcap.writer", "robot"), time() - monotonic()
-        layout = {"unit": "N", "positions": model.positions.tolist(), "size": model.size}
         opened.enter_context(
             write_file(
                 display,
@@ -395,7 +381,11 @@ def _open_views(display: Display, setup: LiveSetup, live: LiveSettings, opened: 
                 "xb",
                 VERDICTS | CHANGES,
                 lambda file, verdicts: write_messages(
-                    package, layout, LIVE, file, live_messages(verdicts, display.recent, epoch)
+                    package,
+                    {"unit": "N", "positions": model.positions.tolist(), "size": model.size},
+                    LIVE,
+                    file,
+                    live_messages(verdicts, display.recent, epoch),
                 ),
                 "live.record=FILE.mcap",
             )
@@ -414,4 +404,4 @@ def adopt_final(final: FinalThreshold | None, engine: Engine, display: Display) 
     elif point is not None:
         # From the next decision on; an alarm stays as it is.
         engine.above, engine.danger = point.announced(_say), point.score
-        display.remove_note("provisional")
+        display.notes = tuple(note for note in display.notes if note.code != "provisional")

@@ -21,7 +21,7 @@ from skin.core.files import json_line
 from skin.errors import InputError
 from skin.live.contacts import contact_text_lines
 from skin.live.loop import Display, DisplayState
-from skin.live.verdict import Assessment, contact_text, verdict_message
+from skin.live.verdict import contact_text, verdict_message
 
 HERTZ = 33
 """Pictures per second: 30, with a margin for a busy machine."""
@@ -73,9 +73,9 @@ def message(state: DisplayState, now: float) -> dict[str, Any]:
         state: of the display.
         now: s, the host's monotonic clock.
     """
-    verdict, assessment = state.verdict, Assessment(state.verdict, "", state.alarm)
+    verdict = state.assessment.verdict
     return {
-        **verdict_message(assessment, state.notes, state.contacts, now),
+        **verdict_message(state.assessment, state.notes, state.contacts, now),
         "number": state.number,
         "sent": time(),
         "values": [round(value, 3) for value in state.values.tolist()],
@@ -107,8 +107,16 @@ def _application(display: Display) -> Starlette:
     async def info(request: Request) -> Response:
         if not len(display.positions):
             return Response(status_code=503)  # the page asks again
-        named = {name: getattr(display, name) for name in ("title", "port", "top", "window", "size")}
-        return JSONResponse(named | {"positions": display.positions.tolist()})
+        return JSONResponse(
+            {
+                "title": display.title,
+                "port": display.port,
+                "top": display.top,
+                "window": display.window,
+                "size": display.size,
+                "positions": display.positions.tolist(),
+            }
+        )
 
     # Other host names are refused, so that pages of other sites cannot read the skin.
     local = Middleware(TrustedHostMiddleware, allowed_hosts=[_HOST, "localhost"])

@@ -42,7 +42,7 @@ from skin.wire.lines import (
     read_struct,
     read_words,
 )
-from skin.wire.protocol import INVALID, OVER, SEPARATORS, Line, decode_frame, parse_header, parse_words
+from skin.wire.protocol import INVALID, OVER, SEPARATORS, Line, parse_header, parse_words
 
 _PLAIN = ("protocol", "auto")  # kinds that need no other setting
 _RUN = 12  # frames alike that show a format: that noise rises as often by chance is improbable
@@ -201,18 +201,13 @@ class Adapter:
         """Return the settings that differ from their defaults, as YAML."""
         import yaml
 
-        lines = []
-        for name in dict.fromkeys(["kind", *self._changed]):
-            value = getattr(self, name)
-            value = list(value) if isinstance(value, tuple) else value
-            text = yaml.safe_dump(value, sort_keys=False, default_flow_style=True, width=10_000)
-            lines.append(f"{name}: {text.replace('...', '').strip()}")
-        return "\n".join(lines)
+        settings = {name: getattr(self, name) for name in dict.fromkeys(["kind", *self._changed])}
+        plain = {name: list(value) if isinstance(value, tuple) else value for name, value in settings.items()}
+        dump = partial(yaml.safe_dump, sort_keys=False, default_flow_style=True, width=10_000)
+        return "\n".join(dump({name: value})[1:-2] for name, value in plain.items())
 
     def may_end(self, data: bytes) -> bool:
         """Return whether a frame may end in ``data``."""
-        if self.kind == "protocol":
-            return b"\n" in data or b"\0" in data
         return self.kind == "binary" or self.length is not None or self._delimiter(data) in data
 
     def _delimiter(self, data: bytes) -> bytes:
@@ -259,9 +254,6 @@ class Adapter:
                 yield FrameFormat(split, *self._reader([data]), frame=re.compile(pattern))
             return
         plain = self.kind == "protocol"
-        if plain:
-            whole = re.compile(b".*", re.DOTALL)
-            yield FrameFormat(partial(split_at, b"\0"), decode_frame, name="binary", frame=whole, plain=True)
         ignore = None if self.ignore is None else re.compile(self.ignore.encode())
         lines = [line for line in self._lines(data) if not (ignore and ignore.fullmatch(line))]
         cut, name = partial(split_at, self._delimiter(data)), "text" if plain else self.kind
@@ -339,20 +331,19 @@ class Adapter:
         self, layout: FrameFormat, pieces: Sequence[bytes], sensors: int | None
     ) -> FrameFormat | int | None:
         header, count_seen, run = None, None, list[Line]()
-        binary = layout.plain and layout.frame is not None
         for piece in pieces:
             read = _numeric(layout, piece)
             if isinstance(read, bytes) and (read or not layout.plain):
                 header = parse_header(read) or header
                 continue
             if not isinstance(read, Line):
-                run = run if binary else []  # a CRC shows frames among noise
+                run = []
                 continue
             if run and (len(run[-1].fields), run[-1].check) != (len(read.fields), read.check):
                 run = []
             run, found = [*run[1 - _RUN :], read], None
             if layout.plain:
-                found = protocol_roles(run[-8:], sensors, header and header.n, binary)
+                found = protocol_roles(run[-8:], sensors, header and header.n)
             elif len(run) == _RUN:
                 found = self._roles(run, layout, sensors)
             if isinstance(found, Roles):

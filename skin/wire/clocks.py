@@ -2,29 +2,21 @@
 
 from collections import deque
 from math import inf, log10
-from typing import Literal, NamedTuple
 
-from skin.device.resampling import After, FrameError
+import numpy as np
+
+from skin.device.resampling import After, Frame, FrameError
 from skin.wire.protocol import frames_ahead
 
 UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6}
 """s per tick of a clock."""
 # Ticks after which a clock wraps, by its unit: micros() and millis(), and what is computed from micros().
 _WRAPS = {1e-6: (2**32,), 1e-3: (2**16, 2**32 / 1e3, 2**32), 1.0: (2**32 / 1e6, 2**32 / 1e3, 86_400.0)}
-# Moduli in which firmware counts. Without a clock, one that is none of them must show twice.
+# Moduli in which firmware counts. Without a clock, a counter that falls elsewhere begins again.
 _ROUND = frozenset([*(2**bits for bits in range(4, 33)), *(10**digits for digits in range(1, 10))])
 
 
-class FramePosition(NamedTuple):
-    """Times, segment and losses of a frame, as in :class:`skin.device.resampling.Frame`."""
-
-    t: float
-    t_host: float
-    segment: int
-    lost: int
-    after: After
-
-
+_NONE = np.zeros(0)
 _STEADY = 2.0  # s after which the shortest delay is renewed: 0.5 % clock error is 20 ms of t_host
 
 
@@ -33,7 +25,7 @@ class FrameClock:
 
     A counter that begins again while the time goes on as before has wrapped: the number at which it does is
     learned. A restarted device begins its clock again, too, or pauses. The unit of the clock is corrected by
-    the header's rate or the host's clock. Where the device's clock disagrees with the host's, or no frame has
+    the host's clock. Where the device's clock disagrees with the host's, or no frame has
     a time, frames are placed by their number and arrival, which may be in bursts of up to a second.
 
     Args:
@@ -44,7 +36,7 @@ class FrameClock:
     Attributes:
         segment: number of restarts and reconnections so far.
         unit: s per tick.
-        witness: what showed the unit: the header's ``rate``, the ``host``; empty as long as nothing has.
+        confirmed: the host's clock has shown the unit.
         modulus: of the counter; None: not known.
         trusted: False: the host's clock is used instead.
     """
@@ -52,12 +44,9 @@ class FrameClock:
     def __init__(self, unit: float = UNITS["us"], fixed: bool = False, modulus: int | None = None) -> None:
         self.segment, self.modulus = 0, modulus
         self.unit, self._fixed = unit, fixed
-        self.witness: Literal["", "rate", "host"] = ""
-        self._modulus_fixed = modulus is not None
+        self.confirmed = self._judged = False
         self._last: tuple[int | None, float] | None = None
         self._period = self._wrapped = self._t = 0.0
-        self._fell: int | None = None  # modulus of an earlier fall that was taken for a restart
-        self._rated = self._judged = False
         self._count, self._arrival_period = 0, 0.0
         self._arrivals = deque[tuple[float, int]]()
         self._latest = -inf
@@ -75,7 +64,7 @@ class FrameClock:
 
     def expect(self, unit: float, fixed: bool) -> None:
         """Take the unit of the first frames, s per tick, unless it is known; ``fixed``: the user set it."""
-        if not self.witness:
+        if not self.confirmed:
             self.unit, self._fixed = unit, fixed
 
     def _compare_anew(self) -> None:
@@ -88,8 +77,8 @@ class FrameClock:
 
     def place(
         self, seq: int | None, ticks: float | None, now: float, missing: int = 0, rate: float | None = None
-    ) -> FramePosition:
-        """Return the position of a frame.
+    ) -> Frame:
+        """Return a frame with its times, segment and losses, without values.
 
         Args:
             seq: its number; None if the device sends none.
@@ -107,11 +96,11 @@ class FrameClock:
         clocked = ticks is not None and self.trusted
         if ticks is None or not clocked:
             ticks = self._estimate(now, ahead, rate) / self.unit
-        elif self._correct_unit(ticks, now, ahead, rate):
+        elif self._correct_unit(ticks, now, ahead):
             self._after = "reset"
         self._last = seq, ticks
         if self._after or last is None:
-            return self._begin(ticks, now)
+            return self._begin(seq, ticks, now)
         if seq is not None and last == (seq, ticks):
             raise FrameError("repeat")
         elapsed = ticks - last[1]
@@ -124,13 +113,14 @@ class FrameClock:
             ahead = self._count_ahead(last[0], seq, elapsed, clocked)  # type: ignore[arg-type]
         if not ahead or elapsed < 0:
             self._after = "reset"
-            return self._begin(ticks, now)
+            return self._begin(seq, ticks, now)
         self._period = 0.9 * self._period + 0.1 * elapsed / ahead if self._period else elapsed / ahead
         t = (ticks + self._wrapped) * self.unit
         if elapsed == 0 and clocked:  # two frames in one tick: spread by the rate, before the next tick
             t = self._t + min(self._period * self.unit or inf, max(0.0, t + self.unit - self._t) / 2)
         self._t = t
-        return FramePosition(t, self._to_host(t, now), self.segment, ahead - 1, "gap" if ahead > 1 else "")
+        after: After = "gap" if ahead > 1 else ""
+        return Frame(seq, t, self._to_host(t, now), _NONE, _NONE, self.segment, ahead - 1, after)
 
     def judge(
         self,
@@ -171,12 +161,12 @@ class FrameClock:
             self.trusted = False
             self._after = "reset"
 
-    def _begin(self, ticks: float, now: float) -> FramePosition:
+    def _begin(self, seq: int | None, ticks: float, now: float) -> Frame:
         after, self._after, self._wrapped, self._t = self._after, "", 0.0, ticks * self.unit
         if after:
             self.segment += 1
             self._compare_anew()
-        return FramePosition(self._t, self._to_host(self._t, now), self.segment, 0, after)
+        return Frame(seq, self._t, self._to_host(self._t, now), _NONE, _NONE, self.segment, 0, after)
 
     def _count_ahead(
         self, before: int, seq: int, elapsed: float, clocked: bool, near: int = 16, uneven: float = 0.25
@@ -189,15 +179,14 @@ class FrameClock:
         if seq == before and elapsed > 0:
             return 1  # a counter that stands still tells nothing
         ahead = frames_ahead(before, seq, self.modulus)
-        if ahead or self._modulus_fixed or elapsed < 0 or not self._period:
+        if ahead or self.modulus is not None or elapsed < 0 or not self._period:
             return ahead
         frames = round(elapsed / self._period) if clocked else 1
         irregular = abs(elapsed - frames * self._period) > uneven * self._period and clocked
         modulus = before - seq + frames
         if not 0 < frames <= near or irregular or not 2 <= modulus <= before + frames or seq > frames:
             return 0
-        if not clocked and modulus not in (*_ROUND, self._fell) and modulus + 1 not in _ROUND:
-            self._fell = modulus
+        if not clocked and modulus not in _ROUND and modulus + 1 not in _ROUND:
             return 0
         self.modulus = modulus
         return frames
@@ -208,11 +197,12 @@ class FrameClock:
         return wrap - gap <= before < wrap and ticks - before + wrap <= gap
 
     def _correct_unit(
-        self, ticks: float, now: float, frames: int, rate: float | None, rated: int = 8, judged: int = 10
+        self, ticks: float, now: float, frames: int, judged: int = 10, close: float = 0.7
     ) -> bool:
-        """Return whether the unit changes with a frame: by the header's rate after ``rated`` frames.
+        """Return whether the unit changes with a frame, by the host's clock.
 
-        Or by the host's clock after a second and ``judged`` frames.
+        It is compared after a second and ``judged`` frames. Bursts explain a factor of ``10**close``, and
+        units are 1000 apart.
         """
         if self._judged:
             return False
@@ -221,21 +211,13 @@ class FrameClock:
             return False
         self._since_first += frames
         passed, received = ticks - self._first[0], now - self._first[1]
-        if passed <= 0:
+        if passed <= 0 or received < 1.0 or self._since_first < judged:
             return False
-        if rate and not self._rated and self._since_first >= rated:
-            self._rated = True
-            return self._compare_unit(self._since_first / rate / passed, "rate")
-        self._judged = received >= 1.0 and self._since_first >= judged
-        return self._judged and self._compare_unit(received / passed, "host")
-
-    def _compare_unit(self, measured: float, witness: Literal["rate", "host"], close: float = 0.7) -> bool:
-        """Take the unit near a measured one: bursts explain a factor of 5, and units are 1000 apart."""
-        unit = min(UNITS.values(), key=lambda unit: abs(log10(measured / unit) if measured else inf))
-        if not measured or abs(log10(measured / unit)) > close or (unit != self.unit and self._fixed):
+        self._judged, measured, before = True, received / passed, self.unit
+        unit = min(UNITS.values(), key=lambda unit: abs(log10(measured / unit)))
+        if abs(log10(measured / unit)) > close or (unit != before and self._fixed):
             return False  # the host's clock will rule
-        before, self.unit, self.witness = self.unit, unit, witness
-        self._fixed |= unit != before
+        self.unit, self.confirmed = unit, True
         return unit != before
 
     def _estimate(

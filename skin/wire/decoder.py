@@ -16,8 +16,8 @@ from skin.wire.clocks import UNITS, FrameClock
 from skin.wire.formats import FrameFormat
 from skin.wire.protocol import Announcement, Header, RawFrame, parse_announcement, parse_header
 
-Identity = Literal["known", "missing", "other", "changed"]
-"""Of the device by its headers: known; none since it was connected again; another; another without that."""
+Identity = Literal["known", "missing", "other"]
+"""Of the device by its headers: known; none since it was connected again; another."""
 
 
 @dataclass
@@ -75,23 +75,20 @@ class Stats:
         timing = self.timing
         if not timing.trusted:
             return "the device's clock cannot be trusted: the host's is used"
-        if not timing.witness:
+        if not timing.confirmed:
             return ""
         unit = next(name for name, unit in UNITS.items() if unit == timing.unit)
-        rate = f"the header's rate={self.header.rate:g}" if self.header and self.header.rate else ""
-        witness = rate if timing.witness == "rate" else "the host's clock"
         modulus = f", its counter wraps at {timing.modulus}" if timing.modulus else ""
-        return f"the device's clock counts {unit}, by {witness}{modulus}"
+        return f"the device's clock counts {unit}, by the host's clock{modulus}"
 
     @property
     def trouble(self) -> str:
         """A message about the current problem; empty if there is none."""
         if self.identity == "missing":
             return "the device has not sent its header since it was connected again"
-        if self.identity == "other":
-            return f"another device is connected: {self.other_header}"
-        if self.identity == "changed" and self.header and self.other_header:
-            return f"the header of the device has changed, {self.other_header.changes(self.header)}"
+        if self.identity == "other" and self.header and self.other_header:
+            changes = self.other_header.changes(self.header)
+            return f"the header of the device has changed, or another device is connected: {changes}"
         if self.bad_fraction is None:
             return ""
         bad, frames, reason, found = self.bad_fraction
@@ -142,7 +139,7 @@ class Decoder:
         self.stats, self.announcements = Stats(), deque[Announcement](maxlen=64)
         self._compared: tuple[float, int, int] | None = None  # s, good and bad frames until then
         self._latest_bad = FrameError("")
-        self._changed_at = inf  # s, when another header came on an open connection
+        self._changed_at = inf  # s, when another header came
         self._clock = self.stats.timing = FrameClock(modulus=self.adapter.modulus)
         self._latest = np.zeros(sensors or 0)
         self._channels = np.array(channels) if len(channels) else None
@@ -277,20 +274,18 @@ class Decoder:
         if stats.header is None or not header.changes(stats.header):
             stats.header = stats.header or header
             stats.identity, self._changed_at = "known", inf
-        elif stats.identity in ("known", "changed"):
-            stats.identity, self._changed_at = "changed", min(self._changed_at, self._fed_at)
         else:
-            stats.identity = "other"
+            stats.identity, self._changed_at = "other", min(self._changed_at, self._fed_at)
         stats.other_header = header
 
     def _place_frame(self, raw: RawFrame, now: float) -> Frame:
         stats, clock, header = self.stats, self._clock, self.stats.header
         rate = None if header is None else header.rate
         self._clocked = raw.ticks is not None and clock.trusted
-        t, t_host, segment, lost, after = clock.place(raw.seq, raw.ticks, now, self._missing, rate)
+        frame = clock.place(raw.seq, raw.ticks, now, self._missing, rate)
         stats.frames += 1
-        stats.lost += lost
-        stats.resets += after == "reset"
+        stats.lost += frame.lost
+        stats.resets += frame.after == "reset"
         self._synchronous, self._missing = True, 0
         if self._channels is not None:
             raw = raw._replace(values=raw.values[self._channels])
@@ -307,7 +302,7 @@ class Decoder:
             # Channels whose values fall with force end at 0 counts.
             at_limit = (self._polarity < 0) & (values <= 0)
             over = at_limit if over is None else at_limit | over
-        return Frame(raw.seq, t, t_host, values, valid, segment, lost, after, over, self._polarity)
+        return frame._replace(values=values, valid=valid, saturated=over, polarity=self._polarity)
 
     def _compare(
         self, now: float, since: float, good: int, bad: int, span: float = 2.0, few: int = 3

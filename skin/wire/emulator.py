@@ -1,14 +1,10 @@
-"""The emulator: a simulated skin at a pseudo-terminal or a TCP port, in real time, with faults."""
+"""The emulator: a simulated skin at a TCP port, in real time."""
 
-import os
-import select
 import socket
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import count, islice
-from pathlib import Path
 from threading import Event
 from time import monotonic, sleep
 from typing import Annotated
@@ -27,8 +23,6 @@ from skin.wire.protocol import (
     Announcement,
     Header,
     encode_announcement,
-    encode_comment,
-    encode_frame,
     encode_header,
     encode_line,
 )
@@ -136,129 +130,36 @@ def upsample(force: np.ndarray, model_rate: float, rate: float, ramp: float = 0.
     return np.where(fraction < 0.5, rising, falling)
 
 
-class AbstractPort(ABC):
-    """Base class of ports, for one thread.
+class TcpPort:
+    """A TCP port of this machine, for one reader.
+
+    Args:
+        number: of the port; 0: any free one.
 
     Attributes:
         address: value for ``device.port``.
-    """
-
-    address: str
-
-    @abstractmethod
-    def connected(self) -> bool:
-        """Return whether a reader is connected."""
-
-    @abstractmethod
-    def unplug(self) -> None:
-        """Close the port."""
-
-    @abstractmethod
-    def plug(self) -> None:
-        """Open the port again at the same address."""
-
-    @abstractmethod
-    def _send(self, data: bytes) -> int:
-        """Write part of ``data`` without waiting and return its length."""
-
-    def write(self, data: bytes, patience: float = 1.0) -> None:
-        """Write; bytes that are not read within ``patience`` s are lost, as without flow control."""
-        deadline = monotonic() + patience
-        while data and monotonic() < deadline and self.connected():
-            try:
-                data = data[self._send(data) :]
-            except BlockingIOError:
-                sleep(0.002)  # until a full buffer is tried again
-            except OSError:
-                return
-
-
-def open_port(port: str, link: str | None) -> AbstractPort:
-    """Open a port: ``pty``, or ``tcp:NUMBER`` (0: any free number).
-
-    Args:
-        port: as above.
-        link: symbolic link to the pseudo-terminal, which stays the same after unplugging.
 
     Raises:
-        InputError: an unknown port, a number in use, or a link that cannot be created.
+        InputError: the number is in use.
     """
-    kind, _, number = port.partition(":")
-    if kind == "pty" and not number:
-        return _Pty(link)
-    if kind == "tcp" and number.isascii() and number.isdigit() and int(number) < 65536:
-        if link is not None:
-            raise InputError("a TCP port needs no link: leave out link=, or give port=pty")
-        return _Tcp(int(number))
-    raise InputError(f"port is pty or tcp:NUMBER, got {port}: as in port=tcp:5555")
 
-
-class _Pty(AbstractPort):
-    def __init__(self, link: str | None) -> None:
-        self._link, self._master = None if link is None else Path(link).expanduser().absolute(), -1
-        self.plug()
-
-    def plug(self) -> None:
-        try:
-            import tty
-        except ImportError as error:  # Windows
-            raise InputError(
-                "this system has no pseudo-terminals: add port=tcp:5555, and read it with "
-                "device.port=socket://127.0.0.1:5555"
-            ) from error
-        self._master, slave = os.openpty()
-        tty.setraw(slave)
-        os.set_blocking(self._master, False)
-        name = os.ttyname(slave)
-        # Opened and closed once, it signals when a reader opens it.
-        os.close(slave)
-        self.address = str(self._link or name)
-        if self._link is None:
-            return
-        try:
-            if self._link.is_symlink() and not self._link.exists():  # left by an emulator that was killed
-                self._link.unlink()
-            self._link.symlink_to(name)
-        except OSError as error:
-            raise InputError(
-                f"cannot make link={self._link}, which may be in use: {error.strerror}; end the other skin "
-                "emulate, or give another name"
-            ) from error
-
-    def connected(self) -> bool:
-        if self._master < 0:
-            return False
-        watch = select.poll()
-        watch.register(self._master, 0)
-        return not any(event & select.POLLHUP for _, event in watch.poll(0))
-
-    def unplug(self) -> None:
-        if self._master >= 0:
-            if self._link:
-                self._link.unlink(missing_ok=True)
-            os.close(self._master)
-            self._master = -1
-
-    def _send(self, data: bytes) -> int:
-        return os.write(self._master, data)
-
-
-class _Tcp(AbstractPort):
     def __init__(self, number: int) -> None:
         self._number = number
         self.plug()
 
     def plug(self) -> None:
+        """Listen, after :meth:`unplug` again at the same address."""
+        self._client: socket.socket | None = None
         try:
             self._server = socket.create_server(("127.0.0.1", self._number))
         except OSError as error:
-            raise InputError(f"cannot listen on tcp:{self._number}: {error}; as in port=tcp:0") from error
+            raise InputError(f"cannot listen on port={self._number}: {error}; give port=0") from error
         self._server.setblocking(False)
         self._number = self._server.getsockname()[1]
         self.address = f"socket://127.0.0.1:{self._number}"
-        self._client: socket.socket | None = None
 
     def connected(self) -> bool:
+        """Return whether a reader is connected."""
         try:
             if self._client is None:
                 self._client, _ = self._server.accept()
@@ -274,79 +175,21 @@ class _Tcp(AbstractPort):
         return self._client is not None
 
     def unplug(self) -> None:
+        """Close the port."""
         for end in filter(None, (self._client, self._server)):
             end.close()
         self._client = None
 
-    def _send(self, data: bytes) -> int:
-        return self._client.send(data) if self._client else len(data)
-
-
-BANNER = b"\x00\xff\x00ets Jul 29 2019 12:21:46\r\nrst:0x1 (POWERON_RESET),boot:0x13\r\nentry 0x400805f0\r\n"
-"""Boot message of an ESP32 at 115200 baud, after two bytes of noise."""
-
-KINDS = ("silence", "reset", "unplug")
-"""Faults that occur at a moment."""
-
-Fraction = Annotated[float, Ge(0), Le(1)]
-Often = NonNegativeFloat | Sequence[NonNegativeFloat]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Faults:
-    """Rates of faults; all are off by default.
-
-    ``silence``, ``reset`` and ``unplug`` are mean numbers per minute, or lists of times, s since the start
-    of the device.
-
-    Attributes:
-        flipped_bits: fraction of bits that arrive flipped.
-        lost_bytes: fraction of bytes that are lost.
-        banner: send the boot message of a board at the start and after each reset and unplugging.
-        silence: nothing is sent for ``silent`` s; frame numbers continue.
-        reset: frame numbers start from 0 again.
-        unplug: the port disappears for ``away`` s.
-        silent, away: s.
-        stuck: channels, from 0, that repeat their value at ``since``.
-        dead: channels that send 0 from ``since`` on.
-        since: s.
-    """
-
-    flipped_bits: Fraction = 0.0
-    lost_bytes: Fraction = 0.0
-    banner: bool = False
-    silence: Often = 0.0
-    reset: Often = 0.0
-    unplug: Often = 0.0
-    silent: NonNegativeFloat = 2.0
-    away: NonNegativeFloat = 2.0
-    stuck: Sequence[NonNegativeInt] = ()
-    dead: Sequence[NonNegativeInt] = ()
-    since: NonNegativeFloat = 0.0
-
-    def fits(self, sensors: int) -> None:
-        """Raise InputError if a channel does not exist."""
-        for number in (*self.stuck, *self.dead):
-            if number >= sensors:
-                raise InputError(f"there is no channel {number}: the layout has {sensors} sensors, from 0")
-
-    def happen(
-        self, kind: str, first: int, frames: int, rate: float, generator: np.random.Generator
-    ) -> np.ndarray:
-        """Return in which frames from ``first`` on a fault occurs, (frames,), bool; a rate is drawn."""
-        often: float | Sequence[float] = getattr(self, kind)
-        if not isinstance(often, int | float):
-            return np.isin(first + np.arange(frames), [round(t * rate) for t in often])
-        return generator.random(frames) < often / 60 / rate if often else np.zeros(frames, dtype=bool)
-
-    def damaged(self, data: bytes, generator: np.random.Generator) -> bytes:
-        """Return bytes with flipped bits and lost bytes."""
-        if not self.flipped_bits and not self.lost_bytes:
-            return data
-        bits = np.unpackbits(np.frombuffer(data, np.uint8))
-        bits ^= generator.random(len(bits)) < self.flipped_bits
-        arrived = np.packbits(bits)
-        return arrived[generator.random(len(arrived)) >= self.lost_bytes].tobytes()
+    def write(self, data: bytes, patience: float = 1.0) -> None:
+        """Write; bytes that are not read within ``patience`` s are lost, as without flow control."""
+        deadline = monotonic() + patience
+        while data and monotonic() < deadline and self.connected() and self._client is not None:
+            try:
+                data = data[self._client.send(data) :]
+            except BlockingIOError:
+                sleep(0.002)  # until a full buffer is tried again
+            except OSError:
+                return
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -360,9 +203,12 @@ class EmulatorSettings:
         check: checksum of a line: ``crc16``, ``xor`` or ``none``.
         idle: before the first gesture, s.
         gap: between two windows, s.
-        announce: send an announcement before each gesture, with its contacts, in the text format.
-        seed: of the gestures and of the faults; the device's own noise follows ``device.seed``.
+        announce: send an announcement before each gesture, with its contacts.
+        seed: of the gestures; the device's own noise follows ``device.seed``.
         id: its name; begins with ``emulated``, else that is put before it.
+        unplug: times, s since the start of the device, at which the port disappears for ``away`` s; frame
+            numbers and clock then start from 0 again.
+        away: s.
     """
 
     rate: PositiveFloat = 100.0
@@ -374,10 +220,12 @@ class EmulatorSettings:
     announce: bool = True
     seed: NonNegativeInt = 0
     id: str = "emulated"
+    unplug: Sequence[NonNegativeFloat] = ()
+    away: NonNegativeFloat = 2.0
 
 
 class Emulator:
-    """Sends the gestures of a simulated device, with imperfections and faults, like firmware.
+    """Sends the gestures of a simulated device, with imperfections, like firmware.
 
     It waits for the first reader and then sends with or without one.
 
@@ -385,8 +233,6 @@ class Emulator:
         device: the skin; its gestures have the rate of the model.
         port: the port it sends to.
         settings: rate, converter and format.
-        faults: injected faults.
-        binary: send COBS frames instead of lines, without announcements.
         on_event: called with the device's time, s, and a message about each event.
 
     Attributes:
@@ -397,22 +243,15 @@ class Emulator:
     def __init__(
         self,
         device: Simulated,
-        port: AbstractPort,
+        port: TcpPort,
         settings: EmulatorSettings,
-        faults: Faults,
-        binary: bool = False,
         on_event: Callable[[float, str], None] = lambda t, text: None,
     ) -> None:
-        faults.fits(len(device.sensors))
-        self.device, self.port, self.settings, self.faults = device, port, settings, faults
+        self.device, self.port, self.settings = device, port, settings
         self.converter = Converter(settings.bits, float(device.constants.clip.max()))
-        self._on_event, self.binary, self.frames = on_event, binary, 0
-        self._number = self._zero = 0
-        self._held: np.ndarray | None = None
-        self._silent_until = -1
+        self._on_event, self.frames, self._zero = on_event, 0, 0
         self._over = Event()
         self._noise = generator(Stream.NOISE, device.seed, Stream.TEST, 2, settings.seed)
-        self._probability = generator(Stream.TEST, 3, settings.seed)
 
     def run(self, seconds: float | None = None, count: int | None = None) -> None:
         """Send until ``count`` gestures or ``seconds`` of device time are over, or until :meth:`stop`."""
@@ -420,7 +259,6 @@ class Emulator:
             pass
         end = None if seconds is None else round(seconds * self.settings.rate)
         self._start = monotonic()
-        self._begin()
         for values in self._pieces(count):
             if self._play(values, end):
                 return
@@ -444,7 +282,7 @@ class Emulator:
         """Return the counts for true readings (F, S), N."""
         if len(true) < 2:
             return np.zeros((0, true.shape[1]))
-        time = torch.from_numpy((self._number + np.arange(len(true))) / self.settings.rate)
+        time = torch.from_numpy((self.frames + np.arange(len(true))) / self.settings.rate)
         output = self.device.imperfection.raw(
             torch.from_numpy(true)[None].float(), self.device.constants, self._noise, time
         )
@@ -453,91 +291,48 @@ class Emulator:
     def _play(self, values: np.ndarray, end: int | None) -> bool:
         """Send frames when they are due; return whether the run is over."""
         rate = self.settings.rate
-        happen = self.faults.happen
-        faults = {kind: happen(kind, self._number, len(values), rate, self._probability) for kind in KINDS}
-        for position, row in enumerate(values):
-            if end is not None and self._number >= end:
+        unplugged = {round(t * rate) for t in self.settings.unplug}
+        for row in values:
+            if end is not None and self.frames >= end:
                 return True
-            due = self._start + self._number / (rate * self.settings.speed)
+            due = self._start + self.frames / (rate * self.settings.speed)
             if self._over.wait(max(0.0, due - monotonic())):
                 return True
-            for kind in KINDS:
-                if faults[kind][position]:
-                    getattr(self, f"_{kind}")()
-            if self._number % max(1, round(rate)) == 0:  # each second
+            if self.frames in unplugged:
+                self._unplug()
+            if self.frames % max(1, round(rate)) == 0:  # each second
                 self._header()
-            self._frame(self._broken(row))
-            self._number += 1
-        return False
-
-    def _frame(self, row: np.ndarray) -> None:
-        seq = self._number - self._zero
-        t_us = round(seq * 1e6 / self.settings.rate) % 2**32
-        if self.binary:
-            # Only counts are whole numbers.
-            data = encode_frame(row, seq, t_us, "f32" if self.settings.bits is None else "u16")
-        else:
+            seq = self.frames - self._zero
             numbers = row.tolist() if self.settings.bits is None else row.astype(int).tolist()
-            data = encode_line(numbers, seq, t_us, self.settings.check)
-        self._send(data)
-        self.frames += 1
-
-    def _send(self, data: bytes) -> None:
-        if self._number >= self._silent_until:
-            self.port.write(self.faults.damaged(data, self._probability))
-
-    def _broken(self, row: np.ndarray) -> np.ndarray:
-        faults = self.faults
-        if self._number < faults.since * self.settings.rate or not (faults.stuck or faults.dead):
-            return row
-        self._held = row if self._held is None else self._held
-        row = row.copy()
-        row[list(faults.stuck)] = self._held[list(faults.stuck)]
-        row[list(faults.dead)] = 0.0
-        return row
-
-    def _begin(self) -> None:
-        """Start counting, like a board after power-on."""
-        self._zero = self._number
-        if self.faults.banner:
-            self._send(BANNER)
-        self._header()
+            self.port.write(encode_line(numbers, seq, round(seq * 1e6 / rate) % 2**32, self.settings.check))
+            self.frames += 1
+        return False
 
     def _header(self) -> None:
         settings, unit = self.settings, "N" if self.settings.bits is None else "adc"
         speed = None if settings.speed == 1 else settings.speed
         name = settings.id if settings.id.startswith(EMULATED) else f"{EMULATED}-{settings.id}"
         header = Header(1, len(self.device.sensors), settings.rate, unit, settings.bits, name, speed)
-        if self.binary:
-            self._send(encode_comment(encode_header(header, "none").rstrip()))
-        else:
-            self._send(encode_header(header, settings.check))
+        self.port.write(encode_header(header, settings.check))
 
     def _announce(self, number: int, gesture: Gesture) -> None:
         rate = self.settings.rate
-        self._on_event(self._number / rate, f"gesture {number}: {label_text(gesture.labels)}")
-        if self.settings.announce and not self.binary:
-            seq, frames = self._number - self._zero, round(len(gesture.force) * rate / self.device.model_rate)
+        self._on_event(self.frames / rate, f"gesture {number}: {label_text(gesture.labels)}")
+        if self.settings.announce:
+            seq, frames = self.frames - self._zero, round(len(gesture.force) * rate / self.device.model_rate)
             announcement = Announcement(
                 number, seq, frames, gesture.labels, self.device.model_rate, gesture.contacts
             )
-            self._send(encode_announcement(announcement))
-
-    def _silence(self) -> None:
-        self._on_event(self._number / self.settings.rate, f"silent for {self.faults.silent:g} s")
-        self._silent_until = self._number + round(self.faults.silent * self.settings.rate)
-
-    def _reset(self) -> None:
-        self._on_event(self._number / self.settings.rate, "reset")
-        self._begin()
+            self.port.write(encode_announcement(announcement))
 
     def _unplug(self) -> None:
         """Disconnect and power off; the clock starts from 0 afterwards."""
-        self._on_event(self._number / self.settings.rate, f"unplugged for {self.faults.away:g} s")
+        self._on_event(self.frames / self.settings.rate, f"unplugged for {self.settings.away:g} s")
         self.port.unplug()
-        if self._over.wait(self.faults.away / self.settings.speed):
+        if self._over.wait(self.settings.away / self.settings.speed):
             return
         self.port.plug()
-        self._on_event(self._number / self.settings.rate, f"plugged in again: {self.port.address}")
-        self._start += self.faults.away / self.settings.speed
-        self._begin()
+        self._on_event(self.frames / self.settings.rate, f"plugged in again: {self.port.address}")
+        self._start += self.settings.away / self.settings.speed
+        self._zero = self.frames
+        self._header()

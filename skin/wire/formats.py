@@ -5,7 +5,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from functools import cached_property
-from itertools import pairwise
 from math import inf, nan
 from typing import Literal
 
@@ -15,7 +14,7 @@ from skin.device.resampling import Check, FrameError
 from skin.errors import InputError
 from skin.wire.clocks import UNITS
 from skin.wire.lines import Reader
-from skin.wire.protocol import Line, RawFrame, frames_ahead
+from skin.wire.protocol import Line, RawFrame
 
 
 @dataclass(frozen=True)
@@ -232,28 +231,20 @@ class FrameFormat:
         return RawFrame(frames[0].seq, frames[0].ticks, values, all(frame.finite for frame in frames))
 
 
-def protocol_roles(
-    run: Sequence[Line], sensors: int | None, n: int | None, binary: bool
-) -> Roles | int | None:
+def protocol_roles(run: Sequence[Line], sensors: int | None, n: int | None) -> Roles | int | None:
     """Return the fields of our protocol: seq and t_us before the values, or the values alone.
 
-    Two binary frames, whose CRC is right, show S. Three lines show one of S sensors; noise may count by
-    chance, so eight are needed where S is unknown.
+    Three lines show one of S sensors; noise may count by chance, so eight are needed where S is unknown.
 
     Args:
         run: frames alike; the last eight.
         sensors: S, or None to detect it.
         n: number of sensors of the header, or None.
-        binary: they are binary frames.
 
     Returns:
         the roles; None: more lines are needed; a number: that of the values of lines of another number.
     """
     count, expected = len(run[-1].fields), sensors or n
-    if binary and (sensors not in (None, count - 2) or count < 3):
-        return count - 2
-    if binary and len(run) > 1:
-        return Roles(count, tuple(range(2, count)), 0, 1)
     if len(run) < 3:
         return None
     counted = _count(run[-3:])
@@ -265,18 +256,16 @@ def protocol_roles(
     return Roles(count, tuple(range(shift, count)), *((0, 1) if shift else ()))
 
 
-def _count(run: Sequence[Line], step: int = 1000) -> bool:
-    """Return whether the first two fields are a frame number, of which ``step`` may be missing, and a time.
+def _count(run: Sequence[Line], missing: int = 1000) -> bool:
+    """Return whether the first two fields are a frame number, some of which may be missing, and a time.
 
-    A clock of whole seconds, or one that stands still, is one too: the decoder judges it.
+    A clock of whole seconds, or one that stands still, is one too: the decoder judges it. Lines across a wrap
+    show neither.
     """
-    table = np.array([line.fields for line in run])[:, :2]
-    if len(run[0].fields) < 3 or not np.isfinite(table).all() or (table < 0).any() or (table[:, 0] % 1).any():
-        return False
-    seqs, times = table.T.tolist()
-    ahead = (frames_ahead(int(before), int(seq)) for before, seq in pairwise(seqs))
-    later = (time >= before or time < 2**31 < before for before, time in pairwise(times))
-    return all(0 < frames <= step for frames in ahead) and all(later)
+    table = np.array([line.fields[:2] for line in run])
+    steps, whole = np.diff(table, axis=0), len(run[0].fields) > 2 and not (table[:, 0] % 1).any()
+    later = (steps >= (1, 0)).all() and (steps[:, 0] <= missing).all()
+    return bool(whole and later and (table >= 0).all() and np.isfinite(table).all())
 
 
 class SensorCountError(InputError):

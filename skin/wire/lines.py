@@ -155,19 +155,12 @@ def find_json(line: bytes) -> dict[str, bytes | None]:
     """
     begin = min((position for position in (line.find(b"{"), line.find(b"[")) if position >= 0), default=0)
     try:
-        content = json.loads(line[begin:], object_pairs_hook=_distinct)
+        content = json.loads(line[begin:])
     except (ValueError, RecursionError) as error:
         raise FrameError("structure") from error
     if not isinstance(content, dict | list):
         raise FrameError("structure")
     return {name: None if value is None else str(value).encode() for name, value in _flatten("", content)}
-
-
-def _distinct(pairs: Sequence[tuple[str, Any]]) -> dict[str, Any]:
-    content = dict(pairs)
-    if len(content) < len(pairs):
-        raise ValueError("a key stands twice")
-    return content
 
 
 def _flatten(name: str, value: Any, depth: int = 8) -> Iterator[tuple[str, Any]]:

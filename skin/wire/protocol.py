@@ -1,27 +1,20 @@
-"""What a device sends: lines of text, or binary frames; and announcements of an emulated skin.
+"""Our protocol: lines of text that a device sends, and announcements of an emulated skin.
 
-Text: one frame a line, ``seq,t_us,v0,...,vN-1*HHHH``. A line that starts with # is a comment. The header is
+One frame a line, ``seq,t_us,v0,...,vN-1*HHHH``. A line that starts with # is a comment. The header is
 one, best with a checksum too: ``# skin proto=1 n=25 rate=100 unit=adc bits=10 id=arm-L``.
 
-Binary: COBS with 0x00 between frames, little-endian. A frame: u8 0xA5, u8 type (1 u16, 2 i16, 3 f32),
-u16 seq, u32 t_us, u16 n, n values, u16 CRC-16/CCITT-FALSE of all before it. A comment, such as the header:
-u8 0xA5, u8 type 35 (``#``), a comment line of the text protocol without its checksum, u16 CRC. COBS: Cheshire
-and Baker, "Consistent overhead byte stuffing", IEEE/ACM ToN 7 (1999).
-
-An emulated skin announces its next gesture in a comment of the text protocol that is JSON with a CRC-16,
+An emulated skin announces its next gesture in a comment that is JSON with a CRC-16,
 ``# {"number": 0, ...}*HHHH``.
 """
 
 import binascii
 import json
-import re
-import struct
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import reduce
 from math import inf, isclose, isfinite, nan
 from operator import xor
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -242,17 +235,6 @@ def _positive(word: str | None, kind: type[float] = float) -> Any:
     return value if 0 < value < 1e9 else None
 
 
-Kind = Literal["u16", "i16", "f32"]
-
-_MAGIC = 0xA5
-_COMMENT = ord("#")
-_HEAD = struct.Struct("<BBHIH")
-_TAIL = struct.Struct("<H")
-_BLOCKS = re.compile(rb"[^\0]{254}|[^\0]{0,253}\0")  # of COBS: bytes up to a zero, at most 254
-_NUMBER: dict[Kind, int] = {"u16": 1, "i16": 2, "f32": 3}
-_TYPE: dict[int, np.dtype] = {1: np.dtype("<u2"), 2: np.dtype("<i2"), 3: np.dtype("<f4")}
-
-
 class RawFrame(NamedTuple):
     """Content of one frame.
 
@@ -267,79 +249,6 @@ class RawFrame(NamedTuple):
     ticks: float | None
     values: np.ndarray
     finite: bool = True
-
-
-def encode_frame(values: Sequence[float] | np.ndarray, seq: int, t_us: int, kind: Kind = "u16") -> bytes:
-    """Return an encoded frame that ends with 0x00; seq is taken modulo 2**16, t_us modulo 2**32.
-
-    Raises:
-        ValueError: a value is out of range for the type.
-    """
-    number, numbers = _NUMBER[kind], np.asarray(values, dtype=np.float64)
-    with np.errstate(invalid="ignore", over="ignore"):
-        packed = numbers.astype(_TYPE[number])
-    if kind != "f32" and (packed != numbers).any():
-        raise ValueError(f"{kind} cannot hold {numbers[packed != numbers][0]:g}")
-    body = _HEAD.pack(_MAGIC, number, seq % 2**16, t_us % 2**32, len(numbers)) + packed.tobytes()
-    return stuff(body + _TAIL.pack(crc16(body))) + b"\0"
-
-
-def decode_frame(data: bytes) -> Line | bytes:
-    """Decode the bytes between two zeros: number, clock and values of a frame, or the text of a comment.
-
-    Raises:
-        FrameError: ``structure`` (no COBS, too short, unknown type), ``checksum`` or ``fields``.
-    """
-    if not data:
-        return b""
-    body = unstuff(data)
-    if len(body) < 4 or body[0] != _MAGIC or body[1] not in (*_TYPE, _COMMENT):
-        raise FrameError("structure")
-    if crc16(body[:-2]) != _TAIL.unpack(body[-2:])[0]:
-        raise FrameError("checksum")
-    if body[1] == _COMMENT:
-        return body[2:-2]
-    if len(body) < _HEAD.size + _TAIL.size:
-        raise FrameError("structure")
-    _, number, seq, t_us, count = _HEAD.unpack_from(body)
-    kind = _TYPE[number]
-    if len(body) != _HEAD.size + count * kind.itemsize + _TAIL.size:
-        raise FrameError("fields", (len(body) - _HEAD.size - _TAIL.size) // kind.itemsize)
-    values = np.frombuffer(body, kind, count, _HEAD.size)
-    return Line([seq, t_us, *values.tolist()], "crc16", bool(np.isfinite(values).all()))
-
-
-def encode_comment(text: bytes) -> bytes:
-    """Return a comment, such as ``# skin proto=1 n=25 bits=10``, encoded, with 0x00 at its end."""
-    body = bytes((_MAGIC, _COMMENT)) + text
-    return stuff(body + _TAIL.pack(crc16(body))) + b"\0"
-
-
-def stuff(data: bytes) -> bytes:
-    """Return ``data`` encoded with COBS: without zeros, each replaced by the distance to the next."""
-    blocks = _BLOCKS.findall(data + b"\0")
-    if len(blocks) > 1 and blocks[-1] == b"\0" and blocks[-2][-1]:
-        blocks.pop()  # the zero behind a full block at the end is not sent
-    return b"".join(b"\xff" + block if block[-1] else bytes((len(block),)) + block[:-1] for block in blocks)
-
-
-def unstuff(data: bytes) -> bytes:
-    """Return the data that :func:`stuff` encoded.
-
-    Raises:
-        FrameError: ``structure``: an invalid distance.
-    """
-    out, position, end = bytearray(), 0, len(data)
-    while position < end:
-        distance = data[position]
-        following = position + distance
-        if distance == 0 or following > end:
-            raise FrameError("structure")
-        out += data[position + 1 : following]
-        if distance < 255 and following < end:
-            out.append(0)
-        position = following
-    return bytes(out)
 
 
 MOST_CONTACTS = 100

@@ -1,9 +1,7 @@
 """Read a port: its settings, streams of bytes, and feeds of frames."""
 
 import errno
-import logging
 import os
-import socket
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, fields
@@ -11,7 +9,6 @@ from itertools import count
 from math import inf
 from time import sleep
 from typing import TYPE_CHECKING, Annotated, Any, Protocol
-from urllib.parse import urlsplit
 
 from pydantic import AfterValidator, NonNegativeFloat, PositiveFloat, PositiveInt
 
@@ -24,8 +21,6 @@ from skin.wire.decoder import Decoder
 
 if TYPE_CHECKING:
     from skin.device.touches import Touches
-
-_log = logging.getLogger(__name__)
 
 
 def _check_order(limits: Limits) -> Limits:
@@ -126,39 +121,23 @@ class ByteStream(Protocol):
         """Close the port."""
 
 
-def open_stream(port: str, baudrate: int) -> ByteStream:
-    """Open a serial port, or ``socket://host:number``.
-
-    Raises:
-        InputError: there is no such port, it cannot be opened, or it is in use.
-    """
-    if port.startswith("socket://"):
-        _address(port)
-    return _Stream(port, baudrate)
-
-
 def check_port(port: str) -> None:
-    """Check that there is something at a port, without opening it: that would restart many boards.
-
-    Args:
-        port: as of :func:`open_stream`. Names of Windows and hosts elsewhere cannot be checked.
+    """Check that there is a device at a serial port, without opening it: that would restart many boards.
 
     Raises:
-        InputError: there is no such device, or nothing on this machine listens at the address.
+        InputError: there is none. Names of Windows and sockets cannot be checked.
     """
-    if port.startswith("socket://"):
-        try:
-            *kind, _, address = socket.getaddrinfo(*_address(port), type=socket.SOCK_STREAM)[0]
-            with socket.socket(*kind) as probe:
-                probe.bind(address)  # an address of this machine that could be taken
-        except OSError:
-            return  # something listens, or it is another machine
-        raise InputError(f"cannot reach {port}: nothing listens there; start what sends the frames first")
     if os.name == "posix" and "/" in port and "://" not in port and not os.path.exists(port):
         raise InputError(f"no port {port}: {_existing()}")
 
 
-class _Stream:
+class PortStream:
+    """A serial port, or ``socket://host:number``.
+
+    Raises:
+        InputError: there is no such port, it cannot be opened, or it is in use.
+    """
+
     def __init__(self, port: str, baudrate: int) -> None:
         import serial
 
@@ -173,19 +152,11 @@ class _Stream:
         self.write, self.close = self._port.write, self._port.close
 
     def read(self) -> bytes:
+        """As of :class:`ByteStream`."""
         data = bytes(self._port.read(_MOST))
         if not data:
             sleep(_WAIT)
         return data
-
-
-def _address(port: str) -> tuple[str, int]:
-    """Return host and number of ``socket://host:number``."""
-    with suppress(ValueError):
-        address = urlsplit(port)
-        if address.hostname and address.port:
-            return address.hostname, address.port
-    raise InputError(f"{port} is not an address: give device.port=socket://HOST:NUMBER")
 
 
 def _refused(port: str, baudrate: int, error: Exception) -> InputError:
@@ -223,12 +194,6 @@ def _existing() -> str:
     return (
         f"there are {ports}; give device.port=PORT" if ports else "there is no serial port; is it plugged in?"
     )
-
-
-_WEAK = {
-    "none": "no checksum: a wrong value passes in 29 % of flipped bits and 76 % of lost bytes",
-    "xor": "a weak checksum (*HH): 2 % of double flipped bits and 6 % of double lost bytes pass",
-}
 
 
 class WireFeed:
@@ -278,8 +243,7 @@ class WireFeed:
             (text or "").encode() for text in (adapter.start, adapter.poll, adapter.stop)
         )
         self._asked_at = self._polled_at = -inf
-        self._attempts, self._started, self._answered, self._warned = 0, False, True, False
-        self._received_at, self._logged_clock = inf, ""
+        self._started, self._answered, self._received_at = False, True, inf
 
     def poll(self, clock: Callable[[], float]) -> list[Frame]:
         """Return the frames received since the last call.
@@ -324,11 +288,11 @@ class WireFeed:
     @property
     def unanswered(self) -> str:
         """What was sent to the board without any frame in return, in words; empty if nothing."""
-        if self._started or not self._attempts:
+        if self._started or not (self._start or self._poll):
             return ""
-        name, text = ("start", self._start) if self._start else ("poll", self._poll)
-        sent = f"the {name} string {text.decode()!r} of the adapter was sent"
-        return f"{sent} {self._attempts} times without an answer"
+        return (
+            f"the string {(self._start or self._poll).decode()!r} of the adapter was sent without an answer"
+        )
 
     def close(self) -> None:
         """Tell the board to stop, and close the port."""
@@ -342,21 +306,13 @@ class WireFeed:
         if self._start and not self._started and now - self._asked_at >= self._again:
             self._stream.write(self._start)
             self._asked_at = now
-            self._attempts += 1
         if self._poll and (self._answered or now - self._polled_at >= self._unanswered):
             self._stream.write(self._poll)
             self._polled_at, self._answered = now, False
-            self._attempts += not self._start
 
     def _prepare(self) -> None:
-        """Warn once of a weak checksum; set limits from the header as soon as it arrives."""
-        stats, header = self._decoder.stats, self._decoder.header
-        if stats.clock != self._logged_clock:
-            (_log.info if stats.timing.trusted else _log.warning)("%s", stats.clock)
-            self._logged_clock = stats.clock
-        if not self._warned and stats.check in _WEAK:
-            _log.warning("frames carry %s; let the firmware send *HHHH", _WEAK[stats.check])
-        self._warned = True
+        """Set limits from the header as soon as it arrives."""
+        header = self._decoder.header
         if header is not None and header.bits:
             self._health.largest = 2**header.bits - 1
             self._health.limits = self._limits or (None, self._health.largest)

@@ -6,7 +6,7 @@ torch is not imported.
 import logging
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Sequence, Sized
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from math import inf
@@ -15,12 +15,11 @@ from time import monotonic
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.ndimage import maximum_filter1d
 
 from skin.device.calibration import read_calibration
 from skin.device.resampling import Frame, check_rate
 from skin.errors import InputError
-from skin.wire.channels import RawRange, UnitConversion, check_sensitivity, fails_in_contact, unit_conversion
+from skin.wire.channels import RawRange, UnitConversion, check_sensitivity, unit_conversion
 from skin.wire.decoder import Decoder, Stats
 from skin.wire.formats import runs
 from skin.wire.protocol import Announcement, Header
@@ -28,10 +27,10 @@ from skin.wire.reader import (
     ByteStream,
     PlaybackFeed,
     Port,
+    PortStream,
     SkinDisconnected,
     SkinTimeout,
     WireFeed,
-    open_stream,
 )
 from skin.wire.tare import HEADER, PATIENCE, SkinTouched, Tare, take_baseline
 
@@ -43,7 +42,7 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 
-class Skin:
+class Skin(AbstractContextManager["Skin"]):
     """Frames from an open skin; iterate over it, or :meth:`read` a block.
 
     Values are in the device's unit; ``frame.values - skin.baseline`` is the change due to touch. A thread
@@ -88,9 +87,6 @@ class Skin:
         self._stop, self._fresh = Event(), Condition()
         self._thread = Thread(target=self._run, name="skin-reader", daemon=True)
         self._thread.start()
-
-    def __enter__(self) -> "Skin":
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()
@@ -301,7 +297,7 @@ def open_skin(
         raise InputError("skin listen adapter=auto proposes an adapter: give device.adapter=FILE.yaml of it")
     decoder = Decoder(sensors, channels=channels, polarity=polarity, adapter=about.frames)
     watched = reconnect and address.startswith("socket://")
-    opener = opener or partial(open_stream, address, about.baudrate)
+    opener = opener or partial(PortStream, address, about.baudrate)
     try:
         silence = (watched and about.silence) or inf
         feed = WireFeed(opener, decoder, about.limits, silence, inwards=inwards)
@@ -368,6 +364,8 @@ class SerialSource:
 
     Attributes:
         three: the same port with the sensors of all axes, if ``inwards``; else None.
+        channels: the device's channel of every sensor; empty: the same order.
+        polarity: 1 or -1 per sensor, -1 where the value falls with force; empty: 1 for all.
 
     Raises:
         InputError: a calibration of another number of sensors, or a conversion that contradicts
@@ -386,21 +384,12 @@ class SerialSource:
         # The sensitivity is that of sensors inwards.
         self.three = SerialSource(replace(settings, sensitivity=None), 3 * sensors, rate) if inwards else None
         path = settings.calibration
-        self._calibration = None if path is None else read_calibration(path, inwards)
-        if settings.scale is not None or self._calibration is not None:
+        calibration = self._calibration = None if path is None else read_calibration(path, inwards)
+        self.channels = calibration.channels if calibration else ()
+        falling = [-1] * sensors if (settings.scale or 0) < 0 else ()
+        self.polarity: Sequence[int] = calibration.polarity if calibration else falling
+        if settings.scale is not None or calibration is not None:
             self.convert(None, None)
-
-    @property
-    def channels(self) -> Sequence[int]:
-        """The device's channel of every sensor; empty: the same order."""
-        return self._calibration.channels if self._calibration else ()
-
-    @property
-    def polarity(self) -> Sequence[int]:
-        """1 or -1 per sensor, -1 where the value falls with force; empty: 1 for all."""
-        if self._calibration is not None:
-            return self._calibration.polarity
-        return [-1] * self._sensors if (self.settings.scale or 0) < 0 else ()
 
     def open(self, reconnect: bool = False) -> Skin:
         """Open the port; ``reconnect`` waits for an unplugged skin."""
@@ -489,11 +478,10 @@ class PortMonitor:
     Args:
         skin: open.
         kept: frames for the statistics of channels.
-        far, near: times the noise, and s, that make a touch.
     """
 
-    def __init__(self, skin: Skin, kept: int = 10_000, far: float = 10.0, near: float = 0.5) -> None:
-        self._skin, self._far, self._near = skin, far, near
+    def __init__(self, skin: Skin, kept: int = 10_000) -> None:
+        self._skin = skin
         self._frames: deque[Frame] = deque(maxlen=kept)
 
     def lines(self, seconds: float | None) -> Iterator[str]:
@@ -527,7 +515,6 @@ class PortMonitor:
         values = np.stack([frame.values for frame in self._frames])
         valid = np.stack([frame.valid for frame in self._frames])
         states = self._skin.channels or ("ok",) * values.shape[1]
-        touched = self._find_contact(values, valid)
         # Of a channel that is never valid, the values that it repeats.
         rows = [row[mask] if mask.any() else row for row, mask in zip(values.T, valid.T, strict=True)]
         lines = [f"header: {self._skin.header or 'none'}", "channel     least    median   largest     noise"]
@@ -539,25 +526,5 @@ class PortMonitor:
                 text = "no value"
             elif runs(row):
                 text = "a clock or counter, no sensor: skin listen adapter=auto describes such a board"
-            elif _fails_under_touch(~valid[:, channel], touched):
-                text += ", more often in contact than at rest: beyond its range?"
             lines.append(f"{channel:7d}{row.min():10.5g}{middle:10.5g}{row.max():10.5g}{noise:10.3g}  {text}")
-        if _fails_under_touch(np.array([frame.lost > 0 for frame in self._frames]), touched):
-            lines.append(
-                "more frames are unreadable or lost in contact than at rest: values beyond the range?"
-            )
         return "\n".join(lines)
-
-    def _find_contact(self, values: np.ndarray, valid: np.ndarray) -> np.ndarray:
-        """Return the frames (F,), bool, within half a second of which a channel is far from its median."""
-        away, noise = np.abs(values - np.median(values, axis=0)), np.abs(np.diff(values, axis=0)).mean(axis=0)
-        touched = ((away > self._far * noise) & valid).any(axis=1)
-        near = 2 * round(self._near * self._skin.stats.rate_hz) + 1
-        return np.asarray(maximum_filter1d(touched, near))
-
-
-def _fails_under_touch(failed: np.ndarray, touched: np.ndarray) -> bool:
-    """Return whether frames (F,) fail more often while the skin is touched, (F,)."""
-    return fails_in_contact(
-        *(int(part.sum()) for part in (failed & touched, touched, failed & ~touched, ~touched))
-    )

@@ -1,6 +1,6 @@
-"""The newtons of a stream: its baseline, readings that freeze, and error values."""
+"""The newtons of a stream: its baseline, and readings that freeze."""
 
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
 from math import inf
@@ -148,64 +148,6 @@ class Freshness:
         return not likely.all() and len(np.unique(self._rows[: self._equal[~likely].max()])) >= self._distinct
 
 
-class Glitches:
-    """Finds error values: one channel jumps to a constant for one frame, and nothing else feels a touch.
-
-    A value that has come so before, and does not last for a second frame, is an error of the device, if a
-    touch of that force would have changed another sensor. Anything else is a reading.
-
-    Args:
-        fractions: (S, S), reading of each sensor under a touch on another, of whose reading it is a fraction;
-            None: unknown, and no value is an error.
-        longest: s, interval of the frames in which no touch comes and goes.
-        seen: times that the constant must have come before.
-        visible: times the change of the other sensors from frame to frame that shows a touch.
-    """
-
-    def __init__(
-        self, fractions: np.ndarray | None = None, longest: float = 0.02, seen: int = 2, visible: float = 10.0
-    ) -> None:
-        self.fractions, self._longest, self._seen, self._visible = fractions, longest, seen, visible
-        self._counts = Counter[tuple[int, float]]()
-        self._before: tuple[float, np.ndarray, np.ndarray] | None = None  # with newtons
-        self._latest: int | None = None  # channel that jumped in the frame before
-
-    def check(self, frame: Frame, t: float, conversion: UnitConversion | None) -> Frame:
-        """Return a frame without its error value, which repeats the value before and is not valid.
-
-        Args:
-            frame: as the device sent it.
-            t: s, time of the stream.
-            conversion: of the values to N, always the same; None: unknown, and no value is an error.
-        """
-        if self.fractions is None or conversion is None:
-            return frame
-        newtons = conversion.newtons(frame.values)
-        before, self._before = self._before, (t, frame.values, newtons)
-        latest, self._latest = self._latest, None
-        if before is None or not 0 < t - before[0] <= self._longest:
-            return frame
-        changes = newtons - before[2]
-        channel = int(changes.argmax())
-        expected = self.fractions[channel] * changes[channel]
-        others = np.arange(len(changes)) != channel
-        visible = self._visible * np.abs(changes[others]).mean()
-        witnesses = others & frame.valid & (expected > visible) & (np.abs(changes) < expected / 2)
-        limited = frame.saturated is not None and frame.saturated[channel]
-        if limited or not frame.valid[channel] or not witnesses.any() or latest == channel:
-            return frame
-        value = float(frame.values[channel])
-        self._counts[channel, value] += 1
-        self._latest = channel
-        if self._counts[channel, value] <= self._seen:
-            return frame
-        values, valid = frame.values.copy(), frame.valid.copy()
-        values[channel], valid[channel] = before[1][channel], False
-        self._before = t, values, before[2]
-        mask = None if frame.mask is None else np.where(valid, frame.mask, frame.mask | Reason.MISSING)
-        return frame._replace(values=values, valid=valid, mask=mask)
-
-
 MakeConversion = Callable[[np.ndarray | None, Header | None], UnitConversion]
 """Returns the conversion for a baseline (S,), or None, and a header, or None; InputError if the scale is
 unknown."""
@@ -254,7 +196,6 @@ class Tare:
         warning: message about what the latest baseline lacks; empty if nothing.
         count: number of baselines taken.
         freshness: tells whether the device still works.
-        glitches: finds error values; its ``fractions`` may be set later.
     """
 
     def __init__(
@@ -271,11 +212,10 @@ class Tare:
         self._conversion, self._header, self.seconds, self._rate = conversion, header, seconds, rate
         self._interval, self._limited, self._lags = interval, limited, lags
         self.conversion: UnitConversion | None = None
-        self._untared: UnitConversion | None = None
         self.state: TareState = "first"
         self._detail = self.warning = ""
         self.count = 0
-        self.freshness, self.glitches, self.three = Freshness(), Glitches(), three
+        self.freshness, self.three = Freshness(), three
         self._clock, self._quiet = StreamClock(), list[Frame]()
         self._waiting = deque[tuple[Frame, float]](maxlen=4096)  # as many as a skin queues
         self._first: float | None = None
@@ -315,7 +255,6 @@ class Tare:
         """
         time = self._clock(frame)
         three = self.three.add(frame.three, touched) if self.three and frame.three else None
-        frame = self.glitches.check(frame, time, self._untared)
         if self.conversion is None or self._deadline is not None:
             self._update(frame, time, touched)
         mask = self.freshness.check(frame, time, self.conversion)
@@ -341,7 +280,7 @@ class Tare:
         self._first = frame.t_host if self._first is None else self._first
         header = self._header()
         try:
-            self._untared = self._conversion(None, header)
+            untared = self._conversion(None, header)
         except InputError:
             # The header may arrive a little late.
             if header is not None or frame.t_host - self._first > HEADER:
@@ -349,7 +288,7 @@ class Tare:
             self.state = "header"
             return
         if not self.seconds:
-            self.conversion, self.state = self._untared, ""
+            self.conversion, self.state = untared, ""
         elif touched and not self._forced:
             self._quiet.clear()
             self.state = "waits"

@@ -67,7 +67,7 @@ def test_parts_of_libraries_may_be_built(name):
         "skin.learning.network.torch.optim.Adam",
         "skin.learning.learner.AbstractLearner",
         "skin.learning.learner.Rules.load",
-        "skin.wire.emulator.AbstractPort",
+        "skin.device.base.AbstractDevice",
         "skinny.Learner",
         "experiments.peers.rocket.AbstractLearner",
         "experiments.peers.rocket.subprocess.Popen",

@@ -20,7 +20,7 @@ def emulated(begin, tmp_path):
 
     @contextmanager
     def emulated(*overrides):
-        with begin(tmp_path, "emulate", *SMALL, *overrides) as process:
+        with begin(tmp_path, "emulate", "port=0", *SMALL, *overrides) as process:
             lines = process.lines()
             yield next(lines), lines, process
 

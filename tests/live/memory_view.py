@@ -18,11 +18,11 @@ class Look:
     """What the display shows at ``t``, s."""
 
     def __init__(self, t, state):
-        verdict = state.verdict
-        self.t, self.alarm, self.reason = t, state.alarm, state.reason
+        verdict, _, self.alarm = state.assessment
+        self.t, self.reason = t, state.reason
         self.notes = [note.code for note in state.notes]
         self.state = "unknown" if verdict is None else verdict.state
-        self.danger = True if state.alarm else None if verdict is None else verdict.danger
+        self.danger = True if self.alarm else None if verdict is None else verdict.danger
         self.words = [] if verdict is None else [word for word, _ in verdict.words()]
 
 
@@ -52,7 +52,6 @@ class MemoryView:
         skin = SimpleNamespace(stats=decoder.stats)
         three = None if source.three is None else Tare(source.three.convert, 2.0, engine.rate)
         tare = Tare(source.convert, 2.0, engine.rate, lambda: decoder.header, three=three)
-        tare.glitches.fractions = engine.fractions
         positions = np.zeros((engine.sensors, 3))
         self.display = Display("memory", "memory", positions, (0.1, 0.1), 4.0)
         self.display.observers.append(lambda assessment, now, event: self.said.append((now, *assessment)))

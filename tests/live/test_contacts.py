@@ -32,11 +32,9 @@ from skin.live.contacts import (
     estimate_contacts,
     unknown_contacts,
 )
-from skin.live.engine import Detection, Engine, Verdict
-from skin.mechanics.simulator.naive import Naive
+from skin.live.engine import Verdict
 from skin.mechanics.simulator.solid import Solid
 from skin.runs.build import build_device
-from skin.touch.labels import TOUCH
 from skin.wire.channels import UnitConversion
 
 PATIENCE = 100
@@ -167,24 +165,6 @@ def test_an_untouched_skin_has_no_contact(posterior):
     message = estimate_contacts(posterior, NOISE, moment(np.zeros(SENSORS)))
     assert (message["state"], message["number"], message["contacts"]) == ("no contact", 0, [])
     assert contact_text_lines(message)[0].startswith("no contact (")
-
-
-def test_few_sensors_that_feel_nothing_show_no_contact_but_a_light_touch():
-    """They cannot rule out a contact between them, which is no reason to show one."""
-    body, count = Sheet((0.15, 0.15), (24, 24), BODY.layers), 12
-    mechanics = Mechanics(Naive, body, Grid(3, 4).sensors(body), NOISE)
-    posterior, rng = mechanics.posterior(), np.random.default_rng(0)
-    # 0.3 N at the first sensor, which reads 0.1 N.
-    position = np.array([[0.0218, 0.025, 0.008]])
-    light = 0.3 * disc_readings(Naive(body, mechanics.sensors), body, position, 0.0015)[0]
-    works = {"valid": np.ones(count, dtype=bool), "saturated": np.zeros(count, dtype=bool)}
-    for _ in range(3):
-        noise = rng.normal(scale=NOISE.frame / 10**0.5, size=count)
-        idle, touched = (
-            estimate_contacts(posterior, NOISE, moment(noise + felt, **works)) for felt in (0.0, light)
-        )
-        assert (idle["state"], touched["state"]) == ("no contact", "contacts")
-        assert touched["probabilities"][0] < 0.1 < 0.8 < idle["probabilities"][0]
 
 
 @pytest.mark.parametrize("values", [np.full(SENSORS, 3.0), [0, 0, 0, 0, -3.0, 0, 0, 0, 0]])
@@ -335,29 +315,3 @@ def test_where_no_contacts_can_be_estimated_a_sentence_says_why(configured):
     device = build_device(configured("simulator=naive", "device.gain_spread=[0.1,0.3]")).reference
     assert Mechanics.of(device, False).noise.gain == pytest.approx(0.2)
     assert Mechanics.of(device, True).noise.gain == pytest.approx(0.02)
-
-
-def test_verdicts_are_the_same_to_the_bit_with_contacts(running, felt):
-    """Each verdict comes from the same frames; contacts are asked for in between."""
-    rng = np.random.default_rng(0)
-    load = np.interp(np.arange(600) / 100, [1, 2, 4, 5], [0, 1, 1, 0])[:, None] * felt
-    valid = np.ones(SENSORS, dtype=bool)
-    stream = [
-        CONVERSION.convert(Frame(None, number / 100, 0.0, row, valid))
-        for number, row in enumerate(load + rng.normal(scale=0.02, size=load.shape))
-    ]
-
-    def classify(readings, valid):
-        return 1 / (1 + np.exp(-readings.sum(axis=(1, 2))[:, None] * np.linspace(-0.1, 0.1, 4)))
-
-    def watch(contacts):
-        engine, verdicts = Engine(classify, TOUCH, SENSORS, 30, 10.0, Detection(0.3)), []
-        for first in range(0, len(stream), 5):
-            verdicts += (fresh := engine.push(stream[first : first + 5]))
-            contacts.look(stream[first : first + 5], CONVERSION, fresh, engine.detector.baseline)
-        return verdicts
-
-    alone, beside = watch(LiveContacts()), watch(running)
-    assert len(alone) > 100
-    assert alone == beside
-    assert any(verdict.touched for verdict in alone)

@@ -1,7 +1,6 @@
 """The live view of an exported model: in a process of its own, without torch."""
 
 import json
-import os
 import re
 import socket
 import subprocess
@@ -67,20 +66,16 @@ def model(trained, tmp_path_factory):
     return path
 
 
-@pytest.fixture
-def skin(request):
-    """Return the address of a skin of six sensors that is touched for one of five seconds, without end."""
-    stop, touched_from = Event(), getattr(request, "param", 4.0)
+@contextmanager
+def served(line, pause):
+    """Yield the address of a board that sends ``line(number)`` every ``pause`` s, without end."""
+    stop = Event()
 
     def serve():
-        rng, peer = np.random.default_rng(0), server.accept()[0]
-        peer.sendall(encode_header(Header(n=6, rate=RATE, unit="N")))
-        with peer, suppress(OSError):  # the reader has ended
+        with server.accept()[0] as peer, suppress(OSError):  # the reader has ended
             for number in range(10**6):
-                touched = 3.0 * (number / RATE % 5.0 > touched_from)
-                values = rng.normal(touched, 0.02, size=6).round(4)
-                peer.sendall(encode_line(values, number, round(1e6 * number / RATE)))
-                if stop.wait(1 / RATE):
+                peer.sendall(line(number))
+                if stop.wait(pause):
                     return
 
     with socket.create_server(("127.0.0.1", 0)) as server:
@@ -89,7 +84,22 @@ def skin(request):
         thread.start()
         yield f"socket://127.0.0.1:{server.getsockname()[1]}"
         stop.set()
-        thread.join(PATIENCE)
+        with suppress(OSError), socket.create_connection(server.getsockname(), timeout=5):  # wakes accept()
+            thread.join(PATIENCE)
+
+
+@pytest.fixture
+def skin(request):
+    """Return the address of a skin of six sensors that is touched for one of five seconds, without end."""
+    rng, touched_from = np.random.default_rng(0), getattr(request, "param", 4.0)
+
+    def line(number):
+        header = b"" if number else encode_header(Header(n=6, rate=RATE, unit="N"))
+        values = rng.normal(3.0 * (number / RATE % 5.0 > touched_from), 0.02, size=6).round(4)
+        return header + encode_line(values, number, round(1e6 * number / RATE))
+
+    with served(line, 1 / RATE) as address:
+        yield address
 
 
 @pytest.mark.slow("starts a process that imports anew")
@@ -228,12 +238,11 @@ def test_a_guarantee_of_a_file_holds_or_has_lapsed(trained, skin, tmp_path, devi
 @pytest.mark.slow("starts a process that imports anew")
 def test_the_example_without_this_package(model, begin, tmp_path):
     sizes = ["layout=grid", "layout.rows=2", "layout.columns=3"]
-    with begin(tmp_path, "emulate", "simulator=naive", *sizes, "link=skin", "emulate.idle=4") as emulator:
-        while "device.scale=" not in emulator.out:
-            assert emulator.poll() is None, emulator.err
-        scale = emulator.out.partition("device.scale=")[2].split()[0]
+    with begin(tmp_path, "emulate", "simulator=naive", *sizes, "port=0", "emulate.idle=4") as emulator:
+        lines = emulator.lines()
+        port, scale = next(lines), next(lines).partition("device.scale=")[2]
         with subprocess.Popen(
-            [sys.executable, "-I", EXAMPLE, model, tmp_path / "skin", scale],
+            [sys.executable, "-I", EXAMPLE, model, port, scale],
             stdout=subprocess.PIPE,
             text=True,
             cwd=tmp_path,
@@ -243,29 +252,6 @@ def test_the_example_without_this_package(model, begin, tmp_path):
     assert {line["touched"] for line in lines} == {False, True}
     assert all(0 <= line[name] <= 1 for line in lines for name in ("big", "dynamic", "press", "dangerous"))
     assert all(line["alarm"] == (line["touched"] and line["dangerous"] > 0.25) for line in lines)
-
-
-@contextmanager
-def board(line):
-    """Yield the port of a board that sends ``line(number)`` without end."""
-    tty = pytest.importorskip("tty", reason="pseudo-terminals need a POSIX system")
-    controller, follower = os.openpty()
-    tty.setraw(controller)
-    stop = Event()
-
-    def send():
-        for number in range(10**6):
-            os.write(controller, line(number))
-            if stop.wait(0.002):
-                return
-
-    thread = Thread(target=send)
-    thread.start()
-    yield os.ttyname(follower)
-    stop.set()
-    thread.join(PATIENCE)
-    os.close(controller)
-    os.close(follower)
 
 
 @contextmanager
@@ -313,7 +299,7 @@ def test_the_example_reads_an_adapter_and_a_calibration(model, tmp_path):
         return ";".join(map(str, words)).encode() + b"\r\n"
 
     with (
-        board(line) as port,
+        served(line, 0.002) as port,
         example(model, port, tmp_path / "gains.yaml", tmp_path / "board.yaml") as reader,
     ):
         said = [json.loads(reader.stdout.readline()) for _ in range(600)]
@@ -334,7 +320,7 @@ def test_the_example_reads_an_adapter_and_a_calibration(model, tmp_path):
 def test_what_the_example_cannot_read_it_refuses_in_a_sentence(model, tmp_path, setting, said):
     (tmp_path / "board.yaml").write_text(setting)
     with (
-        board(lambda number: b"%d,1,2,3,4,5,6\n" % number) as port,
+        served(lambda number: b"%d,1,2,3,4,5,6\n" % number, 0.002) as port,
         example(model, port, "0.01", tmp_path / "board.yaml") as reader,
     ):
         assert re.match(said, reader.stderr.read())

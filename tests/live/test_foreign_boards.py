@@ -58,62 +58,40 @@ def board(request):
     return request.param
 
 
-def test_a_press_is_found_and_rest_is_no_touch(board):
-    seen = watch(board, frames(board, counts(force(12, (7, 9, 4, 6.0)))))
-    assert seen.states(4, 7) == {"no touch"}
-    assert 7 <= seen.first(3) <= 7.5 + LATE
-    assert seen.kept(7.5 + LATE, 9)
+def damaged(stream):
+    """Yield frames of which a tenth loses a byte."""
+    draw = np.random.default_rng(5)
+    for piece in stream:
+        position = int(draw.integers(len(piece)))
+        yield piece[:position] + piece[position + 1 :] if draw.random() < 0.1 else piece
 
 
-def test_a_press_is_found_though_the_board_restarts(board):
-    seen = watch(board, frames(board, counts(force(16, (8, 14, 4, 6.0))), restart=2.5))
-    assert 8 <= seen.first(4) <= 8.5 + LATE
-    assert seen.kept(8.5 + LATE, 14)
+@pytest.mark.parametrize("trouble", ["none", "restarts", "damage"])
+def test_a_press_is_found_and_rest_is_no_touch(board, trouble):
+    restart = 2.5 if trouble == "restarts" else None
+    stream = frames(board, counts(force(14, (7, 11, 4, 6.0))), restart)
+    seen = watch(board, damaged(stream) if trouble == "damage" else stream)
+    assert "no touch" in seen.states(4, 7)
+    assert 7 <= seen.first(3 if trouble == "none" else 7) <= 7.5 + LATE
+    assert seen.kept(7.5 + LATE, 11)
 
 
-def test_frozen_values_are_unknown(board):
+def test_frozen_values_and_silence_are_unknown(board):
     values = counts(force(20))
     values[600:1500] = values[600]
-    seen = watch(board, frames(board, values))
+    seen = watch(board, [*frames(board, values), 3.0, *frames(board, counts(force(1)))])
     assert seen.states(11 + LATE, 15) == {"unknown"}
     assert seen.states(16.5, 20) == {"no touch"}
+    assert seen.states(20.7, 23) == {"unknown"}
 
 
-def test_a_token_for_a_missing_value_is_unknown_and_keeps_the_alarm(board):
+@pytest.mark.parametrize("sent", [NUMBER, -1, 0])
+def test_a_token_for_a_missing_value_or_a_cut_wire_is_unknown_and_keeps_the_alarm(board, sent):
+    """Without a header nobody knows what the converter can give: the channel falls far below rest."""
     values = counts(force(18, (6, 12, 7, 6.0)))
-    values[800:1400, 7] = NUMBER
+    values[800:1400, 7] = sent
     seen = watch(board, frames(board, values))
     assert seen.first(3) <= 6.5 + LATE
     assert seen.kept(6.5 + LATE, 12)
     assert "no touch" not in seen.states(6.2 + LATE, 14)
-    assert seen.states(17, 18) == {"no touch"}
-
-
-@pytest.mark.parametrize("cut", [-1, 0])
-def test_a_cut_wire_is_unknown(board, cut):
-    """Without a header nobody knows what the converter can give: the channel falls far below rest."""
-    values = counts(force(16, (6, 10, 7, 6.0)))
-    values[800:1400, 7] = cut
-    seen = watch(board, frames(board, values))
-    assert seen.first(3) <= 6.5 + LATE
-    assert seen.kept(6.5 + LATE, 10)
-    assert "no touch" not in seen.states(6.2 + LATE, 14)
-
-
-def test_silence_is_unknown(board):
-    seen = watch(board, [*frames(board, counts(force(5))), 3.0, *frames(board, counts(force(1)))])
-    assert seen.states(3, 5) == {"no touch"}
-    assert seen.states(5.7, 8) == {"unknown"}
-
-
-def test_damaged_frames_hide_no_press(board):
-    """A tenth of the frames loses a byte."""
-    randomness, pieces = np.random.default_rng(5), []
-    for piece in frames(board, counts(force(12, (7, 9, 4, 6.0)))):
-        if randomness.random() < 0.1:
-            position = int(randomness.integers(len(piece)))
-            piece = piece[:position] + piece[position + 1 :]
-        pieces.append(piece)
-    seen = watch(board, iter(pieces))
-    assert seen.first(7) <= 7.5 + LATE
-    assert seen.kept(7.5 + LATE, 9)
+    assert sent != NUMBER or seen.states(17, 18) == {"no touch"}

@@ -4,19 +4,15 @@ import json
 import os
 import re
 import signal
-import socket
 import subprocess
 import sys
-from contextlib import ExitStack, suppress
-from threading import Event, Thread
-from time import monotonic, sleep
+from contextlib import ExitStack
 
-import numpy as np
 import pytest
 from mcap.reader import make_reader
 
 from skin.core.files import ROOT
-from skin.wire.protocol import Header, encode_header, encode_line
+from tests.live.waiting import until
 
 SMALL = [
     "experiment=rules",
@@ -27,7 +23,6 @@ SMALL = [
     "evaluation.layouts=1",
     "evaluation.safe_gestures=64",
 ]
-PATIENCE = 240  # s, on a machine that is busy with other things
 
 WATCH = """
 window.log = [];
@@ -36,17 +31,6 @@ const note = () => log.push([document.body.dataset.state, document.getElementByI
 new MutationObserver(note).observe(document.getElementById("head"), {childList: true, subtree: true});
 note();
 """
-
-
-def until(found, process, what):
-    """Wait until a function gives something true, and return it."""
-    deadline = monotonic() + PATIENCE
-    while monotonic() < deadline:
-        assert process.poll() is None, f"ended while waiting for {what}"
-        if result := found():
-            return result
-        sleep(0.2)
-    raise AssertionError(f"waited in vain for {what}")
 
 
 @pytest.fixture(scope="module")
@@ -61,34 +45,28 @@ def store(run, tmp_path_factory):
 
 @pytest.mark.slow("starts a live view and a browser")
 def test_a_dangerous_press_turns_the_page_red_and_a_replugged_skin_heals_it(begin, store, browser, tmp_path):
-    link = tmp_path / "skin"
-    faults = ["faults.unplug=[10]", "faults.away=2"]
-    pace = ["emulate.rate=50", "emulate.gap=1.5"]
+    pace = ["emulate.rate=50", "emulate.gap=1.5", "emulate.unplug=[20,60,100,150,200]"]
     with ExitStack() as both:
-        emulator = both.enter_context(
-            begin(tmp_path, "emulate", "simulator=naive", f"link={link}", *pace, *faults)
-        )
-        scale = until(lambda: re.search(r"device\.scale=(\S+)\n", emulator.out), emulator, "the port")[1]
-        reader = ["device=serial", f"device.port={link}", f"device.scale={scale}", "device.backoff=[0.2,0.5]"]
+        emulator = both.enter_context(begin(tmp_path, "emulate", "simulator=naive", "port=0", *pace))
+        told = until(lambda: re.search(r"device=serial (.*)\n", emulator.out), emulator)
+        reader = ["device=serial", *told[1].split(), "device.backoff=[0.2,0.5]"]
         live = both.enter_context(begin(tmp_path, "live.py", *reader, "web=true", "live.web_port=0", *store))
-        page = until(lambda: re.search(r"page: (http\S+)", live.err), live, "the page")[1]
+        page = until(lambda: re.search(r"page: (http\S+)", live.err), live)[1]
         browser.open(page)
         browser.run(WATCH)
         log = lambda: browser.run("return log")  # noqa: E731
-        red = until(lambda: [entry for entry in log() if entry[0] == "danger"], live, "an alarm")
+        red = until(lambda: [entry for entry in log() if entry[0] == "danger"], live)
         assert "DANGEROUS" in red[0][1]
         assert red[-1][2] == "rgb(163, 13, 29)"
-        away = until(
-            lambda: [n for n, entry in enumerate(log()) if "unplugged" in entry[1]], live, "unplugging"
-        )
+        away = until(lambda: [n for n, entry in enumerate(log()) if "unplugged" in entry[1]], live)
         # An alarm stays while the skin is away.
         assert log()[away[0]][0] in ("unknown", "danger")
         after = lambda: [entry[0] for entry in log()[away[0] :] if "unplugged" not in entry[1]]  # noqa: E731
         healed = lambda: {*after()} & {"idle", "touch", "danger"}  # noqa: E731
-        until(healed, live, "healing")
+        until(healed, live)
         assert browser.run("return pictures") > 20
         line = lambda: browser.run("return document.getElementById('line').textContent")  # noqa: E731
-        until(lambda: "1 reconnected" in line(), live, "the line")  # it is updated twice a second
+        until(lambda: "reconnected" in line(), live)  # it is updated twice a second
         live.send_signal(signal.SIGINT)
         assert live.wait(60) == 0, live.err
     assert '"alarm": true' in live.out
@@ -121,45 +99,6 @@ def test_bad_input_is_one_sentence(run, tmp_path, override, needed):
     assert done.returncode == 2
     assert needed in done.stderr
     assert done.stderr.count("\n") == 1
-
-
-@pytest.mark.slow("waits for a skin to come back")
-def test_a_skin_that_lost_its_power_is_found_again(begin, store, tmp_path):
-    peers, stop = [], Event()
-
-    def serve():
-        """Send until the view has begun, fall silent without closing; send on in the next connection."""
-        rng = np.random.default_rng(0)
-        for frames in (3000, 10**6):  # 30 s
-            peers.append(server.accept()[0])
-            peers[-1].sendall(encode_header(Header(n=25, rate=100.0, unit="N")))
-            for number in range(frames):
-                values = rng.normal(scale=0.02, size=25).round(4)
-                with suppress(OSError):  # live.py has ended
-                    peers[-1].sendall(encode_line(values, number, 10_000 * number))
-                if stop.wait(0.01):
-                    return
-
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        server.settimeout(PATIENCE)
-        thread = Thread(target=serve, daemon=True)
-        thread.start()
-        port = f"device.port=socket://127.0.0.1:{server.getsockname()[1]}"
-        reader = ["device=serial", port, "device.silence=3", "device.backoff=[0.2,0.5]", "device.tare=1"]
-        try:
-            with begin(tmp_path, "live.py", *reader, *store) as live:
-                until(lambda: "stopped sending" in live.out, live, "silence")
-                after = lambda: live.out.rpartition("stopped sending")[2]  # noqa: E731
-                until(lambda: "no touch" in after(), live, "a verdict")
-                live.send_signal(signal.SIGINT)
-                assert live.wait(60) == 0
-        finally:
-            stop.set()
-            thread.join(60)
-            for peer in peers:
-                peer.close()
-    assert "Traceback" not in live.err
-    assert "1 reconnected" in " ".join(live.err.split())  # lines are wrapped
 
 
 COLLECTING = """

@@ -1,6 +1,5 @@
 """Streams of boards that restart, freeze, break or come in bursts: no dangerous touch is hidden or late."""
 
-from contextlib import nullcontext
 from dataclasses import replace
 
 import numpy as np
@@ -127,11 +126,6 @@ def test_a_press_is_found_though_the_device_restarts_every_two_and_a_half_second
     assert seen.first(4) >= 8
 
 
-def test_a_tap_after_a_restart_is_found():
-    seen = watch(lines(force(12, (7.8, 7.9, 4, 6.0)), restart=2.5))
-    assert 7.8 <= seen.first(3) <= 7.8 + 0.3 + LATE
-
-
 def test_frozen_readings_are_unknown():
     values = force(24)
     values[600:2100] = values[600]
@@ -169,14 +163,6 @@ def test_a_broken_wire_does_not_clear_the_alarm(broken):
     assert "no touch" not in seen.states(6.2 + LATE, 15)
     assert not seen.kept(19, 20)
     assert 20 <= seen.first(19.5) <= 20.5 + LATE
-
-
-def test_values_that_fall_with_force_are_unknown_and_told():
-    values = force(12, (6, 8, 4, -6.0), (6, 8, 5, -3.0))
-    seen = watch(lines(values))
-    assert seen.states(6.2, 7.95) == {"unknown"}
-    verdict = next(verdict for at, verdict, _, _ in seen.said if verdict and at > 7)
-    assert "device.scale" in verdict.notes[0].text
 
 
 def test_bursts_without_a_clock_are_decided_like_single_frames():
@@ -234,20 +220,10 @@ def test_a_touch_is_never_shown_as_no_touch():
     assert set(touching) == {"touch"}
 
 
-@pytest.mark.parametrize("dead", [2, 3])
-def test_sensors_that_prove_dead_after_the_self_test_are_counted(dead):
-    """More than a quarter of nine: refused, after the five seconds that show it."""
-    values = force(12)
-    values[:, :dead] = 0.0
-    refused = pytest.raises(InputError, match=r"sensors 0, 1, 2 .* dead, more than 2 of 9.*selftest=false")
-    with refused if dead > 2 else nullcontext():
-        watch(lines(values), verify=lambda conversion: (2, None))
-
-
 def test_sensors_that_break_later_end_no_live_view():
     values = force(15)
     values[700:, :6] = values[700, :6]
-    seen = watch(lines(values), verify=lambda conversion: (2, None))
+    seen = watch(lines(values), verify=lambda conversion: None)
     assert seen.states(13, 15) == {"unknown"}
 
 

@@ -4,7 +4,7 @@ from threading import Thread
 
 import pytest
 
-from skin.wire.emulator import Emulator, EmulatorSettings, Faults, open_port
+from skin.wire.emulator import Emulator, EmulatorSettings, TcpPort
 
 
 @pytest.fixture
@@ -12,9 +12,9 @@ def emulate():
     """Return a function that plays a device at a port and returns the emulator; nothing is left behind."""
     playing = []
 
-    def begin(device, faults=None, binary=False, count=7, port="tcp:0", **settings):
+    def begin(device, count=7, **settings):
         chosen = EmulatorSettings(**{"speed": 40.0, "idle": 4.0, "rate": 40.0} | settings)
-        emulator = Emulator(device, open_port(port, None), chosen, faults or Faults(), binary)
+        emulator = Emulator(device, TcpPort(0), chosen)
         thread = Thread(target=emulator.run, kwargs={"count": count})
         thread.start()
         playing.append((emulator, thread))

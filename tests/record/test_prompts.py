@@ -18,7 +18,6 @@ from skin.record.serial import Serial, convert_session, record_session
 from skin.record.session import read_session
 from skin.touch.labels import TOUCH, TOUCH_OR_NOT
 from skin.wire.channels import UnitConversion
-from skin.wire.emulator import Faults
 from skin.wire.segmentation import label_plan
 
 BODY, LAYOUT = Sheet((0.16, 0.16), (32, 32), [{"material": "EcoFlex 00-30", "thickness": 0.005}]), Grid(3, 3)
@@ -34,7 +33,7 @@ def recorded(emulate, tmp_path, monkeypatch, capfd):
     Nothing touches the skin for some seconds, and then fingertips do. Enter is pressed at every prompt.
     """
 
-    def record(count, stream=False, faults=None):
+    def record(count, stream=False, dead=0):
         device = Simulated(
             body=BODY,
             layout=LAYOUT,
@@ -42,9 +41,9 @@ def recorded(emulate, tmp_path, monkeypatch, capfd):
             gestures=10,
             touch={"window": 1.0, "press": [0.8, 0.95], "radius": [0.006, 0.012]},
             noise=NOISE,
+            dead=dead,
         )
-        played = {"count": 40, "port": "pty", "rate": 100.0, "speed": 5.0, "idle": IDLE, "gap": 0.1}
-        emulator = emulate(device, faults, **played)
+        emulator = emulate(device, count=40, rate=100.0, speed=5.0, idle=IDLE, gap=0.1)
         reader = Serial(
             body=BODY,
             layout=LAYOUT,
@@ -107,8 +106,8 @@ def test_a_prompt_for_no_touch_needs_none(recorded):
 
 
 def test_dead_sensors_feel_nothing_and_the_others_do(recorded):
-    touches, said = recorded(2, faults=Faults(dead=[0, 1, 2, 3]))
-    assert touches.readings[:, :, 4:].amax(dim=(1, 2)).min() > LEAST
+    touches, said = recorded(2, dead=6)
+    assert touches.readings.amax(dim=(1, 2)).min() > LEAST
     assert refused(said)
 
 

@@ -3,12 +3,11 @@
 from random import Random
 
 from skin.wire.decoder import Decoder
-from skin.wire.protocol import crc16, encode_frame, encode_line, stuff, unstuff, xor8
+from skin.wire.protocol import crc16, encode_line, xor8
 
 _SOUP = b"0123456789,.;-+eE* #\t\r\nnaif_x"
 _NO_NUMBERS = (b"nan", b"-inf", b"1e400", b"1_0", b"0x1F", b"--1", b"1.2.3", b"\xd9\xa3", b"1 2", b"")
 _INSERTED = (b"\n", b"\0", b"\r\n", b"*", b"#", b",")
-_KINDS = ("u16", "i16", "f32")
 
 
 def values(number, sensors):
@@ -19,22 +18,13 @@ def values(number, sensors):
 
 
 def frame(number, spoken, sensors):
-    """Return a frame: a line with one of three checksums, or a ``binary`` one."""
-    if spoken == "binary":
-        return encode_frame(values(number, sensors), number, 2000 * number, _KINDS[number % 3])
+    """Return a frame: a line with one of three checksums."""
     return encode_line(values(number, sensors), number, 2000 * number, spoken)
 
 
 def invalid(number, spoken, sensors, rng):
     """Return a frame whose checksum is right and whose content is not: none of it may be read as a value."""
     trouble = rng.randrange(5)
-    if spoken == "binary":
-        body = bytearray(unstuff(frame(number, spoken, sensors)[:-1])[:-2])
-        if trouble < 3:
-            body[(0, 1, 8)[trouble]] ^= rng.choice((0x41, 0x82, 0xF0))  # mark, type, number of values
-        else:
-            body = body[: -(2 if trouble == 3 else len(body))]
-        return stuff(bytes(body) + crc16(body).to_bytes(2, "little")) + b"\0"
     fields = frame(number, "none", sensors).rstrip().split(b",")
     if trouble == 0:
         fields[rng.randrange(len(fields) - 1)] = rng.choice(_NO_NUMBERS)
@@ -50,7 +40,7 @@ def invalid(number, spoken, sensors, rng):
     return body + (rng.choice(others) if trouble == 4 else tails[spoken]) + b"\n"
 
 
-def noise(rng, sensors, end):
+def noise(rng, sensors):
     """Return bytes at random, text at random, a header or, now and then, a line that never ends."""
     kind, length = rng.random(), rng.choice((1, 10, 100, 400))
     if kind < 0.001:
@@ -61,7 +51,7 @@ def noise(rng, sensors, end):
         data = b"# skin proto=1 n=%d rate=50 unit=adc bits=99\n" % sensors
     else:
         data = bytes(rng.choices(_SOUP, k=length))
-    return data + (end if rng.random() < 0.7 else b"")
+    return data + (b"\n" if rng.random() < 0.7 else b"")
 
 
 def damage(piece, rng):
@@ -89,20 +79,20 @@ def fuzz(count, spoken, sensors, seed):
         ``good``: numbers of the frames sent intact behind a delimiter; ``missed``: those not recovered;
         ``wrong``: number of frames decoded with wrong values.
     """
-    rng, end = Random(f"{spoken} {sensors} {seed}"), b"\0" if spoken == "binary" else b"\n"
+    rng = Random(f"{spoken} {sensors} {seed}")
     data, good, kinds = bytearray(), set(), ("good", "damaged", "invalid", "noise")
     for number in range(count):
         # Ten good frames at the beginning, so that the format shows; of them the first may be half a line.
         kind = rng.choices(kinds, (60, 20, 10, 10))[0] if number >= 10 else "good"
         intact = frame(number, spoken, sensors)
-        if kind == "good" and data[-1:] in (b"", end) and (number or spoken in ("crc16", "binary")):
+        if kind == "good" and data[-1:] in (b"", b"\n") and (number or spoken == "crc16"):
             good.add(number)
         if kind == "damaged":
             intact = damage(intact, rng)
         elif kind == "invalid":
             intact = invalid(number, spoken, sensors, rng)
         elif kind == "noise":
-            intact = noise(rng, sensors, end)
+            intact = noise(rng, sensors)
         data += intact
     decoder, position, recovered, wrong = Decoder(sensors), 0, set(), 0
     while position < len(data):

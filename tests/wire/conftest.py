@@ -56,16 +56,11 @@ class Plug:
             self.unplug()
             thread.join(5)
 
-    def sending(self, values: Callable[[int], Sequence[float]], rate: float = 200.0, restart: int = 2**32):
-        """Send frames in the background; the device starts anew after each ``restart`` frames."""
-        starts = [monotonic()]
-
-        def encode(number: int) -> bytes:
-            if number % restart == 0:
-                starts[0] = monotonic()
-            return encode_line(values(number), number % restart, round((monotonic() - starts[0]) * 1e6))
-
-        return self.streaming(encode, 1 / rate)
+    def sending(self, values: Callable[[int], Sequence[float]], rate: float = 200.0):
+        """Send frames in the background."""
+        start = monotonic()
+        line = lambda number: encode_line(values(number), number, round((monotonic() - start) * 1e6))  # noqa: E731
+        return self.streaming(line, 1 / rate)
 
 
 @pytest.fixture
@@ -74,17 +69,3 @@ def plug():
     cable = Plug()
     yield cable
     cable.unplug()
-
-
-@pytest.fixture
-def new_plug():
-    """Return what makes cables, unplugged at the end."""
-    cables: list[Plug] = []
-
-    def make() -> Plug:
-        cables.append(Plug())
-        return cables[-1]
-
-    yield make
-    for cable in cables:
-        cable.unplug()

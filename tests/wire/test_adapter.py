@@ -1,7 +1,6 @@
 """Adapters: their settings, what they refuse, what they say to a board, and any bytes at all."""
 
 from contextlib import suppress
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -80,11 +79,6 @@ def test_lines_that_do_not_match_are_shown_with_the_field_that_failed():
     assert "adapter=auto" in error
 
 
-def cut(data, cuts):
-    positions = sorted({0, len(data), *(position % (len(data) + 1) for position in cuts)})
-    return [data[first:last] for first, last in pairwise(positions)]
-
-
 TEXTS = st.one_of(
     st.binary(max_size=200),
     st.text(alphabet='0123456789,.;:-+eE \t\r\n"{}[]<>|nafov', max_size=300).map(str.encode),
@@ -118,36 +112,11 @@ def test_a_proposal_of_anything_is_one_or_a_sentence(pieces):
 def encoded(name, n, row):
     """Return a frame of three values as an adapter describes it."""
     values = [str(value) for value in row]
-    if name == "json_lines":
-        return f'{{"v": [{", ".join(values)}]}}\n'.encode()
-    if name == "arduino_plotter":
-        return (",".join(f"p{k}:{value}" for k, value in enumerate(values)) + "\n").encode()
-    if name == "pattern":
-        return f"<{n}|{','.join(values)}>\n".encode()
     if name == "struct":
         return b"\xaa\x55" + bytes([n % 256]) + np.array(row, "<i2").tobytes()
     if name == "index":
         return "".join(f"{k},{value}\n" for k, value in enumerate(values)).encode()
-    return (";" if name == "decimal" else ",").join(values).encode() + b"\n"
-
-
-@pytest.mark.parametrize(
-    "name", ["csv", "json_lines", "arduino_plotter", "pattern", "decimal", "struct", "index"]
-)
-@given(
-    noise=st.binary(max_size=60), cuts=st.lists(st.integers(0, 10**6), max_size=8), seed=st.integers(0, 999)
-)
-@quickly
-def test_noise_between_frames_changes_no_value_of_the_others(name, noise, cuts, seed):
-    rows = np.random.default_rng(seed).integers(300, 700, (60, 3)).tolist()
-    frames = [encoded(name, n, row) for n, row in enumerate(rows)]
-    data = b"".join(frames[:40]) + noise + (b"" if name == "struct" else b"\n") + b"".join(frames[40:])
-    decoder = Decoder(3, adapter=ALL[name])
-    decoded = [frame.values.tolist() for piece in cut(data, cuts) for frame in decoder.feed(piece)]
-    # Bytes that look like frames are frames; all others are as sent, and those after the noise come back.
-    waiting = int(name == "struct")  # the last frame counts once the next one follows it
-    assert [row for row in decoded if row in rows][-15:] == rows[-15 - waiting : len(rows) - waiting]
-    assert sum(row not in rows for row in decoded) <= 1 + noise.count(b"\n")
+    return ",".join(values).encode() + b"\n"
 
 
 @pytest.mark.parametrize("name", ["csv", "struct", "index"])
@@ -204,7 +173,7 @@ def test_a_board_is_told_to_start_for_each_frame_and_to_stop(adapter, answer, to
     frames = [frame for step in range(60) for frame in feed.poll(lambda step=step: 0.1 * step)]
     feed.close()
     assert board.received == told
-    (name, text), *_ = adapter.items()
-    unanswered = f"the {name} string {text!r} of the adapter was sent {len(told) // len(text)} times"
-    assert feed.unanswered.startswith("" if frames else unanswered)
+    text = next(iter(adapter.values()))
+    sent = f"the string {text!r} of the adapter was sent without an answer"
+    assert feed.unanswered == ("" if frames else sent)
     assert bool(frames) == (answer(b"go\r")[:1].isdigit())

@@ -1,4 +1,4 @@
-"""The emulator: its gestures, its converter, its faults, and how it ends."""
+"""The emulator: its gestures, its converter, and how it ends."""
 
 import socket
 import time
@@ -13,9 +13,8 @@ from skin.body.base import Sheet
 from skin.body.layout import Grid
 from skin.device.resampling import resample
 from skin.device.simulated import Simulated
-from skin.errors import InputError
 from skin.mechanics.simulator.naive import Naive
-from skin.wire.emulator import Converter, Emulator, EmulatorSettings, Faults, open_port, upsample
+from skin.wire.emulator import Converter, Emulator, EmulatorSettings, TcpPort, upsample
 
 SHEET = Sheet((0.16, 0.16), (16, 16), [{"material": "EcoFlex 00-30", "thickness": 0.005}])
 RATE = 10.0
@@ -55,35 +54,13 @@ def test_counts_are_those_of_a_converter():
     assert Converter(None, 10.0)(np.array([0.25])).tolist() == [0.25]
 
 
-def test_bits_and_bytes_at_their_rates():
-    data, draw = bytes(100_000), np.random.default_rng(1)
-    arrived = Faults(flipped_bits=0.01, lost_bytes=0.1).damaged(data, draw)
-    # Five standard deviations of either count.
-    assert len(arrived) == pytest.approx(90_000, abs=5 * np.sqrt(9000))
-    flipped = np.unpackbits(np.frombuffer(arrived, np.uint8)).sum()
-    assert flipped == pytest.approx(0.01 * 8 * len(arrived), abs=5 * np.sqrt(7200))
-
-
-def test_a_rate_is_per_minute_and_a_list_is_moments():
-    draw = np.random.default_rng(2)
-    happened = Faults(reset=6.0).happen("reset", 0, 600_000, 100.0, draw).sum()
-    assert happened == pytest.approx(600, abs=5 * np.sqrt(600))
-    listed = Faults(reset=[1.5, 3]).happen("reset", 100, 300, 100.0, draw)
-    assert np.flatnonzero(listed).tolist() == [50, 200]
-
-
-def test_a_channel_that_is_not_there():
-    with pytest.raises(InputError, match="no channel 4"):
-        Faults(dead=[4]).fits(4)
-
-
 @pytest.mark.parametrize("waits_for", ["a reader", "the next frame", "its power"])
 def test_it_stops_wherever_it_waits(waits_for):
     device = Simulated(body=SHEET, layout=Grid(2, 2), simulator=Naive, gestures=10)
-    port = open_port("tcp:0", None)
+    port = TcpPort(0)
     rate = 0.005 if waits_for == "the next frame" else 100.0
-    faults = Faults(unplug=[0.0], away=600.0) if waits_for == "its power" else Faults()
-    emulator = Emulator(device, port, EmulatorSettings(rate=rate, idle=600.0), faults)
+    unplug = [0.01] if waits_for == "its power" else []
+    emulator = Emulator(device, port, EmulatorSettings(rate=rate, idle=600.0, unplug=unplug, away=600.0))
     thread = Thread(target=emulator.run)
     thread.start()
     try:
@@ -106,5 +83,5 @@ def test_its_header_says_that_it_is_emulated(name, sent):
     written = []
     port = SimpleNamespace(write=written.append)
     device = SimpleNamespace(sensors=[0], seed=0, constants=SimpleNamespace(clip=torch.ones(1)))
-    Emulator(device, port, EmulatorSettings(id=name), Faults())._header()
+    Emulator(device, port, EmulatorSettings(id=name))._header()
     assert f"id={sent}" in written[0].decode().partition("*")[0].split()

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from experiments.benchmarks import measure_decoder
 from skin.wire.decoder import Decoder
-from skin.wire.protocol import encode_frame, encode_line
+from skin.wire.protocol import encode_line
 from tests.wire import bad_stream
 from tests.wire.memory import parse_line
 
@@ -19,19 +19,13 @@ quickly = settings(
     max_examples=60, deadline=None, derandomize=True, database=None, suppress_health_check=list(HealthCheck)
 )
 CHUNKS = int(os.environ.get("FUZZ_CHUNKS", 5000))
-ENCODERS = {"text": (encode_line, b"\n"), "binary": (encode_frame, b"\0")}
 
 
-def good(spoken, first, count):
-    encode, _ = ENCODERS[spoken]
-    return [encode([7, number % 1000, 1023], number, 1000 * number) for number in range(first, first + count)]
-
-
-@pytest.mark.parametrize("spoken", ["text", "binary"])
 @given(noise=st.binary(max_size=400))
 @quickly
-def test_noise_before_the_format_is_known_costs_no_frame(spoken, noise):
-    frames = Decoder(3).feed(noise + ENCODERS[spoken][1] + b"".join(good(spoken, 0, 4)))
+def test_noise_before_the_format_is_known_costs_no_frame(noise):
+    lines = (encode_line([7, number, 1023], number, 1000 * number) for number in range(4))
+    frames = Decoder(3).feed(noise + b"\n" + b"".join(lines))
     assert [frame.seq for frame in frames][-4:] == [0, 1, 2, 3]
 
 
@@ -42,19 +36,6 @@ def test_lines_survive_the_way_there_and_back(values, seq):
     fields = parse_line(line[:-1]).fields
     assert fields[0] == seq
     assert np.array(fields[2:], "f4").tolist() == [value for value in values if abs(value) < 1e38]
-
-
-@pytest.mark.parametrize(("check", "maximum"), [("crc16", 0.001), ("xor", 0.1), ("none", 0.9)])
-def test_how_many_wrong_values_pass_each_checksum(check, maximum):
-    rng, wrong, count = Random(5), 0, 3000
-    decoder = Decoder(16)
-    decoder.feed(b"".join(bad_stream.frame(number, check, 16) for number in range(3)))
-    for number in range(3, count):
-        spoilt = bad_stream.damage(bad_stream.frame(number, check, 16)[:-1], rng) + b"\n"
-        for frame in decoder.feed(spoilt):
-            wrong += frame.values.tolist() != bad_stream.values(frame.seq or 0, 16)
-    assert wrong / count <= maximum
-    assert wrong > 0 or check == "crc16"  # the test can see them
 
 
 @pytest.mark.slow("streams for long")
@@ -84,18 +65,16 @@ def test_decoding_takes_less_than_a_twentieth_of_a_core():
     assert measure_decoder(1)["decode_core_share"] < 0.05
 
 
-@pytest.mark.parametrize("spoken", ["crc16", "xor", "none", "binary"])
+@pytest.mark.parametrize("spoken", ["crc16", "xor", "none"])
 def test_every_good_frame_of_a_long_bad_stream_is_recovered(spoken):
-    count = min(CHUNKS, 50_000)  # below the modulus of binary frames
-    for seed in range(-(-CHUNKS // count)):
-        found = bad_stream.fuzz(count, spoken, 25, seed)
-        assert not found["missed"]
-        assert len(found["good"]) > 0.4 * count
-        if spoken in ("crc16", "binary"):
-            assert found["wrong"] <= count // 10_000  # 16 bits fit by chance once in 65,536
+    found = bad_stream.fuzz(CHUNKS, spoken, 25, 0)
+    assert not found["missed"]
+    assert len(found["good"]) > 0.4 * CHUNKS
+    if spoken == "crc16":
+        assert found["wrong"] <= CHUNKS // 10_000  # 16 bits fit by chance once in 65,536
 
 
-@pytest.mark.parametrize("spoken", ["crc16", "xor", "none", "binary"])
+@pytest.mark.parametrize("spoken", ["crc16", "xor", "none"])
 @given(seed=st.integers(0, 2**32), sensors=st.integers(1, 70))
 @settings(quickly, max_examples=15)
 def test_every_good_frame_of_any_bad_stream_is_recovered(spoken, seed, sensors):

@@ -4,11 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 
 from skin.device.calibration import Calibration, read_calibration, write_calibration
-from skin.device.imperfection import Imperfection
-from skin.device.resampling import Frame, Window
+from skin.device.resampling import Window
 from skin.errors import InputError
 from skin.wire.channels import unit_conversion
 from skin.wire.decoder import Decoder
@@ -90,22 +88,6 @@ def test_a_scale_may_be_negative_but_not_beside_a_calibration_and_not_0():
             Port(scale=scale)
     with pytest.raises(InputError, match="above 0 beside a calibration"):
         unit_conversion(3, None, -0.02, FALLING, None)
-
-
-def test_a_simulated_device_reads_force_as_positive():
-    still = Imperfection(calibration=FALLING)
-    constants = still.constants(3, np.random.default_rng(0))
-    readings, *_ = still.apply(torch.full((1, 1, 3), 4.0), constants, np.random.default_rng(0))
-    np.testing.assert_allclose(readings[0, 0], [8.1, 1.8, 4.0], atol=1e-5)
-
-
-def test_an_interval_keeps_the_value_of_most_force():
-    window = Window(2, 10.0, 2)
-    for number in range(20):
-        values = np.array([500.0 + number % 10, 500.0 - number % 10])
-        frame = Frame(number, number / 100, 0.0, values, np.ones(2, dtype=bool))
-        window.add(frame._replace(polarity=np.array([1.0, -1.0])))
-    np.testing.assert_array_equal(window.read().values, [[509, 491], [509, 491]])
 
 
 def test_frames_come_in_the_order_of_the_layout():

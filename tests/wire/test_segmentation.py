@@ -135,16 +135,11 @@ def test_an_announcement_comes_back_among_frames_and_not_damaged():
         assert parse_announcement(bytes(line)) is None
 
 
+MANY = np.zeros((3, 101, 5)).tolist()
+
+
 @pytest.mark.parametrize(
-    "contacts",
-    [
-        np.zeros((3, 101, 5)).tolist(),
-        [[[0, 0, 0]]],
-        [[[0, 0, 0, 0, 1e999]]],
-        [[["a", 0, 0, 0, 0]]],
-        [1, 2],
-        7,
-    ],
+    "contacts", [MANY, [[[0, 0, 0]]], [[[0, 0, 0, 0, 1e999]]], [[["a", 0, 0, 0, 0]]], [1, 2], 7]
 )
 def test_contacts_that_cannot_be_are_no_announcement(contacts):
     body = b"# " + json.dumps({"number": 0, "seq": 0, "frames": 3, "contacts": contacts}).encode()

@@ -76,6 +76,7 @@ def test_a_command_that_fails_does_not_stop_the_others(run, tmp_path):
     assert "failed:\nskin study study=nope" in done.stderr
 
 
+@pytest.mark.slow("designs a skin")
 def test_bounds_are_published_in_a_folder_of_their_own(run, tmp_path):
     parts = "results.parts.design=[['design design.touches=64 simulator=naive out=a/b', 1]]"
     done = run(tmp_path, "results", *PARTS, parts, "results.part=design", *SMALL)

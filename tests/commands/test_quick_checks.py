@@ -1,55 +1,37 @@
-"""What is wrong in a configuration is refused before a run is loaded."""
+"""A port that does not exist is refused before a run is loaded."""
 
 import socket
 
 import pytest
-from hydra import compose, initialize_config_dir
 
-from skin.commands._command import check_quickly
-from skin.core.files import CONF
 from skin.errors import InputError
-from skin.runs.configuration import validate_config
-
-
-def check(*overrides, name="evaluate"):
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        config = compose(name, list(overrides))
-        check_quickly(validate_config(config), config.get("run"), overrides)
+from skin.wire.reader import check_port
 
 
 @pytest.mark.parametrize(
-    ("overrides", "message"),
+    ("port", "message"),
     [
-        (["device=serial", "device.port=/dev/none"], "no port /dev/none"),
-        (["device=serial", "device.port=./skin-port"], "no port ./skin-port"),
-        (["device=serial", "device.port=socket://x"], "is not an address"),
-        (["touch.rate=-1"], r"touch\.rate=-1 must be greater than 0"),
-        (["device.noise=-1"], r"device\.noise=-1"),
-        (["body.size=[160,160]"], r"body\.size=160 m is not plausible"),
-        (["layout=grid", "layout.rows=0"], r"layout\.rows=0"),
+        ("/dev/none", "no port /dev/none"),
+        ("./skin-port", "no port ./skin-port"),
+        ("socket://x", "is not an address"),
     ],
 )
-def test_a_wrong_setting_is_refused(overrides, message):
+def test_a_wrong_port_is_refused(port, message):
     with pytest.raises(InputError, match=message):
-        check(*overrides)
-
-
-@pytest.mark.parametrize("name", ["train", "live", "export", "adapt", "record", "listen", "emulate", "study"])
-def test_the_defaults_of_every_command_are_accepted(name):
-    check(name=name)
+        check_port(port)
 
 
 def test_a_port_of_this_machine_needs_a_listener():
     with socket.create_server(("127.0.0.1", 0)) as server:
         address = f"socket://127.0.0.1:{server.getsockname()[1]}"
-        check("device=serial", f"device.port={address}")
+        check_port(address)
         server.settimeout(0.1)
         with pytest.raises(TimeoutError):
             server.accept()  # the check did not connect
     with pytest.raises(InputError, match=f"cannot reach {address}: nothing listens there"):
-        check("device=serial", f"device.port={address}")
+        check_port(address)
 
 
-def test_ports_that_cannot_be_checked_are_left_to_the_device():
-    for port in ("COM3", "rfc2217://host:1", "socket://192.0.2.1:7", "null"):
-        check("device=serial", f"device.port={port}")
+@pytest.mark.parametrize("port", ["COM3", "rfc2217://host:1", "socket://192.0.2.1:7"])
+def test_ports_that_cannot_be_checked_are_left_to_the_device(port):
+    check_port(port)

@@ -18,7 +18,7 @@ from scipy.stats import binomtest
 from experiments.studies.measures import Subject
 from experiments.studies.pages import Page
 from skin.calibration.bench import BenchSession
-from skin.calibration.known_loads import KnownLoad, Protocol, emulate_placements, fit_known_load
+from skin.calibration.known_loads import KnownLoad, emulate_placements, fit_known_load
 from skin.core.rng import Stream, generator
 from skin.device.resampling import Frame
 from skin.device.simulated import Simulated
@@ -296,7 +296,7 @@ def record(device: Simulated, procedure: str, seed: int) -> BenchSession:
     draw = np.random.default_rng([100 * seed + list(ROUNDS).index(procedure), 2])
     pressures = weight_pressure(device, ROUNDS[procedure], draw)
     readings = torch.cat([device.model(part).readings for part in pressures.split(16)]).double().numpy()
-    return emulate_placements(device, readings, Protocol(idle=10.0, rest=2.0), draw)
+    return emulate_placements(device, readings, draw, idle=10.0)
 
 
 @dataclass(frozen=True)
@@ -317,7 +317,7 @@ class KnownLoadGains:
             true = device.constants.gain.numpy()[working]
             for procedure in ROUNDS:
                 session = record(device, procedure, seed)
-                gains = fit_known_load(nominal, session, WEIGHT).calibration.known("gain")[working]
+                gains = fit_known_load(nominal, session, WEIGHT).known("gain")[working]
                 parts.append(pd.DataFrame({"procedure": procedure, "device": seed, "ratio": gains / true}))
                 drawn = drawn or _shown(session, gains, true)
         sensors = pd.concat(parts)
@@ -393,7 +393,7 @@ class KnownLoadAlarms:
             device = make_skin(subject, seed, test_gestures=self.touches, **quiet)
             measured, true = device.touches("test"), device.constants.gain
             session = record(make_skin(subject, seed), _ALARMED, seed)
-            fitted = fit_known_load(nominal, session, WEIGHT).calibration.known("gain")
+            fitted = fit_known_load(nominal, session, WEIGHT).known("gain")
             gains = {"not corrected": torch.ones_like(true), "true gains": true}
             gains[_ALARMED] = torch.from_numpy(fitted).float()
             for name, gain in gains.items():

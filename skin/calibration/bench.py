@@ -158,11 +158,13 @@ def _join(folder: Path) -> tuple[dict[str, Any], pd.DataFrame]:
     metadata, parts = read_parts(folder)
     if damaged := [path.name for path, part in parts.items() if part is None]:
         _log.warning("%s: damaged files are left out: %s", folder, ", ".join(damaged))
-    intact = [part.to_pandas() for part in parts.values() if part is not None]
+    intact = [part for part in parts.values() if part is not None]
     if not intact:
         raise ValueError("it has no frames: record some")
-    table = pd.concat(intact, ignore_index=True).sort_values("time", ignore_index=True)
-    return metadata, table[[name for name in table if name in _OTHER or name.startswith("raw_")]]
+    table = pa.concat_tables(intact).sort_by("time")
+    return metadata, table.select(
+        [name for name in table.column_names if name in _OTHER or name.startswith("raw_")]
+    ).to_pandas()
 
 
 def _numbers(table: pd.DataFrame, names: Sequence[str], where: str) -> np.ndarray:

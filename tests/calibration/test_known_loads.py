@@ -6,7 +6,13 @@ import torch
 
 from skin.calibration.bench import BenchSession
 from skin.calibration.fit import print_calibration
-from skin.calibration.known_loads import KnownLoad, base_readings, emulate_placements, fit_known_load
+from skin.calibration.known_loads import (
+    KnownLoad,
+    base_readings,
+    emulate_placements,
+    find_placements,
+    fit_known_load,
+)
 from skin.errors import InputError
 from tests.calibration.test_fit import device, solid
 
@@ -103,3 +109,16 @@ def test_a_load_in_another_unit_shows_in_the_noise(bits):
 def test_impossible_loads_are_refused(load, reason):
     with pytest.raises(InputError, match=reason):
         KnownLoad.of(*load, (0.16, 0.16))
+
+
+@pytest.mark.parametrize("noise", [0.0005, 0.05])
+def test_loads_are_found_on_a_skin_that_creeps_and_recovers(noise):
+    """Noise shows neither where a load begins nor how far the skin recovers."""
+    time, begin = np.arange(0, 22, 0.02), 5 + 3.2 * np.arange(5)
+    since = time[:, None] - begin
+    on, creep = (since >= 0) & (since < 1.6), 0.09 * np.exp(-np.maximum(since, 0) / 0.8)
+    raw = np.where(on, 3 - creep, np.where(since < 0, 0.0, 0.1 * np.exp(-(since - 1.6) / 0.8)))
+    raw = raw + noise * np.random.default_rng(0).standard_normal(raw.shape)
+    found = find_placements(BenchSession(time, raw, "N"))
+    assert (len(found.change), found.unsteady) == (5, 0)
+    np.testing.assert_allclose(np.diagonal(found.change), 2.95, atol=0.04)

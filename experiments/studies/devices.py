@@ -15,7 +15,7 @@ from scipy.stats import binomtest
 
 from experiments.studies.measures import Subject
 from skin.calibration.bench import BenchSession
-from skin.calibration.known_loads import KnownLoad, Protocol, emulate_placements, fit_known_load
+from skin.calibration.known_loads import KnownLoad, emulate_placements, fit_known_load
 from skin.core.rng import Stream, generator
 from skin.device.resampling import Frame
 from skin.device.simulated import Simulated
@@ -292,7 +292,7 @@ def record(device: Simulated, procedure: str, seed: int) -> BenchSession:
     draw = np.random.default_rng([100 * seed + list(ROUNDS).index(procedure), 2])
     pressures = weight_pressure(device, ROUNDS[procedure], draw)
     readings = torch.cat([device.model(part).readings for part in pressures.split(16)]).double().numpy()
-    return emulate_placements(device, readings, Protocol(idle=10.0, rest=2.0), draw)
+    return emulate_placements(device, readings, draw, idle=10.0)
 
 
 @dataclass(frozen=True)
@@ -312,8 +312,8 @@ class KnownLoadGains:
             working = ~device.constants.dead.numpy()
             true = device.constants.gain.numpy()[working]
             for procedure in ROUNDS:
-                fitted = fit_known_load(nominal, record(device, procedure, seed), WEIGHT)
-                gains = fitted.calibration.known("gain")[working]
+                session = record(device, procedure, seed)
+                gains = fit_known_load(nominal, session, WEIGHT).known("gain")[working]
                 parts.append(pd.DataFrame({"procedure": procedure, "device": seed, "ratio": gains / true}))
         sensors = pd.concat(parts)
         sensors["scale"] = sensors.groupby(["procedure", "device"]).ratio.transform("median")
@@ -360,7 +360,7 @@ class KnownLoadAlarms:
             device = make_skin(subject, seed, test_gestures=self.touches, **quiet)
             measured, true = device.touches("test"), device.constants.gain
             session = record(make_skin(subject, seed), _ALARMED, seed)
-            fitted = fit_known_load(nominal, session, WEIGHT).calibration.known("gain")
+            fitted = fit_known_load(nominal, session, WEIGHT).known("gain")
             gains = {"not corrected": torch.ones_like(true), "true gains": true}
             gains[_ALARMED] = torch.from_numpy(fitted).float()
             for name, gain in gains.items():

@@ -2,7 +2,7 @@
 
 import json
 import logging
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -11,15 +11,15 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import pandas as pd
 import pyarrow as pa
-import pyarrow.csv
 import pyarrow.parquet
 import torch
 from annotated_types import Ge, Le
+from pydantic import NonNegativeInt, PositiveFloat
 
 from skin.body.base import AbstractBody, require_memory
-from skin.core.files import tabular, whole, write
+from skin.core.files import tabular, whole
 from skin.core.safe_loading import read_parts
-from skin.core.settings import checked
+from skin.core.settings import checked, configured
 from skin.device.simulated import Simulated
 from skin.errors import InputError
 from skin.mechanics.simulator.base import AbstractSimulator
@@ -28,17 +28,102 @@ from skin.touch.shapes import Shapes
 
 _KEY = b"skin_session"
 _log = logging.getLogger(__name__)
-GAUGE = ("force", "x_m", "y_m", "indenter", "radius_m", "angle", "press")
-"""Columns besides ``time``; the first three are required."""
+_PRESS = ["indenter", "x_m", "y_m", "radius_m", "angle"]  # what stays the same during a press
 _PAUSE = 1.0  # s without a row end a press
 _SLOWEST, _FASTEST = 1.0, 5000.0  # Hz of a bench's files
-_UNITS = {"ms": 1e-3, "microseconds": 1e-6, "minutes": 60.0, "ms in place of microseconds": 1e3}
-"""Units that a time may have by mistake, in s."""
-_OTHER = ("time", "t_us", "seq", "gesture", *GAUGE)
+_OTHER = ("time", "t_us", "seq", "gesture", "force", "press", *_PRESS)  # columns that are no sensor
+
+Turn = Literal[
+    "as_given",
+    "mirror_x",
+    "mirror_y",
+    "rotate_180",
+    "transpose",
+    "rotate_90",
+    "rotate_270",
+    "transpose_other",
+]
+TURNS: dict[Turn, tuple[np.ndarray, str]] = {
+    "as_given": (np.array([[1, 0], [0, 1]]), "as given"),
+    "mirror_x": (np.array([[-1, 0], [0, 1]]), "mirrored in x (the x axis counts to the left)"),
+    "mirror_y": (np.array([[1, 0], [0, -1]]), "mirrored in y (the y axis counts upwards)"),
+    "rotate_180": (np.array([[-1, 0], [0, -1]]), "turned by 180 degrees (both axes count backwards)"),
+    "transpose": (np.array([[0, 1], [1, 0]]), "transposed (x and y are exchanged)"),
+    "rotate_90": (np.array([[0, -1], [1, 0]]), "turned by 90 degrees"),
+    "rotate_270": (np.array([[0, 1], [-1, 0]]), "turned by 270 degrees"),
+    "transpose_other": (
+        np.array([[0, -1], [-1, 0]]),
+        "mirrored at the other diagonal (x and y are exchanged, and both count backwards)",
+    ),
+}
+"""Values of ``places``, the simplest first: from the direction in the gauge's frame to that on the sheet, x
+right and y down; and its words."""
 
 
-def load_table(path: str | Path, what: str) -> tuple[pa.Table, dict[str, Any]]:
-    """Return a table and its metadata: JSON in the Parquet schema, or in ``x.csv.json`` beside a CSV.
+@dataclass(frozen=True)
+class BenchSettings:
+    """How the files of a bench are read, and what the user confirms about them.
+
+    Attributes:
+        indenter, radius: of gauge rows without them, name as in ``touch.shapes``, and m.
+        unit: of the session; None: the unit in the file, else N.
+        force_scale: N per unit of the gauge, negative where pressing is; None: N.
+        time_scale: s per unit of ``time``; None: s, and a rate that no bench has is refused.
+        delay: s, added to the times of a gauge's own file to match the session's.
+        places: how the positions of the presses are turned to be those of the sheet.
+        channels: column of the session, from 0, of every sensor; None: the same order.
+        broken: sensors, from 0, that count as dead.
+        command: whose settings these are; errors name it.
+    """
+
+    indenter: str = "disc"
+    radius: PositiveFloat = 0.01
+    unit: Literal["N", "adc"] | None = None
+    force_scale: float | None = None
+    time_scale: PositiveFloat | None = None
+    delay: float = 0.0
+    places: Turn = "as_given"
+    channels: Sequence[NonNegativeInt] | None = None
+    broken: Sequence[NonNegativeInt] = ()
+    command: str = "calibrate"
+
+    @classmethod
+    def of(cls, group: Mapping[str, Any], command: str) -> "BenchSettings":
+        """Return these settings of the group of a command.
+
+        Raises:
+            InputError: a value is invalid.
+        """
+        names = cls.__dataclass_fields__.keys() & group.keys()
+        return configured(cls, {name: group[name] for name in names} | {"command": command}, command)
+
+    def seconds(self, time: np.ndarray, where: str) -> np.ndarray:
+        """Return times (N,) in s.
+
+        Raises:
+            InputError: they are fewer than two, do not increase, or their steps are those of another unit.
+        """
+        time = time * (self.time_scale or 1.0)
+        if len(time) < 2:
+            raise InputError(f"{where}: at least two rows are needed, got {len(time)}")
+        steps = np.diff(time)
+        if (back := np.flatnonzero(~(steps > 0))).size:
+            before, after = time[back[0] : back[0] + 2]
+            raise InputError(
+                f"{where}: time must grow from row to row, but after row {back[0]} it goes from {before:.9g} "
+                f"to {after:.9g} s: check the clock, such as micros() of a board, and record again"
+            )
+        if self.time_scale is None and not _SLOWEST <= (rate := 1 / np.median(steps)) <= _FASTEST:
+            raise InputError(
+                f"{where}: {rate:.4g} rows per second, and a bench has {_SLOWEST:g} to {_FASTEST:g}: "
+                f"add {self.command}.time_scale=0.001 if times are in ms, 1e-6 if they are in "
+                "microseconds, 60 if they are in minutes"
+            )
+        return time
+
+
+def load_table(path: str | Path, what: str) -> tuple[pd.DataFrame, dict[str, Any]]:
+    """Return a table and its metadata, which a Parquet file has as JSON in its schema, and a CSV lacks.
 
     Lines of a CSV that start with ``#`` are comments. The folder of a session of skin record becomes the
     table of its frames; damaged files are left out, with a warning.
@@ -48,58 +133,48 @@ def load_table(path: str | Path, what: str) -> tuple[pa.Table, dict[str, Any]]:
     """
     path = Path(path).expanduser()
     path = path if path.is_dir() else tabular(path, f"a {what}")
-    if not path.exists():
-        raise InputError(f"no {what} {path}")
     try:
         if path.is_dir():
-            about, table = _join(path)
+            metadata, table = _join(path)
         elif path.suffix == ".parquet":
             with pa.parquet.ParquetFile(path) as file:
                 size = 16.0 * file.metadata.num_rows * file.metadata.num_columns
                 require_memory(size, f"the {what} {path}", "give fewer rows")
-                table = file.read()
-            about = json.loads((table.schema.metadata or {}).get(_KEY, b"{}"))
+                content = file.read()
+            metadata = json.loads((content.schema.metadata or {}).get(_KEY, b"{}"))
+            table = content.to_pandas()
         else:
-            frame = pd.read_csv(path, comment="#", index_col=False, encoding="utf-8-sig", low_memory=False)
-            table = pa.Table.from_pandas(frame, preserve_index=False)
-            sidecar = path.with_name(path.name + ".json")
-            about = json.loads(sidecar.read_text(encoding="utf-8")) if sidecar.is_file() else {}
-        if not isinstance(about, dict):
-            raise ValueError(f"its metadata are {about!r}, and must be an object, as in {{}}")
-        if not len(table):
-            raise ValueError("it has no rows below its header")
-    except InputError:
-        raise
+            table = pd.read_csv(path, comment="#", index_col=False, encoding="utf-8-sig", low_memory=False)
+            metadata = {}
+        if not isinstance(metadata, dict) or table.empty:
+            raise ValueError(f"it has no rows below its header, or its metadata {metadata!r} are no object")
     except (OSError, pa.ArrowException, ValueError, RecursionError) as error:
         raise InputError(f"cannot read the {what} {path}: {' '.join(str(error).split())}") from error
-    return table.rename_columns([name.strip() for name in table.column_names]), about
+    return table.rename(columns=str.strip), metadata
 
 
-def _join(folder: Path) -> tuple[dict[str, Any], pa.Table]:
+def _join(folder: Path) -> tuple[dict[str, Any], pd.DataFrame]:
     """Return the metadata of a session of skin record, and the frames in all of its intact files."""
-    about, parts = read_parts(folder)
+    metadata, parts = read_parts(folder)
     if damaged := [path.name for path, part in parts.items() if part is None]:
         _log.warning("%s: damaged files are left out: %s", folder, ", ".join(damaged))
     intact = [part for part in parts.values() if part is not None]
     if not intact:
         raise ValueError("it has no frames: record some")
     table = pa.concat_tables(intact).sort_by("time")
-    names = [name for name in table.column_names if name in _OTHER or name.startswith("raw_")]
-    return about, table.select(names)
+    return metadata, table.select(
+        [name for name in table.column_names if name in _OTHER or name.startswith("raw_")]
+    ).to_pandas()
 
 
-def numbers(table: pa.Table, name: str, where: str) -> np.ndarray:
-    """Return a column as float64; empty cells are NaN.
-
-    Raises:
-        InputError: the column is missing or is not numeric.
-    """
+def _numbers(table: pd.DataFrame, names: Sequence[str], where: str) -> np.ndarray:
+    """Return columns as float64, (N, K); empty cells are NaN."""
     try:
-        # A copy, because Arrow's memory cannot be written to and torch warns of that.
-        return np.array(table[name].cast(pa.float64()).to_numpy())
-    except (KeyError, pa.ArrowException) as error:
-        present = ", ".join(table.column_names)
-        raise InputError(f"{where}: the column {name} must hold numbers, found {present}: {error}") from error
+        return table[[*names]].apply(pd.to_numeric).to_numpy(float)
+    except (KeyError, ValueError, TypeError) as error:
+        raise InputError(
+            f"{where}: {', '.join(names)} must be columns of numbers, found {', '.join(table)}: {error}"
+        ) from error
 
 
 @dataclass(frozen=True)
@@ -109,32 +184,61 @@ class Gauge:
     Attributes:
         time: (N,), s, by the clock of the session.
         force: (N,), N.
-        position: (N, 2), m: centre of the indenter, x right and y down from the upper left corner.
-        radius: (N,), m: half the larger extent of the indenter.
-        angle: (N,), rad: rotation from x towards y.
-        indenter: (N,), names as in ``touch.shapes``.
-        press: (N,): number of the press.
+        press: (N,): number of the press, from 0.
+        presses: a row per press: ``indenter``, name as in ``touch.shapes``; ``x_m`` and ``y_m``, centre of
+            the indenter, x right and y down from the upper left corner; ``radius_m``, half its larger
+            extent; ``angle``, rotation from x towards y, rad.
     """
 
     time: np.ndarray
     force: np.ndarray
-    position: np.ndarray
-    radius: np.ndarray
-    angle: np.ndarray
-    indenter: np.ndarray
     press: np.ndarray
+    presses: pd.DataFrame
+
+    @classmethod
+    def of(cls, table: pd.DataFrame, where: str, settings: BenchSettings) -> "Gauge":
+        """Return a gauge from the rows of a table with ``time``, ``force``, ``x_m``, ``y_m`` and others.
+
+        Raises:
+            InputError: the rows are invalid.
+        """
+        spare = {"indenter": settings.indenter, "radius_m": settings.radius, "angle": 0.0, "press": 0.0}
+        table = table.assign(**{name: value for name, value in spare.items() if name not in table})
+        names = ["time", "force", "press", *_PRESS[1:]]
+        values = _numbers(table, names, where)
+        complete = np.isfinite(values).all(axis=1)
+        if not complete.any():
+            raise InputError(f"{where}: no row has a time, a force and a place")
+        rows = pd.DataFrame(values[complete], columns=names)
+        rows["indenter"] = table["indenter"].astype(str).to_numpy()[complete]
+        time = settings.seconds(rows["time"].to_numpy(), where)
+        force = rows["force"].to_numpy() * (settings.force_scale or 1.0)
+        if -force.min() > 0.05 * force.max():
+            raise InputError(
+                f"{where}: force goes down to {force.min():g} N: zero the gauge, or if pressing is negative, "
+                f"add {settings.command}.force_scale={-(settings.force_scale or 1):g}"
+            )
+        same = rows[["press", *_PRESS]]
+        new = (same != same.shift()).any(axis=1).to_numpy() | (np.diff(time, prepend=time[0]) > _PAUSE)
+        press = new.cumsum() - 1
+        return cls(time, np.maximum(force, 0), press, rows[_PRESS].groupby(press).first())
 
     def __len__(self) -> int:
-        return int(self.press.max()) + 1
+        return len(self.presses)
+
+    @property
+    def position(self) -> np.ndarray:
+        """The centre of the indenter in every press, (P, 2), m."""
+        return self.presses[["x_m", "y_m"]].to_numpy()
 
     @cached_property
     def first(self) -> np.ndarray:
         """The first row of every press, (P,)."""
         return np.searchsorted(self.press, np.arange(len(self)))
 
-    def lies_on(self, size: Sequence[float]) -> bool:
-        """Return whether all positions are on a sheet of this size, x and y, m."""
-        return bool((self.position >= 0).all() and (self.position <= np.array(size)).all())
+    def outside(self, size: Sequence[float]) -> np.ndarray:
+        """Return the positions that are outside a sheet of this size, x and y, m, (K, 2)."""
+        return self.position[((self.position < 0) | (self.position > np.array(size))).any(axis=1)]
 
     def at(self, time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return force, (T,), N, and number of the press, (T,), -1 outside of presses, at times (T,), s."""
@@ -144,6 +248,18 @@ class Gauge:
         press = np.where(time == self.time[row], self.press[row], press)
         press[(time < self.time[0]) | (time > self.time[-1])] = -1
         return np.where(press >= 0, np.interp(time, self.time, self.force), 0.0), press
+
+    def turned(self, turn: Turn, size: Sequence[float]) -> "Gauge":
+        """Return this gauge with its places and angles in the frame of the sheet.
+
+        Args:
+            turn: from the frame of the gauge to that of the sheet.
+            size: of the sheet, x and y, m.
+        """
+        matrix, middle = TURNS[turn][0], np.array(size) / 2
+        x, y = matrix @ (self.position - np.abs(matrix).T @ middle).T + middle[:, None]
+        across, along = matrix @ np.stack([np.cos(self.presses["angle"]), np.sin(self.presses["angle"])])
+        return replace(self, presses=self.presses.assign(x_m=x, y_m=y, angle=np.arctan2(along, across)))
 
     def contacts(self, time: np.ndarray, peaks: np.ndarray) -> np.ndarray:
         """Return the presses as contacts at times (T,), s, (T, 1, 5), NaN without force.
@@ -156,120 +272,9 @@ class Gauge:
             The columns :data:`skin.touch.labels.CONTACT`.
         """
         force, press = self.at(time)
-        rows = self.first[np.maximum(press, 0)]
-        values = np.column_stack([self.position[rows], self.radius[rows], force, force * peaks[press]])
+        places = self.presses[["x_m", "y_m", "radius_m"]].to_numpy()[press]
+        values = np.column_stack([places, force, force * peaks[press]])
         return np.where((force > 0)[:, None], values, np.nan)[:, None]
-
-
-@dataclass(frozen=True)
-class Units:
-    """Units of force and time in the files of a bench.
-
-    Attributes:
-        force_scale: N per unit of the gauge, negative where pressing is; None: N.
-        time_scale: s per unit of ``time``; None: s, and a rate that no bench has is refused.
-        command: whose settings these are; errors name it.
-    """
-
-    force_scale: float | None = None
-    time_scale: float | None = None
-    command: str = "calibrate"
-
-    def __post_init__(self) -> None:
-        if self.force_scale == 0 or (self.time_scale is not None and not self.time_scale > 0):
-            raise InputError(
-                f"{self.command}.force_scale must not be 0, and {self.command}.time_scale must be above 0"
-            )
-
-    def seconds(self, time: np.ndarray, where: str) -> np.ndarray:
-        """Return times (N,) in s.
-
-        Raises:
-            InputError: their steps are those of another unit.
-        """
-        if self.time_scale is not None or len(time) < 3:
-            return time * (1.0 if self.time_scale is None else self.time_scale)
-        step = float(np.median(np.diff(time)))
-        if not step > 0 or _SLOWEST <= 1 / step <= _FASTEST:
-            return time
-        fits = {name: unit for name, unit in _UNITS.items() if _SLOWEST <= 1 / (step * unit) <= _FASTEST}
-        near = sorted(fits, key=lambda name: abs(np.log(100 * step * fits[name])))
-        hint = "check the column time"
-        if near:
-            unit = fits[near[0]]
-            hint = f"{near[0]} would be {1 / (step * unit):.4g} Hz: add {self.command}.time_scale={unit:g}"
-        raise InputError(
-            f"{where}: a row every {step:.4g} s is not the rate of a bench "
-            f"({_SLOWEST:g} to {_FASTEST:g} Hz); {hint}"
-        )
-
-
-def read_gauge(
-    path: str | Path, indenter: str, radius: float, delay: float = 0.0, units: Units | None = None
-) -> Gauge:
-    """Read a gauge file with the columns ``time``, ``force``, ``x_m``, ``y_m`` and others of ``GAUGE``.
-
-    Args:
-        path: .csv or .parquet.
-        indenter: of a file without this column.
-        radius: m, of a file without this column.
-        delay: s, added to the times of the file to match the session's.
-        units: of the file; None: N and s.
-
-    Raises:
-        InputError: the file is invalid.
-    """
-    table, _ = load_table(path, "gauge file")
-    return gauge_from_table(table, str(path), indenter, radius, delay, units)
-
-
-def gauge_from_table(
-    table: pa.Table,
-    where: str,
-    indenter: str,
-    radius: float,
-    delay: float = 0.0,
-    units: Units | None = None,
-) -> Gauge:
-    """Return a gauge from the complete rows of a table; see :func:`read_gauge`."""
-    units = units or Units()
-    columns = {name: numbers(table, name, where) for name in ("time", "force", "x_m", "y_m")}
-    for name, spare in (("radius_m", radius), ("angle", 0.0), ("press", 0.0)):
-        present = name in table.column_names
-        columns[name] = numbers(table, name, where) if present else np.full(len(table), spare)
-    names = (
-        table["indenter"].fill_null("").to_numpy(zero_copy_only=False)
-        if "indenter" in table.column_names
-        else np.full(len(table), indenter, dtype=object)
-    )
-    rows = np.isfinite(np.stack(list(columns.values()))).all(axis=0)
-    if not rows.any():
-        raise InputError(f"{where}: no row has a time, a force and a place")
-    complete = {name: values[rows] for name, values in columns.items()}
-    time = units.seconds(complete["time"], where) + delay
-    force = complete["force"] * (units.force_scale or 1.0)
-    if (np.diff(time) <= 0).any():
-        raise InputError(f"{where}: time must grow from row to row, in s")
-    if -force.min() > 2 * force.max():
-        raise InputError(
-            f"{where}: force goes down to {force.min():g}, so pressing seems to be negative: add "
-            f"{units.command}.force_scale={-(units.force_scale or 1.0):g}"
-        )
-    if force.min() < -0.05 * force.max():
-        raise InputError(f"{where}: force must be at least 0 N, got {force.min():g}: zero the gauge")
-    position = np.stack([complete["x_m"], complete["y_m"]], axis=1)
-    same = np.column_stack([position, complete["radius_m"], complete["angle"], complete["press"]])
-    new = (np.diff(same, axis=0) != 0).any(axis=1) | (names[rows][1:] != names[rows][:-1])
-    press = np.concatenate([[0], np.cumsum(new | (np.diff(time) > _PAUSE))])
-    return Gauge(
-        time,
-        np.maximum(force, 0),
-        position,
-        complete["radius_m"],
-        complete["angle"],
-        names[rows].astype(str),
-        press,
-    )
 
 
 @torch.no_grad()
@@ -281,37 +286,33 @@ def per_newton(simulator: AbstractSimulator, body: AbstractBody, gauge: Gauge) -
     Raises:
         InputError: a position outside the sheet, a radius that is not above 0, or an unknown indenter.
     """
-    position, radius = gauge.position[gauge.first], gauge.radius[gauge.first]
-    if (position < 0).any() or (position > body.size).any():
-        wrong = position[((position < 0) | (position > body.size)).any(axis=1)][0]
+    if len(outside := gauge.outside(body.size)):
         raise InputError(
-            f"a press at {wrong.tolist()} m is outside the sheet of {list(body.size)} m: x_m and y_m are "
-            "metres from its upper left corner"
+            f"a press at {outside[0].tolist()} m is outside the sheet of {list(body.size)} m: x_m and y_m "
+            "are metres from its upper left corner"
         )
-    if not (radius > 0).all():
-        raise InputError(f"radius_m must be above 0 m, got {radius.min():g}")
+    if not (gauge.presses["radius_m"] > 0).all():
+        raise InputError(f"radius_m must be above 0 m, got {gauge.presses['radius_m'].min():g}")
     return torch.cat([simulator(image).readings for image in pressed_images(body, gauge)]).double().numpy()
 
 
 def pressed_images(body: AbstractBody, gauge: Gauge) -> Iterator[torch.Tensor]:
     """Yield the pressure of each press under 1 N, (1, H, W), Pa."""
-    shapes, kind, scale = _indenters(body, gauge)
-    for number, row in enumerate(gauge.first):
-        pose = kind[[number]], gauge.angle[[row]], scale[[number]], gauge.position[[row]]
-        yield shapes.render(*pose) / float(np.prod(body.cell))
+    shapes, kind = _indenters(body, gauge)
+    scale = gauge.presses["radius_m"].to_numpy() / half_extents(shapes)[kind]
+    for pose in zip(kind, gauge.presses["angle"].to_numpy(), scale, gauge.position, strict=True):
+        yield shapes.render(*(np.array([value]) for value in pose)) / float(np.prod(body.cell))
 
 
 def pressed_peaks(body: AbstractBody, gauge: Gauge) -> np.ndarray:
     """Return the highest pressure of each press under 1 N, (P,), Pa, by the picture of its indenter."""
-    shapes, kind, _ = _indenters(body, gauge)
-    return peak_per_newton(shapes, kind, gauge.radius[gauge.first])
+    return peak_per_newton(*_indenters(body, gauge), gauge.presses["radius_m"].to_numpy())
 
 
-def _indenters(body: AbstractBody, gauge: Gauge) -> tuple[Shapes, np.ndarray, np.ndarray]:
-    """Return the shapes that press, and of each press the shape's index and the scale, m."""
-    names, kind = np.unique(gauge.indenter[gauge.first], return_inverse=True)
-    shapes = Shapes(names.tolist(), body)
-    return shapes, kind, gauge.radius[gauge.first] / half_extents(shapes)[kind]
+def _indenters(body: AbstractBody, gauge: Gauge) -> tuple[Shapes, np.ndarray]:
+    """Return the shapes that press, and the index of the shape of each press."""
+    names, kind = np.unique(gauge.presses["indenter"], return_inverse=True)
+    return Shapes(names.tolist(), body), kind
 
 
 @checked("session")
@@ -323,13 +324,13 @@ class BenchSession:
         time: (T,), s.
         raw: (T, S), in ``unit``; NaN where a frame was lost.
         unit: ``N``, or ``adc`` for counts of a converter.
-        gauge: rows of the force gauge in the same file; None if they are in another file.
+        gauge: rows of the force gauge; None if there are none.
         bits: of the converter; None if unknown.
         channels: the device's channel of every column, where skin record has put them into the order of the
             layout; None: columns are in the device's order.
 
     Raises:
-        InputError: another unit, or times that do not increase.
+        InputError: another unit.
     """
 
     time: np.ndarray
@@ -339,97 +340,69 @@ class BenchSession:
     bits: Annotated[int, Ge(1), Le(64)] | None = None
     channels: Sequence[int] | None = None
 
-    def __post_init__(self) -> None:
-        if len(self.time) < 2:
-            raise InputError(f"a session needs at least two frames, this one has {len(self.time)}")
-        if (self.time == self.time[0]).all():
-            raise InputError(
-                f"the device's clock stood still: all {len(self.time)} frames of the session have the time "
-                f"{self.time[0]:g} s; let it send micros() and record again"
-            )
-        if (back := np.flatnonzero(~(np.diff(self.time) > 0))).size:
-            before, after = self.time[back[0] : back[0] + 2]
-            raise InputError(
-                f"the session's time must grow from frame to frame: after frame {back[0]} it goes from "
-                f"{before:.9g} to {after:.9g} s"
-            )
-
 
 def read_bench_session(
-    path: str | Path, indenter: str, radius: float, unit: str | None = None, units: Units | None = None
+    path: str | Path, settings: BenchSettings, presses: str | Path | None = None
 ) -> BenchSession:
     """Read a session.
 
     The file has a column ``time`` (s) or ``t_us`` (microseconds) and one per sensor in the layout's order, of
     any name; ``seq`` is ignored. Columns of a gauge may stand beside them, empty outside the presses. Unit
-    and bits may stand in the Parquet schema or in ``x.csv.json``: ``{"unit": "adc", "bits": 10}``.
+    and bits may stand in the Parquet schema: ``{"unit": "adc", "bits": 10}``.
 
     Args:
         path: .csv or .parquet, or the folder of a session of skin record.
-        indenter: of gauge rows without one.
-        radius: m, of gauge rows without one.
-        unit: ``N`` or ``adc``; None: the unit in the file, else N.
-        units: of the columns of a gauge, and of ``time``; None: N and s.
+        settings: of the files.
+        presses: .csv or .parquet with the rows of the gauge; None: they are in the session.
 
     Raises:
-        InputError: the file is invalid.
+        InputError: a file is invalid.
     """
-    table, about = load_table(path, "session")
-    names = [name for name in table.column_names if name not in _OTHER]
+    table, metadata = load_table(path, "session")
+    names = [name for name in table if name not in _OTHER]
     if not names:
-        raise InputError(f"{path}: no column of a sensor beside {', '.join(table.column_names)}")
-    in_microseconds = "time" not in table.column_names and "t_us" in table.column_names
-    time = numbers(table, "t_us" if in_microseconds else "time", str(path))
-    units = units or Units()
-    time = units.seconds(1e-6 * time if in_microseconds else time, str(path))
-    raw = np.stack([numbers(table, name, str(path)) for name in names], axis=1)
-    inside = "force" in table.column_names
-    if inside:
-        present = [name for name in table.column_names if name != "time"]
-        table = table.select(present).append_column("time", [time])
-    in_seconds = replace(units, time_scale=1.0)
-    rows = gauge_from_table(table, str(path), indenter, radius, units=in_seconds) if inside else None
+        raise InputError(f"{path}: no column of a sensor beside {', '.join(table)}")
+    if "time" not in table and "t_us" in table:
+        table = table.assign(time=1e-6 * _numbers(table, ["t_us"], str(path))[:, 0])
+    time, raw = _numbers(table, ["time"], str(path))[:, 0], _numbers(table, names, str(path))
+    gauge = Gauge.of(table, str(path), settings) if "force" in table and presses is None else None
+    if presses is not None:
+        gauge = Gauge.of(load_table(presses, "gauge file")[0], str(presses), settings)
+        gauge = replace(gauge, time=gauge.time + settings.delay)
+    unit: Any = settings.unit or metadata.get("unit", "N")
     try:
-        unit_of_values: Any = unit or about.get("unit", "N")
-        return BenchSession(time, raw, unit_of_values, rows, about.get("bits"), about.get("channels"))
+        session = BenchSession(time, raw, unit, gauge, metadata.get("bits"), metadata.get("channels"))
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
+    return replace(session, time=settings.seconds(time, str(path)))
 
 
 def write_bench_session(session: BenchSession, path: str | Path) -> Path:
     """Write a session with its gauge atomically, as :func:`load_table` reads it; single precision.
 
+    A CSV has no unit: read it with that of the session.
+
     Raises:
         InputError: another ending than .csv or .parquet, or the file cannot be written.
     """
-    path, digits = tabular(path, "a session"), max(2, len(str(session.raw.shape[1] - 1)))
-    counts = session.unit == "adc" and np.isfinite(session.raw).all()
-    raw = session.raw.T.astype(np.int32 if counts else np.float32)
-    columns = {"time": session.time} | {f"raw_{n:0{digits}d}": values for n, values in enumerate(raw)}
-    if (gauge := session.gauge) is not None:
-        force, press = gauge.at(session.time)
-        row = gauge.first[np.maximum(press, 0)]
-        position, shape = gauge.position[row].T, (gauge.indenter[row], gauge.radius[row], gauge.angle[row])
-        values = zip(GAUGE, (force, *position, *shape, press), strict=True)
-        columns |= {name: np.ma.masked_array(column, press < 0) for name, column in values}
-    table, about = pa.table(columns), json.dumps({"unit": session.unit, "bits": session.bits})
+    path, columns = tabular(path, "a session"), enumerate(session.raw.T.astype(np.float32))
+    table = pd.DataFrame({"time": session.time} | {f"raw_{n:03d}": values for n, values in columns})
+    if session.gauge is not None:
+        force, press = session.gauge.at(session.time)
+        presses = session.gauge.presses.rename_axis("press").reset_index().reindex(press)
+        table = table.join(presses.assign(force=np.where(press >= 0, force, np.nan)).reset_index(drop=True))
+    metadata = json.dumps({"unit": session.unit, "bits": session.bits})
     with whole(path) as partial:
         if path.suffix == ".parquet":
-            pa.parquet.write_table(table.replace_schema_metadata({_KEY: about}), partial)
+            written = pa.Table.from_pandas(table, preserve_index=False)
+            pa.parquet.write_table(written.replace_schema_metadata({_KEY: metadata}), partial)
         else:
-            pa.csv.write_csv(table, partial)
-            write(about + "\n", path.with_name(path.name + ".json"))
+            table.to_csv(partial, index=False)
     return path
 
 
 _LEAD, _TAIL = 0.2, 1.0  # s around a press that are not idle
 _FEWEST = 50  # idle frames
-
-
-def true_readings(gauge: Gauge, each: np.ndarray, time: np.ndarray) -> np.ndarray:
-    """Return true readings (T, S), N, of presses that give ``each`` (P, S) per N; 0 outside of them."""
-    force, press = gauge.at(time)
-    return np.where(press[:, None] >= 0, force[:, None] * each[press], 0.0)
 
 
 @dataclass(frozen=True)
@@ -449,7 +422,7 @@ class BenchData:
     @cached_property
     def true(self) -> np.ndarray:
         """Simulated true readings, (T, S), N."""
-        return true_readings(self.gauge, self.each, self.session.time)
+        return self.applied[0][:, None] * self.each[self.applied[1]]
 
     @cached_property
     def applied(self) -> tuple[np.ndarray, np.ndarray]:
@@ -457,16 +430,16 @@ class BenchData:
         return self.gauge.at(self.session.time)
 
     @cached_property
+    def begun(self) -> np.ndarray:
+        """Number of presses that have begun, (T,), a fifth of a second before their first row."""
+        starts = self.gauge.time[self.gauge.first] - _LEAD
+        return np.searchsorted(starts, self.session.time, side="right")
+
+    @cached_property
     def idle(self) -> np.ndarray:
         """Frames without a press, (T,), bool."""
-        first, time = self.gauge.first, self.session.time
-        ends = self.gauge.time[np.append(first[1:], len(self.gauge.time)) - 1]
-        begun = np.searchsorted(self.gauge.time[first] - _LEAD, time, side="right")
-        return (begun == 0) | (time > ends[begun - 1] + _TAIL)
-
-    def frames_of(self, presses: Collection[int]) -> np.ndarray:
-        """Frames of some presses, (T,), bool."""
-        return np.isin(self.applied[1], list(presses))
+        ends = np.maximum.reduceat(self.gauge.time, self.gauge.first) + _TAIL
+        return self.session.time > np.append(-np.inf, ends)[self.begun]
 
     @cached_property
     def peaks(self) -> np.ndarray:
@@ -490,20 +463,20 @@ def check_channels(device: Simulated, session: BenchSession) -> None:
         )
 
 
-def build_bench_data(device: Simulated, session: BenchSession, gauge: Gauge | None) -> BenchData:
+def build_bench_data(device: Simulated, session: BenchSession) -> BenchData:
     """Simulate the presses of a session on the skin as designed.
 
     Raises:
         InputError: no gauge, another number of sensors, or times of gauge and session that do not overlap.
     """
-    rows = gauge or session.gauge
-    if rows is None:
+    gauge = session.gauge
+    if gauge is None:
         raise InputError("no force in the session: add presses=gauge.csv with time, force, x_m and y_m")
     check_channels(device, session)
     model = device.simulator(device.body, device.sensors)
-    bench = BenchData(session, rows, per_newton(model, device.body, rows))
+    bench = BenchData(session, gauge, per_newton(model, device.body, gauge))
     if not bench.loading.any():
-        spans = [np.ptp(values) for values in (session.time, rows.time)]
+        spans = [np.ptp(values) for values in (session.time, gauge.time)]
         raise InputError(
             f"no frame of the session ({spans[0]:.4g} s long) falls into a press of the gauge "
             f"({spans[1]:.4g} s): check the clocks and their units, see calibrate.delay"

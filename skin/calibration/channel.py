@@ -12,12 +12,13 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
+import pandas as pd
 import torch
 from scipy.interpolate import CubicSpline
 from scipy.optimize import OptimizeResult, least_squares
 
 from skin.calibration.bench import BenchData
-from skin.calibration.wiring import MAD, list_numbers
+from skin.calibration.wiring import MAD
 from skin.device.calibration import Table
 from skin.mechanics.relaxation import first_order_lag
 
@@ -31,8 +32,7 @@ _REACHED = 0.05  # of the strongest press of a sensor: a weaker one says nothing
 _MODEL = 0.01  # of a value: error of the simulated shape of a press, added to the noise
 _FACTOR = 0.05  # of the factors of the nearest presses: what sensors misplaced by 1 mm cause
 _FEWEST, _BELOW = 10, 3  # frames that determine anything; frames of a rising force below the limit
-_LINE = 0.03  # an exponent this near to 1 is a line
-_KNOTS, _APART = 8, 0.06  # of a table; least distance of their logarithms
+_KNOTS = 8  # of a table
 _MOST = 40  # evaluations of a solution: a curve that wavers between two knots needs no more
 _STORED = 33  # columns of a table
 _GOOD, _BETTER = 0.3, 0.5  # loss per frame of a curve that needs no other; part of it that another may leave
@@ -111,11 +111,9 @@ class Loads:
     @cached_property
     def owner(self) -> np.ndarray:
         """The press of every frame, (T,), until its lag is over; -1 outside, and where the force jumps."""
-        bench, (force, press) = self.bench, self.bench.applied
-        owner = np.searchsorted(bench.gauge.time[bench.gauge.first], bench.session.time, side="right") - 1
-        peaks = np.array([force[press == n].max(initial=0.0) for n in range(len(bench.gauge))])
-        share, beside = _SUDDEN
-        jumps = np.abs(np.diff(force, prepend=0.0)) > share * peaks[owner]
+        bench, owner = self.bench, self.bench.begun - 1
+        force, (fraction, beside) = pd.Series(bench.applied[0]), _SUDDEN
+        jumps = force.diff().abs() > fraction * force.groupby(owner).transform("max")
         near = np.convolve(jumps, np.ones(2 * beside + 1), mode="same") > 0
         return np.where(bench.idle | near | ~np.isin(owner, list(self.presses)), -1, owner)
 
@@ -215,6 +213,11 @@ class _Model:
         margin = max(_RISE * limit, 5 * self.noise / np.sqrt(fewer))
         return not upper.any() or bool(np.median(value[upper]) - np.median(value[~upper]) < margin)
 
+    def seen(self, solution: np.ndarray) -> np.ndarray:
+        """Return logarithms of the true readings whose value is above the noise and below the limit, (M,)."""
+        above, limit = self.value > 5 * self.noise, np.exp(solution[1])
+        return self.true(solution)[self.loading & above & (self.value < 0.97 * limit)]
+
     def loss(self, result: OptimizeResult) -> float:
         """Return the mean robust loss of frames while the force rises, about 0.8 where all is as expected."""
         squares = result.fun[: len(self.value)][self.loading] ** 2
@@ -236,22 +239,18 @@ def fit_channel(loads: Loads, each: np.ndarray, change: np.ndarray, noise: float
     if prepared is None:
         return None
     model, start, middle = prepared
-    count, whole = len(start), np.array([-np.inf, np.inf])
-    line = best = model.fit(start, whole)
-    edges = whole
+    count, edges = len(start), np.array([-np.inf, np.inf])
+    best = model.fit(start, edges)
     if model.loss(best) > _GOOD:
-        power = model.fit(np.append(line.x, 1.0), whole)
-        if abs(power.x[count] - 1) < _LINE:  # the line may have ended beside its solution
-            line = best = model.fit(power.x[:count], whole)
-        elif model.loss(power) < _BETTER * model.loss(line):
-            best = power
-        knots = _choose_knots(model, best)
-        if model.loss(best) > _GOOD and len(knots):
-            inner = np.r_[-np.inf, knots, np.inf]
-            slopes = np.full(len(inner) - 1, power.x[count])
-            table = model.fit(np.r_[power.x[:count], slopes], inner)
+        power = model.fit(np.append(best.x, 1.0), edges)
+        best = power if model.loss(power) < _BETTER * model.loss(best) else best
+        if model.loss(best) > _GOOD:
+            seen = model.seen(best.x)
+            knots = np.linspace(seen.min(initial=0.0), seen.max(initial=0.0), _KNOTS)
+            knots[[0, -1]] = -np.inf, np.inf
+            table = model.fit(np.r_[power.x[:count], np.full(len(knots) - 1, power.x[count])], knots)
             if model.loss(table) < _BETTER * model.loss(best):
-                best, edges = table, inner
+                best, edges = table, knots
     return _describe(loads, model, best, edges, middle)
 
 
@@ -288,14 +287,6 @@ def _prepare(
     return model, start, middle
 
 
-def _choose_knots(model: _Model, result: OptimizeResult) -> np.ndarray:
-    """Return logarithms of true readings, against the middle, between which a curve may change its slope."""
-    inside = model.loading & (model.value > 5 * model.noise) & (model.value < 0.97 * np.exp(result.x[1]))
-    points = np.unique(np.round(model.true(result.x)[inside] / _APART)) * _APART
-    count = int(np.clip(len(points) // 3, 2, _KNOTS))
-    return np.unique(np.quantile(points, np.linspace(0, 1, count)))[1:-1] if len(points) > 1 else points[:0]
-
-
 def _describe(
     loads: Loads,
     model: _Model,
@@ -314,9 +305,7 @@ def _describe(
     force, gap = model.felt(solution[2])
     falling = ~model.loading & (shown < 0.9 * limit) & (gap > 0.05 * force.max())
     bend = solution[3] if solution[3] > 2 * errors[3] else 0.0
-    seen = model.true(solution)[
-        model.loading & (model.value > 5 * model.noise) & (model.value < 0.97 * limit)
-    ]
+    seen = model.seen(solution)
     return Channel(
         solution[4 + count :] if len(solution) > 4 + count else np.ones(1),
         edges + middle,
@@ -327,19 +316,3 @@ def _describe(
         float(np.interp(solution[2], np.arange(_LAGS), loads.lags)) * (solution[2] >= 1),
         float(bend) if falling.sum() >= _FEWEST else np.nan,
     )
-
-
-def describe_channels(channels: dict[int, Channel]) -> list[str]:
-    """Return a line for each group of channels, by number, with the same response that is no line."""
-    groups: dict[str, list[int]] = {}
-    for number, channel in channels.items():
-        words = f"force^{channel.slopes[0]:.2f}"
-        if channel.kind == "table":
-            ends = channel.slopes[[0, -1]]
-            words = f"a table, from force^{ends[0]:.1f} at small to force^{ends[1]:.1f} at large forces"
-        if channel.kind != "linear":
-            groups.setdefault(words, []).append(number)
-    return [
-        f"channel{'s' * (len(numbers) > 1)} {list_numbers(numbers)} follow{'s' * (len(numbers) == 1)} {words}"
-        for words, numbers in groups.items()
-    ]

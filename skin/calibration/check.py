@@ -86,9 +86,10 @@ def describe_setup(
     }
 
 
-def _folder() -> Path:
-    """Return the folder of checks: below the variable SKIN_DATA, else below the user's data."""
-    return Path(os.environ.get("SKIN_DATA") or platformdirs.user_data_dir("skin")).expanduser() / "checks"
+def _path(setup: dict[str, Any]) -> Path:
+    """Return the file of the check of a device: below the variable SKIN_DATA, else below the user's data."""
+    folder = Path(os.environ.get("SKIN_DATA") or platformdirs.user_data_dir("skin")).expanduser() / "checks"
+    return folder / f"{hashlib.sha256(setup['device'].encode()).hexdigest()[:16]}.json"
 
 
 def store_check(check: Check) -> Path:
@@ -105,20 +106,16 @@ def store_check(check: Check) -> Path:
             f"device.scale or calibrate again; nothing was stored (usual factors or their inverse: 9.8 kg "
             "and N, 4.45 lbf, 2.2 lb, 1000 g, 2.8 a calibration with simulator=fem, below 0 polarity)"
         )
-    path = _folder() / f"{hashlib.sha256(check.setup['device'].encode()).hexdigest()[:16]}.json"
-    with whole(path, "SKIN_DATA=FOLDER") as partial:
+    with whole(_path(check.setup), "SKIN_DATA=FOLDER") as partial:
         partial.write_text(json_line(asdict(check)) + "\n", encoding="utf-8")
-    return path
+    return _path(check.setup)
 
 
 def find_check(setup: dict[str, Any]) -> Check | None:
-    """Return the check of a device, or else the latest of its layout; None without one that can be read."""
-    checks = []
-    for path in _folder().glob("*.json"):
-        with suppress(InputError, OSError, ValueError, TypeError):  # a damaged check confirms nothing
-            checks.append(configured(Check, parse_json(read_file(path, TEXT).decode()), path.name))
-    alike = [c for c in checks if any(c.setup.get(name) == setup[name] for name in ("device", "layout"))]
-    return max(alike, key=lambda c: (c.setup.get("device") == setup["device"], c.date), default=None)
+    """Return the check of a device; None without one that can be read."""
+    with suppress(InputError, OSError, ValueError, TypeError):  # a damaged check confirms nothing
+        return configured(Check, parse_json(read_file(_path(setup), TEXT).decode()), "check")
+    return None
 
 
 def verify_source(

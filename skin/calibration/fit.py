@@ -3,28 +3,27 @@
 import math
 import warnings
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import pandas as pd
 import torch
-from scipy.stats import theilslopes
 
 from skin.calibration.bench import BenchData, BenchSession
-from skin.calibration.channel import Channel, Loads, describe_channels, fit_channel
+from skin.calibration.channel import Channel, Loads, fit_channel
 from skin.calibration.wiring import (
     MAD,
     QUIET,
     check_usable,
     collect_responses,
     find_polarity,
+    list_numbers,
     measure_rests,
 )
-from skin.device.calibration import BROKEN, QUANTITIES, Calibration, Curves
+from skin.device.calibration import BROKEN, QUANTITIES, Calibration, Curves, Table
 from skin.device.imperfection import Imperfection
 from skin.errors import InputError
-from skin.mechanics.relaxation import first_order_lag
 
 _PRESSED = 0.05  # of the largest true reading: less determines no gain
 _LIMIT = 0.95  # of the largest reading of all: a channel that is always there is saturated
@@ -34,7 +33,7 @@ _CLIPPED = 0.95  # of the limit: a reading above may be cut off
 _TOO_FAR = 0.25  # error of a held-out force; positions off by 2 mm cause less
 _WEAK = 0.05  # of the median gain: such a channel has 20 times the noise of others
 _GAUGES, _LIKE = {"kg": 9.80665, "g": 0.00980665}, 1.5  # N; factor within which a unit explains
-_UNITS = {"gain": "", "hysteresis": "of peak", "time_constant": "s", "drift": "N/s"}
+_UNITS = {"gain": "", "exponent": "", "hysteresis": "of peak", "time_constant": "s", "drift": "N/s"}
 
 
 def fit_calibration(bench: BenchData, presses: Collection[int] | None = None) -> Calibration:
@@ -54,27 +53,25 @@ def fit_calibration(bench: BenchData, presses: Collection[int] | None = None) ->
     used = range(len(bench.gauge)) if presses is None else presses
     raw, responses = bench.session.raw, collect_responses(bench)
     counts = (np.isfinite(raw) & bench.idle[:, None]).sum(axis=0)
-    broken = _find_broken(bench.session, bench.true.max(axis=0), responses.responding)
+    responding = responses.responding & (counts >= QUIET)
+    broken = _find_broken(bench.session, bench.true.max(axis=0), responding)
     usable = ~np.isin(np.arange(raw.shape[1]), np.concatenate([*broken.values()]))
-    if few := np.flatnonzero(usable & (counts < QUIET)).tolist():
-        raise InputError(
-            f"channel {few[0]} has {counts[few[0]]} idle frames: do not touch the skin for some seconds"
-        )
     rests = measure_rests(bench.session, bench.idle)
     polarity, (offset, drift) = find_polarity(responses, bench.each), rests[["offset", "drift"]].to_numpy().T
     changes = polarity * (raw - offset - drift * bench.session.time[:, None])
-    driven = bench.true[bench.frames_of(used)].max(axis=0, initial=0.0)
-    loads, channels = Loads(bench, used), dict[int, Channel]()
-    for number in np.flatnonzero(usable & (driven >= _PRESSED * driven.max())).tolist():
-        noise = math.hypot(rests["noise"][number], rests["quantum"][number] / math.sqrt(12))
-        channel = fit_channel(loads, bench.each[:, number], changes[:, number], noise)
-        channels |= {} if channel is None else {number: channel}
+    driven = bench.true[np.isin(bench.applied[1], list(used))].max(axis=0, initial=0.0)
+    noise, loads = np.hypot(rests["noise"], rests["quantum"] / math.sqrt(12)), Loads(bench, used)
+    channels = {
+        number: channel
+        for number in np.flatnonzero(usable & (driven >= _PRESSED * driven.max())).tolist()
+        if (channel := fit_channel(loads, bench.each[:, number], changes[:, number], noise[number]))
+    }
     if not any(channel.known for channel in channels.values()):
         raise InputError(
             "no channel responds to a press below its limit: check layout, indenter, the forces and the "
             "session's clock"
         )
-    return _describe(bench, rests, polarity, channels, changes, broken)
+    return _describe(bench, rests.assign(drift=polarity * drift), polarity, channels, changes, broken)
 
 
 def _find_broken(session: BenchSession, pressed: np.ndarray, responding: np.ndarray) -> dict[str, list[int]]:
@@ -99,48 +96,32 @@ def _curved_noise(bench: BenchData, curves: Curves, number: int, change: np.ndar
     return MAD / math.sqrt(6) * float(np.median(np.abs(np.diff(loaded, 2)))) * float(curves.slopes[number])
 
 
-def _curves(channels: Mapping[int, Channel], sensors: int) -> Curves | None:
-    """Return the curves of all channels, in the session's unit; None: all are linear."""
-    bent = {n: channel for n, channel in channels.items() if channel.kind != "linear"}
-    if not bent:
-        return None
-    at, exponent = math.exp(float(np.median([one.middle[1] for one in bent.values()]))), np.ones(sensors)
-    for number, channel in bent.items():
-        exponent[number] = channel.slopes[0] if channel.kind == "power" else 1.0
-    tables = {n: channel.table(at) for n, channel in bent.items() if channel.kind == "table"}
-    return Curves(exponent, np.full(sensors, at), tables)
-
-
 def _describe(
     bench: BenchData,
-    rests: pd.DataFrame,
+    values: pd.DataFrame,
     polarity: np.ndarray,
     channels: Mapping[int, Channel],
     changes: np.ndarray,
     broken: Mapping[str, list[int]],
 ) -> Calibration:
     """Return the calibration that follows from the rest and the response of every channel."""
-    known = {n: one for n, one in channels.items() if one.known}
-    curves = _curves(known, len(rests))
-    at, values = 1.0 if curves is None else float(curves.at[0]), rests.assign(drift=polarity * rests["drift"])
-    values["clip"] = pd.Series({n: one.clip for n, one in channels.items()})
-    values["gain"] = pd.Series({n: one.gain(at) for n, one in known.items()})
+    known = {n: channel for n, channel in channels.items() if channel.known}
+    bent = {n: channel for n, channel in known.items() if channel.kind != "linear"}
+    at = math.exp(float(np.median([channel.middle[1] for channel in bent.values()]))) if bent else 1.0
+    tables = {n: channel.table(at) for n, channel in bent.items() if channel.kind == "table"}
+    values["clip"] = pd.Series({n: channel.clip for n, channel in channels.items()})
+    values["gain"] = pd.Series({n: channel.gain(at) for n, channel in known.items()})
     for name in ("hysteresis", "time_constant"):
-        values[name] = pd.Series({n: getattr(one, name) for n, one in known.items()})
-    if curves is not None:
-        values["exponent"] = pd.Series(curves.exponent)[list(known)]
-        for n in (n for n, one in known.items() if one.kind != "linear"):
+        values[name] = pd.Series({n: getattr(channel, name) for n, channel in known.items()})
+    if bent:
+        values["exponent"] = pd.Series(
+            {n: channel.slopes[0] if channel.kind == "power" else 1.0 for n, channel in known.items()}
+        )
+        curves = Curves(values["exponent"].fillna(1.0).to_numpy(), np.full(len(values), at), tables)
+        for n in bent:
             values.loc[n, "noise"] = _curved_noise(bench, curves, n, changes[:, n])
     metadata = {"presses": len(bench.gauge), "frames": len(bench.session.time)}
-    calibration = convert_to_newton(bench.session, values, polarity, broken, metadata)
-    scale, (low, high) = calibration.scale, calibration.ranges["gain"]
-    error = 2 * scale * float(np.median([channel.error * channel.gain(at) for channel in known.values()]))
-    ranges = {**calibration.ranges, "gain": [max(low - error, 0.0), high + error]}
-    if curves is None:
-        return replace(calibration, ranges=ranges)
-    about = {**calibration.about, "responses": describe_channels(known)}
-    tables = {n: (scale * np.array(table)).tolist() for n, table in curves.tables.items()}
-    return replace(calibration, ranges=ranges, about=about, exponent_at=at * scale, tables=tables)
+    return convert_to_newton(bench.session, values, polarity, broken, metadata, at if bent else None, tables)
 
 
 def convert_to_newton(
@@ -149,6 +130,8 @@ def convert_to_newton(
     polarity: np.ndarray,
     broken: Mapping[str, Sequence[int]],
     metadata: Mapping[str, Any],
+    at: float | None = None,
+    tables: Mapping[int, Table] | None = None,
 ) -> Calibration:
     """Return the calibration of a session, with ranges over the working channels.
 
@@ -159,25 +142,35 @@ def convert_to_newton(
         polarity: (S,), 1 or -1.
         broken: kind -> numbers of channels.
         metadata: origin of the calibration.
+        at, tables: of curves (:class:`skin.device.calibration.Curves`), in the session's unit; None: all
+            channels are linear.
     """
     alive = ~np.isin(np.arange(len(polarity)), np.concatenate([*broken.values()]))
     # Counts have an unknown zero, common to all channels; readings in N do not.
     scale, zero = 1.0, 0.0
     if session.unit != "N":
         scale, zero = 1 / float(np.nanmedian(values["gain"])), float(np.median(values["offset"][alive]))
-    sensors, ranges = dict[str, list[float | None]](), {"dead": [0.0, float((~alive).sum())]}
-    for name, column in values.assign(offset=polarity * (values["offset"] - zero)).items():
-        converted = column * (1.0 if name in ("hysteresis", "time_constant", "exponent") else scale)
-        # No negative 0.
-        sensors[name] = [float(f"{value:.6g}") + 0.0 if np.isfinite(value) else None for value in converted]
-        working = [
-            value for value, live in zip(sensors[name], alive, strict=True) if live and value is not None
-        ]
-        ranges |= {name: [min(working), max(working)]} if working else {}
-    signs: Sequence[int] = polarity.astype(int).tolist() if polarity.min() < 0 else ()
-    kinds = {kind: list(map(int, numbers)) for kind, numbers in broken.items()}
-    about = {"unit": session.unit, **metadata}
-    return Calibration(sensors, kinds, ranges, scale, zero, about, polarity=signs)
+    values = values.assign(offset=polarity * (values["offset"] - zero))
+    forces = values.columns.difference(["hysteresis", "time_constant", "exponent"])
+    # Six digits, and no negative 0.
+    values[forces] *= scale
+    values = values.map(lambda value: float(f"{value:.6g}") + 0.0)
+    known = values[alive].dropna(axis="columns", how="all")
+    ranges = {"dead": [0.0, float((~alive).sum())]} | {
+        str(name): [float(column.min()), float(column.max())] for name, column in known.items()
+    }
+    sensors = values.astype(object).where(values.notna(), None).to_dict("list")
+    return Calibration(
+        {str(name): column for name, column in sensors.items()},
+        {kind: list(map(int, numbers)) for kind, numbers in broken.items()},
+        ranges,
+        scale,
+        zero,
+        {"unit": session.unit, **metadata},
+        polarity=polarity.astype(int).tolist() if polarity.min() < 0 else (),
+        exponent_at=1.0 if at is None else at * scale,
+        tables={n: (scale * np.array(table)).tolist() for n, table in (tables or {}).items()},
+    )
 
 
 @dataclass(frozen=True)
@@ -188,8 +181,8 @@ class HeldOutErrors:
         rmse: N, of the ``simulated`` true readings (gain 1, no offset), of these ``tared``, with the offset
             of each sensor, and of the ``calibrated`` simulation.
         held_out: numbers of these presses.
-        force: ratio of estimated force to the gauge's, median over the loading of each held-out press, (n,);
-            empty if no sensor could be used.
+        force: ratio of the force that measured readings give to that of the calibrated simulation, median
+            over the loading of each held-out press, (n,); empty if no sensor could be used.
     """
 
     rmse: dict[str, float]
@@ -213,30 +206,35 @@ def evaluate_held_out(bench: BenchData, fraction: float) -> HeldOutErrors:
     Raises:
         InputError: no sensor has two presses.
     """
-    strongest = bench.each.argmax(axis=1)
+    strongest = pd.Series(bench.each.argmax(axis=1))
     # Each has an earlier press at the same strongest sensor.
-    spare = [n for n in range(len(strongest)) if (strongest[:n] == strongest[n]).any()]
-    if not spare:
+    spare = np.flatnonzero(strongest.duplicated())
+    if not len(spare):
         raise InputError("no press can be held out: press near every sensor at least twice")
     count = min(len(spare), max(1, round(fraction * len(strongest))))
-    held = [spare[n] for n in np.linspace(0, len(spare) - 1, count).round().astype(int)]
-    calibration = fit_calibration(bench, [n for n in range(len(bench.gauge)) if n not in held])
-    answers = bench.each[bench.applied[1]]
+    held = spare[np.linspace(0, len(spare) - 1, count).round().astype(int)].tolist()
+    calibration = fit_calibration(bench, set(range(len(bench.gauge))) - set(held))
+    answers, simulated = bench.each[bench.applied[1]], predict_session(bench, calibration)
     responding = answers > _RESPONDING * answers.max(axis=1, keepdims=True)
     alive = ~calibration.values()["dead"] & np.isfinite(bench.session.raw)
-    counted = bench.frames_of(held)[:, None] & responding & alive
+    counted = np.isin(bench.applied[1], held)[:, None] & responding & alive
     measured, tared = calibration.newtons(bench.session.raw), bench.true + calibration.values()["offset"]
-    sides = {"simulated": bench.true, "tared": tared, "calibrated": predict_session(bench, calibration)}
+    sides = {"simulated": bench.true, "tared": tared, "calibrated": simulated}
     rmse = {name: float(np.sqrt(np.mean((side - measured)[counted] ** 2))) for name, side in sides.items()}
-    return HeldOutErrors(rmse, held, _estimate_forces(bench, held, calibration))
+    shown = simulated / (calibration.scale * calibration.signs) + calibration.zero
+    loaded, ratios = bench.loading & (bench.applied[0] > _LOADED * bench.gauge.force.max()), list[float]()
+    for number in held:
+        rows, each = loaded & (bench.applied[1] == number), bench.each[number]
+        force, expected = (estimate_force(raw[rows], each, calibration) for raw in (bench.session.raw, shown))
+        ratios.append(pd.Series(force / expected).median())
+    return HeldOutErrors(rmse, held, pd.Series(ratios).dropna().to_numpy())
 
 
 def predict_session(bench: BenchData, calibration: Calibration) -> np.ndarray:
     """Return the simulated readings of a calibrated device without noise, (T, S), N."""
     imperfection = Imperfection(calibration=calibration)
     randomness = np.random.default_rng(0)
-    constants = imperfection.constants(bench.each.shape[1], randomness)
-    constants = constants._replace(noise=torch.zeros(()))
+    constants = imperfection.constants(bench.each.shape[1], randomness)._replace(noise=torch.zeros(()))
     time = torch.from_numpy(bench.session.time).float()
     true = torch.from_numpy(bench.true)[None].float()
     return imperfection.raw(true, constants, randomness, time)[0].double().numpy()
@@ -258,25 +256,7 @@ def estimate_force(raw: np.ndarray, each: np.ndarray, calibration: Calibration) 
     below = calibration.newtons(raw) - values["offset"] < _CLIPPED * values["clip"]
     weights = np.where(below & np.isfinite(true) & (each > _RESPONDING * each.max()), each, 0.0)
     square = (weights**2).sum(axis=-1)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return (weights * np.nan_to_num(true)).sum(axis=-1) / np.where(square > 0, square, np.nan)
-
-
-def _estimate_forces(bench: BenchData, presses: Sequence[int], calibration: Calibration) -> np.ndarray:
-    """Return the ratio of estimated force to the lagged force of the gauge, of each press."""
-    force, press = bench.applied
-    lag = torch.tensor([float(np.median(calibration.known("time_constant")))]).double()
-    late = first_order_lag(torch.from_numpy(force)[None, :, None], lag, torch.from_numpy(bench.session.time))
-    late_force = late[0, :, 0].numpy()
-    per_second = calibration.signs * calibration.known("drift") / calibration.scale
-    drift = per_second * bench.session.time[:, None]
-    raw, fractions = bench.session.raw - drift, []
-    for number in presses:
-        mine = bench.loading & (press == number)
-        mine &= force > _LOADED * force[press == number].max()
-        fractions.append(estimate_force(raw[mine], bench.each[number], calibration) / late_force[mine])
-    finite = [ratios[np.isfinite(ratios)] for ratios in fractions]
-    return np.array([np.median(ratios) for ratios in finite if len(ratios)])
+    return (weights * np.nan_to_num(true)).sum(axis=-1) / np.where(square > 0, square, np.nan)
 
 
 def check_force(calibration: Calibration, clip: float) -> None:
@@ -290,90 +270,19 @@ def check_force(calibration: Calibration, clip: float) -> None:
         InputError: gains of sensors in N, or limits of sensors in counts, are those of a gauge in another
             unit.
     """
-    if calibration.about.get("unit") == "N":
-        ratio = float(np.median([gain for gain in calibration.sensors["gain"] if gain is not None]))
-        words = f"the readings, in N, are {ratio:.3g} times what the gauge's force makes of them"
-    else:
-        limits = np.array([np.nan if value is None else value for value in calibration.sensors["clip"]])
-        if not np.isfinite(limits).any():
-            return
-        if calibration.curves is not None:
-            limits = calibration.curves.straighten(limits)
-        limit = float(np.nanmedian(limits))
-        ratio = clip / limit
-        words = f"sensors reach their limit at {limit:.3g} N, and device.clip is {clip:g} N"
-    fits = [name for name, unit in _GAUGES.items() if abs(math.log(ratio / unit)) < math.log(_LIKE)]
-    if fits:
-        raise InputError(
-            f"{words}: the force of the gauge seems to be in {fits[0]}; add "
-            f"calibrate.force_scale={_GAUGES[fits[0]]:g}, or calibrate.force_scale=1 if it is in N"
-        )
-
-
-# A force gauge that drifts during the session.
-
-
-_LINEAR = 0.8  # of the channel's largest response: above, it may be at its limit
-_STRONG = 0.5  # of the sensor's strongest press: weaker ones depend on where it lies
-_LINE_STEPS = 2  # steps below the limit that determine a line: what the protocol asks for
-_GAUGE_CHANGES = {"sensitivity": 0.2, "zero": 0.1}
-"""Largest changes. Sensors misplaced by 2 mm look like a sensitivity that changes by 12 %, as the protocol
-presses them first where the response should be highest."""
-_PRESSED_AGAIN = 3  # that were pressed again: fewer may all be misplaced alike
-
-
-def check_gauge(bench: BenchData) -> None:
-    """Raise InputError if sensitivity or zero of the gauge change during a session.
-
-    Each press gives a line of the gauge's force over the reading of a sensor, whose intercept is the zero of
-    the gauge. Its slope, compared with that of other presses on the sensor, shows the sensitivity.
-
-    Args:
-        bench: the session.
-
-    Raises:
-        InputError: the sensitivity changes by more than 20 %, or the zero by 10 % of the peak force.
-    """
-    time, sensor, slope, zero = _gauge_lines(bench).T
-    # Sensors have gains of their own, but the gauge has one zero.
-    for what, group, values in (("sensitivity", sensor, slope), ("zero", 0 * sensor, zero)):
-        if abs(change := _gauge_change(time, group, values)) > _GAUGE_CHANGES[what]:
+    sensors = pd.DataFrame(calibration.sensors).astype(float)
+    ratio, words = sensors["gain"].median(), "the gains of sensors in N are {:.3g}"
+    if calibration.about.get("unit") != "N":
+        limits = sensors["clip"].to_numpy()
+        limits = limits if calibration.curves is None else calibration.curves.straighten(limits)
+        ratio = clip / pd.Series(limits).median()
+        words = f"device.clip={clip:g} N is {{:.3g}} times the limit of the sensors"
+    for name, unit in _GAUGES.items():
+        if abs(math.log(ratio / unit)) < math.log(_LIKE):
             raise InputError(
-                f"the {what} of the gauge, against the sensors, changes by {change:+.0%} during the session: "
-                "let it warm up, zero it between presses, and record again"
+                f"{words.format(ratio)}: the force of the gauge seems to be in {name}; add "
+                f"calibrate.force_scale={unit:g}, or calibrate.force_scale=1 if it is in N"
             )
-
-
-def _gauge_lines(bench: BenchData) -> np.ndarray:
-    """Return rows of time (fraction of presses before), sensor, log slope, and intercept over the peak."""
-    responses, rows = collect_responses(bench), []
-    strength, largest = bench.each.max(axis=0), np.abs(responses.measured).max(axis=0)
-    for press, each in enumerate(bench.each):
-        steps = responses.press == press
-        force = responses.force[steps]
-        for sensor in np.flatnonzero(responses.responding & (each >= _STRONG * strength)):
-            reading = np.abs(responses.measured[steps, sensor])
-            linear = reading < _LINEAR * largest[sensor]
-            if linear.sum() >= _LINE_STEPS and np.ptp(reading[linear]) > 0:
-                slope, zero = np.polyfit(reading[linear], force[linear], 1)
-                sensitivity = np.log(abs(slope) * each[sensor])
-                rows.append((press / len(bench.each), sensor, sensitivity, zero / force.max()))
-    return np.array(rows).reshape(-1, 4)
-
-
-def _gauge_change(time: np.ndarray, group: np.ndarray, values: np.ndarray) -> float:
-    """Return how values change from time 0 to 1 within groups; 0 if its interval of 95 % contains 0.
-
-    By the slopes between pairs (Theil and Sen), so that some misplaced sensors do not bend the line.
-    """
-    frame = pd.DataFrame({"time": time, "values": values})
-    # Rounded, because a slope between two times that differ in the last digit is none.
-    within = (frame - frame.groupby(group).transform("mean")).round(6)
-    moved = within[within["time"] != 0]
-    if len(moved) - len(np.unique(group)) < _PRESSED_AGAIN:
-        return 0.0
-    change, _, low, high = theilslopes(moved["values"], moved["time"])
-    return float(change) if low * high > 0 else 0.0
 
 
 def fit_presses(bench: BenchData, fraction: float, clip: float | None) -> tuple[Calibration, HeldOutErrors]:
@@ -385,47 +294,44 @@ def fit_presses(bench: BenchData, fraction: float, clip: float | None) -> tuple[
         clip: of the designed device, N, with which the unit of the gauge is compared; None: it is known.
 
     Raises:
-        InputError: the gauge drifts, its unit is wrong, or too few sensors can be used.
+        InputError: the unit of the gauge is wrong, or too few sensors can be used.
     """
-    check_gauge(bench)
     calibration = fit_calibration(bench)
     check_usable(calibration)
     if clip is not None:
         check_force(calibration, clip)
-    outcome = evaluate_held_out(bench, fraction)
-    rmse = {name: round(value, 6) for name, value in outcome.rmse.items()}
-    metadata = {**calibration.about, "held_out": list(outcome.held_out), "rmse": rmse}
-    return replace(calibration, about=metadata), outcome
+    return calibration, evaluate_held_out(bench, fraction)
 
 
-def print_calibration(calibration: Calibration, outcome: HeldOutErrors) -> None:
-    """Print the constants of working sensors, the broken, inverse and weak ones, and held-out errors."""
+def print_calibration(calibration: Calibration, errors: HeldOutErrors | None = None) -> None:
+    """Print the constants of working sensors, what is unusual about others, and held-out errors."""
     rows = {
         name: [np.median(calibration.known(name)), *calibration.ranges[name], _UNITS.get(name, "N")]
         for name in QUANTITIES
         if name in calibration.ranges
     }
     table = pd.DataFrame.from_dict(rows, orient="index", columns=["median", "least", "largest", ""])
-    print(table.to_string(float_format="{:.4g}".format))
-    for line in calibration.about.get("responses", []):
-        print(line)
-    gains = {n: gain for n, gain in enumerate(calibration.sensors["gain"]) if gain is not None}
-    weak = [n for n, gain in gains.items() if gain < _WEAK * float(np.median(list(gains.values())))]
-    broken = {number for group in calibration.broken.values() for number in group}
-    unknown = [n for n in range(len(calibration)) if n not in gains and n not in broken]
-    groups = [
-        *((kind, numbers, " (from 0)") for kind, numbers in calibration.broken.items()),
-        ("inverse, values fall with force", np.flatnonzero(calibration.signs < 0).tolist(), ""),
-        (f"weak, less than {_WEAK:.0%} of the median gain", weak, ""),
-        ("not pressed, or at the limit, so of median gain", unknown, ""),
-    ]
-    for words, numbers, note in groups:
-        if numbers:
-            print(f"{words}: sensors {', '.join(map(str, numbers))}{note}")
-    errors = ", ".join(f"{name} {value:.4f} N" for name, value in outcome.rmse.items())
-    print(f"RMSE on {len(outcome.held_out)} held-out presses: {errors}")
-    if len(outcome.force):
-        off = np.abs(outcome.force - 1)
+    about = ", ".join(f"{name} {value}" for name, value in calibration.about.items() if name != "unit")
+    print(about, table.to_string(float_format="{:.4g}".format), sep="\n")
+    gains = pd.Series(calibration.sensors["gain"], dtype=float)
+    groups: dict[str, Sequence[int] | np.ndarray] = {
+        **calibration.broken,
+        "inverse, values fall with force": np.flatnonzero(calibration.signs < 0),
+        "curved, as in a table": list(calibration.tables),
+        f"weak, less than {_WEAK:.0%} of the median gain": np.flatnonzero(gains < _WEAK * gains.median()),
+        "not loaded, or at the limit, so of median gain": np.flatnonzero(
+            gains.isna() & ~calibration.values()["dead"]
+        ),
+    }
+    for words, numbers in groups.items():
+        if len(numbers):
+            print(f"{words}: sensors {list_numbers(numbers)} (from 0)")
+    if errors is None:
+        return
+    sides = ", ".join(f"{name} {value:.4f} N" for name, value in errors.rmse.items())
+    print(f"RMSE on {len(errors.held_out)} held-out presses: {sides}")
+    if len(errors.force):
+        off = np.abs(errors.force - 1)
         print(f"force of these presses from readings: off by {np.median(off):.1%}, at most {off.max():.1%}")
         if off.max() > _TOO_FAR:
             warnings.warn(

@@ -5,15 +5,13 @@ below it.
 """
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
-from typing import Any
 
 import numpy as np
 import pandas as pd
 import torch
-from pydantic import PositiveFloat
 
 from skin.body.base import AbstractBody, Sensors
 from skin.calibration.bench import (
@@ -21,12 +19,10 @@ from skin.calibration.bench import (
     Gauge,
     check_channels,
     per_newton,
-    true_readings,
     write_bench_session,
 )
 from skin.calibration.fit import convert_to_newton
 from skin.calibration.wiring import MAD, find_quantum, list_numbers, measure_rests
-from skin.core.settings import configured
 from skin.device.calibration import Calibration
 from skin.device.resampling import Frame, StreamClock
 from skin.device.simulated import Simulated
@@ -48,12 +44,12 @@ _PATIENCE = 60.0  # s in which a further load must be put down
 
 
 _BLOCK = 0.2  # s, whose median is one value
-_REST = 5  # blocks without a load before the first one
+_LEVEL = 3  # blocks that do not differ from the one before are a level
 _LOADED = 6.0  # standard deviations of a block: no noise of 100 channels and ten minutes reaches it
 _STEPS = 2.0  # steps of the converter, likewise
+_CREEP = 0.02  # of a channel's range: a skin that creeps changes less from block to block
 _LIFTED = 0.15  # of the largest change of a load: below, it is lifted, and the skin recovers
-_SETTLE = 2  # blocks after a load is lifted that are not used
-_AFTER = 4  # blocks after it for the rest; fewer before the next load
+_SETTLE, _REST = 2, 4  # blocks after a load is lifted that are not used, and that are its rest
 _SHORTEST = 1.0  # s of a load: less is a touch
 _STEADY = 0.4, 0.9  # part of a load that is used: a hand no longer guides it, and has not come back
 _UNSTEADY = 0.2  # of the largest change: a load that changes more was touched or slid
@@ -65,7 +61,7 @@ class Placements:
 
     Attributes:
         change: (P, S), against the rest before and after the load, in the session's unit.
-        begin, end: (P,), s.
+        span: (P, 2), begin and end, s.
         idle: (T,), bool: frames without a load.
         noise: (S,), standard deviation of ``change``.
         unsteady: number of loads that were left out because they changed.
@@ -73,8 +69,7 @@ class Placements:
     """
 
     change: np.ndarray
-    begin: np.ndarray
-    end: np.ndarray
+    span: np.ndarray
     idle: np.ndarray
     noise: np.ndarray
     unsteady: int
@@ -87,68 +82,54 @@ def find_placements(session: BenchSession) -> Placements:
     A load begins where a channel leaves its noise, and ends where all have lost most of their change. The
     first second must be without a load. There may be no load, or one that still lies at the end.
     """
-    time, raw = session.time, session.raw
-    block = np.floor((time - time[0]) / _BLOCK).astype(int)
-    _, first = np.unique(block, return_index=True)
-    medians = pd.DataFrame(raw).groupby(block).median()
+    blocks = np.floor((session.time - session.time[0]) / _BLOCK)
+    _, first, block = np.unique(blocks, return_index=True, return_inverse=True)
+    medians, starts = pd.DataFrame(session.raw).groupby(block).median(), session.time[first]
     # Of a block without a value, what is between those before and after it; 0 of a channel without any.
     values = medians.interpolate(limit_direction="both").fillna(0.0).to_numpy()
-    steps = np.array([find_quantum(column[np.isfinite(column)]) for column in raw.T])
+    steps = np.array([find_quantum(column[np.isfinite(column)]) for column in session.raw.T])
     noise = MAD / np.sqrt(2) * np.median(np.abs(np.diff(values, axis=0)), axis=0)
     noise = np.maximum(noise, steps / np.sqrt(12))
-    spans, rests = _find_loads(values, np.maximum(_LOADED * noise, _STEPS * steps))
-    starts = time[first]
-    idle = np.ones(len(time), dtype=bool)
-    rows, times, unsteady = [], [], 0
-    for (begin, end), (before, after) in zip(spans, rests, strict=True):
-        margin = slice(first[max(begin - 1, 0)], first[end + _SETTLE] if end + _SETTLE < len(first) else None)
-        idle[margin] = False
-        if starts[end - 1] - starts[begin] < _SHORTEST:
+    limits = np.maximum(_LOADED * noise, _STEPS * steps)
+    loaded, resting = _find_loads(values, limits)
+    rows, spans, unsteady = [], [], 0
+    for _, load in pd.Series(loaded)[~resting].groupby(resting.cumsum()[~resting]):
+        levels = load.index[load] if load.any() else load.index  # a load may change all the time
+        begin, end = levels[0], levels[-1]
+        if starts[end] - starts[begin] < _SHORTEST:
             continue
-        low, high = (begin + round(fraction * (end - begin)) for fraction in _STEADY)
-        steady = values[low : max(high, low + 3)] - (before + after) / 2
-        change = np.median(steady, axis=0)
+        low, high = (begin + round(fraction * (end + 1 - begin)) for fraction in _STEADY)
+        steady = values[low : max(high, low + 3)]
+        after = values[end:][resting[end:]][_SETTLE : _SETTLE + _REST]
+        change = np.median(steady, axis=0) - np.vstack(
+            [values[:begin][resting[:begin]][-_REST:], after]
+        ).mean(axis=0)
         if (np.ptp(steady, axis=0) > _UNSTEADY * np.abs(change).max() + _LOADED * noise).any():
             unsteady += 1
             continue
         rows.append(change)
-        times.append((starts[begin], starts[end - 1]))
-    moments = np.array(times).reshape(-1, 2)
-    change = np.array(rows).reshape(-1, len(noise))
-    few = noise * np.sqrt(1 / 5 + 1 / (2 * _AFTER))
-    reached = (np.abs(change) > np.maximum(_LOADED * few, _STEPS * steps)).any(axis=0)
-    return Placements(change, moments[:, 0], moments[:, 1], idle, few, unsteady, reached)
+        spans.append((starts[begin], starts[end]))
+    change, error = np.array(rows).reshape(-1, len(noise)), noise * np.sqrt(1 / 5 + 1 / (2 * _REST))
+    reached = (np.abs(change) > np.maximum(_LOADED * error, _STEPS * steps)).any(axis=0)
+    return Placements(change, np.array(spans).reshape(-1, 2), resting[block], error, unsteady, reached)
 
 
-def _find_loads(
-    values: np.ndarray, limits: np.ndarray
-) -> tuple[list[tuple[int, int]], list[tuple[np.ndarray, np.ndarray]]]:
-    """Return first and last block of every load, and the rests (S,) before and after it."""
-    spans, rests = list[tuple[int, int]](), list[tuple[np.ndarray, np.ndarray]]()
-    count = len(values)
-    number = min(_REST, count)
-    rest = np.median(values[:number], axis=0)
-    while number < count:
-        if not (np.abs(values[number] - rest) > limits).any():
-            rest = rest + 0.2 * (values[number] - rest)
-            number += 1
-            continue
-        begin, peak = number, np.zeros(len(limits))
-        while number < count:
-            change = np.abs(values[number] - rest)
-            peak = np.maximum(peak, change)
-            if not (change > np.maximum(limits, _LIFTED * peak.max())).any():
-                break
-            number += 1
-        after = rest
-        if number < count:
-            quiet = values[number + _SETTLE : number + _SETTLE + _AFTER]
-            calm = quiet[(np.abs(quiet - rest) <= np.maximum(limits, _LIFTED * peak.max())).all(axis=1)]
-            after = np.median(calm, axis=0) if len(calm) else rest
-        spans.append((begin, number))
-        rests.append((rest, after))
-        rest, number = after, number + _SETTLE
-    return spans, rests
+def _find_loads(values: np.ndarray, limits: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return which blocks (N,) are of levels under a load, and which of levels at rest, as the first is."""
+    still = np.maximum(limits, _CREEP * np.ptp(values, axis=0))
+    level = np.append(0, (np.abs(np.diff(values, axis=0)) > still).any(axis=1).cumsum())
+    levels = np.bincount(level) >= _LEVEL
+    loaded, rest, peak = (
+        np.zeros(len(values), dtype=bool),
+        np.median(values[level == levels.argmax()], axis=0),
+        0.0,
+    )
+    for number in np.flatnonzero(levels):
+        middle = np.median(values[level == number], axis=0)
+        change = np.abs(middle - rest)
+        loaded[level == number] = under = (change > np.maximum(limits, _LIFTED * peak)).any()
+        rest, peak = (rest, max(peak, change.max())) if under else (middle, 0.0)
+    return loaded, levels[level] & ~loaded
 
 
 @dataclass(frozen=True)
@@ -170,19 +151,11 @@ class KnownLoad:
         Raises:
             InputError: no mass or no base, or one that is too large or not above 0.
         """
-        if weight is None or base is None:
+        if not (weight and base and 0 < weight <= _HEAVIEST and 0 < base <= min(size) / 2):
             raise InputError(
-                "a known load is a mass in kg on a round base of a radius in m: give weight=2.0 base=0.02"
-            )
-        if not 0 < weight <= _HEAVIEST:
-            in_grams = f"; for {weight:g} g give weight={weight / 1000:g}" * (weight >= 100)
-            raise InputError(f"weight={weight:g} is a mass in kg above 0 and up to {_HEAVIEST:g}{in_grams}")
-        widest = min(size) / 2
-        if not 0 < base <= widest:
-            in_mm = f"; for {base:g} mm give base={base / 1000:g}" * (base >= 1)
-            raise InputError(
-                f"base={base:g} is a radius in m above 0 that fits on the skin of {size[0]:g} x "
-                f"{size[1]:g} m, so at most {widest:g}{in_mm}"
+                f"weight={weight} base={base} is no known load: give a mass in kg, up to {_HEAVIEST:g}, and "
+                f"the radius in m of its round base, which lies on the skin, up to {min(size) / 2:g}: as in "
+                "weight=2.0 base=0.02"
             )
         return cls(weight, base)
 
@@ -192,25 +165,7 @@ class KnownLoad:
         return GRAVITY * self.weight
 
 
-@dataclass(frozen=True)
-class LoadResult:
-    """A calibration by known loads, and how well it is determined.
-
-    Attributes:
-        calibration: of the skin.
-        placements: number of placements of every sensor, (S,).
-        differ: median difference between placements of the same sensor, fraction; NaN where every sensor has
-            one.
-        never: sensors that were never loaded: their gain is the median.
-    """
-
-    calibration: Calibration
-    placements: np.ndarray
-    differ: float
-    never: list[int]
-
-
-def fit_known_load(device: Simulated, session: BenchSession, load: KnownLoad) -> LoadResult:
+def fit_known_load(device: Simulated, session: BenchSession, load: KnownLoad) -> Calibration:
     """Fit offsets and noise to idle frames, and gains to placements of a load.
 
     Args:
@@ -219,7 +174,7 @@ def fit_known_load(device: Simulated, session: BenchSession, load: KnownLoad) ->
         load: what was put on it.
 
     Raises:
-        InputError: another number of channels, no placement, or sensors without one.
+        InputError: another number of channels, no placement, sensors without one, or a load in another unit.
     """
     check_channels(device, session)
     placements = find_placements(session)
@@ -229,8 +184,31 @@ def fit_known_load(device: Simulated, session: BenchSession, load: KnownLoad) ->
             f"no placement in the session{touched * bool(placements.unsteady)}: leave the skin untouched for "
             "3 s, put the load down, let go of it for 2 s, lift it for 2 s, and so on"
         )
-    gains, counts, differ = _fit_weight(device, placements, load)
-    return _build(session, placements, load, gains, counts, differ, float(device.constants.noise.median()))
+    expected = load.force * base_readings(device.model, device.body, device.sensors, load.base)
+    signs, reached = _find_signs(placements), placements.reached
+    sensor = _assign(expected, placements, signs)
+    at_sensor = signs[sensor] * placements.change[np.arange(len(sensor)), sensor]
+    ratios = pd.Series(at_sensor / np.diagonal(expected)[sensor]).groupby(sensor)
+    gains = ratios.median().reindex(range(len(expected)))
+    gains = gains.where((gains > 0) & reached)
+    if len(missed := np.flatnonzero(gains.isna())) > _MISSED * len(gains):
+        raise InputError(
+            f"sensors {list_numbers(missed)} were never loaded, or do not respond: put the load on every "
+            "sensor and record again, or check the wiring"
+        )
+    # Slow drift is left to the tare: placements move the rest a little, too.
+    time = session.time - session.time[placements.idle].mean()
+    rests = measure_rests(replace(session, time=time), placements.idle).drop(columns="drift")
+    quiet = float(np.hypot(rests["noise"], rests["quantum"] / math.sqrt(12)).median() / gains.median())
+    usual = float(device.constants.noise.median())
+    if quiet < usual / _QUIETER:  # a load in another unit makes the noise that of no sensor
+        raise InputError(
+            f"weight={load.weight:g} (kg) would mean a noise of {quiet:.2g} N, device.noise is {usual:g}: "
+            "give the load in this unit, or device.noise= if the sensors are so quiet"
+        )
+    metadata = {"placements": len(placements.change), "weight": load.weight, "base": load.base}
+    broken = {"dead": np.flatnonzero(~reached).tolist()}
+    return convert_to_newton(session, rests.assign(gain=gains), signs, broken, metadata)
 
 
 def base_readings(model: AbstractSimulator, body: AbstractBody, sensors: Sensors, base: float) -> np.ndarray:
@@ -239,107 +217,27 @@ def base_readings(model: AbstractSimulator, body: AbstractBody, sensors: Sensors
     Near the rim the base is as far inside as it needs to be to lie on the skin.
     """
     positions = np.clip(sensors.positions[:, :2], base, np.array(body.size) - base)
-    count = len(positions)
-    zeros, names = np.zeros(count), np.full(count, "disc")
-    presses = np.arange(count)
-    rows = Gauge(presses.astype(float), zeros + 1, positions, zeros + base, zeros, names, presses)
-    return per_newton(model, body, rows)
+    return per_newton(model, body, stair_gauge(positions, indenter="disc", radius=base))
 
 
-def _fit_weight(
-    device: Simulated, placements: Placements, load: KnownLoad
-) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return gains (S,), in the session's unit per N, NaN if unknown; placements (S,); their difference."""
-    expected = load.force * base_readings(device.model, device.body, device.sensors, load.base)
-    sensor = _assign(expected, placements)
-    gains, counts = np.full(len(expected), np.nan), np.bincount(sensor, minlength=len(expected))
-    differences = []
-    for number in np.flatnonzero((counts > 0) & placements.reached):
-        ratios = placements.change[sensor == number, number] / expected[number, number]
-        gains[number] = np.median(ratios) if len(ratios) > 2 else ratios.mean()
-        if len(ratios) > 1:
-            differences.append(np.abs(ratios / gains[number] - 1).mean() * 2)
-    return gains, counts, float(np.median(differences)) if differences else math.nan
-
-
-def _assign(expected: np.ndarray, placements: Placements) -> np.ndarray:
+def _assign(expected: np.ndarray, placements: Placements, signs: np.ndarray) -> np.ndarray:
     """Return the sensor (P,) below each placement: that whose pattern of readings is the most likely.
 
     Gains are unknown, so a reading is its expectation within a third. A dead sensor is found by the readings
     of its neighbours.
     """
-    size = np.abs(placements.change)
-    typical = float(np.median(size.max(axis=1)) / np.median(np.diagonal(expected)))
-    measured = placements.change[:, None, :] * np.sign(_sign(placements)) / typical
-    noise = placements.noise / typical
+    typical = float(np.median(np.abs(placements.change).max(axis=1)) / np.median(np.diagonal(expected)))
+    measured, noise = signs * placements.change[:, None, :] / typical, placements.noise / typical
     variance = (_SPREAD * expected) ** 2 + noise**2 + (_FLOOR * expected.max()) ** 2
     cost = (measured - expected) ** 2 / variance + np.log(variance)
     return np.asarray(cost[..., placements.reached].sum(axis=-1).argmin(axis=1))
 
 
-def _sign(placements: Placements) -> np.ndarray:
+def _find_signs(placements: Placements) -> np.ndarray:
     """Return 1 or -1 per channel, (S,): whether it rises under load; as most others, if it is silent."""
     strongest = np.abs(placements.change).argmax(axis=0)
-    signs = np.sign(placements.change[strongest, np.arange(placements.change.shape[1])])
-    maximum = -1.0 if signs[placements.reached].sum() < 0 else 1.0
-    return np.where(placements.reached & (signs != 0), signs, maximum)
-
-
-def _build(
-    session: BenchSession,
-    placements: Placements,
-    load: KnownLoad,
-    gains: np.ndarray,
-    counts: np.ndarray,
-    differ: float,
-    usual: float,
-) -> LoadResult:
-    """Return the calibration of gains (S,), in the session's unit per N, NaN if unknown.
-
-    A load in another unit makes the noise, N, that of no sensor; ``usual`` is that of the simulated device.
-    """
-    signs = _sign(placements)
-    dead = [int(n) for n in np.flatnonzero(~placements.reached)]
-    never = [int(n) for n in np.flatnonzero(placements.reached & ~(gains * signs > 0))]
-    if len(dead) + len(never) > _MISSED * len(gains):
-        raise InputError(
-            f"sensors {list_numbers(sorted(dead + never))} were never loaded, or do not respond: put the "
-            "load on every sensor and record again, or check the wiring"
-        )
-    # Slow drift is left to the tare: placements move the rest a little, too.
-    rests = measure_rests(
-        replace(session, time=session.time - session.time[placements.idle].mean()), placements.idle
-    )
-    absolute = np.where(np.isfinite(gains), gains * signs, np.nan)
-    typical = float(np.nanmedian(absolute))
-    quiet = float(np.median(np.maximum(rests["noise"], rests["quantum"] / math.sqrt(12)))) / typical
-    if quiet < usual / _QUIETER:
-        raise InputError(
-            f"weight={load.weight:g} (kg) would mean a noise of {quiet:.2g} N, device.noise is {usual:g}: "
-            "give the load in this unit, or device.noise= if the sensors are so quiet"
-        )
-    metadata = {"placements": len(placements.change), "weight": load.weight, "base": load.base}
-    values = rests.drop(columns="drift").assign(gain=absolute)
-    calibration = convert_to_newton(session, values, signs, {"dead": dead}, metadata)
-    return LoadResult(calibration, counts, differ, never)
-
-
-def print_known_load(result: LoadResult) -> None:
-    """Print gains, placements, and the sensors without a gain."""
-    calibration = result.calibration
-    gains = [gain for gain in calibration.sensors["gain"] if gain is not None]
-    print(
-        f"{calibration.about['placements']} placements, {len(gains)} of {len(calibration)} sensors have a "
-        f"gain: median {np.median(gains):.4g}, {min(gains):.4g} to {max(gains):.4g}"
-    )
-    if math.isfinite(result.differ):
-        print(f"placements of the same sensor differ by {result.differ:.1%} (median)")
-    if dead := calibration.broken["dead"]:
-        print(f"dead, or never loaded: sensors {list_numbers(dead)} (from 0) never left their noise")
-    if result.never:
-        print(f"never loaded, so of median gain: sensors {list_numbers(result.never)}")
-    if inverse := np.flatnonzero(calibration.signs < 0).tolist():
-        print(f"inverse, values fall with force: sensors {list_numbers(inverse)}")
+    signs = np.where(placements.change[strongest, np.arange(len(strongest))] < 0, -1.0, 1.0)
+    return np.where(placements.reached, signs, -1.0 if signs[placements.reached].sum() < 0 else 1.0)
 
 
 # A second load, measured while it is put on three sensors.
@@ -381,7 +279,7 @@ def measure_ratios(
                 "readings changed while a load lay: the device seems to follow its own baseline, so that a "
                 "long press disappears: switch that off in its firmware; or the load moved: check again"
             )
-        counted = found.end - found.begin >= seconds
+        counted = np.ptp(found.span, axis=1) >= seconds
         for change in found.change[counted]:
             # The pattern identifies the sensor for any scale and sign.
             sensor = int(np.abs(shapes @ change).argmax())
@@ -393,7 +291,7 @@ def measure_ratios(
             ratios[str(sensor)] = float(change[sensor] / expected[sensor, sensor])
         if len(ratios) >= enough and lying == 0:
             return ratios
-        if time[-1] - found.begin[counted].max(initial=0.0) > _PATIENCE + seconds:
+        if time[-1] - found.span[counted].min(axis=1).max(initial=0.0) > _PATIENCE + seconds:
             break
     raise InputError(
         f"no further load lay for {seconds:g} s within {_PATIENCE:g} s: give a heavier one, as in weight=1, "
@@ -401,157 +299,122 @@ def measure_ratios(
     )
 
 
-# A simulated bench: the protocol of its presses, and the session of a device under them.
+# Simulated sessions: presses of a gauge, and placements of a load.
 
 
-@dataclass(frozen=True)
-class Protocol:
-    """Idle time, then a staircase at each position: up, down, up to the peak, and a sudden release.
+_RAMP = 0.05  # s from one step of force to the next; a release takes none
+
+
+def stair_gauge(
+    positions: np.ndarray,
+    peak: float = 120.0,
+    steps: Sequence[float] = (0.1, 0.2, 0.4, 0.7, 1.0),
+    hold: float = 0.3,
+    idle: float = 3.0,
+    rest: float = 2.0,
+    indenter: str = "blurred_disc",
+    radius: float = 0.01,
+    rate: float = 100.0,
+) -> Gauge:
+    """Return a gauge's rows for a staircase at each position: up, down, up to the peak, and a sudden release.
 
     The upward steps determine gains, the downward steps hysteresis, the release the lag, and idle time
     offset, noise and drift.
 
-    Attributes:
+    Args:
+        positions: of the presses, (P, 2), m.
         peak: largest force of every press, N.
         steps: fractions of the peak on the way up, and reversed on the way down.
         hold: at every step, s.
-        ramp: from one step to the next, s; the release takes none.
         idle: before the first press, s.
         rest: after every press, s.
         indenter: name as in ``touch.shapes``.
         radius: half its larger extent, m.
         rate: of gauge and session, Hz.
     """
+    levels = [0.0, *steps, *list(steps)[-2::-1], steps[-1]]
+    corners = np.cumsum([0.0, *[_RAMP, hold] * (len(levels) - 1)])
+    inside = np.arange(0, corners[-1], 1 / rate)
+    press = np.interp(inside, corners, peak * np.repeat(levels, 2)[1:])
+    press = np.append(press, np.zeros(max(2, round(0.2 * rate))))
+    starts = round(idle * rate) + np.arange(len(positions)) * (len(press) + round(rest * rate))
+    presses = pd.DataFrame({"indenter": indenter, "x_m": positions[:, 0], "y_m": positions[:, 1]})
+    return Gauge(
+        (starts[:, None] + np.arange(len(press))).ravel() / rate,
+        np.tile(press, len(positions)),
+        np.repeat(np.arange(len(positions)), len(press)),
+        presses.assign(radius_m=radius, angle=0.0),
+    )
 
-    peak: PositiveFloat = 120.0
-    steps: Sequence[float] = (0.1, 0.2, 0.4, 0.7, 1.0)
-    hold: PositiveFloat = 0.3
-    ramp: PositiveFloat = 0.05
-    idle: PositiveFloat = 3.0
-    rest: PositiveFloat = 2.0
-    indenter: str = "blurred_disc"
-    radius: PositiveFloat = 0.01
-    rate: PositiveFloat = 100.0
 
-    def gauge(self, positions: np.ndarray) -> Gauge:
-        """Return a gauge's rows for presses at positions (P, 2), m."""
-        levels = [0.0, *self.steps, *list(self.steps)[-2::-1], self.steps[-1]]
-        corners = np.cumsum([0.0, *[self.ramp, self.hold] * (len(levels) - 1)])
-        heights = self.peak * np.repeat(levels, 2)[1:]
-        inside = np.arange(0, corners[-1], 1 / self.rate)
-        press = np.concatenate(
-            [np.interp(inside, corners, heights), np.zeros(max(2, round(0.2 * self.rate)))]
-        )
-        pause, start = round(self.rest * self.rate), round(self.idle * self.rate)
-        starts = start + np.arange(len(positions)) * (len(press) + pause)
-        frame = (starts[:, None] + np.arange(len(press))).ravel()
-        rows = len(frame)
-        return Gauge(
-            frame / self.rate,
-            np.tile(press, len(positions)),
-            np.repeat(positions, len(press), axis=0),
-            np.full(rows, self.radius),
-            np.zeros(rows),
-            np.full(rows, self.indenter),
-            np.repeat(np.arange(len(positions)), len(press)),
-        )
-
-    def positions(self, device: Simulated, generator: np.random.Generator) -> np.ndarray:
-        """Return two positions per sensor, on it and up to 3 mm beside it, (2 S, 2), m, inside the sheet."""
-        centre = device.sensors.positions[:, :2]
-        beside = centre + generator.uniform(-0.003, 0.003, centre.shape)
-        return np.clip(np.concatenate([centre, beside]), 0, device.size)
+def choose_presses(device: Simulated, generator: np.random.Generator) -> np.ndarray:
+    """Return two positions per sensor, on it and up to 3 mm beside it, (2 S, 2), m, inside the sheet."""
+    centre = device.sensors.positions[:, :2]
+    beside = centre + generator.uniform(-0.003, 0.003, centre.shape)
+    return np.clip(np.concatenate([centre, beside]), 0, device.size)
 
 
 def emulate_session(
     device: Simulated,
     gauge: Gauge,
-    protocol: Protocol,
     generator: np.random.Generator,
     bits: int | None = None,
+    each: np.ndarray | None = None,
 ) -> BenchSession:
-    """Simulate a session of a device under the presses of a gauge, in N, or in counts of ``bits``."""
-    frames = round((gauge.time[-1] + protocol.rest) * protocol.rate)
-    time = np.arange(frames) / protocol.rate
-    true = true_readings(gauge, per_newton(device.model, device.body, gauge), time)
-    return sent_session(device, true, time, generator, bits, gauge)
-
-
-def sent_session(
-    device: Simulated,
-    true: np.ndarray,
-    time: np.ndarray,
-    generator: np.random.Generator,
-    bits: int | None,
-    gauge: Gauge | None = None,
-) -> BenchSession:
-    """Return what a device sends of true readings (T, S), N, at times (T,), s: N, or counts of ``bits``."""
-    measured = device.imperfection.raw(
-        torch.from_numpy(true)[None].float(), device.constants, generator, torch.from_numpy(time).float()
-    )[0].numpy() * device.imperfection.signs(true.shape[1])
-    sent = Converter(bits, device.imperfection.clip)(measured)
-    return BenchSession(time, sent, "N" if bits is None else "adc", gauge, bits)
-
-
-def write_demo_session(device: Simulated, settings: Mapping[str, Any], path: str) -> str:
-    """Write the simulated session of a device under the protocol; return a summary.
+    """Return what a device sends under the presses of a gauge: N, or counts of a converter.
 
     Args:
-        device: the simulated device.
-        settings: ``conf/calibrate.yaml`` under ``calibrate``.
-        path: .csv or .parquet.
-
-    Raises:
-        InputError: the protocol is invalid.
+        device: the skin.
+        gauge: rows at the rate of the session.
+        generator: of the noise.
+        bits: of the converter; None: N are sent.
+        each: true readings per N of each press, (P, S); None: those of the device.
     """
-    protocol = configured(Protocol, settings["protocol"], "calibrate.protocol")
-    randomness = np.random.default_rng(device.seed)
-    rows = protocol.gauge(protocol.positions(device, randomness))
-    session = emulate_session(device, rows, protocol, randomness, settings["bits"])
-    return f"{write_bench_session(session, path)}: {len(rows)} presses in {session.time[-1]:.0f} s"
-
-
-# A session of an emulated skin under the load.
+    step = float(np.median(np.diff(gauge.time)))
+    time = np.arange(0.0, gauge.time[-1] + 2.0, step)
+    each = per_newton(device.model, device.body, gauge) if each is None else each
+    force, press = gauge.at(time)
+    true = torch.from_numpy(force[:, None] * each[press])[None].float()
+    readings = device.imperfection.raw(true, device.constants, generator, torch.from_numpy(time).float())
+    measured = readings[0].numpy() * device.imperfection.signs(true.shape[2])
+    sent = Converter(bits, device.imperfection.clip)(measured)
+    return BenchSession(time, sent, "N" if bits is None else "adc", gauge, bits)
 
 
 def emulate_placements(
     device: Simulated,
     readings: np.ndarray,
-    protocol: Protocol,
     generator: np.random.Generator,
     bits: int | None = None,
+    idle: float = 3.0,
 ) -> BenchSession:
-    """Simulate placements of a load one after the other, 2 s each, with pauses of ``protocol.rest``.
+    """Return a session of placements of a load one after the other, each of 2 s, with pauses of 2 s.
 
     Args:
         device: the skin.
         readings: true readings of each placement, (P, S), N.
-        protocol: its ``idle``, ``rest``, ``ramp`` and ``rate``.
         generator: of the noise.
         bits: of the converter; None: N are sent.
+        idle: before the first one, s.
     """
-    period = 2 * protocol.ramp + 2.0 + protocol.rest
-    time = np.arange(round((protocol.idle + len(readings) * period) * protocol.rate)) / protocol.rate
-    number = np.floor((time - protocol.idle) / period).astype(int)
-    inside = (time - protocol.idle) % period
-    corners = [0.0, protocol.ramp, protocol.ramp + 2.0, 2 * protocol.ramp + 2.0]
-    fraction = np.where(number >= 0, np.interp(inside, corners, [0.0, 1.0, 1.0, 0.0]), 0.0)
-    true = fraction[:, None] * readings[np.maximum(number, 0)]
-    return sent_session(device, true, time, generator, bits)
+    gauge = stair_gauge(np.zeros((len(readings), 2)), 1.0, (1.0,), hold=1.0, idle=idle)
+    return replace(emulate_session(device, gauge, generator, bits, readings), gauge=None)
 
 
-def write_demo_placements(device: Simulated, load: KnownLoad, settings: Mapping[str, Any], path: str) -> str:
-    """Write the simulated session of a load on every sensor twice, in any order; return a summary.
+def write_demo(device: Simulated, load: KnownLoad | None, bits: int | None, path: str) -> str:
+    """Write a simulated session of presses, or of a load on every sensor twice; return a summary.
 
     Args:
         device: the skin.
-        load: what is put on it.
-        settings: ``conf/calibrate.yaml`` under ``calibrate``.
+        load: what is put on it, in any order; None: it is pressed with a gauge.
+        bits: of the converter; None: N are sent.
         path: .csv or .parquet.
     """
-    protocol = configured(Protocol, settings["protocol"], "calibrate.protocol")
-    randomness = np.random.default_rng(device.seed)
-    order = np.concatenate([randomness.permutation(len(device.sensors)) for _ in range(2)])
-    readings = load.force * base_readings(device.model, device.body, device.sensors, load.base)[order]
-    session = emulate_placements(device, readings, protocol, randomness, settings["bits"])
-    return f"{write_bench_session(session, path)}: {session.time[-1]:.0f} s"
+    randomness, count = np.random.default_rng(device.seed), len(device.sensors)
+    if load is None:
+        session = emulate_session(device, stair_gauge(choose_presses(device, randomness)), randomness, bits)
+    else:
+        order = np.concatenate([randomness.permutation(count) for _ in range(2)])
+        readings = load.force * base_readings(device.model, device.body, device.sensors, load.base)[order]
+        session = emulate_placements(device, readings, randomness, bits)
+    return f"{write_bench_session(session, path)}: {2 * count} presses in {session.time[-1]:.0f} s"

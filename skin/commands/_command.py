@@ -3,10 +3,9 @@
 import logging
 import os
 import re
-import shlex
 import sys
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from difflib import get_close_matches
 from functools import wraps
 from inspect import signature
@@ -18,22 +17,19 @@ from hydra import compose, initialize_config_dir, version
 from hydra._internal.utils import _run_hydra, get_args_parser  # what hydra.main itself calls, with sys.argv
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
-from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.errors import HydraException, OverrideParseException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from yaml import YAMLError
 
 from skin.core.files import CONF
 from skin.core.messages import JobInputError, one_line, to_input_error
-from skin.core.settings import check_groups, check_settings, walk_settings
+from skin.core.settings import check_settings, walk_settings
 from skin.errors import InputError
 from skin.runs.configuration import (
     Config,
     check_numbers,
     check_server,
     hide_password,
-    overrides,
     plain_settings,
     refuse_unknown,
     validate_config,
@@ -48,13 +44,6 @@ _VERSION = "1.3"  # of Hydra, whose defaults hold
 _UNKNOWN = re.compile(r"Could not override '([^']+)'")
 _NO_OPTION = re.compile(r"Could not find '(\S+)/([^/']+)'")
 _OPTIONS = re.compile(r"Available options in '[^']+':((?:\s+\S+)+)")
-_EXTRAS = {
-    "hydra/launcher/joblib": "parallel",
-    "hydra/launcher/submitit_local": "slurm",
-    "hydra/launcher/submitit_slurm": "slurm",
-    "hydra/sweeper/optuna": "optuna",
-}  # options of Hydra's plugins -> extra of this package
-_AMBIGUOUS = re.compile(r"Ambiguous value for argument '(.+?)'\n")
 
 
 def suggest(error: Exception, name: str) -> str | None:
@@ -65,88 +54,34 @@ def suggest(error: Exception, name: str) -> str | None:
         name: the primary configuration.
     """
     text = str(error).split("Config search path:")[0]
-    ambiguous = _AMBIGUOUS.search(text)
-    if isinstance(error, OverrideParseException) or ambiguous:
-        override = ambiguous[1] if ambiguous else str(getattr(error, "override", ""))
-        quoted = quote_value(override)
-        return quoted and f"{override} cannot be read: quote the value, as in {quoted}"
     if unknown := _UNKNOWN.search(text):
-        names, group = _names(name), unknown[1].partition(".")[0]
-        others = {
-            f"{group}.{key}": path.stem
-            for path in sorted((CONF / group).glob("*.yaml"), reverse=True)
-            for key in map(str, OmegaConf.load(path))
-        }
-        if unknown[1] in others:
-            return f"there is no setting or group {unknown[1]}, but {group}={others[unknown[1]]} has it"
-        near = get_close_matches(unknown[1], [*names, *others], 1, 0.8)
-        option = f", which {group}={others[near[0]]} has" if near and near[0] not in names else ""
-        return f"there is no setting or group {unknown[1]}: did you mean {near[0]}{option}?" if near else None
-    chosen, options = _NO_OPTION.search(text), _OPTIONS.search(text)
-    if not chosen or not options:
+        with initialize_config_dir(str(CONF), version_base=_VERSION):
+            paths = [path for path, _ in walk_settings(OmegaConf.to_container(compose(name)))]
+        names = [*(folder.name for folder in CONF.iterdir() if folder.is_dir()), *map(".".join, paths)]
+        group, _, key = unknown[1].partition(".")
+        options = [path for path in sorted((CONF / group).glob("*.yaml")) if key in OmegaConf.load(path)]
+        if options:
+            return f"there is no setting or group {unknown[1]}, but {group}={options[0].stem} has it"
+        near = get_close_matches(unknown[1], names, 1, 0.8)
+        return f"there is no setting or group {unknown[1]}: did you mean {near[0]}?" if near else None
+    chosen, listed = _NO_OPTION.search(text), _OPTIONS.search(text)
+    if not chosen or not listed:
         return None
-    names, extra = options[1].split(), _EXTRAS.get(f"{chosen[1]}/{chosen[2]}")
-    near = get_close_matches(chosen[2], names, 1)
+    near = get_close_matches(chosen[2], listed[1].split(), 1)
     hint = f"did you mean {near[0]}? There are" if near else "there are"
-    hint = f'pip install "tactile-skin[{extra}]" adds it; there are' if extra else hint
-    return f"there is no {chosen[1]}={chosen[2]}: {hint} {', '.join(names)}"
+    return f"there is no {chosen[1]}={chosen[2]}: {hint} {', '.join(listed[1].split())}"
 
 
-def quote_value(override: str) -> str | None:
-    """Return an override with a quoted value, as a shell takes it; None if that does not help."""
-    key, equals, value = override.partition("=")
-    escaped = value.replace("\\", "\\\\").replace('"', '\\"')
-    quoted = f'{key}="{escaped}"'
-    try:
-        parsed = OverridesParser.create().parse_override(quoted)
-    except HydraException:
-        return None
-    return shlex.quote(quoted) if equals and parsed.value() == value else None
-
-
-def _names(name: str) -> list[str]:
-    """Return the groups and settings of a configuration by their names on the command line."""
-    with initialize_config_dir(str(CONF), version_base=_VERSION):
-        paths = (path for path, _ in walk_settings(OmegaConf.to_container(compose(name))))
-    return [*(folder.name for folder in CONF.iterdir() if folder.is_dir()), *map(".".join, paths)]
-
-
-# Checks of a configuration that need no run, made before anything is loaded.
-
-
-_GROUPS = ("body", "layout", "touch", "device", "contact")
-
-
-def check_quickly(config: Config, run: str | None, overrides: Sequence[str]) -> None:
-    """Refuse settings of a skin that no skin has, and a port that does not exist.
-
-    Args:
-        config: of a command; groups that it lacks are not checked.
-        run: that the command uses; None: none.
-        overrides: of its command line. The groups that they name are checked further, which imports torch.
+def output(out: str | None, example: str, *endings: str) -> Path:
+    """Return the path that ``out=`` gives.
 
     Raises:
-        InputError: naming the setting, or the port.
+        InputError: no path, or one with another ending than these; the ending of a folder is empty.
     """
-    # They import numpy, for which a mistyped setting must not wait.
-    from skin.body.base import check_plausibility
-
-    groups: dict[str, Any] = {name: group for name in _GROUPS if (group := getattr(config, name))}
-    check_groups({name: groups[name] for name in ("body", "layout") if name in groups})
-    check_plausibility(groups)
-    device = groups.get("device", {})
-    if isinstance(port := device.get("port"), str):
-        from skin.wire.reader import Port, check_port
-
-        Port.select({name: value for name, value in device.items() if value is not None})
-        check_port(port)
-    if run is not None and not run.endswith(".onnx"):
-        named = groups.keys() & {override.split("=")[0].split(".")[0] for override in overrides}
-        check_groups({name: groups[name] for name in {"device", "contact"} & named})
-        if "touch" in named:
-            from skin.touch.fingertips import read_touch
-
-            read_touch(groups["touch"])
+    if not out or not Path(out).name or Path(out).suffix not in endings:
+        kinds = " or ".join(f"a {ending} file" if ending else "a folder" for ending in endings)
+        raise InputError(f"out={out} must be {kinds}: add out={example}")
+    return Path(out).expanduser()
 
 
 # What Hydra raises on overrides such as layout=[[1]] or model=1, and on files that are not YAML, before a
@@ -186,7 +121,7 @@ def command(name: str = "train") -> Callable[[Callable[..., Any]], Callable[...,
             try:
                 own, checked = _verb_settings(config, task), validate_config(config)
                 check_server(checked.tracking.uri)
-                check_quickly(checked, own.get("run"), overrides())
+                _check_port(checked.device)
                 return task(checked, **own)
             except Exception as error:
                 refused = to_input_error(error)
@@ -198,7 +133,6 @@ def command(name: str = "train") -> Callable[[Callable[..., Any]], Callable[...,
                 sys.exit(2)
 
         def main(words: Sequence[str] | None = None) -> None:
-            _log_to_stderr()
             started.clear()  # where this process ran the command before
             arguments = [
                 hide_password(word) if "tracking.uri=" in word else word
@@ -256,16 +190,20 @@ def notify(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
 
 
-def _log_to_stderr() -> None:
-    """Write the messages of this package to standard error; results go to standard output."""
-    logger = logging.getLogger("skin")
-    logger.setLevel(logging.INFO)
-    # A handler of an earlier command in this process would write to the standard error of that time.
-    logger.handlers = [logging.StreamHandler()]
+def _check_port(device: Mapping[str, Any] | None) -> None:
+    """Refuse a port that does not exist, before anything that takes seconds."""
+    if isinstance(port := (device or {}).get("port"), str):
+        from skin.wire.reader import check_port
+
+        check_port(port)
 
 
 def _run(job: Callable[[DictConfig], Any], name: str, words: Sequence[str]) -> None:
     """Compose a configuration and run a job with it, or print help."""
+    logger = logging.getLogger("skin")
+    logger.setLevel(logging.INFO)
+    # To standard error; a handler of an earlier command in this process would write to that of its time.
+    logger.handlers = [logging.StreamHandler()]
     warnings.formatwarning = lambda message, *_: f"warning: {message}\n"
     version.setbase(_VERSION)
     parser = get_args_parser()
@@ -278,18 +216,9 @@ def _run(job: Callable[[DictConfig], Any], name: str, words: Sequence[str]) -> N
         ]
     )
     if options.help:
-        _print(_help(sys.modules[job.__module__].__doc__ or "", options.config_name or name, options))
+        print(_help(sys.modules[job.__module__].__doc__ or "", options.config_name or name, options))
         return
     _run_hydra(options, parser, job, str(CONF), name)
-
-
-def _print(text: str) -> None:
-    """Print a text; end quietly where nobody reads it to the end, as in ``skin VERB --help | head``."""
-    try:
-        print(text, flush=True)
-    except BrokenPipeError:
-        # Python flushes once more when it ends.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 _UNSHOWN = re.compile(

@@ -6,8 +6,7 @@
 Without device= the touch is simulated.
 """
 
-from skin.commands._command import command
-from skin.errors import InputError
+from skin.commands._command import command, output
 from skin.runs.configuration import Config
 
 
@@ -21,12 +20,7 @@ def main(
     index: int | None,
 ) -> None:
     """Write a GIF or PNG of a simulated or recorded touch."""
-    if out is None or not out.endswith((".gif", ".png")):
-        raise InputError(
-            f"an animation is a .gif file, a still a .png file, got out={out}: add out=touch.gif"
-        )
-
-    from pathlib import Path
+    path = output(out, "touch.gif", ".gif", ".png")
 
     from skin.plot.animation import read_scene, simulate_scene, still, write_animation
     from skin.runs.build import build_device
@@ -36,5 +30,5 @@ def main(
         scene = read_scene(device, index or 0)
     else:
         scene = simulate_scene(device.simulation, labels, shape, config.seed, view == "skin3d")
-    path = (still if out.endswith(".png") else write_animation)(scene, str(view), Path(out).expanduser())
+    (still if path.suffix == ".png" else write_animation)(scene, view, path)
     print(f"{path}: {scene.title}, {len(scene.readings)} frames at {scene.rate:g} Hz")

@@ -11,7 +11,6 @@ calibrate.demo=true first writes the session of an emulated device: no hardware 
 
 import sys
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 from skin.commands._command import command
@@ -32,51 +31,40 @@ def main(
     """Print the errors on held-out presses, or what a known load gives, and write the calibration."""
     if session is None:
         raise InputError("which session? add session=bench.csv, or try session=demo.csv calibrate.demo=true")
-    files = [presses, None if calibrate["demo"] else session]
-    if missing := [name for name in files if name and not Path(name).expanduser().exists()]:
-        raise InputError(f"no file {missing[0]}: calibrate.demo=true makes a session without hardware")
     by_load = weight is not None or base is not None
     if by_load and presses is not None:
         raise InputError("a known load replaces the gauge: leave out presses=, or weight= and base=")
 
-    from rich.console import Console
-
-    from skin.calibration import bench, known_loads
+    from skin.calibration.bench import BenchSettings, read_bench_session
     from skin.calibration.fit import fit_presses, print_calibration
-    from skin.calibration.wiring import Confirmed, device_channels, wired_bench
+    from skin.calibration.known_loads import KnownLoad, fit_known_load, write_demo
+    from skin.calibration.wiring import ordered, wired_bench
     from skin.device.calibration import write_calibration
     from skin.runs.build import build_device
 
-    confirmed = Confirmed(calibrate["places"], calibrate["channels"], calibrate["broken"])
-    units = bench.Units(calibrate["force_scale"], calibrate["time_scale"])
+    settings = BenchSettings.of(calibrate, "calibrate")
     device = build_device(config).simulated("a calibration fits the simulation to a skin")
-    load = known_loads.KnownLoad.of(weight, base, device.size) if by_load else None
+    load = KnownLoad.of(weight, base, device.size) if by_load else None
     if calibrate["demo"]:
-        print(
-            known_loads.write_demo_session(device, calibrate, session)
-            if load is None
-            else known_loads.write_demo_placements(device, load, calibrate, session)
-        )
-    shape, metadata = (calibrate["indenter"], calibrate["radius"]), dict[str, Any](session=session)
-    recorded = bench.read_bench_session(session, *shape, calibrate["unit"], units)
+        print(write_demo(device, load, calibrate["bits"], session))
+        settings = replace(settings, unit="adc" if calibrate["bits"] else settings.unit)
+    recorded = read_bench_session(session, settings, presses)
+    errors = None
     if load is not None:
-        result = known_loads.fit_known_load(device, confirmed.ordered(recorded), load)
-        known_loads.print_known_load(result)
-        calibration = result.calibration
+        calibration = fit_known_load(device, ordered(recorded, settings), load)
     else:
-        rows = None if presses is None else bench.read_gauge(presses, *shape, calibrate["delay"], units)
-        clip = device.imperfection.clip if units.force_scale is None else None
-        with Console(stderr=True).status("fitting"):
-            calibration, errors = fit_presses(
-                wired_bench(device, recorded, rows, confirmed), calibrate["held_out"], clip
-            )
-        print_calibration(calibration, errors)
-        if not errors.helps:
-            print(
-                f"The calibration does not reduce the error, so {out} was not written: is the layout, the "
-                "body or the clock wrong?"
-            )
-            sys.exit(1)
-        metadata |= {"presses_file": presses}
-    metadata, channels = {**calibration.about, **metadata}, device_channels(recorded, confirmed)
-    print(write_calibration(replace(calibration, about=metadata, channels=channels), out))
+        clip = device.imperfection.clip if settings.force_scale is None else None
+        calibration, errors = fit_presses(
+            wired_bench(device, recorded, settings), calibrate["held_out"], clip
+        )
+    print_calibration(calibration, errors)
+    if errors and not errors.helps:
+        print(
+            f"The calibration does not reduce the error, so {out} was not written: is the layout, the body "
+            "or the clock wrong?"
+        )
+        sys.exit(1)
+    about = {**calibration.about, "session": session, "presses_file": presses}
+    channels = list(ordered(recorded, settings).channels or ())
+    channels = [] if channels == sorted(channels) else channels
+    print(write_calibration(replace(calibration, about=about, channels=channels), out))

@@ -42,14 +42,14 @@ def main(
     device = build_device(config).simulated("a session is compared with a simulation")
     comparison = compare_session(device, session, presses, compare)
     agreement = [] if run is None else compare_predictions(run, config, comparison, device)
-    if compare["miss_rate"] is not None and (run is None or comparison.bench is None):
-        raise InputError("compare.miss_rate needs presses of known force, and run= whose alarm they test")
-    if run is not None and comparison.bench is not None:
-        agreement += _test_alarm(run, config, comparison.bench, device, compare)
+    bench = comparison.bench
+    alarm = _test_alarm(run, config, bench, device, compare) if run and bench else []
+    if compare["miss_rate"] is not None and not alarm:
+        raise InputError("compare.miss_rate needs presses of known force, and run= with an alarm to test")
     calibrated = f" with {device.calibration}." if device.calibration else ", not calibrated."
     page, picture = publish_comparison(
         comparison,
-        agreement,
+        [*agreement, *alarm],
         f"Session {session}, simulated by {type(device.model).__name__}{calibrated}",
         compare["shown"],
         results(out),
@@ -76,8 +76,6 @@ def _test_alarm(
     used = replace(trained, device={**config.device, "port": "that of the session"})
     model = load_model(run, trained, used, alarm=False)
     if not model.alarms:
-        if compare["miss_rate"] is not None:
-            raise InputError(f"run={name} has no label dangerous: leave compare.miss_rate out")
         return []
     rate, patience = 1 / float(np.median(np.diff(bench.session.time))), DebounceSettings()
     conditions = model.live_conditions(rate, patience.alarm, False)

@@ -16,8 +16,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from skin.commands._command import command
-from skin.core.files import tabular, whole
+from skin.commands._command import command, output
+from skin.core.files import write
 from skin.errors import InputError
 from skin.runs.configuration import Config, overrides
 
@@ -32,22 +32,16 @@ def main(
     out: str | None,
 ) -> None:
     """Read the files of a mapping or by a function, a recording or a session, and write one file or set."""
-    if (from_ is None) == (reader is None) or out is None:
+    if (from_ is None) == (reader is None):
         raise InputError("skin convert needs from= or reader=, and out=, as in from=map.yaml out=x.parquet")
-    source, target = Path(from_ or "map.yaml").expanduser(), Path(out).expanduser()
+    source = Path(from_ or "map.yaml").expanduser()
     if (source / "about.json").is_file():
-        from pyarrow.csv import write_csv
-
         from skin.calibration.bench import load_table
 
-        if target.suffix != ".csv":
-            raise InputError(f"the table of a session is a .csv file, got {out}: give out=x.csv")
-        table, _ = load_table(source, "session")
-        with whole(target) as partial:
-            write_csv(table, partial)
-        print(f"{target}: {len(table)} frames")
+        target, (table, _) = output(out, "x.csv", ".csv"), load_table(source, "session")
+        print(f"{write(table.to_csv(index=False), target)}: {len(table)} frames")
         return
-    file = target if target.suffix in ("", ".mcap") else tabular(out, "a recording")
+    file = output(out, "x.parquet", ".parquet", ".csv", ".mcap", "")
 
     from skin.device.conversion import convert_files, read_by_function, summarise_conversion
     from skin.device.files import write_recording

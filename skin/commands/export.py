@@ -22,10 +22,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from annotated_types import Ge, MinLen
 from pydantic import PositiveFloat
 
-from skin.commands._command import command
+from skin.commands._command import command, output
 from skin.core.files import results
 from skin.core.messages import quiet
-from skin.core.progress import Steps
 from skin.core.settings import check_settings
 from skin.errors import InputError
 from skin.runs.configuration import Config, overrides, settings_of
@@ -35,16 +34,6 @@ if TYPE_CHECKING:
     from skin.evaluation.decisions import LiveConditions
     from skin.runs.build import TorchModel
     from skin.runs.run import FinishedRun
-
-_THRESHOLDS = "choosing the thresholds of the alarm for touches"
-# Expected seconds of each step, for the fraction that is done.
-_STEPS = {
-    "loading the run and the threshold of its alarm": 25.0,
-    "tuning the contact threshold": 10.0,
-    _THRESHOLDS: 80.0,
-    "simulating touches to compare": 10.0,
-    "writing the file and comparing it": 15.0,
-}
 
 
 @command("export")
@@ -71,30 +60,23 @@ def main(
         raise InputError("only a folder takes name and licence: add format=folder, or leave them out")
     else:
         check_settings(_export_file, export, "export")
-        with Steps(_STEPS) as steps:
-            if format == "onnx":
-                _export_file(run, config, _path(out, ".onnx"), steps, **export)
-            elif format == "c":
-                _export_header(run, config, _path(out, ".h"), export["touch"], export["rates"])
-            else:
-                from skin.evaluation.alarm import ship_thresholds
+        if format == "onnx":
+            _export_file(run, config, output(out, "skin.onnx", ".onnx") if out else None, **export)
+        elif format == "c":
+            _export_header(
+                run, config, output(out, "skin.h", ".h") if out else None, export["touch"], export["rates"]
+            )
+        else:
+            from skin.evaluation.alarm import ship_thresholds
 
-                _, _, model, conditions = _load(run, config, export["touch"], export["rates"], alarm=False)
-                ship_thresholds(model.alarm, conditions, print)
-
-
-def _path(out: str | None, suffix: str) -> Path | None:
-    """Return the path that the user gives, of a file with the suffix; None: of ``results``."""
-    if out is not None and Path(out).suffix != suffix:
-        raise InputError(f"out={out} must end in {suffix}: as in out=skin{suffix}")
-    return None if out is None else Path(out).expanduser()
+            _, _, model, conditions = _load(run, config, export["touch"], export["rates"], alarm=False)
+            ship_thresholds(model.alarm, conditions, print)
 
 
 def _export_file(
     name: str,
     config: Config,
     path: Path | None,
-    steps: Steps,
     touch: PositiveFloat | None,
     touches: Annotated[int, Ge(1)],
     rates: Annotated[Sequence[PositiveFloat], MinLen(1)] | None,
@@ -105,7 +87,6 @@ def _export_file(
         name: of the run.
         config: of the command.
         path: of the file; None: in ``results``.
-        steps: to be shown.
         touch: contact threshold, N above the baseline; None: as in the run.
         touches: number of touches on which the file is compared with the run.
         rates: of devices, Hz, for each of which the threshold of the alarm is chosen; None: that of the run's
@@ -124,19 +105,15 @@ def _export_file(
     module = model.learner.pipeline(model.sites)  # refused before anything else is simulated
     if advice := equation10_warning(run.stored):
         print(advice, file=sys.stderr)
-    steps.begin("tuning the contact threshold")
     described = replace(model.describe(), skin=describe_skin(settings_of(whole), model.positions))
     if "simulator" in run.stored.device and model.threshold is not None:
-        steps.begin(_THRESHOLDS)
         described = replace(described, **_choose_thresholds(model.alarm, conditions))
     path = path or results(None) / f"{run.title.split()[0]}_{run.identity[:8]}.onnx"
-    steps.begin("simulating touches to compare")
     compared = (
         device.fresh_touches(touches)
         if (device := model.device.reference)
         else model.device.touches("test")[:touches]
     )
-    steps.begin("writing the file and comparing it")
     difference = write_model(module, described, compared, path)
     print(f"{path}: differs from the run by {difference:.1g} at most on {len(compared)} touches")
 

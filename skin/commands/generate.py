@@ -8,26 +8,14 @@ killed continues when it is repeated. A file also has the displacements under th
 the touches, and warns if the shape alone predicts a label.
 """
 
-from pathlib import Path
-
-from skin.commands._command import command
-from skin.errors import InputError
+from skin.commands._command import command, output
 from skin.runs.configuration import Config, settings_of
 
 
 @command("generate")
 def main(config: Config, n: int, out: str | None) -> None:
     """Draw a budget of n gestures and write readings, labels and parameters."""
-    if out is None:
-        raise InputError(
-            "out is missing: add out=touches.parquet or out=touches.csv, or out=touches for a folder"
-        )
-    path = Path(out).expanduser()
-    if path.suffix not in ("", ".parquet", ".csv"):
-        raise InputError(
-            f"touches are written to a .parquet or .csv file, or to a folder, got {out}: add "
-            "out=touches.parquet, or out=touches for a folder"
-        )
+    path = output(out, "touches.parquet", ".parquet", ".csv", "")
 
     from skin.runs.build import build_device
     from skin.runs.generation import generate_data_set, generate_file

@@ -10,20 +10,17 @@ Listens for seconds=, or until Ctrl-C.
 import signal
 import sys
 from contextlib import closing, suppress
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from skin.commands._command import command
 from skin.errors import InputError
 from skin.runs.configuration import Config
 
-if TYPE_CHECKING:
-    from skin.wire.reader import Port
-
 _ENOUGH = 5.0  # s of a stream that show what a board sends
 
 
 @command("listen")
-def main(config: Config, n: int | None, seconds: float | None, adapter: Any) -> None:
+def main(config: Config, seconds: float | None, adapter: Any) -> None:
     """Print rate and errors once a second, and statistics of each channel at the end."""
     device = config.device
     if device["port"] is None:
@@ -31,16 +28,15 @@ def main(config: Config, n: int | None, seconds: float | None, adapter: Any) -> 
             "device.port is missing: add device.port=/dev/ttyACM0 or device.port=socket://HOST:NUMBER"
         )
 
-    from skin.wire.formats import SensorCountError
     from skin.wire.reader import Port, SkinDisconnected, SkinTimeout
     from skin.wire.skin import PortMonitor, open_skin
 
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     settings = Port.select(device)
     if settings.frames.kind == "auto":
-        _propose(settings, _ENOUGH if seconds is None else min(seconds, _ENOUGH))
+        _propose(str(settings.port), settings.baudrate, _ENOUGH if seconds is None else min(seconds, _ENOUGH))
         return
-    with open_skin(settings, None if n is None else range(n)) as skin:
+    with open_skin(settings, None) as skin:
         listener = PortMonitor(skin)
         try:
             with suppress(KeyboardInterrupt):
@@ -48,15 +44,10 @@ def main(config: Config, n: int | None, seconds: float | None, adapter: Any) -> 
                     print(line, flush=True)
         except (SkinTimeout, SkinDisconnected) as error:
             raise InputError(f"{device['port']}: {error}") from error
-        except SensorCountError as error:
-            raise InputError(
-                f"n={n}, but the device sends {error.sent} values per frame: give n={error.sent}, or "
-                "leave it out"
-            ) from error
         print(listener.summary())
 
 
-def _propose(settings: "Port", seconds: float) -> None:
+def _propose(port: str, baudrate: int, seconds: float) -> None:
     """Print an adapter that reads the board, as YAML to paste, with what it makes of it in comments."""
     from time import monotonic
 
@@ -64,7 +55,7 @@ def _propose(settings: "Port", seconds: float) -> None:
     from skin.wire.reader import PortStream
 
     pieces, begin = list[tuple[float, bytes]](), monotonic()
-    with closing(PortStream(str(settings.port), settings.baudrate)) as stream, suppress(OSError):
+    with closing(PortStream(port, baudrate)) as stream, suppress(OSError):
         while (now := monotonic() - begin) < seconds:
             if data := stream.read():
                 pieces.append((now, data))

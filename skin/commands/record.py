@@ -7,27 +7,21 @@ device=recording; record.finish=true writes only that.
 """
 
 from contextlib import suppress
-from pathlib import Path
 from typing import Any
 
-from skin.commands._command import command, notify
-from skin.errors import InputError
+from skin.commands._command import command, notify, output
 from skin.runs.configuration import Config
 
 
 @command("record")
 def main(config: Config, out: str | None, seconds: float | None, record: dict[str, Any]) -> None:
     """Record raw frames to a session, then convert its gestures to a recording."""
-    if out is None or Path(out).suffix in (".csv", ".parquet") or not Path(out).name:
-        raise InputError(f"a session is a folder, got out={out}: give out=session")
-    if unknown := sorted(set(record) - {"free", "finish"}):
-        raise InputError(f"record has no {unknown[0]}: it takes free, finish")
+    path = output(out, "session", "")
 
     from skin.record.serial import convert_session, record_session, require_port
     from skin.runs.build import build_device
 
     device = require_port(build_device(config))
-    path = Path(out).expanduser()
     if not record["finish"]:
         with suppress(KeyboardInterrupt):
             record_session(device, path, seconds, record["free"], notify)

@@ -55,7 +55,10 @@ def to_input_error(error: Exception) -> InputError | None:
             )
         link = link.__cause__ or (None if link.__suppress_context__ else link.__context__)
     if isinstance(error, OverrideParseException):
-        return InputError(f"{error.override} cannot be read as an override: {one_line(error)}")
+        return InputError(
+            f"{error.override} cannot be read as an override, quote its value, as in 'out=\"a (1).csv\"': "
+            f"{one_line(error)}"
+        )
     if isinstance(error, InstantiationException):
         cause = error.__cause__
         if isinstance(cause, InputError):
@@ -92,6 +95,7 @@ _LEVELS = {
     "pytorch_lightning.utilities.rank_zero": logging.ERROR,
     "alembic": logging.WARNING,
     "mlflow": logging.WARNING,
+    "urllib3.connectionpool": logging.ERROR,  # else a line for each repeated request to a tracking server
 }
 
 
@@ -101,14 +105,6 @@ def quiet() -> None:
         logger = logging.getLogger(name)
         logger.handlers.clear()
         logger.setLevel(level)
-    logging.getLogger("urllib3.connectionpool").addFilter(_rephrase)
     # One task needs no srun.
     for text in ("treespec", "does not have many workers", "`srun` command is available"):
         warnings.filterwarnings("ignore", message=f".*{text}")
-
-
-def _rephrase(record: logging.LogRecord) -> bool:
-    """Say in plain words that a request to the tracking server is repeated."""
-    if "/mlflow" in str(record.args):
-        record.msg, record.args = "the tracking server does not answer: trying again", ()
-    return True

@@ -110,15 +110,12 @@ def load_npz(path: Path, maximum: int = _BYTES) -> dict[str, np.ndarray]:
         maximum: largest total size of the arrays and their headers, bytes.
 
     Raises:
-        ValueError: no such file, objects, larger arrays, or shapes that do not match the data.
-        OSError: unreadable.
+        ValueError: no such file, unreadable, objects, larger arrays, or shapes that do not match the data.
     """
     try:
         check_archive(path, maximum)
         with np.load(path, allow_pickle=False) as file:
             return dict(file)
-    except OSError:
-        raise
     except Exception as error:  # whatever zipfile, zlib, numpy and the parser of its header raise
         raise ValueError(" ".join(str(error).split()) or "it is cut off") from error
 
@@ -183,8 +180,7 @@ class ChecksumError(ValueError):
     """A file is not as it was written; its argument, if any, is what fixes that."""
 
     def __str__(self) -> str:
-        reason = "it is damaged or was changed: its checksum differs from its content"
-        return ": ".join([reason, *self.args])
+        return ": ".join(["it is damaged or was changed: its checksum differs from its content", *self.args])
 
 
 def sha256(content: bytes) -> str:

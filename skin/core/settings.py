@@ -72,8 +72,7 @@ def check_settings(
     for key, value in ((str(key), value) for key, value in settings.items()):
         if key in parameters and (wrong := _explain_refusal(parameters[key].annotation, value)):
             label, default = f"{name}.{key}".removeprefix("."), _written(parameters[key].default)
-            text = str(list(value) if isinstance(value, tuple) else value)
-            text = text if len(text) <= _LONGEST else f"{text[:_LONGEST]}..."
+            text = str(list(value) if isinstance(value, tuple) else value)[:_LONGEST]
             example = f": as in {label}={default}" if default else ""
             raise InputError(f"{label}={text} {wrong}{example}")
         if not (key in parameters or key.startswith("_") or takes_others):

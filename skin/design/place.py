@@ -95,7 +95,7 @@ class Place:
     Args:
         count: number of sensors, with those that stay; None: as many as the layout.
         touches: number of sampled touches.
-        seed: of the touches, and of the random layouts for comparison.
+        seed: of the touches.
         noise: standard deviation of a reading, N; None: the median of the device's sensors.
         distance: least distance of a new sensor from all others, m.
         raster: pitch of the sites, or pitches along x and y, m; None: the cells of the body.
@@ -141,7 +141,7 @@ class Place:
         clip = _median(device.constants.clip)
         covariance, frames = reading_covariance(device, problem.sensors, self.touches, self.seed, clip)
         with Console(stderr=True).status("placing sensors"):
-            chosen, outcome = problem.solve(covariance / noise**2, self.seed)
+            chosen, outcome = problem.solve(covariance / noise**2)
         settings: dict[str, Any] = {"sites": problem.sites, "touches": self.touches, "frames": frames}
         settings |= {"noise_N": noise, "clip_N": clip, "distance_m": self.distance}
         content = settings | outcome | {"seconds": round(time.perf_counter() - started, 1)}

@@ -18,7 +18,6 @@ from scipy.linalg import solve
 from skin.body.base import AbstractBody, Sensors, overlaps
 from skin.body.layout import Grid, place_sensors
 from skin.core.files import candidates
-from skin.core.rng import Stream, generator
 from skin.device.simulated import Simulated
 from skin.errors import InputError
 
@@ -257,7 +256,6 @@ def _covered(
 # The sites of a skin, the sensors that stay, and other layouts for comparison.
 
 
-_RANDOM = 100  # layouts
 _TILE = 4.0  # largest aspect ratio of the tiles of a grid
 
 
@@ -327,12 +325,11 @@ class PlacementProblem:
         layout = len(sites) + np.arange(len(old))
         return cls(body, sensors, len(sites), layout[staying], layout, count, distance)
 
-    def solve(self, signal: np.ndarray, seed: int) -> tuple[np.ndarray, dict[str, Any]]:
+    def solve(self, signal: np.ndarray) -> tuple[np.ndarray, dict[str, Any]]:
         """Return the chosen sensors, in the order of the layout, and what is known of them.
 
         Args:
             signal: covariance of the readings of all sensors divided by the variance of the noise.
-            seed: of the random layouts.
         """
         eligible = np.concatenate([np.arange(self.sites), self.kept])
         fixed = self.sites + np.arange(len(self.kept))
@@ -342,9 +339,7 @@ class PlacementProblem:
         fresh = eligible[sites[len(fixed) :]]
         x, y = self.sensors.positions[fresh, :2].T.round(6)
         chosen = np.concatenate([self.kept, fresh[np.lexsort((x, y))]])
-        drawn = best_of_random(inner, self.count, near, fixed, seed)
         others = {"configured": self.layout, "grid": np.arange(self.layout[-1] + 1, len(signal))}
-        others["best_of_random"] = eligible[np.array(drawn, dtype=int)]
         layouts = {
             name: {"sensors": len(rows), "information_nats": mutual_information(signal, rows)}
             for name, rows in others.items()
@@ -352,20 +347,6 @@ class PlacementProblem:
         }
         information = mutual_information(inner, sites)
         return chosen, {"sensors": self.count, "information_nats": information, "layouts": layouts}
-
-
-def best_of_random(
-    signal: np.ndarray, count: int, near: np.ndarray, fixed: Sites = (), seed: int = 0
-) -> list[int]:
-    """Return the most informative of 100 random choices of sites; none if the sites do not fit in any.
-
-    Args:
-        signal, count, near, fixed: as of :func:`skin.design.placement.greedy`.
-        seed: of the choices.
-    """
-    draws = (_draw_sites(near, count, fixed, generator(Stream.PLACEMENT, seed, 0, n)) for n in range(_RANDOM))
-    whole = (sites for sites in draws if len(sites) == count)
-    return max(whole, key=lambda sites: mutual_information(signal, sites), default=[])
 
 
 def _find_staying(keep: str | Sequence[int], sensors: int, count: int) -> np.ndarray:
@@ -395,14 +376,3 @@ def _grid(body: AbstractBody, count: int, footprint: tuple[float, float], depth:
     if aspect(rows)[0] > _TILE:
         return []
     return [Grid(rows, count // rows, footprint, depth=depth).sensors(body)]
-
-
-def _draw_sites(near: np.ndarray, count: int, fixed: Sites, draw: np.random.Generator) -> list[int]:
-    """Return sites that are drawn at random, or fewer if no more fit."""
-    sites = [int(site) for site in fixed]
-    taken = np.asarray(near[sites].any(axis=0))
-    for site in map(int, draw.permutation(len(near))):
-        if len(sites) < count and not taken[site]:
-            sites.append(site)
-            taken |= near[site]
-    return sites

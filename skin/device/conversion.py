@@ -412,18 +412,15 @@ def read_by_function(reader: str, path: Path, options: Mapping[str, Any], *skin:
 
 
 def summarise_conversion(recording: Recording) -> str:
-    """Return a line with the numbers of touches, readings, labels that are known, targets and groups."""
+    """Return a line with the numbers of touches, readings, labels that are known, parameters and groups."""
     touches, metadata = recording.touches, recording.metadata
     (batch, time, sensors), labels = touches.readings.shape, touches.labels
     parts = ["no labels"] if labels is None else []
     for name, column in zip(recording.task.names, () if labels is None else labels.T, strict=False):
         parts.append(f"{name} in {int(column.nansum())} of {int((~column.isnan()).sum())}")
     parts += [f"classes {', '.join(metadata['classes'])}"] if "classes" in metadata else []
-    parts += [
-        f"{name} of {int((~values.isnan()).sum())}"
-        for name, values in recording.parameters.items()
-        if name != CLASS and not name.startswith(GROUP)
-    ]
+    names = [name for name in recording.parameters if name != CLASS and not name.startswith(GROUP)]
+    parts += [f"{len(names)} parameters, as {', '.join(names[:3])}"] if names else []
     parts += [f"{len(values)} of {name}" for name, values in metadata.get("groups", {}).items()]
     return ", ".join(
         [

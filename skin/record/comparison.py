@@ -18,14 +18,12 @@ from matplotlib.figure import Figure
 
 from skin.calibration.bench import (
     BenchData,
-    Units,
+    BenchSettings,
     build_bench_data,
     pressed_images,
     pressed_peaks,
     read_bench_session,
-    read_gauge,
 )
-from skin.calibration.wiring import turn_gauge
 from skin.core.files import write
 from skin.core.rng import Stream, generator
 from skin.device.base import Blank
@@ -134,16 +132,14 @@ def compare_session(
     """
     if presses is None and Path(path).expanduser().is_dir():
         return compare_gestures(device, path, settings["seed"])
-    shape = settings["indenter"], settings["radius"]
-    units = Units(settings["force_scale"], settings["time_scale"], "compare")
-    session = read_bench_session(path, *shape, settings["unit"], units)
+    files = BenchSettings.of(settings, "compare")
+    session = read_bench_session(path, files, presses)
     calibration = device.imperfection.calibration
     if calibration is not None and calibration.channels and session.channels is None:
         session = replace(session, raw=session.raw[:, list(calibration.channels)])
-    rows = session.gauge if presses is None else read_gauge(presses, *shape, settings["delay"], units)
-    if rows is not None:
-        rows = turn_gauge(rows, settings["places"], device.size)
-    return compare_presses(device, build_bench_data(device, session, rows), settings["scale"])
+    if session.gauge is not None:
+        session = replace(session, gauge=session.gauge.turned(files.places, device.size))
+    return compare_presses(device, build_bench_data(device, session), settings["scale"])
 
 
 def compare_predictions(

@@ -122,7 +122,6 @@ def test_a_scale_is_verified_by_its_check_alone(data):
     [
         ({"scale": 0.01}, "scale"),
         ({"scale": -0.02}, "scale"),
-        ({"name": "arm-R"}, "device"),
         ({"positions": POSITIONS + 0.001}, "layout"),
     ],
 )

@@ -1,7 +1,7 @@
 """`skin adapt` makes a run of another skin from few gestures, which all commands take."""
 
 import sqlite3
-from contextlib import closing, contextmanager
+from contextlib import closing
 from dataclasses import replace
 
 import pytest
@@ -84,12 +84,6 @@ def test_a_recorded_skin_is_adapted_to_and_the_rest_of_it_is_reported(run, folde
 
 
 @pytest.mark.slow("trains and adapts a run")
-def test_the_new_run_is_shown_live(run, folder, adapted):
-    done = run(folder, "live", f"run={adapted[1]}", "live.touch=0.3", "live.patience.above=0.5", "seconds=2")
-    assert "verdicts" in done.stderr
-
-
-@pytest.mark.slow("trains and adapts a run")
 def test_the_same_adaptation_is_not_repeated(run, folder, adapted):
     parent, made, _ = adapted
     before = runs(folder)
@@ -169,28 +163,3 @@ def test_bad_input_ends_with_2_and_one_sentence(run, folder, adapted, bad, row, 
     done = run(folder, "adapt", f"run={bad['rules'] if row else adapted[0]}", *words, *SMALL, code=2)
     assert reason in done.stderr
     assert query(folder, "select count(*) from runs") == before
-
-
-@contextmanager
-def emulated(begin, folder, seed):
-    """Run an emulator of a skin whose gains and positions nobody knows; give the settings of its port."""
-    hidden = [*OTHER, "device.position_error=0.005", "emulate.speed=10", f"emulate.seed={seed}"]
-    with begin(folder, "emulate", *SKIN, *hidden) as process:
-        port = next(process.lines())
-        yield [f"device.port={port}", "device.scale=0.0390625", "device.labels=announced"]
-
-
-@pytest.mark.slow("trains, records and adapts a run")
-def test_gestures_recorded_at_a_port_make_the_run_better_on_others(run, begin, folder, adapted):
-    for name, seed, count in (("few", 0, 48), ("others", 1, 96)):
-        with emulated(begin, folder, seed) as port:
-            done = run(folder, "record", *SKIN, *port, f"out={name}", f"device.gestures={count}", store=False)
-        assert f"{count} gestures" in done.stdout
-    recorded = ["device=recording", "device.path=few.parquet", "adapt.gestures=48"]
-    done = run(folder, "adapt", f"run={adapted[0]}", *recorded, *QUICK)
-    made, accuracies = runs(folder)[-1], []
-    for one in (adapted[0], made):
-        others = ["device=recording", "device.path=others.parquet", "device.test=all"]
-        done = run(folder, "evaluate", f"run={one}", *others)
-        accuracies.append(metrics(folder, runs(folder)[-1])["same/overall/accuracy"])
-    assert accuracies[1] > accuracies[0] + 0.02

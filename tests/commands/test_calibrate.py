@@ -4,7 +4,7 @@ import pytest
 
 from skin.device.calibration import read_calibration
 
-SMALL = ["layout=grid", "layout.rows=2", "layout.columns=2", "calibrate.protocol.rest=1.5"]
+SMALL = ["layout=grid", "layout.rows=2", "layout.columns=2"]
 
 
 @pytest.mark.slow("fits and generates a data set")

@@ -1,12 +1,15 @@
 """`skin convert` as a person runs it, and a training on what it wrote."""
 
 import sqlite3
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
 import pytest
+import torch
 import yaml
 
+from skin.device.conversion import summarise_conversion
 from skin.device.files import read_recording
 from tests.budget import free
 
@@ -69,6 +72,8 @@ def test_a_folder_is_converted_and_trained_on_by_person(run, converted, tmp_path
     assert said.startswith("x.parquet: 144 touches of 12 frames at 10 Hz, 3 readings, press in 48 of 96, ")
     assert said.endswith("6 of person, positions unknown\n")
     recording = read_recording(path)
+    many = replace(recording, parameters={f"p{number}": torch.zeros(144) for number in range(30)})
+    assert ", 30 parameters, as p0, p1, p2, " in summarise_conversion(many)
     assert recording.touches.labels[:, 0].isnan().sum() == 48
     assert recording.touches.labels[:, 1].isnan().sum() == 36
     train = ["device=recording", f"device.path={path}", "device.test_groups=[p1]", *settings]

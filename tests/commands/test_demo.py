@@ -119,20 +119,3 @@ def test_what_is_killed_leaves_no_process_and_no_port(begin, tmp_path):
         assert children
         assert not any(child.is_running() for child in children)
     assert refuses(page)
-
-
-@pytest.mark.slow("trains a run and starts the demo")
-def test_a_run_of_equation_10_says_why_it_estimates_no_contacts(begin, tmp_path):
-    words = ["run=default_skin", "live.web_port=0", "live.patience.above=0.95", "seconds=10"]
-    with begin(tmp_path, "live", "demo=true", *words) as demo:
-        page = page_of(demo)
-        with suppress(OSError):
-            told = {
-                (one["contacts"]["state"], one["contacts"]["reason"])
-                for one in pictures(page)
-                if not one["stale"]
-            }
-        assert demo.wait(PATIENCE) == 0, demo.err
-    reason = "readings of equation 10 do not add up: use run=any_skin, or a run of simulator=solid"
-    assert told == {("unknown", reason)}
-    assert " ".join(demo.err.split()).count(f"no contacts: {reason}") == 1

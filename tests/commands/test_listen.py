@@ -53,12 +53,6 @@ def test_it_says_what_comes(address):
     ]
 
 
-def test_another_number_of_sensors_ends_with_code_2(address):
-    done = listen(f"device.port={address}", "n=25", "seconds=20", "device.timeout=20")
-    assert done.returncode == 2
-    assert done.stderr == "n=25, but the device sends 3 values per frame: give n=3, or leave it out\n"
-
-
 def test_ctrl_c_ends_it_well(address):
     command = [sys.executable, *LISTEN, f"device.port={address}", "seconds=null"]
     with subprocess.Popen(

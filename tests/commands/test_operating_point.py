@@ -105,15 +105,6 @@ def test_a_profile_gets_a_threshold_of_its_own(folder, found):
     assert abs(found - stored(folder)["threshold"]) > 1e-3
 
 
-@pytest.mark.slow("trains and evaluates once more")
-def test_a_training_stores_the_threshold_of_a_profile(run, found, tmp_path):
-    words = ["experiment=rules", *SKIN, *SMALL, "evaluation.profile=rough"]
-    done = run(tmp_path, "train", *words)
-    assert threshold(" ".join(done.stdout.split())) == found
-    done = run(tmp_path, "evaluate", f"out={tmp_path}/again")
-    assert threshold(done.stdout) == found
-
-
 def test_an_unknown_profile_is_refused_before_anything_is_trained(run, folder, tmp_path):
     for where, words in ((folder, ["evaluate"]), (tmp_path, ["train", "experiment=rules", *SKIN])):
         done = run(where, *words, "evaluation.profile=none_such", code=2)

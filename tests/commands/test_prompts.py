@@ -126,22 +126,6 @@ def test_ctrl_c_at_a_prompt_keeps_what_there_is(person_at, address, tmp_path):
         assert ended(person) == (0, "s.parquet: 1 gestures\n")
 
 
-@pytest.mark.slow("waits for prompts and recordings")
-def test_free_recording_asks_for_nothing_and_goes_on_after_a_kill(person_at, address, tmp_path):
-    command = ["record.py", *SKIN, "out=f", f"device.port={address}", "record.free=true"]
-    with person_at(tmp_path, *command) as person:
-        person.until("gesture 2")
-        person.process.kill()
-    done = len(read_session(tmp_path / "f").gestures)
-    assert done >= 2
-    with person_at(tmp_path, *command, "seconds=5") as person:
-        code, said = ended(person)
-    stored = read_recording(tmp_path / "f.parquet")
-    assert (code, said) == (0, f"f.parquet: {len(stored)} gestures\n")
-    assert len(stored) > done
-    assert stored.touches.labels is None
-
-
 @pytest.mark.slow("trains a run and waits for prompts")
 def test_evaluating_a_person(run, person_at, address, tmp_path):
     own = [f"tracking.uri=sqlite:///{tmp_path}/m.db", f"tracking.artifacts={tmp_path}/a"]

@@ -191,7 +191,7 @@ def test_a_board_of_nine_sensors_is_read_mapped_and_calibrated(board, tmp_path, 
         os.killpg(person.process.pid, signal.SIGINT)  # as Ctrl-C at a terminal
         person.until("5 of 7: calibrate")
         person.types("", "2 20")
-        person.until("9 of 9 sensors have a gain")
+        person.until("placements 9, weight 2.0, base 0.02")
         person.until("6 of 7: check")
         person.types("q")
         person.until("to continue: skin setup device.port=")

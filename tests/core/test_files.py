@@ -19,8 +19,7 @@ from skin.device.touches import Recording
 from skin.errors import InputError
 from skin.evaluation.report import write_probabilities
 from skin.mechanics import array_cache
-from skin.plot import animation, figures
-from skin.plot.animation import simulate_scene
+from skin.plot import figures
 from skin.runs.configuration import Tracking
 from skin.runs.store import Store
 from skin.touch.labels import TOUCH
@@ -98,16 +97,6 @@ def test_numbers_in_json_are_finite_without_digits_of_the_processor():
     content = {"a": [float("inf"), -1e300, 1], "b": {"c": (float("nan"), "NaN")}}
     assert json_line(content) == '{"a": [null, -1e+300, 1], "b": {"c": [null, "NaN"]}}'
     assert json.loads(json_text({"a": float("inf")})) == {"a": None}
-
-
-def test_an_animation_is_whole(tmp_path, configured):
-    from skin.runs.build import build_device
-
-    small = ["data.gestures=10", "simulator=naive", "layout=grid", "layout.rows=2", "layout.columns=2"]
-    scene = simulate_scene(build_device(configured(*small)), [], None, 0, False)
-    with full(500), pytest.raises(InputError, match=r"^cannot write .*x\.gif"):
-        animation.write_animation(scene, "flat", tmp_path / "x.gif")
-    assert not list(tmp_path.iterdir())
 
 
 def test_a_cache_that_cannot_be_kept_costs_a_warning(tmp_path):

@@ -9,7 +9,6 @@ from skin.body.base import Sheet
 from skin.body.layout import Grid
 from skin.design.drawing import print_blind_places
 from skin.design.expected import ExpectedPosterior
-from skin.errors import InputError
 from skin.inference.candidates import FingertipPrior, disc_readings
 from skin.inference.noise import Noise
 from skin.inference.posterior import Posterior
@@ -128,24 +127,8 @@ def test_the_map_has_no_value_where_no_touch_is():
     assert (trials.touches[:, :2] >= 0.02).all()
 
 
-def test_findings_repeat_and_change_with_the_seed():
-    first, again, other = (design(touches=32, seed=seed).find(solid(), BODY)[0] for seed in (1, 1, 2))
-    assert first == again
-    assert first.place_m != other.place_m
-
-
-def test_noise_costs_precision():
-    clear, noisy = (design(touches=128, noise=noise).find(solid(), BODY)[0] for noise in (0.02, 0.5))
-    assert clear.place_m < noisy.place_m
-    assert clear.blind_share < noisy.blind_share
-
-
-def test_unknown_gains_cost_precision():
-    certain, unknown = (design(touches=128, gain=gain).find(solid(), BODY)[0] for gain in (0.0, 0.3))
-    assert certain.force_relative < unknown.force_relative
-    assert certain.place_median_m < unknown.place_median_m
-
-
-def test_a_margin_that_leaves_no_place_is_refused():
-    with pytest.raises(InputError, match=r"leaves no place on 0\.12 x 0\.08 m: give less than 0\.04"):
-        design(margin=0.05).find(solid(), BODY)
+@pytest.mark.parametrize(("setting", "values"), [("noise", (0.02, 0.5)), ("gain", (0.0, 0.3))])
+def test_noise_and_unknown_gains_cost_precision(setting, values):
+    less, more = (design(touches=128, **{setting: value}).find(solid(), BODY)[0] for value in values)
+    assert less.place_median_m < more.place_median_m
+    assert less.force_relative < more.force_relative

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 import torch
-from scipy.stats import chi2
 
 from skin.body.base import Sheet
 from skin.body.layout import Grid
@@ -91,60 +90,3 @@ def test_more_frames_and_known_gains_lower_the_variance():
     assert force() == pytest.approx(0.1)  # one sensor that reads the force itself
     assert force(frames=4) == pytest.approx(0.05)
     assert force(frames=4, gain=0.12) == pytest.approx(0.13)
-
-
-def estimate(simulator, fingertip, readings, start, noise, centre, priors):
-    """Return the most probable parameters (B, 4) for readings (B, S): Levenberg-Marquardt from a start."""
-    scale = priors
-
-    def cost(position):
-        missed = (simulator.press(fingertip(position)).readings - readings) / deviation
-        return missed.square().sum(1) + ((position - centre) / scale).square().sum(1)
-
-    deviation = noise.frame / noise.frames**0.5
-    found, damping = start.clone(), torch.full((len(start), 1, 1), 1e-2, dtype=torch.float64)
-    best = cost(found)
-    for _ in range(15):
-        now = sensitivity(simulator, fingertip, found)
-        slopes = now.slopes * scale / deviation
-        missed = (now.readings - readings) / deviation
-        normal = slopes.mT @ slopes + torch.eye(4)
-        towards = (slopes.mT @ missed[..., None])[..., 0] + (found - centre) / scale
-        step = torch.linalg.solve(
-            normal + damping * torch.diag_embed(normal.diagonal(dim1=1, dim2=2)), towards
-        )
-        tried = found - step * scale
-        tried[:, 2:] = tried[:, 2:].clamp(min=1e-4)
-        value = cost(tried)
-        better = value < best
-        found, best = torch.where(better[:, None], tried, found), torch.where(better, value, best)
-        damping = torch.where(better[:, None, None], damping / 3, damping * 4)
-    return found
-
-
-@pytest.mark.slow("200 touches with four noises each")
-def test_the_most_probable_place_has_the_local_precision():
-    """200 touches that raise three sensors above five standard deviations, four noises each."""
-    body, force, draws = sheet(THICK), 20.0, 4
-    sensors = Grid(5, 5, depth=0.0195).sensors(body)
-    simulator, noise = Solid(body, sensors, divisions=3), Noise(0.05, 10)
-    fingertip = Fingertip(body, 0.0015, simulator.smooth)
-    given = touches(2000, 2, force)
-    felt = sensitivity(simulator, fingertip, given)
-    clear = (felt.readings > 5 * noise.frame).sum(1) >= 3
-    given, felt = given[clear][:200], Sensitivity(felt.readings[clear][:200], felt.slopes[clear][:200])
-    assert len(given) == 200
-    centre = torch.tensor([0.06, 0.06, 0.008, force], dtype=torch.float64)
-    priors = torch.tensor([0.12 / 12**0.5, 0.12 / 12**0.5, 0.008 / 12**0.5, force / 2], dtype=torch.float64)
-    variances = local_covariance(felt, noise, priors).diagonal(dim1=1, dim2=2)
-    generator = torch.Generator().manual_seed(3)
-    true = given.repeat_interleave(draws, 0)
-    scatter = torch.randn(len(true), len(sensors), generator=generator, dtype=torch.float64)
-    readings = felt.readings.repeat_interleave(draws, 0) + scatter * noise.frame / noise.frames**0.5
-    found = estimate(simulator, fingertip, readings, true, noise, centre, priors)
-    error = (found - true).square().unflatten(0, (200, draws)).mean(1)
-    position = (error[:, :2].mean(1) / variances[:, :2].mean(1)).sqrt()
-    # Medians of the root of the mean of eight and of four squared normal values: 0.96 and 0.92, not 1.
-    normal = [(chi2(number).median() / number) ** 0.5 for number in (2 * draws, draws)]
-    assert 0.9 < position.median() / normal[0] < 1.3
-    assert 0.9 < (error[:, 3] / variances[:, 3]).sqrt().median() / normal[1] < 1.3

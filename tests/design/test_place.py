@@ -54,7 +54,7 @@ def test_the_layout_is_read_by_the_next_command(run, tmp_path, simulator):
     words = (*simulator, *BODY, "design=place", f"design.touches={TOUCHES}")
     done = run(tmp_path, "design", *words, *GRID, "design.count=4", "out=first", store=False)
     assert done.returncode == 0, done.stderr
-    assert "best of random" in done.stdout
+    assert "configured" in done.stdout
     assert "placement.csv" in done.stdout
     found = content(tmp_path / "first")
     with Image.open(tmp_path / "first" / "placement.png") as picture:
@@ -74,7 +74,7 @@ def test_tells_more_than_other_layouts(placed):
     folder = placed()
     found = content(folder)
     layouts = found["layouts"]
-    assert set(layouts) == {"configured", "grid", "best_of_random"}
+    assert set(layouts) == {"configured", "grid"}
     assert all(one["sensors"] == found["sensors"] == 6 for one in layouts.values())
     assert found["information_nats"] > max(one["information_nats"] for one in layouts.values())
     assert layouts["grid"] == pytest.approx(layouts["configured"])

@@ -5,7 +5,6 @@ import pytest
 import torch
 from PIL import Image
 
-from skin.device.files import write_recording as store
 from skin.errors import InputError
 from skin.plot.animation import VIEWS, read_scene, simulate_scene, thinning, write_animation
 from skin.plot.plot3d import Scene
@@ -55,15 +54,6 @@ def test_the_pressure_is_shown_where_it_is(tmp_path):
     picture = columns < shown.shape[2] * 0.45
     assert rows[picture].mean() < 0.4 * shown.shape[1]
     assert columns[picture].mean() > 0.22 * shown.shape[2]
-
-
-def test_sensors_that_move_are_shown_moving(tmp_path):
-    scene = made()
-    away = scene.positions.copy()
-    away[4:] += [0.005, 0.0, 0.0]
-    moving = Scene(scene.readings, away, scene.size, scene.rate, scene.title)
-    shown, _ = frames_of(write_animation(moving, "flat", tmp_path / "x.gif"))
-    assert (np.abs(shown[4] - shown[3]).max(axis=-1) > 60).sum() > 50
 
 
 def test_long_and_fast_touches_are_thinned_out(tmp_path):
@@ -122,15 +112,6 @@ def test_a_slide_on_the_arm_is_drawn_in_space(view, configured, tmp_path):
     assert scene.moved is None
     shown, _ = frames_of(write_animation(scene, view, tmp_path / "x.gif"))
     assert len(shown) == 30
-
-
-def test_a_recording_of_an_arm_is_drawn_on_the_arm(configured, tmp_path):
-    made = build_device(configured("body=arm", "simulator=naive", "data.gestures=10"))
-    path = store(made.recording(), tmp_path / "x.parquet")
-    device = build_device(configured("body=arm", "device=recording", f"device.path={path}"))
-    assert read_scene(device, 2).body == made.body
-    sheet = build_device(configured("device=recording", f"device.path={path}"))
-    assert read_scene(sheet, 2).body is None
 
 
 def test_an_unknown_label_is_refused(configured):

@@ -7,7 +7,6 @@ from PIL import Image
 
 from skin.plot.figures import (
     confusions,
-    force_and_reading,
     images,
     misclassified,
     misclassified_fractions,
@@ -44,13 +43,6 @@ def test_a_trace_is_of_the_most_active_sensor():
     axis = traces({"naive": readings}, rate=10).axes[0]
     assert axis.lines[0].get_ydata().max() == 4
     assert axis.lines[0].get_xdata()[-1] == pytest.approx(0.4)
-
-
-def test_force_and_reading_share_the_time():
-    force, readings = torch.rand(2, 6), torch.rand(2, 6, 3)
-    figure = force_and_reading(force, readings, rate=10)
-    assert len(figure.axes) == 4
-    assert figure.axes[0].lines[0].get_ydata() == pytest.approx(force[0].numpy())
 
 
 def test_a_picture_is_saved_whole(tmp_path):

@@ -9,7 +9,7 @@ from skin.body.layout import Grid
 from skin.mechanics.simulator.fem import Structure, build
 from skin.mechanics.simulator.naive import Naive
 from skin.mechanics.simulator.solid import Solid
-from skin.plot.plot3d import deflection, surface, surface_motion
+from skin.plot.plot3d import deflection, surface_motion
 
 LAYERS = [
     {"material": "Dragon Skin 10 Medium", "thickness": 0.010},
@@ -66,12 +66,3 @@ def test_without_a_compliance_plates_and_beams_tell_how_a_flat_skin_moves():
     np.testing.assert_array_equal(moved, deflection(body, pressure)[:, -1])
     arm = Arm(radius=0.05, length=0.1, angle=2.0, cells=[4, 4], layers=LAYERS)
     assert surface_motion(Naive(arm, Grid(2, 2).sensors(arm)), arm, pressure) is None
-
-
-def test_the_map_shows_millimetres():
-    moved = np.zeros((5, 7))
-    moved[1, 2] = 0.002
-    figure = surface(moved, 0.0, (0.06, 0.04), "a press")
-    shown = figure.axes[1].images[0]
-    assert np.asarray(shown.get_array()).max() == 2
-    assert shown.get_extent() == pytest.approx((0, 60, 40, 0))

@@ -10,7 +10,7 @@ import pytest
 from skin.body.base import Sheet
 from skin.body.layout import Grid
 from skin.calibration.bench import build_bench_data, write_bench_session
-from skin.calibration.known_loads import Protocol, emulate_session
+from skin.calibration.known_loads import choose_presses, emulate_session, stair_gauge
 from skin.core.files import CONF
 from skin.core.safe_loading import load_yaml
 from skin.device.resampling import Frame, Window
@@ -122,9 +122,9 @@ def test_gestures_without_labels_are_refused(device, tmp_path):
 
 def test_presses_are_compared_as_gestures_are(device, tmp_path):
     """A skin reads 80 % of what the device does; a lost frame and a silent channel do not count."""
-    protocol, randomness = Protocol(rate=50.0), np.random.default_rng(0)
-    rows = protocol.gauge(protocol.positions(device, randomness))
-    session = emulate_session(device, rows, protocol, randomness, None)
+    randomness = np.random.default_rng(0)
+    rows = stair_gauge(choose_presses(device, randomness), rate=50.0)
+    session = emulate_session(device, rows, randomness)
     raw = GAIN * session.raw
     force, press = rows.at(session.time)
     raw[np.flatnonzero(press == 1)[5]] = np.nan
@@ -155,17 +155,16 @@ def loud(readings, valid):
 
 
 def test_a_press_that_the_engine_misses_counts_if_it_is_above_the_limit_and_on_a_valid_sensor(device):
-    protocol, randomness = Protocol(rate=50.0, peak=60.0, steps=(1.0,)), np.random.default_rng(0)
-    rows = protocol.gauge(np.tile(device.sensors.positions[:, :2], (3, 1)))
-    weak, beside = rows.press >= 18, rows.press == 17
-    rows = replace(rows, force=np.where(weak, 0.15, 1.0) * rows.force)
-    rows = replace(rows, position=np.where(beside[:, None], 0.055, rows.position))
-    session = emulate_session(device, rows, protocol, randomness)
+    positions = np.tile(device.sensors.positions[:, :2], (3, 1))
+    positions[17] = 0.055
+    rows = stair_gauge(positions, peak=60.0, steps=(1.0,), rate=50.0)
+    rows = replace(rows, force=np.where(rows.press >= 18, 0.15, 1.0) * rows.force)
+    session = emulate_session(device, rows, np.random.default_rng(0))
     press, raw = rows.at(session.time)[1], session.raw.copy()
     raw[press == 2] *= 0.01  # the skin hardly felt it
     raw[:, 8] = np.nan  # presses 8, 17 and 26 are on no valid sensor
     raw[np.flatnonzero(press == 3)[::7]] = np.nan
-    bench = build_bench_data(device, replace(session, raw=raw), None)
+    bench = build_bench_data(device, replace(session, raw=raw))
     engine = Engine(loud, TOUCH, 9, device.window, device.model_rate, Detection(0.5))
     judged = judge_presses(device, bench, None, device.model_rate, partial(raises_alarm, engine))
     peak, sensed, alarmed = judged

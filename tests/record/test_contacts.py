@@ -3,7 +3,7 @@
 from itertools import islice
 
 import numpy as np
-import pyarrow as pa
+import pandas as pd
 import pytest
 import torch
 
@@ -61,9 +61,8 @@ def test_a_recorded_session_has_them(emulate, device, played, tmp_path):
 
 def test_a_gauge_tells_its_contacts():
     columns = {"time": [1.0, 1.5, 2.0, 2.5], "force": [0.0, 10.0, 20.0, 0.0], "x_m": [0.05] * 4}
-    rows = bench.gauge_from_table(
-        pa.table(columns | {"y_m": [0.06] * 4}), "x", "disc", 0.01, 0.0, bench.Units()
-    )
+    table = pd.DataFrame(columns | {"y_m": [0.06] * 4})
+    rows = bench.Gauge.of(table, "x", bench.BenchSettings())
     peaks = bench.pressed_peaks(SHEET, rows)
     assert peaks == pytest.approx(1 / (np.pi * 0.01**2), rel=0.02)
     contacts = rows.contacts(np.array([0.5, 1.25, 2.0, 3.0]), peaks)
@@ -74,9 +73,9 @@ def test_a_gauge_tells_its_contacts():
 
 
 def test_presses_of_a_bench_session_have_them(device, tmp_path):
-    protocol = known_loads.Protocol(idle=3.0, rate=50.0, indenter="disc")
-    gauge = protocol.gauge(np.array([[0.03, 0.03], [0.08, 0.08]]))
-    session = known_loads.emulate_session(device, gauge, protocol, np.random.default_rng(0))
+    places = np.array([[0.03, 0.03], [0.08, 0.08]])
+    gauge = known_loads.stair_gauge(places, rate=50.0, indenter="disc")
+    session = known_loads.emulate_session(device, gauge, np.random.default_rng(0))
     path = bench.write_bench_session(session, tmp_path / "s.parquet")
     settings = load_yaml(CONF / "compare.yaml")["compare"]
     sides = compare_session(device, str(path), None, settings).touches

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 pytest.importorskip("fcntl", reason="file limits need a POSIX system")
 
-from skin.calibration.bench import load_table, read_bench_session
+from skin.calibration.bench import BenchSettings, load_table, read_bench_session
 from skin.device.calibration import Curves
 from skin.device.resampling import Frame, Window
 from skin.errors import InputError
@@ -140,9 +140,11 @@ def test_every_frame_is_in_one_file(recorded):
 
 def test_calibration_reads_it(recorded):
     table, _ = load_table(recorded[0], "session")
-    assert table.column_names == ["time", "seq", "gesture", "raw_00", "raw_01"]
-    assert table["gesture"].to_pylist() == [row["gesture"] for row in frames_of(recorded[0])]
-    session = read_bench_session(recorded[0], "disc", 0.01)
+    assert [*table] == ["time", "seq", "gesture", "raw_00", "raw_01"]
+    assert [None if np.isnan(number) else number for number in table["gesture"]] == [
+        row["gesture"] for row in frames_of(recorded[0])
+    ]
+    session = read_bench_session(recorded[0], BenchSettings())
     assert (session.raw.shape, session.unit, session.bits) == ((74, 2), "adc", 10)
     assert np.array_equal(session.time, table["time"].to_numpy())
 
@@ -184,7 +186,7 @@ def test_a_damaged_file_costs_its_gesture_which_is_recorded_again(copied, record
     rows = len(frames_of(copied))
     assert rows < 74
     caplog.clear()
-    assert len(read_bench_session(copied, "disc", 0.01).raw) == rows
+    assert len(read_bench_session(copied, BenchSettings()).raw) == rows
     assert [entry.message for entry in caplog.records] == [f"{copied}: damaged files are left out: {name}"]
     log = SessionLog(copied, METADATA)
     assert log.done == set(left)
@@ -222,7 +224,7 @@ def test_damage_never_passes_for_another_value(copied, recorded, name):
         assert stored.metadata == METADATA
         for row in (row for table in stored.tables for row in table.to_pylist()):
             assert row == frames[row["segment"], row["seq"]]
-        opened(lambda: read_bench_session(copied, "disc", 0.01))
+        opened(lambda: read_bench_session(copied, BenchSettings()))
 
     damage()
 

@@ -4,12 +4,13 @@ import math
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass
-from functools import cached_property, reduce
 from itertools import product
 from typing import NamedTuple
 
 import numpy as np
 import torch
+from numpy.lib.stride_tricks import sliding_window_view
+from scipy.special import expit, spence
 
 from skin.body.base import AbstractBody
 from skin.errors import InputError
@@ -49,13 +50,13 @@ class FingertipPrior:
     friction: float | None = None
 
     def __post_init__(self) -> None:
-        if min(self.numbers) < 0 or not any(self.numbers[1:]) or not self.large >= 0:
+        known = self.friction is None or 0 <= self.friction < math.inf
+        if not (min(*self.numbers, self.large) >= 0 and any(self.numbers[1:]) and known):
             raise InputError(
-                "a prior of fingertips needs probabilities of 0 or more, and one above 0 of a contact, got "
-                f"numbers={list(self.numbers)} and large={self.large:g}"
+                "a prior of fingertips needs probabilities of 0 or more, one above 0 of a contact, and "
+                f"friction of 0 or more, got numbers={list(self.numbers)}, large={self.large:g} and "
+                f"friction={self.friction}"
             )
-        if not (self.friction is None or 0 <= self.friction < math.inf):
-            raise InputError(f"a prior of fingertips needs friction of 0 or more, got {self.friction:g}")
         if not (self.force > 0 and self.spread > 0 and self.rim > 0 and 0 < self.radii[0] < self.radii[1]):
             raise InputError(
                 "a prior of fingertips needs force, spread and rim above 0 and two rising radii, got "
@@ -64,15 +65,10 @@ class FingertipPrior:
 
     def peak(self, radius: np.ndarray) -> np.ndarray:
         """Return the pressure in the middle of a fingertip of 1 N and some radius, m, in Pa/N."""
-        return np.interp(radius, *self._peaks)
-
-    @cached_property
-    def _peaks(self) -> tuple[np.ndarray, np.ndarray]:
-        """Radii, m, and the pressure in the middle of fingertips of 1 N, Pa."""
-        knots = np.linspace(*self.radii, 33)
-        reach = np.linspace(0, 1, 400)[:, None] * (knots + 12 * self.rim)
-        fraction = 1 / (1 + np.exp((reach - knots) / self.rim))
-        return knots, fraction[0] / np.trapezoid(2 * np.pi * reach * fraction, reach, axis=0)
+        # The integral of the pressure, 2 pi r / (1 + exp((r - radius) / rim)), is a dilogarithm.
+        steep = radius / self.rim
+        integral = np.pi**2 / 6 + steep**2 / 2 + spence(1 + np.exp(-steep))
+        return expit(steep) / (2 * np.pi * self.rim**2 * integral)
 
 
 def disc_readings(
@@ -119,19 +115,12 @@ class Boxes(NamedTuple):
 
     def split(self, along: np.ndarray) -> "Boxes":
         """Return the halves of each box along some axes, (N, 3), bool: up to eight children each."""
-        centre, width = self.centre, self.width
-        for axis in range(3):
-            cut = along[:, axis]
-            half = np.where(cut, width[:, axis] / 2, width[:, axis])
-            low, high = centre.copy(), centre[cut]
-            low[cut, axis] -= half[cut] / 2
-            high[:, axis] += half[cut] / 2
-            width = width.copy()
-            width[:, axis] = half
-            centre = np.concatenate([low, high])
-            width = np.concatenate([width, width[cut]])
-            along = np.concatenate([along, along[cut]])
-        return Boxes(centre, width)
+        width = np.where(along, self.width / 2, self.width)
+        sides = np.array([*product((-1, 1), repeat=3)])
+        centre = self.centre[:, None] + (self.width - width)[:, None] / 2 * sides
+        # Along an axis that is not cut, both halves are the box itself.
+        which = (along[:, None] | (sides < 0)).all(2)
+        return Boxes(centre[which], np.repeat(width, which.sum(1), axis=0))
 
 
 # Patches of the surface with a polynomial each.
@@ -140,6 +129,7 @@ class Boxes(NamedTuple):
 _POWERS = [(i, j) for i, j in product(range(4), repeat=2) if i + j <= 3]
 _EXPONENTS = np.array(_POWERS).T
 _RADII = 4  # Chebyshev points over the radii
+_DEGREES = np.arange(4, dtype=np.float32)[:, None]
 _PATCH = 0.002  # m, largest side of a patch
 _AT_ONCE = 64  # discs
 
@@ -154,7 +144,6 @@ class CandidateReadings:
         simulator: of the skin; its readings must add up.
         body: the skin.
         prior: radii and rim of fingertips.
-        coarse: largest width of the first boxes, m.
 
     Attributes:
         radii, span: least and largest radius, and their difference, m.
@@ -168,16 +157,13 @@ class CandidateReadings:
         readings: (N, L, S), the first of them.
     """
 
-    def __init__(
-        self, simulator: AbstractSimulator, body: AbstractBody, prior: FingertipPrior, coarse: float = 0.004
-    ) -> None:
+    def __init__(self, simulator: AbstractSimulator, body: AbstractBody, prior: FingertipPrior) -> None:
         self.radii, self.size = prior.radii, np.array(body.size)
         self.span = prior.radii[1] - prior.radii[0]
         largest = 0.8 * (simulator.axes > 1) if prior.friction is None else prior.friction
         self.friction = largest / math.sqrt(6)  # of a uniform fraction in a uniform direction
         # An even number, so that two by two of them make a first box.
-        self._per_box = max(1, round(coarse / _PATCH))
-        self._counts = self._per_box * np.ceil(self.size / coarse - 1e-9).astype(int)
+        self._counts = 2 * np.ceil(self.size / (2 * _PATCH) - 1e-9).astype(int)
         self._patch = self.size / self._counts
         self._coefficients = self._fit(simulator, body, prior)
         self.boxes = self._first_boxes()
@@ -192,8 +178,9 @@ class CandidateReadings:
     def mixed(parts: "Sequence[CandidateReadings]", weights: np.ndarray) -> "CandidateReadings":
         """Return the weighted sum of the readings of skins of one size; weights (N,), float32."""
         mixed = copy(parts[0])
-        weighted = (weight * part._coefficients for weight, part in zip(weights, parts, strict=True))
-        mixed._coefficients = reduce(np.add, weighted)
+        mixed._coefficients = sum(
+            weight * part._coefficients for weight, part in zip(weights, parts, strict=True)
+        )
         mixed._tabulate()
         return mixed
 
@@ -209,17 +196,14 @@ class CandidateReadings:
         monomials = np.linalg.inv(np.vander(nodes, increasing=True))
         samples = np.einsum("kr,yxrs->yxks", monomials, samples)
         # Beyond the edge the neighbours are continued along a line.
-        samples = _extend(_extend(samples, 0), 1)
+        edges = [(1, 1), (1, 1), (0, 0), (0, 0)]
+        near = sliding_window_view(np.pad(samples, edges, "reflect", reflect_type="odd"), (4, 4), (0, 1))
         fit = _stencil()
-        rows, columns = self._counts[1], self._counts[0]
-        total = np.zeros((rows, columns, len(_POWERS), _RADII, flat.shape[1]), np.float32)
-        for row in range(rows):
-            near = [samples[row + down, x : x + columns] for down, x in product(range(4), repeat=2)]
-            total[row] = np.einsum("km,mcrs->ckrs", fit, np.array(near), optimize=True)
-        return total.reshape(rows * columns, len(_POWERS) * _RADII, flat.shape[1])
+        rows = [np.einsum("mij,xrsij->xmrs", fit, row, optimize=True).astype(np.float32) for row in near]
+        return np.concatenate(rows).reshape(-1, len(_POWERS) * _RADII, flat.shape[1])
 
     def _first_boxes(self) -> Boxes:
-        counts = self._counts // self._per_box
+        counts = self._counts // 2
         width = np.array([*(self.size / counts), (self.radii[1] - self.radii[0]) / 2])
         x, y = ((np.arange(count) + 0.5) * side for count, side in zip(counts, width, strict=False))
         radius = self.radii[0] + np.array([0.5, 1.5]) * width[2]
@@ -248,38 +232,21 @@ def _monomials(
     across: np.ndarray, down: np.ndarray, wide: np.ndarray, scales: tuple[float, float, float]
 ) -> np.ndarray:
     """Return what coefficients are multiplied by for the value and three derivatives, (N, 4, K), float32."""
-    axes = np.stack([across, down, wide]).astype(np.float32)
-    powers = np.ones((3, 4, len(across)), np.float32)
-    powers[:, 1] = axes
-    np.multiply(axes, axes, out=powers[:, 2])
-    np.multiply(powers[:, 2], axes, out=powers[:, 3])
-    slopes = np.zeros_like(powers)
-    slopes[:, 1:] = powers[:, :3] * (np.arange(1, 4)[:, None] * np.array(scales)[:, None, None]).astype(
-        np.float32
-    )
+    powers = np.stack([across, down, wide]).astype(np.float32)[:, None] ** _DEGREES
+    slopes = np.pad(powers[:, :-1], [(0, 0), (1, 0), (0, 0)]) * _DEGREES
+    slopes *= np.array(scales, np.float32)[:, None, None]
     i, j = _EXPONENTS
     (x, y, r), (dx, dy, dr) = powers, slopes
-    columns = y[j]
-    position = x[i] * columns
     terms = np.empty((4, len(_POWERS), _RADII, len(across)), np.float32)
-    np.multiply(position[:, None], r, out=terms[0])
-    np.multiply((dx[i] * columns)[:, None], r, out=terms[1])
-    np.multiply((x[i] * dy[j])[:, None], r, out=terms[2])
-    np.multiply(position[:, None], dr, out=terms[3])
+    for term, column, row, radial in zip(terms, (x, dx, x, x), (y, y, dy, y), (r, r, r, dr), strict=True):
+        np.multiply((column[i] * row[j])[:, None], radial, out=term)
     return terms.reshape(4, -1, len(across)).transpose(2, 0, 1)
 
 
-def _extend(samples: np.ndarray, axis: int) -> np.ndarray:
-    """Continue samples by a step at both ends of an axis."""
-    first, second = (samples.take([number], axis) for number in (0, 1))
-    last, before = (samples.take([number], axis) for number in (-1, -2))
-    return np.concatenate([2 * first - second, samples, 2 * last - before], axis)
-
-
 def _stencil() -> np.ndarray:
-    """Return what fits the polynomial of a patch to 4 x 4 samples, (terms, 16); the inner ones count most."""
+    """Return what fits the polynomial of a patch to 4 x 4 samples, (terms, 4, 4), most to the inner ones."""
     at = np.array([-3.0, -1.0, 1.0, 3.0])
     down, across = (part.ravel() for part in np.meshgrid(at, at, indexing="ij"))
     design = np.stack([across**i * down**j for i, j in _POWERS], axis=1)
     weight = np.where((np.abs(across) < 2) & (np.abs(down) < 2), 10.0, 1.0)
-    return np.linalg.pinv(design * weight[:, None]) * weight
+    return (np.linalg.pinv(design * weight[:, None]) * weight).reshape(-1, 4, 4)

@@ -42,6 +42,7 @@ class Cloud:
         misfit: posterior mean of the squared misfit in variances.
         tangential, variance: (N, J, 2), mean and variance of the force along x and y, N; (N, J, 0) without
             friction.
+        mode: (4 or 6,), the most probable contact: x, y and radius, m, and forces inwards, along x and y, N.
     """
 
     boxes: Boxes
@@ -51,12 +52,7 @@ class Cloud:
     misfit: float
     tangential: np.ndarray
     variance: np.ndarray
-
-    @property
-    def mode(self) -> np.ndarray:
-        """The most probable contact (1, 4 or 6): x, y and radius, m, and forces inwards, along x and y, N."""
-        box, force = np.unravel_index(self.weight.argmax(), self.weight.shape)
-        return np.array([[*self.boxes.centre[box], self.force[box, force], *self.tangential[box, force]]])
+    mode: np.ndarray
 
 
 class _Leaves(NamedTuple):
@@ -256,5 +252,7 @@ def _weigh(
     misfit += 1 + mean.shape[2] - np.trace(covariance[:, 0], axis1=1, axis2=2)
     extent = float(np.prod(candidates.size) * candidates.span)
     evidence = float(top + math.log(total) - math.log(extent))
-    sides = side * tangent, side**2 * variances
-    return Cloud(boxes, force, weight, evidence, float(weight.sum(1) @ misfit), *sides)
+    sides, best = side * tangent, np.unravel_index(weight.argmax(), weight.shape)
+    mode = np.array([*boxes.centre[best[0]], force[best], *sides[best]])
+    sure = float(weight.sum(1) @ misfit)
+    return Cloud(boxes, force, weight, evidence, sure, sides, side**2 * variances, mode)

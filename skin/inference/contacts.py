@@ -1,16 +1,18 @@
 """Several contacts: found one after the other on the residual, refined together, weighed by samples."""
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import permutations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import ndtr, ndtri
+from scipy.special import logsumexp, ndtr, ndtri, softmax
 from scipy.stats.qmc import Sobol
 
-from skin.inference.candidates import CandidateReadings, FingertipPrior
+from skin.inference.candidates import Boxes, CandidateReadings, FingertipPrior
+from skin.inference.contact import Cloud
 from skin.inference.likelihood import Observation, fit_residual
 
 _STEPS = 12  # of Gauss-Newton
@@ -22,7 +24,7 @@ _SAMPLES = 10  # binary logarithm of the number of samples
 _WIDER = 1.1  # spread of the samples' proposal, relative to the posterior's
 _FREEDOM = 8.0  # degrees of freedom of the proposal, Student's distribution
 _MODES, _UNLIKELY, _ALIKE = 6, 6.0, 0.002  # modes that are sampled; log score below the best; m between two
-_WALKERS, _WALK = 256, 60  # and steps of each
+_WALKERS, _WALKS, _NARROWER = 64, 4, 0.6  # samples to start from, rounds, and spread, relative to the first
 
 # A guess is (M, n, P): x, y, m, and scores whose prior is the standard normal distribution: of the radius,
 # which is uniform, of the force, which is log-normal (P = 4), and with friction of the tangential force along
@@ -36,18 +38,20 @@ class Mixture:
     Attributes:
         samples: (N, n, P), x, y, m, with scores of radius and forces.
         weight: (N,), probabilities that sum to 1.
+        owner: (N,), the distribution that each is from.
+        spread: (M, P n, P n), roots of the covariances of these distributions.
         evidence: log of the likelihood integrated over the prior.
         misfit: posterior mean of the squared misfit in variances.
         mode: (n, P), the most probable contacts, with scores of radius and forces.
-        predicted: (S,), readings at the mode, N.
     """
 
     samples: np.ndarray
     weight: np.ndarray
+    owner: np.ndarray
+    spread: np.ndarray
     evidence: float
     misfit: float
     mode: np.ndarray
-    predicted: np.ndarray
 
 
 class Addition(NamedTuple):
@@ -116,51 +120,49 @@ class Search:
         force = self.prior.force * np.exp(self.prior.spread * guess[:, 3])
         return np.column_stack([guess[:, :2], radius]), force, stretch
 
-    def scores(self, radius: np.ndarray, force: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the scores of radii, m, and forces, N."""
-        fraction = ((radius - self._minimum) / self._range).clip(0.02, 0.98)
-        return ndtri(fraction), np.log(force / self.prior.force) / self.prior.spread
+    def guess(self, contacts: np.ndarray) -> np.ndarray:
+        """Return contacts (..., 4 or 6), as of :meth:`contacts`, as (..., P); without, friction is 0."""
+        fraction, force = (contacts[..., 2:3] - self._minimum) / self._range, contacts[..., 3:4]
+        scores = ndtri(fraction.clip(0.02, 0.98)), np.log(force / self.prior.force) / self.prior.spread
+        sides = contacts[..., 4:] / (force * (self.candidates.friction or 1))
+        guess = np.concatenate([contacts[..., :2], *scores, sides], axis=-1)
+        return np.pad(guess, [(0, 0)] * (guess.ndim - 1) + [(0, self._parameters - guess.shape[-1])])
 
     def variance(self, frame: Observation, predicted: np.ndarray, columns: np.ndarray) -> np.ndarray:
         """Return the variance (M, S), N^2, of readings as of :meth:`predict`."""
-        variance = frame.noise.floor + (frame.noise.relative * predicted) ** 2
-        if frame.noise.position:
-            for axis in (0, 1):
-                moved = columns[:, axis :: self._parameters].sum(1)
-                variance = variance + (frame.noise.position * moved) ** 2
-        return variance
+        moved = columns.reshape(len(columns), -1, self._parameters, columns.shape[2])[:, :, :2].sum(1)
+        further = (frame.noise.relative * predicted) ** 2 + np.square(frame.noise.position * moved).sum(1)
+        return frame.noise.floor + further
 
     def refine(self, frame: Observation, guess: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return guesses after steps of Gauss and Newton, and their log posterior (M,)."""
         guess, damping = self._inside(guess), np.full(len(guess), 1e-2)
-        score, pull, information = self._expand(frame, guess)
+        best = self._expand(frame, guess)
         for _ in range(_STEPS):
+            score, pull, information = best
             ridge = damping[:, None] * np.diagonal(information, axis1=1, axis2=2)
             step = np.linalg.solve(information + ridge[:, None] * np.eye(pull.shape[1]), pull[..., None])
             longest = np.array(_LONGEST[: self._parameters])
-            bounded = np.clip(step.reshape(guess.shape), -longest, longest)
-            tried = self._inside(guess + bounded)
+            tried = self._inside(guess + np.clip(step.reshape(guess.shape), -longest, longest))
             after = self._expand(frame, tried)
             better = after[0] > score
-            guess = np.where(better[:, None, None], tried, guess)
-            gain = np.where(better, after[0] - score, 0).max()
-            score, pull, information = (
+            best = tuple(
                 np.where(better.reshape(-1, *(1,) * (new.ndim - 1)), new, old)
-                for new, old in zip(after, (score, pull, information), strict=True)
+                for new, old in zip(after, best, strict=True)
             )
+            guess = np.where(better[:, None, None], tried, guess)
             damping = np.where(better, damping / 5, damping * 5).clip(1e-6, 1e3)
-            if gain < 1e-2 and better.any():
+            if better.any() and (best[0] - score).max() < 1e-2:
                 break
-        return guess, score
+        return guess, best[0]
 
     def _inside(self, guess: np.ndarray) -> np.ndarray:
         free = [np.inf] * (self._parameters - 3)
         return np.clip(guess, [0, 0, -4, *np.negative(free)], [*self.candidates.size, 4, *free])
 
-    def _expand(self, frame: Observation, guess: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _expand(self, frame: Observation, guess: np.ndarray) -> tuple[np.ndarray, ...]:
         """Return the log posterior (M,), its gradient (M, P n) and information (M, P n, P n)."""
-        predicted, columns = self.predict(guess)
-        variance = self.variance(frame, predicted, columns)
+        score, _, predicted, columns, variance = self._weigh(frame, guess)
         misfit = frame.readings - predicted
         counts = np.broadcast_to(frame.counts, predicted.shape)
         if len(frame.clipped):
@@ -173,8 +175,7 @@ class Search:
         pull = np.vecdot(columns, (weight * misfit)[:, None]) - distance.reshape(len(guess), -1)
         information = np.matmul(columns * weight[:, None], columns.transpose(0, 2, 1))
         information = information + np.diag(np.tile(self._scale**-2, guess.shape[1]))
-        penalty = 0.5 * (distance**2).sum((1, 2))
-        return frame.likelihood(predicted, variance - frame.noise.floor) - penalty, pull, information
+        return score, pull, information
 
     def add(self, frame: Observation, guess: np.ndarray) -> "Addition":
         """Return what a further contact, beside a guess (n, P), would explain.
@@ -194,20 +195,11 @@ class Search:
 
     def extend(self, guess: np.ndarray, addition: "Addition") -> np.ndarray:
         """Return guesses (M, n + 1, P) with the best further contacts."""
-        best = self._apart(addition.ratio, self._positions, 3)
-        scores = self.scores(self._positions[best, 2], np.exp(addition.mode[best]))
-        new = self.without_friction(np.column_stack([self._positions[best, :2], *scores]))[:, None]
-        return np.concatenate([np.repeat(guess[None], len(best), 0), new], axis=1)
-
-    @staticmethod
-    def _apart(score: np.ndarray, positions: np.ndarray, number: int) -> list[int]:
-        """Return the best candidates that are not next to each other."""
-        chosen = list[int]()
-        for index in np.argsort(-score)[: 20 * number]:
-            near = np.linalg.norm(positions[chosen, :2] - positions[index, :2], axis=1)
-            if len(chosen) < number and (near > 2 * _LATTICE).all():
-                chosen.append(int(index))
-        return chosen
+        best = np.argsort(-addition.ratio)[:60]
+        force = np.exp(addition.mode[best, None])
+        new = self.guess(np.concatenate([self._positions[best], force], axis=1))[:, None]
+        new = new[_distinct(new, addition.ratio[best], 2 * _LATTICE, 3)]
+        return np.concatenate([np.repeat(guess[None], len(new), 0), new], axis=1)
 
     def pairs(self, frame: Observation, predicted: np.ndarray) -> np.ndarray:
         """Return the pairs (M, 2, P) that explain best what contacts with readings (S,), N, leave over."""
@@ -222,38 +214,13 @@ class Search:
         possible = (first > 0) & (first.T > 0) & (determinant > 1e-6 * square[:, None] * square)
         with np.errstate(divide="ignore", invalid="ignore"):
             gain = np.where(possible, (first * along[:, None] + first.T * along) / determinant, 0)
-        rows, columns = np.triu_indices(len(along), 1)
-        flat = gain[rows, columns]
-        chosen = list[tuple[int, int]]()
-        count = min(60 * _PAIRS, len(flat) - 1)
-        best = np.argpartition(-flat, count)[:count]
-        for index in best[np.argsort(-flat[best], kind="stable")]:
-            pair = int(rows[index]), int(columns[index])
-            if len(chosen) < _PAIRS and flat[index] > 0 and self._new(pair, chosen):
-                chosen.append(pair)
-        index = np.array(chosen, int).reshape(-1, 2)
-        i, j = index.T
-        force = np.stack([first[i, j], first[j, i]], 1) / np.maximum(determinant[i, j], 1e-30)[:, None]
-        positions = self._positions[index]
-        radius, score = self.scores(positions[..., 2], np.maximum(force, 1e-3 * self.prior.force))
-        scores = np.stack([radius, score.clip(-4, 4)], -1)
-        return self.without_friction(np.concatenate([positions[..., :2], scores], axis=2))
-
-    def without_friction(self, guess: np.ndarray) -> np.ndarray:
-        """Return guesses (..., 4) as (..., P)."""
-        return np.pad(guess, [(0, 0)] * (guess.ndim - 1) + [(0, self._parameters - 4)])
-
-    def _new(self, pair: tuple[int, int], chosen: list[tuple[int, int]]) -> bool:
-        """Return whether a pair is not nearly one of those that are chosen."""
-        positions = self._positions[:, :2]
-        return all(
-            max(
-                np.abs(positions[pair[0]] - positions[a]).max(),
-                np.abs(positions[pair[1]] - positions[b]).max(),
-            )
-            > 1.5 * _LATTICE
-            for a, b in chosen
-        )
+        gain = np.triu(gain, 1)
+        best = np.argpartition(-gain, min(60 * _PAIRS, gain.size) - 1, axis=None)[: 60 * _PAIRS]
+        i, j = np.unravel_index(best[gain.flat[best] > 0], gain.shape)
+        force = np.stack([first[i, j], first[j, i]], 1) / determinant[i, j, None]
+        force = force.clip(*self.prior.force * np.exp(np.array([-4, 4]) * self.prior.spread))
+        pairs = np.concatenate([self._positions[np.stack([i, j], 1)], force[..., None]], axis=2)
+        return self.guess(pairs[_distinct(pairs, gain[i, j], 1.5 * _LATTICE, _PAIRS)])
 
     def sample(self, frame: Observation, modes: np.ndarray, score: np.ndarray) -> Mixture:
         """Return the posterior of contacts by importance samples around modes (M, n, P), and its evidence.
@@ -263,104 +230,83 @@ class Search:
             modes: as of :meth:`refine`.
             score: (M,), their log posterior.
         """
-        chosen = self._distinct(modes, score)
-        modes, number = _order(modes[chosen], modes[chosen[0]]), modes.shape[1]
-        size = self._parameters * number
-        information = self._expand(frame, modes)[2]
-        spread = np.linalg.cholesky(np.linalg.inv(information)) * _WIDER
-        owner = np.arange(2**_SAMPLES) % len(modes)
-        normal, stretch = self._normal[:, :size], self._stretch[:, None]
-        moved = np.matmul(spread[owner], (normal * stretch)[..., None])
-        guess = modes[owner] + moved.reshape(-1, *modes.shape[1:])
-        flat, log_density = guess.reshape(len(guess), -1), list[np.ndarray]()
-        for mode, lower in zip(modes.reshape(len(modes), -1), spread, strict=True):
-            away = np.linalg.solve(lower, (flat - mode).T)
-            tails = -0.5 * (_FREEDOM + size) * np.log1p((away**2).sum(0) / _FREEDOM)
-            log_density.append(tails - np.log(np.diagonal(lower)).sum())
-        top = np.max(log_density, axis=0)
-        proposal = top + np.log(np.exp(log_density - top).mean(0)) + self._tail_constant(size)
-        log_posterior, misfit = self._weigh(frame, guess)
-        scores = size - 2 * number
-        constant = -scores / 2 * math.log(2 * math.pi) + math.lgamma(number + 1) + number * self._density
-        logs = log_posterior - proposal + constant
-        highest = logs.max()
-        weight = np.exp(logs - highest)
-        evidence = float(highest + math.log(weight.mean()))
-        weight /= weight.sum()
-        return Mixture(
-            guess, weight, evidence, float(weight @ misfit), modes[0], self.predict(modes[:1])[0][0]
-        )
+        likely = score > score.max() - _UNLIKELY
+        modes = modes[likely][_distinct(modes[likely], score[likely], _ALIKE, _MODES)]
+        modes = _order(modes, modes[0])
+        spread = np.linalg.cholesky(np.linalg.inv(self._expand(frame, modes)[2])) * _WIDER
+        return self._draw(frame, modes, spread, modes[0])
 
-    @staticmethod
-    def _tail_constant(size: int) -> float:
-        """Return the log of the factor of Student's density in some dimensions."""
-        gammas = math.lgamma((_FREEDOM + size) / 2) - math.lgamma(_FREEDOM / 2)
-        return gammas - size / 2 * math.log(_FREEDOM * math.pi)
+    def _draw(self, frame: Observation, middles: np.ndarray, spread: np.ndarray, mode: np.ndarray) -> Mixture:
+        """Return weighted samples of Student's distributions around guesses (M, n, P).
 
-    @staticmethod
-    def _distinct(modes: np.ndarray, score: np.ndarray) -> list[int]:
-        """Return the modes that count, the best first: likely ones, each set of positions once."""
-        chosen = list[int]()
-        for index in np.argsort(-score, kind="stable"):
-            likely = score[index] > score.max() - _UNLIKELY and len(chosen) < _MODES
-            if likely and all(_differ(modes[index], modes[better]) for better in chosen):
-                chosen.append(int(index))
-        return chosen
+        ``spread`` (M, P n, P n) holds the roots of their covariances; they are drawn in turns.
+        """
+        number, size = middles.shape[1], spread.shape[1]
+        owner = np.arange(2**_SAMPLES) % len(middles)
+        moved = np.matmul(spread[owner], (self._normal[:, :size] * self._stretch[:, None])[..., None])
+        guess = middles[owner] + moved.reshape(-1, *middles.shape[1:])
+        away = (guess - middles[:, None]).reshape(len(middles), -1, size).transpose(0, 2, 1)
+        squares = np.square(np.linalg.solve(spread, away)).sum(1)
+        tails = -0.5 * (_FREEDOM + size) * np.log1p(squares / _FREEDOM)
+        volume = np.log(np.diagonal(spread, axis1=1, axis2=2)).sum(1, keepdims=True)
+        constant = math.lgamma((_FREEDOM + size) / 2) - math.lgamma(_FREEDOM / 2)
+        constant -= size / 2 * math.log(_FREEDOM * math.pi) + math.log(len(middles))
+        logs, misfit, *_ = self._weigh(frame, guess)
+        scores = -(size - 2 * number) / 2 * math.log(2 * math.pi)
+        logs = logs - logsumexp(tails - volume, axis=0) - constant
+        evidence = float(logsumexp(logs)) - _SAMPLES * math.log(2)
+        evidence += scores + math.lgamma(number + 1) + number * self._density
+        weight = softmax(logs)
+        return Mixture(_order(guess, mode), weight, owner, spread, evidence, float(weight @ misfit), mode)
 
-    def _weigh(self, frame: Observation, guess: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the log posterior (M,) but for constants, and the squared misfit in variances."""
+    def _weigh(self, frame: Observation, guess: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Return the log posterior (M,) but for constants, and the squared misfit in variances.
+
+        The further results are readings and derivatives as of :meth:`predict`, and variances.
+        """
         inside = self._inside(guess)
         predicted, columns = self.predict(inside)
         variance = self.variance(frame, predicted, columns)
-        density = -0.5 * (guess[..., 2:] ** 2).sum((1, 2))
-        likelihood = frame.likelihood(predicted, variance - frame.noise.floor)
         misfit = ((frame.readings - predicted) ** 2 / variance) @ frame.counts
-        return np.where((inside == guess).all((1, 2)), likelihood + density, -np.inf), misfit
+        score = frame.likelihood(predicted, variance - frame.noise.floor) - 0.5 * (guess[..., 2:] ** 2).sum(
+            (1, 2)
+        )
+        return np.where((inside == guess).all((1, 2)), score, -np.inf), misfit, predicted, columns, variance
 
     def walk(self, frame: Observation, mixture: Mixture) -> Mixture:
-        """Return the posterior with samples that have walked, where those of importance are few.
+        """Return the posterior by samples around samples, which follow it where it is not Gaussian.
 
-        Differential evolution Markov chains (ter Braak 2006): each of half of the walkers tries a step along
-        the difference of two of the other half.
+        Population Monte Carlo (Cappe 2004): each round proposes from narrow distributions around samples that
+        are drawn by their weights.
         """
-        rng = np.random.default_rng(0)
-        start = np.searchsorted(
-            np.cumsum(mixture.weight), (np.arange(_WALKERS) + 0.5) / _WALKERS * (1 - 1e-9)
-        )
-        guess = mixture.samples[rng.permutation(start)]
-        score, misfit = self._weigh(frame, guess)
-        size = guess[0].size
-        samples, misfits, half = list[np.ndarray](), list[float](), _WALKERS // 2
-        for step in range(_WALK):
-            for mine, others in (
-                (slice(None, half), slice(half, None)),
-                (slice(half, None), slice(None, half)),
-            ):
-                first, second = rng.integers(0, half, (2, half))
-                factor = 0.98 if step % 8 == 7 else 2.38 / math.sqrt(2 * size)
-                difference = guess[others][first] - guess[others][second]
-                jitter = rng.standard_normal(difference.shape) * self._scale * 1e-3
-                tried = guess[mine] + factor * difference + jitter
-                after, worse = self._weigh(frame, tried)
-                taken = np.log(rng.random(half)) < after - score[mine]
-                guess[mine] = np.where(taken[:, None, None], tried, guess[mine])
-                score[mine], misfit[mine] = (
-                    np.where(taken, after, score[mine]),
-                    np.where(taken, worse, misfit[mine]),
-                )
-            if step >= _WALK // 3:
-                samples.append(guess.copy())
-                misfits.append(float(misfit.mean()))
-        every = _order(np.concatenate(samples), mixture.mode)
-        weight = np.full(len(every), 1 / len(every))
-        return replace(mixture, samples=every, weight=weight, misfit=float(np.mean(misfits)))
+        edges, rounds = (np.arange(_WALKERS) + 0.5) / _WALKERS * (1 - 1e-9), list[Mixture]()
+        last = replace(mixture, spread=_NARROWER * mixture.spread)
+        for _ in range(_WALKS):
+            chosen = np.searchsorted(np.cumsum(last.weight), edges)
+            spread = last.spread[last.owner[chosen]]
+            last = self._draw(frame, last.samples[chosen], spread, mixture.mode)
+            rounds.append(last)
+        weight = np.concatenate([each.weight for each in rounds]) / _WALKS
+        return replace(last, samples=np.concatenate([each.samples for each in rounds]), weight=weight)
 
-    def contacts(self, samples: np.ndarray) -> np.ndarray:
-        """Return x, y and radius, m, force and tangential forces, N, of samples (N, n, P)."""
-        flat = samples.reshape(-1, self._parameters)
+    def contacts(self, guess: np.ndarray) -> np.ndarray:
+        """Return x, y and radius, m, force and tangential forces, N, of guesses (N, n, P)."""
+        flat = guess.reshape(-1, self._parameters)
         positions, force, _ = self._positions_of(flat)
         tangential = self.candidates.friction * force[:, None] * flat[:, 4:]
-        return np.column_stack([positions, force, tangential]).reshape(samples.shape)
+        return np.column_stack([positions, force, tangential]).reshape(guess.shape)
+
+    def clouds(self, mixture: Mixture) -> Iterator[Cloud]:
+        """Yield the posterior of each contact; a sample is a box a standard deviation wide."""
+        weight, modes = mixture.weight[:, None], self.contacts(mixture.mode[None])
+        for contact, mode in zip(self.contacts(mixture.samples).swapaxes(0, 1), modes[0], strict=True):
+            moved = contact[:, :2] - mixture.weight @ contact[:, :2]
+            width = np.sqrt(np.maximum(mixture.weight @ moved**2, 1e-12))
+            boxes = Boxes(contact[:, :3], np.tile([*width, 0], (len(contact), 1)))
+            sides = contact[:, None, 4:]
+            yield Cloud(
+                boxes, contact[:, 3:4], weight, mixture.evidence, mixture.misfit, sides, 0 * sides, mode
+            )
 
 
 def _order(guess: np.ndarray, mode: np.ndarray) -> np.ndarray:
@@ -373,7 +319,11 @@ def _order(guess: np.ndarray, mode: np.ndarray) -> np.ndarray:
     return np.take_along_axis(guess, orders[away.argmin(1)][..., None], axis=1)
 
 
-def _differ(first: np.ndarray, second: np.ndarray) -> bool:
-    """Return whether contacts (n, P) are elsewhere than others, in whatever order."""
-    away = np.linalg.norm(first[:, None, :2] - second[:, :2], axis=2)
-    return bool(max(away.min(0).max(), away.min(1).max()) > _ALIKE)
+def _distinct(guess: np.ndarray, score: np.ndarray, apart: float, most: int) -> list[int]:
+    """Return which guesses (M, n, P) are best, the best first; each has a contact apart, m, in any order."""
+    chosen, left = list[int](), np.argsort(-score, kind="stable")
+    while len(left) and len(chosen) < most:
+        chosen.append(int(left[0]))
+        away = np.linalg.norm(guess[left][:, :, None, :2] - guess[left[0], :, :2], axis=3)
+        left = left[np.maximum(away.min(1).max(1), away.min(2).max(1)) > apart]
+    return chosen

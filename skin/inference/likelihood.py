@@ -58,13 +58,9 @@ class Observation:
         fit += np.log(np.float32(2 * math.pi) * variance) @ self.counts
         fit *= np.float32(-0.5)
         if len(self.clipped):
-            fit += self.clipping(predicted[..., self.clipped], variance)
+            above = predicted[..., self.clipped] - np.float32(self.noise.clip)
+            fit += log_ndtr(above / np.sqrt(variance[..., self.clipped])).sum(-1)
         return fit
-
-    def clipping(self, predicted: np.ndarray, variance: np.ndarray) -> np.ndarray:
-        """Return the log probability (...,) that those sensors clip, from their readings (..., C), N."""
-        deviation = np.sqrt(variance[..., self.clipped] if variance.ndim else variance)
-        return log_ndtr((predicted - np.float32(self.noise.clip)) / deviation).sum(-1)
 
 
 # Friction. Readings (..., L, S) are those of the force into the skin (L = 1) and, with friction (L = 3), of a

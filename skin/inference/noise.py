@@ -36,18 +36,13 @@ class Noise:
     thickness: tuple[float, float] = (1.0, 1.0)
 
     def __post_init__(self) -> None:
-        if not self.frame > 0:
+        known = min(self.gain, self.offset, self.position) >= 0
+        if not (self.frame > 0 and self.frames >= 1 and self.clip > 0 and known):
             raise InputError(
-                f"noise needs a standard deviation above 0 N in a frame, got frame={self.frame:g}"
-            )
-        if self.frames < 1 or not self.clip > 0:
-            raise InputError(
-                f"noise needs frames >= 1 and clip > 0 N, got frames={self.frames} and clip={self.clip:g}"
-            )
-        if not min(self.gain, self.offset, self.position) >= 0:
-            raise InputError(
-                "noise needs gain, offset and position of 0 or more, got "
-                f"gain={self.gain:g}, offset={self.offset:g} and position={self.position:g}"
+                "noise needs a standard deviation above 0 N in a frame, frames >= 1, clip > 0 N, and gain, "
+                f"offset and position of 0 or more, got frame={self.frame:g}, frames={self.frames}, "
+                f"clip={self.clip:g}, gain={self.gain:g}, offset={self.offset:g} and "
+                f"position={self.position:g}"
             )
         low, high = self.thickness
         if not 0 < low <= 1 <= high < math.inf:

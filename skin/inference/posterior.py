@@ -3,13 +3,14 @@
 Boxes of positions and radii are refined until they are 1.8 standard deviations long. The likelihood is
 averaged over each to second order, with the force integrated. A further contact is tried where the frame fits
 badly or the residual supports it: it starts from the residual and from all pairs of positions, is refined by
-Gauss-Newton, and importance samples give its evidence, Markov chains the regions.
+Gauss-Newton, and importance samples give its evidence. Further ones, around the first, give the regions.
 """
 
 import math
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from scipy.ndimage import map_coordinates
 from scipy.special import expit, gammaincc, ndtr
 
 from skin.body.base import AbstractBody
@@ -25,7 +26,6 @@ from skin.touch.shapes import load_image
 MOST_CONTACTS = 3
 """Largest number of contacts in an estimate."""
 
-_WIDTH = 1.0  # of the boxes around samples of several contacts, in standard deviations
 _PER_CONTACT = 3  # sensors that a contact takes at least: it has a position and a force
 _FITS = 0.01  # a smaller predictive probability says that no contacts give such readings
 _POOR, _LIKELY = 1e-3, 0.5  # a further contact is tried below this probability, or above these odds
@@ -85,8 +85,7 @@ class LargeContacts:
     def evidence(self, frame: Observation) -> float:
         """Return the log of the mean likelihood of a frame."""
         _, evidence = fit_force(frame, self.prior, self._readings, self._spread)
-        top = evidence.max()
-        return float(top) + math.log(float(np.exp(evidence - top).mean()))
+        return float(np.logaddexp.reduce(evidence, dtype=float)) - math.log(len(evidence))
 
 
 def draw_large(candidates: CandidateReadings, count: int, rng: np.random.Generator) -> np.ndarray:
@@ -114,14 +113,10 @@ def draw_large(candidates: CandidateReadings, count: int, rng: np.random.Generat
 
 def _sample(picture: np.ndarray, area: float, angle: float, away: np.ndarray) -> np.ndarray:
     """Return the values of a picture of some area, m^2, at points (P, 2) from its middle, m."""
-    touched = picture > 0
-    pixel = math.sqrt(area / touched.sum())
-    cos, sin = math.cos(angle) / pixel, math.sin(angle) / pixel
-    column = np.floor(cos * away[:, 0] + sin * away[:, 1] + picture.shape[1] / 2).astype(int)
-    row = np.floor(cos * away[:, 1] - sin * away[:, 0] + picture.shape[0] / 2).astype(int)
-    height, width = picture.shape
-    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-    return np.where(inside, picture[row.clip(0, height - 1), column.clip(0, width - 1)], 0)
+    turned = (away @ [1, 1j]) * np.exp(-1j * angle) / math.sqrt(area / (picture > 0).sum())
+    middle = (np.array(picture.shape) - 1) / 2
+    rows, columns = turned.imag + middle[0], turned.real + middle[1]
+    return map_coordinates(picture, [rows, columns], order=0, mode="grid-constant")
 
 
 @dataclass(frozen=True)
@@ -280,13 +275,11 @@ class Posterior:
                 "estimated: give contacts=1, or set simulator.reading=interface or simulator=solid"
             )
         self.prior = prior or FingertipPrior()
-        possible = np.flatnonzero(self.prior.numbers[: contacts + 1])
-        self._maximum = int(possible[-1])
+        self._maximum = int(np.flatnonzero(self.prior.numbers[: contacts + 1])[-1])
         self.assume(CandidateReadings(simulator, body, self.prior), noise)
         self._large = LargeContacts(self.candidates, noise) if self.prior.large else None
         with np.errstate(divide="ignore"):
             self._numbers = np.log(np.array(self.prior.numbers[: self._maximum + 1]))
-        self._peak = self.prior.peak
 
     def assume(self, candidates: CandidateReadings, noise: Noise) -> None:
         """Take the readings of fingertips, and the noise of readings, to be these."""
@@ -306,23 +299,23 @@ class Posterior:
         Raises:
             InputError: readings of another number of sensors.
         """
-        values = np.asarray(readings, dtype=float)
-        sensors = self.candidates.sensors
+        values, valued, clips = self._checked(readings, valid, saturated)
+        frames = zip(np.atleast_2d(values), np.atleast_2d(valued), np.atleast_2d(clips), strict=True)
+        estimates = [self._frame(Observation.of(*frame, self.noise)) for frame in frames]
+        return estimates if values.ndim == 2 else estimates[0]
+
+    def _checked(
+        self, readings: np.ndarray, valid: np.ndarray | None, saturated: np.ndarray | None
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return readings, N, which have a value, and which exceed the largest force."""
+        values, sensors = np.asarray(readings, dtype=float), self.candidates.sensors
         if values.ndim not in (1, 2) or values.shape[-1] != sensors:
             raise InputError(
                 f"this skin has {sensors} sensors: give readings ({sensors},) or (T, {sensors}), N, got "
                 f"{values.shape}"
             )
-        valued = np.isfinite(values) & (True if valid is None else np.asarray(valid, bool))
         clips = values >= self.noise.clip if saturated is None else np.asarray(saturated, bool)
-        clipped = valued & clips
-        estimates = [
-            self._frame(Observation.of(frame, works, limits, self.noise))
-            for frame, works, limits in zip(
-                np.atleast_2d(values), np.atleast_2d(valued), np.atleast_2d(clipped), strict=True
-            )
-        ]
-        return estimates if values.ndim == 2 else estimates[0]
+        return values, np.isfinite(values) & (True if valid is None else np.asarray(valid, bool)), clips
 
     def estimate_touch(
         self, readings: np.ndarray, valid: np.ndarray | None = None, saturated: np.ndarray | None = None
@@ -336,11 +329,10 @@ class Posterior:
             readings: (T, S), N.
             valid, saturated: as of :meth:`estimate`.
         """
-        values = np.atleast_2d(np.asarray(readings, dtype=float))
-        valued = np.isfinite(values) & (True if valid is None else np.asarray(valid, bool))
-        clips = values >= self.noise.clip if saturated is None else np.asarray(saturated, bool)
+        values, valued, clips = map(np.atleast_2d, self._checked(readings, valid, saturated))
         noise = replace(self.noise, frames=self.noise.frames * len(values))
-        return self._frame(Observation.of(values.mean(0), valued.all(0), (valued & clips).any(0), noise))
+        works, limited = np.logical_and.reduce(valued), np.logical_or.reduce(valued & clips)
+        return self._frame(Observation.of(values.mean(0), works, limited, noise))
 
     def _frame(self, frame: Observation) -> FrameEstimate:
         """Return the estimate of a frame, which depends on nothing else."""
@@ -352,37 +344,25 @@ class Posterior:
         logs = np.full(len(self._numbers), -np.inf)
         logs[: len(evidence)] = np.array(evidence) + self._numbers[: len(evidence)]
         number = int(logs.argmax())
-        total = float(logs.max() + np.log(np.exp(logs - logs.max()).sum()))
+        total = float(np.logaddexp.reduce(logs))
         probabilities = np.exp(logs - total)
-        misfits = {0: frame.misfit_empty(), 1: single.misfit} | {
-            n: each.misfit for n, each in mixtures.items()
-        }
-        fit = float(gammaincc(max(frame.counts.sum(), 1) / 2, misfits[number] / 2))
-        if number in mixtures:
-            mixtures[number] = self._search.walk(frame, mixtures[number])
-        contacts = self._contacts(number, single, mixtures)
-        large = self._probability_of_large(frame, total)
+        misfit = frame.misfit_empty() if number == 0 else mixtures.get(number, single).misfit
+        fit = float(gammaincc(max(frame.counts.sum(), 1) / 2, misfit / 2))
+        # The most probable number, if there are several, is one that was refined.
+        walked = self._search.walk(frame, mixtures[number]) if number > 1 else None
+        clouds = self._search.clouds(walked) if walked else [single][:number]
+        contacts = tuple(sorted(map(self._summary, clouds), key=lambda each: -each.force))
+        odds = self._large.evidence(frame) + math.log(self.prior.large) - total if self._large else -math.inf
+        large = float(expit(odds))
         fingertip = number > 0 and fit >= _FITS and large < 0.5
         return FrameEstimate(number, probabilities, contacts, fit, large, fingertip, _unknown(sensors, frame))
-
-    def _probability_of_large(self, frame: Observation, fingertips: float) -> float:
-        """Return the probability of a large contact, beside the log evidence of fingertips."""
-        if self._large is None:
-            return 0.0
-        odds = self._large.evidence(frame) + math.log(self.prior.large) - fingertips
-        return float(expit(odds))
 
     def _several(
         self, frame: Observation, single: Cloud, maximum: int
     ) -> tuple[list[float], dict[int, Mixture]]:
         """Return the log evidence of each number of contacts, and the posteriors of several."""
         evidence, mixtures, misfit = [frame.empty(), single.evidence], dict[int, Mixture](), single.misfit
-        force, sides = single.mode[:, 3], single.mode[:, 4:]
-        scores = self._search.scores(single.mode[:, 2], force)
-        friction = sides / (force[:, None] * (self.candidates.friction or 1))
-        mode = np.column_stack([single.mode[:, :2], *scores, friction])
-        sensors = max(frame.counts.sum(), 1) / 2
-        predicted = self._search.predict(mode[None])[0][0]
+        mode, sensors = self._search.guess(single.mode[None]), max(frame.counts.sum(), 1) / 2
         for number in range(2, maximum + 1):
             addition = self._search.add(frame, mode)
             # It explains no more than the first contact: where no sensor responds, both are hidden.
@@ -391,77 +371,36 @@ class Posterior:
             if gammaincc(sensors, misfit / 2) > _POOR and odds < math.log(_LIKELY):
                 evidence.append(evidence[-1] + factor)
                 continue
-            mixture = self._refine(frame, self._search.extend(mode, addition), mode, predicted)
+            mixture = self._refine(frame, self._search.extend(mode, addition), mode)
             evidence.append(max(evidence[-1] + factor, mixture.evidence))
             mixtures[number] = mixture
-            mode, predicted, misfit = mixture.mode, mixture.predicted, mixture.misfit
+            mode, misfit = mixture.mode, mixture.misfit
         return evidence, mixtures
 
-    def _refine(
-        self, frame: Observation, guesses: np.ndarray, mode: np.ndarray, predicted: np.ndarray
-    ) -> Mixture:
+    def _refine(self, frame: Observation, guesses: np.ndarray, mode: np.ndarray) -> Mixture:
         """Return the best contacts, one more than a mode (n, P), from several starts."""
         starts = [guesses]
         for index in range(len(mode)):
             others = np.delete(mode, index, 0)
-            left = predicted * 0 if not len(others) else self._search.predict(others[None])[0][0]
-            pairs = self._search.pairs(frame, left)
+            known = self._search.predict(others[None])[0][0] if len(others) else 0 * frame.readings
+            pairs = self._search.pairs(frame, known)
             starts.append(np.concatenate([np.repeat(others[None], len(pairs), 0), pairs], axis=1))
         modes, score = self._search.refine(frame, np.concatenate(starts))
         return self._search.sample(frame, modes, score)
 
-    def _contacts(
-        self, number: int, single: Cloud, mixtures: dict[int, Mixture]
-    ) -> tuple[ContactEstimate, ...]:
-        if number == 0:
-            return ()
-        if number == 1:
-            boxes, tangential = single.boxes, (single.tangential, single.variance)
-            mode = single.mode[0, 2:]
-            return (self._summary(boxes.centre, boxes.width, single.force, single.weight, mode, *tangential),)
-        mixture = mixtures[number]  # the most probable number is one that was refined
-        weight = mixture.weight[:, None]
-        parts = list[ContactEstimate]()
-        modes = self._search.contacts(mixture.mode[None])[0]
-        for contact, mode in zip(
-            self._search.contacts(mixture.samples).transpose(1, 0, 2), modes, strict=True
-        ):
-            spread = np.sqrt(np.maximum(_variance(contact[:, :2], weight[:, 0]), 1e-12))
-            widths = np.zeros((len(contact), 3))
-            widths[:, :2] = _WIDTH * spread
-            tangential = contact[:, None, 4:]
-            parts.append(
-                self._summary(
-                    contact[:, :3], widths, contact[:, 3:4], weight, mode[2:], tangential, 0 * tangential
-                )
-            )
-        return tuple(sorted(parts, key=lambda part: -part.force))
-
-    def _summary(
-        self,
-        boxes: np.ndarray,
-        widths: np.ndarray,
-        force: np.ndarray,
-        weight: np.ndarray,
-        mode: np.ndarray,
-        tangential: np.ndarray,
-        variance: np.ndarray,
-    ) -> ContactEstimate:
-        """Return the moments of weighted boxes of positions and radii (N, 3), m, and forces (N, J), N.
-
-        ``mode`` (2,) holds the most probable radius, m, and force, N; ``tangential`` and ``variance`` are
-        those of the force along x and y, (N, J, 2), or (N, J, 0).
-        """
+    def _summary(self, cloud: Cloud) -> ContactEstimate:
+        """Return the moments of the posterior of a contact."""
+        (boxes, widths), force, weight = cloud.boxes, cloud.force, cloud.weight
         total = weight.sum(1)
         # Three radii of the variance of a box, which is up to a third of the range: the peak falls as r^2.
         radii = boxes[:, 2:] + widths[:, 2:] * np.sqrt(1 / 8) * np.array([-1, 0, 1])
-        peaks = (self._peak(radii)[:, :, None] * force[:, None]).reshape(len(force), -1)
+        peaks = (self.prior.peak(radii)[:, :, None] * force[:, None]).reshape(len(force), -1)
         thirds = np.tile(weight / 3, 3)
         middle = total @ boxes
         deviation = np.sqrt(total @ ((boxes - middle) ** 2 + widths**2 / 12))
         mean, order = float((weight * force).sum()), np.argsort(peaks, axis=None)
-        sideways = np.einsum("nj,njk->k", weight, tangential)
-        squares = np.einsum("nj,njk->k", weight, (tangential - sideways) ** 2 + variance)
+        sideways = np.einsum("nj,njk->k", weight, cloud.tangential)
+        squares = np.einsum("nj,njk->k", weight, (cloud.tangential - sideways) ** 2 + cloud.variance)
         low, high = np.interp([0.05, 0.95], np.cumsum(thirds.ravel()[order]), peaks.ravel()[order]).tolist()
         return ContactEstimate(
             middle[:2],
@@ -472,17 +411,13 @@ class Posterior:
             np.sqrt(squares) if len(sideways) else None,
             float(middle[2]),
             float(deviation[2]),
-            float(self._peak(mode[:1])[0] * mode[1]),
+            float(self.prior.peak(cloud.mode[2]) * cloud.mode[3]),
             (low, high),
             boxes[:, :2],
             widths[:, :2],
             peaks,
             thirds,
         )
-
-
-def _variance(positions: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    return weight @ (positions - weight @ positions) ** 2
 
 
 def _unknown(sensors: int, frame: Observation) -> str | None:
@@ -494,4 +429,6 @@ def _unknown(sensors: int, frame: Observation) -> str | None:
             f"{sensors} valid sensor{'s' if sensors > 1 else ''}: position and force cannot be separated; "
             "regions follow the prior, and several contacts look like one"
         )
+    if len(frame.clipped):
+        return f"beyond the range of sensors {frame.clipped.tolist()}: force and position may be elsewhere"
     return None

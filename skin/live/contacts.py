@@ -118,7 +118,7 @@ def contact_text_lines(message: dict[str, Any]) -> list[str]:
     if message["thickness"]:
         fits, described = (1e3 * thickness for thickness in message["thickness"])
         contacts.append(f"readings fit {fits:.3g} mm better than the described {described:.3g} mm")
-    return [head, *contacts]
+    return [head, *contacts, *filter(None, [message["reason"]])]
 
 
 def _words(contact: dict[str, Any]) -> str:

@@ -331,6 +331,17 @@ def test_a_sensor_that_clips_says_at_least_so_much():
     assert not blind or blind[0].position_deviation.max() > contact.position_deviation.max()
 
 
+def test_a_force_far_above_the_prior_is_held_or_said_to_be_beyond_the_range():
+    touches = draw(9, seed=2, margin=0.03)
+    touches[..., 3] = 150.0
+    noise, true = Noise(0.05, 10, clip=1.0), true_readings(touches, thin=True)
+    for row in np.flatnonzero((true > noise.clip).any(1)):
+        estimate = posterior(True, noise).estimate(np.minimum(measure(true[row], noise, 3), noise.clip))
+        held = any(each.region().contains(touches[row, 0, :2]) for each in estimate.contacts)
+        assert held or "beyond the range of sensors" in estimate.unknown
+    assert posterior(True, noise).estimate(np.minimum(true[0] / 300, 0.9)).unknown is None
+
+
 def test_frames_of_a_touch_tell_more_together():
     touches = draw(1, 19, margin=0.05)
     frames = np.concatenate([measure(true_readings(touches), Noise(0.05), seed) for seed in range(10)])
@@ -440,7 +451,7 @@ def test_precise_readings_of_three_axes_have_finite_regions(three_axes):
 
 def test_friction_needs_a_simulator_that_has_it(three_axes):
     body, sensors = SMALL, sensors_of(SMALL, None, 3)
-    with pytest.raises(skin.InputError, match="friction of 0 or more, got -1"):
+    with pytest.raises(skin.InputError, match=r"friction of 0 or more.* friction=-1"):
         FingertipPrior(friction=-1)
     with pytest.raises(skin.InputError, match="friction needs a simulator with tangential forces"):
         Posterior(Naive(body, sensors), NOISE, body, FingertipPrior(friction=0.8))

@@ -200,6 +200,7 @@ def test_broken_sensors_do_not_look_like_no_contact(posterior, felt):
     clipped = estimate_contacts(posterior, NOISE, moment(limited, saturated=strongest))
     assert clipped["state"] == "contacts"
     assert clipped["contacts"][0]["force"] > 3
+    assert contact_text_lines(clipped)[-1].startswith("beyond the range of sensors")
 
 
 def test_messages_of_every_state_have_the_same_fields(posterior, felt):

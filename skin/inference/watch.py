@@ -3,7 +3,7 @@
 Tests for changes may run for ever. Each touch gives one residual per sensor: its reading, against what the
 other sensors say that it should be. A residual is ranked among those of earlier touches, and tests bet on its
 rank. While nothing has changed, no way of betting multiplies capital on average, so that the mean capital of
-all tests reaches 20 times the first one with a probability of at most 1/20 (Ville 1939), however long the
+all tests reaches 50 times the first one with a probability of at most 1/50 (Ville 1939), however long the
 skin is watched.
 
 That rests on:
@@ -33,8 +33,8 @@ from skin.inference.mechanics import Mechanics
 from skin.inference.noise import Noise
 from skin.inference.posterior import Posterior
 
-THRESHOLD = 20.0
-"""Mean capital of all tests at which sensors are reported; 1/20 bounds the probability of a false report."""
+THRESHOLD = 50.0
+"""Mean capital of all tests at which sensors are reported; 1/50 bounds the probability of a false report."""
 
 _FORCE, _SPREAD = 10.0, 1.2  # N, and of its logarithm: of touches of any kind, 0.9 to 110 N
 _RISEN = 5.0  # standard deviations above rest: two such sensors are a touch; one may be broken

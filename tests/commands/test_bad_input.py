@@ -10,15 +10,18 @@ PORT = "device.port=/dev/ttyACM77"
     [
         ("animate", "add out=touch.gif"),
         ("animate out=x.gif touch=fingertips labels=[big]", "fingertips cannot be drawn to be big"),
-        ("animate out=x.mp4", "a still a .png file, got out=x.mp4"),
+        ("animate out=x.mp4", "out=x.mp4 must be a .gif file or a .png file: add out=touch.gif"),
         ("animate vieww=flat", "vieww"),
         ("calibrate", "which session?"),
-        ("calibrate session=none.csv", "no file none.csv"),
-        ("check weight=0 layout=grid simulator=naive", "weight=0 is a mass in kg above 0"),
+        ("calibrate session=none.csv", "cannot read the session none.csv: "),
+        ("check weight=0 layout=grid simulator=naive", "is no known load: give a mass in kg, up to 50"),
         ("check seconds=1 layout=grid", "seconds=1 must be greater than or equal to 2"),
         ("compare", "which session?"),
         ("convert", "skin convert needs from= or reader=, and out=, as in from=map.yaml out=x.parquet"),
-        ("convert from=map.yaml out=x.txt", "a recording is a .parquet or .csv file, got x.txt"),
+        (
+            "convert from=map.yaml out=x.txt",
+            "out=x.txt must be a .parquet file or a .csv file or a .mcap file or a folder",
+        ),
         ("convert from=none.yaml out=x.csv", "cannot read the mapping none.yaml"),
         (
             "convert from=efles out=x.csv",

@@ -53,6 +53,12 @@ def main(arguments: Sequence[str] | None = None, before: Sequence[str] = ()) -> 
     else:
         try:
             import_module(modules[verb]).main(overrides)
+            sys.stdout.flush()
+        except BrokenPipeError:
+            if not {"-h", "--help"} & {*overrides}:
+                raise
+            # Nobody reads the help to its end. Python flushes once more when it ends.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         except SystemExit as end:
             if end.code == 128 + signal.SIGTERM and arguments is None:
                 interrupt.leave(end.code)

@@ -112,3 +112,11 @@ def test_bash_completes_verbs_groups_options_and_settings(line, choices):
         ["bash", "-c", script], env=environment, capture_output=True, text=True, timeout=120, check=True
     )
     assert set(done.stdout.split()) == choices
+
+
+def test_help_that_is_not_read_to_its_end_is_no_error():
+    line = [sys.executable, "-m", "skin", "check", "--help"]
+    with subprocess.Popen(line, stdout=subprocess.PIPE, stderr=subprocess.PIPE, cwd=ROOT) as process:
+        process.stdout.close()
+        assert process.stderr.read() == b""
+    assert process.returncode == 0

@@ -85,7 +85,8 @@ class LargeContacts:
     def evidence(self, frame: Observation) -> float:
         """Return the log of the mean likelihood of a frame."""
         _, evidence = fit_force(frame, self.prior, self._readings, self._spread)
-        return float(np.logaddexp.reduce(evidence, dtype=float)) - math.log(len(evidence))
+        top = float(evidence.max())
+        return top + math.log(float(np.exp(evidence - top).mean()))
 
 
 def draw_large(candidates: CandidateReadings, count: int, rng: np.random.Generator) -> np.ndarray:

@@ -162,8 +162,10 @@ class Recorded(AbstractDevice):
                 f"{body.size[0]:g} x {body.size[1]:g} m: add {body.resized(size)}"
             )
         if len(stored) != len(sensors):
+            three = len(stored) == 3 * len(sensors)  # sites with three axes, for a run of normal sensors
             raise InputError(
-                f"{self.path} has {len(stored)} sensors, the layout has {len(sensors)}: {layout}"
+                f"{self.path} has {len(stored)} sensors, the layout has {len(sensors)}: "
+                + ("keep the channels inwards, readings[..., 2::3]" if three else layout)
             )
         apart = np.abs(stored - sensors.positions).max(axis=1)
         if apart.max() > 1e-6:  # m: the file's positions are float32

@@ -39,6 +39,13 @@ def test_a_run_is_trained(windows):
     assert "overall/accuracy" in done.stdout
 
 
+@pytest.mark.slow("imports all libraries anew")
+def test_the_emulator_asks_for_a_socket(windows):
+    done = windows("emulate", "simulator=naive")
+    assert done.returncode == 2
+    assert done.stderr == "this system has no pseudo-terminals: give a TCP port, as in port=5555\n"
+
+
 @pytest.mark.parametrize("port", ["COM3", "/dev/cu.usbmodem1101"])
 def test_a_port_is_a_serial_port_by_any_name(windows, port):
     done = windows("listen", f"device.port={port}")

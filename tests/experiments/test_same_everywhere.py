@@ -50,7 +50,7 @@ def test_a_skin_at_a_port_and_its_recording_are_judged_alike(run, begin, played,
 
     tell("train.py", "experiment=rules", *SKIN, *SMALL)
     data, scale = stream(begin, tmp_path)
-    assert data.count(b"# gesture") == COUNT
+    assert data.count(b'# {"number"') == COUNT
     port = played(lambda reader, stop: reader.sendall(data))
     there = [f"device.port={port}", f"device.scale={scale}", f"device.gestures={COUNT}"]
     live = answers(tmp_path, tell("evaluate.py", "device=serial", *there, f"out={tmp_path}/live"))

@@ -78,7 +78,7 @@ def test_verbs_show_their_help(installed):
     shown = {line.split()[0] for line in lines if line.startswith("  ")}
     for verb, module in verbs().items():
         assert (verb in shown) == module.startswith("skin."), verb
-    assert "port: 5555" in installed("-m", "skin", "emulate", "--help")
+    assert "port: pty" in installed("-m", "skin", "emulate", "--help")
 
 
 @pytest.mark.slow("trains from an installed wheel")

@@ -18,8 +18,8 @@ import skin
 # %%
 # Start the emulator
 # ------------------
-# In a terminal of its own this is ``skin emulate port=0``. It prints its address and the settings that
-# connect to it, then plays simulated touches in real time.
+# In a terminal of its own this is ``skin emulate port=0``, or ``port=pty`` for a pseudo-terminal. It
+# prints its address and the settings that connect to it, then plays simulated touches in real time.
 
 command = [sys.executable, "-m", "skin", "emulate", "port=0", "simulator=naive", "emulate.idle=2.5"]
 emulator = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
@@ -65,5 +65,5 @@ axis.set(xlabel="time, s", ylabel="reading, N", title=f"sensor {strongest} has t
 # .. code-block:: bash
 #
 #     skin train experiment=features simulator=solid
-#     skin emulate simulator=solid
-#     skin live device=serial device.port=socket://127.0.0.1:5555 device.scale=0.0390625 web=true
+#     skin emulate link=./skin-port simulator=solid
+#     skin live device=serial device.port=./skin-port device.scale=0.0390625 web=true

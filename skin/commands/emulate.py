@@ -1,13 +1,13 @@
-"""Emulate a skin at a TCP port of this machine, with simulated gestures.
+"""Emulate a skin at a pseudo-terminal or TCP port, with simulated gestures.
 
-    skin emulate
+    skin emulate port=pty link=./skin-port
 
 Prints the settings that connect to it, then sends gestures until Ctrl-C.
 """
 
 import signal
 from contextlib import suppress
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from annotated_types import Ge, Le
 
@@ -19,19 +19,20 @@ from skin.runs.configuration import Config
 @command("emulate")
 def main(
     config: Config,
-    port: Annotated[int, Ge(0), Le(65535)],
+    port: Literal["pty"] | Annotated[int, Ge(0), Le(65535)],
+    link: str | None,
     seconds: float | None,
     gestures: int | None,
     emulate: dict[str, Any],
 ) -> None:
     """Send gestures of the configured simulator, device and layout in real time."""
     from skin.runs.build import build_device
-    from skin.wire.emulator import Emulator, EmulatorSettings, TcpPort
+    from skin.wire.emulator import Emulator, EmulatorSettings, PtyPort, TcpPort
 
     settings = configured(EmulatorSettings, emulate, "emulate")
     device = build_device(config).simulated("only simulated gestures can be emulated")
     signal.signal(signal.SIGTERM, signal.default_int_handler)
-    opened = TcpPort(port)
+    opened = PtyPort(link) if port == "pty" else TcpPort(port)
     try:
         emulator = Emulator(
             device,

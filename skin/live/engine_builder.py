@@ -85,7 +85,7 @@ class SelfTest:
         text = f"self-test: {raised.sum()} of {len(raised)} dangerous presses raise the alarm"
         scale = (
             "only its range tests the scale"
-            if device.known
+            if device.maximum is not None  # too large or too small a force would leave the range
             else "the device declares no range, so its scale is not checked"
         )
         say(f"{text}, {expected.sum()} with nominal settings; {silent and f'not on {silent}; '}{scale}")

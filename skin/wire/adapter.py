@@ -30,7 +30,6 @@ from skin.wire.formats import (
 )
 from skin.wire.lines import (
     LABEL,
-    NUMBER,
     NumberWords,
     Reader,
     StructField,
@@ -57,17 +56,14 @@ class Adapter:
             ``auto``: to be proposed by ``skin listen``.
         separator: text between fields; None: comma, semicolon, tab or blanks.
         decimal: ``.`` or ``,``.
-        thousands: sign between groups of three digits.
         base: of whole numbers, 10 or 16.
         label: text between the name of a field and its number, such as ``:``.
         pattern: regular expression of a whole line: a named group per field, or a group ``values`` with
             fields between separators; with a group ``value``, of one field, whose name is the group ``name``.
             Without ``value``, a group ``name`` names the line: its position in ``names`` is that of the row.
-        number: regular expression of one number, where nothing separates fields.
         names: of the fields, repeated over all of them; of labelled fields and JSON their order.
         ignore: regular expression of lines that are no frames.
         end: text after each frame; None: LF, CRLF, LF CR or CR.
-        length: bytes of a frame of text that has no end.
         rows: lines per frame; 0: found in the stream; None: each line is a frame.
         index: field with the number of the row; None: another line, or an empty one, separates frames.
         struct: name -> numpy type of each field of a binary frame, as in ``{time: <u4, force: (16,)<u2}``;
@@ -92,15 +88,12 @@ class Adapter:
     kind: Literal["protocol", "text", "json", "binary", "auto"] = "protocol"
     separator: str | None = None
     decimal: Literal[".", ","] = "."
-    thousands: str = ""
     base: Literal[10, 16] = 10
     label: str | None = None
     pattern: str | None = None
-    number: str | None = None
     names: Sequence[str] = ()
     ignore: str | None = None
     end: str | None = None
-    length: Annotated[int, Ge(1)] | None = None
     rows: Annotated[int, Ge(0)] | None = None
     index: int | str | None = None
     struct: Mapping[str, str] | None = None
@@ -124,7 +117,7 @@ class Adapter:
     def __post_init__(self) -> None:
         check_settings(Adapter, {name: getattr(self, name) for name in self._changed}, "device.adapter")
         groups = {}
-        for name in ("pattern", "number", "ignore"):
+        for name in ("pattern", "ignore"):
             text = getattr(self, name)
             try:
                 groups[name] = re.compile(text or "").groupindex
@@ -134,7 +127,7 @@ class Adapter:
                 ) from error
         binary = self.kind == "binary"
         size = sum(field.size for field in self._fields) if self.struct else 1
-        empty = [name for name in ("start", "poll", "separator", "label") if getattr(self, name) == ""]
+        empty = [name for name in ("start", "poll", "separator", "label", "end") if getattr(self, name) == ""]
         for wrong, message in (
             (
                 self.pattern and not groups["pattern"],
@@ -142,10 +135,6 @@ class Adapter:
             ),
             (self.decimal == self.separator, ": the decimal sign cannot separate fields, too: set separator"),
             (empty, f".{' and '.join(empty)} is empty: leave it out"),
-            (
-                self.kind == "text" and self.end == "" and not self.length,
-                ": text without an end needs its length, as in length: 11",
-            ),
             (binary and not self.struct, ": binary frames need a struct, as in struct: {force: (16,)<u2}"),
             (
                 binary and not self._mark(self.head) + self._mark(self.tail),
@@ -187,15 +176,13 @@ class Adapter:
         over, invalid = (
             {str(word).lower().encode() for word in words} for words in (self.over, self.invalid)
         )
-        return NumberWords(
-            self.decimal, self.thousands, self.base, (INVALID | invalid) - over, OVER - invalid | over
-        )
+        return NumberWords(self.decimal, self.base, (INVALID | invalid) - over, OVER - invalid | over)
 
     @cached_property
     def _numbers(self) -> frozenset[float]:
         """Numbers that mean no value."""
-        read = parse_words([str(word).encode() for word in self.invalid], invalid=())
-        return frozenset(filter(isfinite, read.fields))
+        words = [str(word).encode() for word in self.invalid]
+        return frozenset(filter(isfinite, parse_words(words, invalid=()).fields))
 
     def describe(self) -> str:
         """Return the settings that differ from their defaults, as YAML."""
@@ -208,7 +195,7 @@ class Adapter:
 
     def may_end(self, data: bytes) -> bool:
         """Return whether a frame may end in ``data``."""
-        return self.kind == "binary" or self.length is not None or self._delimiter(data) in data
+        return self.kind == "binary" or self._delimiter(data) in data
 
     def _delimiter(self, data: bytes) -> bytes:
         return self.end.encode() if self.end else b"\n" if b"\n" in data or self.kind == "protocol" else b"\r"
@@ -238,20 +225,6 @@ class Adapter:
         """Yield how data may be cut and read; what the adapter leaves open follows from them."""
         if self.kind == "binary":
             yield from self._binary_layouts(data)
-            return
-        if self.length is not None:
-            mark = (
-                self.separator.encode()
-                if self.separator
-                else next((m for m in SEPARATORS if m in data), b" ")
-            )
-            count = data[: self.length].count(mark) + 1
-            width, odd = divmod(self.length - (count - 1) * len(mark), count)
-            number = rb"[-+.\d ]{%d}" % width
-            pattern = re.escape(mark).join([number] * count)
-            if not odd and width > 0 and count > 1 and re.search(b"(?:" + pattern + b"){%d}" % _RUN, data):
-                split = fixed_length(self.length, pattern, number + re.escape(mark), width + len(mark))
-                yield FrameFormat(split, *self._reader([data]), frame=re.compile(pattern))
             return
         plain = self.kind == "protocol"
         ignore = None if self.ignore is None else re.compile(self.ignore.encode())
@@ -283,9 +256,8 @@ class Adapter:
             return partial(read_named, numbers, find_json, keys), keys
         marks = [self.separator.encode()] if self.separator and self.separator.strip() else []
         if self.separator is None:
-            marks = [mark for mark in SEPARATORS if mark.decode() not in (self.decimal, self.thousands)]
+            marks = [mark for mark in SEPARATORS if mark.decode() != self.decimal]
         text = self.pattern or (self.label and LABEL % re.escape(self.label))
-        text = text or (self.number and NUMBER % self.number)
         if text is None:
             bodies = [line.rpartition(b"*")[0 if b"*" in line else 2].rstrip(b" \r") for line in lines]
             trailing = 2 * sum(body.endswith(tuple(marks)) for body in bodies) > len(bodies)
@@ -395,7 +367,7 @@ class Adapter:
             return InputError(
                 f"{missing}: is the baud rate right, as in device.baudrate=115200? For another format, {hint}"
             )
-        texts = [] if self.kind == "binary" or self.length is not None else self._lines(data)[-3:]
+        texts = [] if self.kind == "binary" else self._lines(data)[-3:]
         if not texts:
             return InputError(f"the adapter reads {missing}: {hint}")
         layout = next(self.layouts(data))

@@ -52,11 +52,6 @@ class RawRange:
     whole: bool = False
     limits: Limits = (None, None)
 
-    @property
-    def known(self) -> bool:
-        """Whether the scale can be checked: too large or too small a force would leave the range."""
-        return self.maximum is not None
-
 
 class ChannelHealth:
     """Checks channels frame by frame.

@@ -1,10 +1,13 @@
-"""The emulator: a simulated skin at a TCP port, in real time."""
+"""The emulator: a simulated skin at a pseudo-terminal or a TCP port, in real time."""
 
+import os
+import select
 import socket
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import count, islice
+from pathlib import Path
 from threading import Event
 from time import monotonic, sleep
 from typing import Annotated
@@ -180,16 +183,67 @@ class TcpPort:
             end.close()
         self._client = None
 
-    def write(self, data: bytes, patience: float = 1.0) -> None:
-        """Write; bytes that are not read within ``patience`` s are lost, as without flow control."""
-        deadline = monotonic() + patience
-        while data and monotonic() < deadline and self.connected() and self._client is not None:
+    def write(self, data: bytes) -> int:
+        """Write a part of ``data`` without waiting; return its length."""
+        return self._client.send(data) if self._client else len(data)
+
+
+class PtyPort:
+    """A pseudo-terminal, which programs read like a serial port; the methods are those of :class:`TcpPort`.
+
+    Args:
+        link: path of a symbolic link to it, which :meth:`plug` makes again; None: none.
+
+    Attributes:
+        address: value for ``device.port``.
+
+    Raises:
+        InputError: this system has no pseudo-terminals, or the link cannot be made.
+    """
+
+    def __init__(self, link: str | None) -> None:
+        self._link = None if link is None else Path(link).expanduser().absolute()
+        self.plug()
+
+    def plug(self) -> None:
+        """As of :class:`TcpPort`; without a link, the address may be another."""
+        if not hasattr(os, "openpty"):
+            raise InputError("this system has no pseudo-terminals: give a TCP port, as in port=5555")
+        import tty
+
+        master, slave = os.openpty()
+        tty.setraw(slave)
+        os.set_blocking(master, False)
+        name = os.ttyname(slave)
+        self.address = str(self._link or name)
+        if self._link is not None:
             try:
-                data = data[self._client.send(data) :]
-            except BlockingIOError:
-                sleep(0.002)  # until a full buffer is tried again
-            except OSError:
-                return
+                if not self._link.exists():  # left by an emulator that was killed
+                    self._link.unlink(missing_ok=True)
+                self._link.symlink_to(name)
+            except OSError as error:
+                raise InputError(
+                    f"cannot make link={self._link}, which may be in use: {error.strerror}; end the other "
+                    "skin emulate, or give another name"
+                ) from error
+        os.close(slave)  # opened and closed once, it tells when a reader opens it
+        self._master = os.fdopen(master, "wb", 0)
+
+    def connected(self) -> bool:
+        """As of :class:`TcpPort`."""
+        watch = select.poll()
+        watch.register(self._master, 0)
+        return not watch.poll(0)  # that nobody has it open is reported always
+
+    def unplug(self) -> None:
+        """As of :class:`TcpPort`."""
+        if self._link is not None:
+            self._link.unlink(missing_ok=True)
+        self._master.close()
+
+    def write(self, data: bytes) -> int:
+        """As of :class:`TcpPort`."""
+        return os.write(self._master.fileno(), data)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -203,12 +257,14 @@ class EmulatorSettings:
         check: checksum of a line: ``crc16``, ``xor`` or ``none``.
         idle: before the first gesture, s.
         gap: between two windows, s.
-        announce: send an announcement before each gesture, with its contacts.
         seed: of the gestures; the device's own noise follows ``device.seed``.
-        id: its name; begins with ``emulated``, else that is put before it.
         unplug: times, s since the start of the device, at which the port disappears for ``away`` s; frame
             numbers and clock then start from 0 again.
+        silence: times, s, from which it sends nothing for ``away`` s; frame numbers and clock go on.
         away: s.
+        stuck: channels, from 0, that keep their value from ``since`` on.
+        dead: channels that send 0 from then on.
+        since: s.
     """
 
     rate: PositiveFloat = 100.0
@@ -217,11 +273,13 @@ class EmulatorSettings:
     check: Check = "crc16"
     idle: NonNegativeFloat = 3.0
     gap: NonNegativeFloat = 0.5
-    announce: bool = True
     seed: NonNegativeInt = 0
-    id: str = "emulated"
     unplug: Sequence[NonNegativeFloat] = ()
+    silence: Sequence[NonNegativeFloat] = ()
     away: NonNegativeFloat = 2.0
+    stuck: Sequence[NonNegativeInt] = ()
+    dead: Sequence[NonNegativeInt] = ()
+    since: NonNegativeFloat = 0.0
 
 
 class Emulator:
@@ -238,18 +296,27 @@ class Emulator:
     Attributes:
         converter: from N to counts.
         frames: number of frames sent.
+
+    Raises:
+        InputError: a channel that fails does not exist.
     """
 
     def __init__(
         self,
         device: Simulated,
-        port: TcpPort,
+        port: TcpPort | PtyPort,
         settings: EmulatorSettings,
         on_event: Callable[[float, str], None] = lambda t, text: None,
     ) -> None:
         self.device, self.port, self.settings = device, port, settings
         self.converter = Converter(settings.bits, float(device.constants.clip.max()))
         self._on_event, self.frames, self._zero = on_event, 0, 0
+        self._sent = np.zeros(len(device.sensors))
+        if max([*settings.stuck, *settings.dead], default=0) >= len(device.sensors):
+            raise InputError(
+                f"emulate.stuck={list(settings.stuck)} and emulate.dead={list(settings.dead)} must be below "
+                f"{len(device.sensors)}, the number of sensors of the layout"
+            )
         self._over = Event()
         self._noise = generator(Stream.NOISE, device.seed, Stream.TEST, 2, settings.seed)
 
@@ -290,7 +357,7 @@ class Emulator:
 
     def _play(self, values: np.ndarray, end: int | None) -> bool:
         """Send frames when they are due; return whether the run is over."""
-        rate = self.settings.rate
+        rate, stuck, dead = self.settings.rate, list(self.settings.stuck), list(self.settings.dead)
         unplugged = {round(t * rate) for t in self.settings.unplug}
         for row in values:
             if end is not None and self.frames >= end:
@@ -302,35 +369,46 @@ class Emulator:
                 self._unplug()
             if self.frames % max(1, round(rate)) == 0:  # each second
                 self._header()
-            seq = self.frames - self._zero
+            if self.frames > self.settings.since * rate:
+                row[stuck], row[dead] = self._sent[stuck], 0.0
+            self._sent, seq = row, self.frames - self._zero
             numbers = row.tolist() if self.settings.bits is None else row.astype(int).tolist()
-            self.port.write(encode_line(numbers, seq, round(seq * 1e6 / rate) % 2**32, self.settings.check))
+            self._send(encode_line(numbers, seq, round(seq * 1e6 / rate) % 2**32, self.settings.check))
             self.frames += 1
         return False
+
+    def _send(self, data: bytes, patience: float = 1.0) -> None:
+        """Write; bytes that are not read within ``patience`` s are lost, as without flow control."""
+        t, deadline = self.frames / self.settings.rate, monotonic() + patience
+        silent = any(0 <= t - begin < self.settings.away for begin in self.settings.silence)
+        while data and not silent and monotonic() < deadline and self.port.connected():
+            try:
+                data = data[self.port.write(data) :]
+            except BlockingIOError:
+                sleep(0.002)  # until a full buffer is tried again
+            except OSError:
+                return
 
     def _header(self) -> None:
         settings, unit = self.settings, "N" if self.settings.bits is None else "adc"
         speed = None if settings.speed == 1 else settings.speed
-        name = settings.id if settings.id.startswith(EMULATED) else f"{EMULATED}-{settings.id}"
-        header = Header(1, len(self.device.sensors), settings.rate, unit, settings.bits, name, speed)
-        self.port.write(encode_header(header, settings.check))
+        header = Header(1, len(self.device.sensors), settings.rate, unit, settings.bits, EMULATED, speed)
+        self._send(encode_header(header, settings.check))
 
     def _announce(self, number: int, gesture: Gesture) -> None:
         rate = self.settings.rate
         self._on_event(self.frames / rate, f"gesture {number}: {label_text(gesture.labels)}")
-        if self.settings.announce:
-            seq, frames = self.frames - self._zero, round(len(gesture.force) * rate / self.device.model_rate)
-            announcement = Announcement(
-                number, seq, frames, gesture.labels, self.device.model_rate, gesture.contacts
-            )
-            self.port.write(encode_announcement(announcement))
+        seq, frames = self.frames - self._zero, round(len(gesture.force) * rate / self.device.model_rate)
+        announcement = Announcement(
+            number, seq, frames, gesture.labels, self.device.model_rate, gesture.contacts
+        )
+        self._send(encode_announcement(announcement))
 
     def _unplug(self) -> None:
         """Disconnect and power off; the clock starts from 0 afterwards."""
         self._on_event(self.frames / self.settings.rate, f"unplugged for {self.settings.away:g} s")
         self.port.unplug()
-        if self._over.wait(self.settings.away / self.settings.speed):
-            return
+        self._over.wait(self.settings.away / self.settings.speed)
         self.port.plug()
         self._on_event(self.frames / self.settings.rate, f"plugged in again: {self.port.address}")
         self._start += self.settings.away / self.settings.speed

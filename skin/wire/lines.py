@@ -13,7 +13,6 @@ import numpy as np
 from skin.device.resampling import FrameError
 from skin.wire.protocol import Line, parse_words, split_words, verify_line
 
-_DAYTIME = re.compile(rb"(?:\d{4}-\d\d-\d\d[T ])?(\d{1,2}):(\d\d):(\d\d(?:\.\d+)?)")
 _HEX = re.compile(rb"(?i)(?:0x)?[0-9a-f]+")
 # Each blank is matched in one way, or blanks would take a time as the square of their number.
 LABEL = (
@@ -21,8 +20,6 @@ LABEL = (
     r"\s*+(?P<value>[^\s,;]*+)\s*+[,;]?\s*+"
 )
 """Pattern of one field with a name, as in ``A0: 12``, for the text between both."""
-NUMBER = r"(?P<value>%s)[ \t,;]*+"
-"""Pattern of one number, with anything of a separator after it, for that of its digits."""
 
 Reader = Callable[[bytes], Line | bytes]
 """Returns the :class:`skin.wire.protocol.Line` of a piece, or bytes of a comment, or raises FrameError."""
@@ -34,41 +31,26 @@ class NumberWords:
 
     Attributes:
         decimal: the decimal sign.
-        thousands: sign between groups of three digits; empty: none.
         base: 10 or 16.
         invalid: words, in lower case, that mean no value.
         over: words, in lower case, for a value beyond the range of the converter.
     """
 
     decimal: str
-    thousands: str
     base: int
     invalid: Collection[bytes]
     over: Collection[bytes]
 
     def __call__(self, words: Sequence[bytes], check: Any = "none") -> Line:
-        """Return the numbers of words; the time of the day in s."""
+        """Return the numbers of words."""
         if self.base == 16:
             words = [b"%d" % int(word, 16) if _HEX.fullmatch(word.strip()) else word for word in words]
-        if self.thousands:
-            mark = self.thousands.encode()
-            grouped = re.compile(rb"\s*[-+]?\d{1,3}(%s\d{3})+(\D\d*)?\s*" % re.escape(mark))
-            words = [word.replace(mark, b"") if grouped.fullmatch(word) else word for word in words]
         if self.decimal == ",":
-            words = [word.translate(_SWAPPED) if b":" not in word else word for word in words]
-        read = parse_words(words, check, self.invalid, self.over)
-        if any(b":" in word for word in read.strange.values()):
-            return parse_words([*map(_to_seconds, words)], check, self.invalid, self.over)
-        return read
+            words = [word.translate(_SWAPPED) for word in words]
+        return parse_words(words, check, self.invalid, self.over)
 
 
 _SWAPPED = bytes.maketrans(b".,", b",.")  # a point is no decimal sign then
-
-
-def _to_seconds(word: bytes) -> bytes:
-    """Return the time of the day in s where a field is one; else the field."""
-    match = _DAYTIME.fullmatch(word.strip())
-    return b"%.6f" % np.dot((3600, 60, 1), [*map(float, match.groups())]) if match else word
 
 
 def read_words(numbers: NumberWords, marks: Sequence[bytes], trailing: bool, line: bytes) -> Line:

@@ -32,7 +32,8 @@ _WORD = r"[-+.:\w/]+"  # a number, or a word in its position
 _ASIDE = re.compile(r"(?i)temp.*|.*[_\[(](t|temp.*|°?c|deg.?c)[\])]?|.*humid.*|rssi|.*batt.*|temperature")
 _GUIDE = re.compile(r"(?i)min|max|low|lower|high|upper|zero|ref.*|limit")
 """Names of fields that are not forces, and of lines that keep a plotter from scaling."""
-_UNIT = re.compile(rb"[-+]?\d+\.?\d*\s*(?:[^\x00-\x7f]+)?(?:C|F|%|V|dBm?)")
+_UNIT = re.compile(rb"[-+]?\d+\.?\d*\s*(?:[^\x00-\x7f]+)?(?:C|F|%|V|dBm?)|\d+:\d\d:\d\d\S*")
+"""Texts with a number in each: a quantity with its unit, and the time of the day."""
 
 
 @dataclass(frozen=True)
@@ -140,7 +141,7 @@ def _read(adapter: Adapter, pieces: Pieces, data: bytes) -> Proposal:
         _ImplausibleError: what it reads are no frames of a skin.
     """
     notes, score = list[str](), 0.0
-    if adapter.kind in ("text", "json") and adapter.length is None:
+    if adapter.kind in ("text", "json"):
         adapter, notes, score = _settle(adapter, data)
     decoder = Decoder(adapter=adapter)
     frames = [frame for now, piece in pieces for frame in decoder.feed(piece, now)]
@@ -256,7 +257,7 @@ def _settle(adapter: Adapter, data: bytes) -> tuple[Adapter, list[str], float]:
     described = {position: names[position] if by_name else position for position in sorted(left_out)}
     notes = [f"field {field} {left_out[position]}" for position, field in described.items()]
     notes += [f"{count} lines such as {kind!r} are ignored" for kind, count in kinds]
-    if by_name and adapter.pattern is None and adapter.number is None:
+    if by_name and adapter.pattern is None:
         roles["names"] = tuple(names)
     drop = (*adapter.drop, *described.values())
     return replace(adapter, drop=drop, ignore=ignore, **roles), notes, score
@@ -373,7 +374,7 @@ def _sums(inner: np.ndarray, table: np.ndarray, counter: int | None) -> Iterator
             yield from (total, total % 256, total % 65536)
 
 
-def _text(data: bytes, longest: int = 512) -> Iterator[Adapter]:
+def _text(data: bytes) -> Iterator[Adapter]:
     """Yield adapters of text, the most specific first."""
     yield Adapter()
     if not is_text(data):
@@ -383,11 +384,7 @@ def _text(data: bytes, longest: int = 512) -> Iterator[Adapter]:
         lines = (ANSI.sub(b"", line).strip(b"\r\n ") for line in data.split(mark)[1:-1])
         yield from _lines([line for line in lines if line and not line.startswith(b"#")])
         return
-    # Text without lines: of a fixed length, or with a word at the end of each frame.
-    classes = np.frombuffer(re.sub(rb"[-+.\d ]", b"0", data), np.uint8)
-    for length in range(3, min(longest, len(data) // 4)):
-        if np.mean(classes[length:] == classes[:-length]) > _SAME:
-            yield Adapter(kind="text", end="", length=length)
+    # Text without lines: with a word at the end of each frame.
     for word, count in Counter(re.findall(rb"[^\d\s.,;+-]+", data)).most_common(2):
         if count >= _FRAMES and word.isascii():
             yield from _lines(data.split(word)[1:-1], word.decode())
@@ -397,13 +394,6 @@ def _lines(lines: Sequence[bytes], end: str | None = None) -> Iterator[Adapter]:
     text = partial(Adapter, kind="text", end=end)
     yield Adapter(kind="json", end=end)
     yield from (text(label=label, decimal=sign) for label in (":", "=") for sign in (".", ","))
-    words = re.split(rb"[;\t ]+", b" ".join(lines))
-    if (
-        any(re.fullmatch(rb"[-+]?\d{1,3}(,\d{3})+", word) for word in words)
-        and len(words) >= 2 * len(lines)
-        and any(word.isdigit() and int(word) < 1000 for word in words)
-    ):
-        yield text(thousands=",")
     digits = re.split(rb"[,;\t ]+", b" ".join(lines).strip())
     hexadecimal = all(re.fullmatch(rb"(?i)(0x)?[0-9a-f]{2,}", word) for word in digits)
     if hexadecimal and any(not word.isdigit() for word in digits):
@@ -417,7 +407,6 @@ def _lines(lines: Sequence[bytes], end: str | None = None) -> Iterator[Adapter]:
         yield text(pattern=pattern, names=(*order[begin:], *order[:begin]), rows=0, counter=None)
     yield from (text(**described) for described in _patterns(lines))
     yield replace(read_adapter("anyskin"), end=end)
-    yield from (text(number=rf"-?\d+\.\d{{{decimals}}}") for decimals in range(1, 7))
 
 
 def _patterns(lines: Sequence[bytes]) -> Iterator[dict[str, Any]]:

@@ -1,5 +1,6 @@
 """The commands of a skin at a port, end to end: emulate, record, play back, evaluate."""
 
+import signal
 import time
 from contextlib import contextmanager
 
@@ -20,11 +21,22 @@ def emulated(begin, tmp_path):
 
     @contextmanager
     def emulated(*overrides):
-        with begin(tmp_path, "emulate", "port=0", *SMALL, *overrides) as process:
+        with begin(tmp_path, "emulate", *SMALL, *overrides) as process:
             lines = process.lines()
             yield next(lines), lines, process
 
     return emulated
+
+
+@pytest.mark.slow("starts an emulator and waits for a signal")
+def test_ctrl_c_ends_the_emulator_well(emulated, tmp_path):
+    link = tmp_path / "skin"
+    with emulated(f"link={link}") as (port, lines, process):
+        assert port == str(link)
+        assert "device.scale=0.0390625" in next(lines)
+        process.send_signal(signal.SIGINT)
+        assert process.wait() == 0
+    assert not link.is_symlink()
 
 
 @pytest.mark.slow("records twice from an emulator")

@@ -238,7 +238,7 @@ def test_a_guarantee_of_a_file_holds_or_has_lapsed(trained, skin, tmp_path, devi
 @pytest.mark.slow("starts a process that imports anew")
 def test_the_example_without_this_package(model, begin, tmp_path):
     sizes = ["layout=grid", "layout.rows=2", "layout.columns=3"]
-    with begin(tmp_path, "emulate", "simulator=naive", *sizes, "port=0", "emulate.idle=4") as emulator:
+    with begin(tmp_path, "emulate", "simulator=naive", *sizes, "link=skin", "emulate.idle=4") as emulator:
         lines = emulator.lines()
         port, scale = next(lines), next(lines).partition("device.scale=")[2]
         with subprocess.Popen(

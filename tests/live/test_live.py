@@ -45,9 +45,10 @@ def store(run, tmp_path_factory):
 
 @pytest.mark.slow("starts a live view and a browser")
 def test_a_dangerous_press_turns_the_page_red_and_a_replugged_skin_heals_it(begin, store, browser, tmp_path):
+    link = f"link={tmp_path / 'skin'}"
     pace = ["emulate.rate=50", "emulate.gap=1.5", "emulate.unplug=[20,60,100,150,200]"]
     with ExitStack() as both:
-        emulator = both.enter_context(begin(tmp_path, "emulate", "simulator=naive", "port=0", *pace))
+        emulator = both.enter_context(begin(tmp_path, "emulate", "simulator=naive", link, *pace))
         told = until(lambda: re.search(r"device=serial (.*)\n", emulator.out), emulator)
         reader = ["device=serial", *told[1].split(), "device.backoff=[0.2,0.5]"]
         live = both.enter_context(begin(tmp_path, "live.py", *reader, "web=true", "live.web_port=0", *store))

@@ -1,17 +1,24 @@
 """Streams of boards that restart, freeze, break or come in bursts: no dangerous touch is hidden or late."""
 
+import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from skin.body.base import Sheet
+from skin.body.layout import Grid
+from skin.device.simulated import Simulated
 from skin.errors import InputError
 from skin.live.engine import DebounceSettings, Detection, Engine
 from skin.live.engine_builder import SelfTest
 from skin.live.loop import STALE, Display, LiveLoop
+from skin.mechanics.simulator.naive import Naive
 from skin.touch.labels import TOUCH
 from skin.wire.channels import RawRange, UnitConversion
 from skin.wire.decoder import Decoder
+from skin.wire.emulator import Emulator, EmulatorSettings
 from skin.wire.protocol import Header, encode_header, encode_line
 from skin.wire.reader import Port, SkinDisconnected, SkinTimeout
 from skin.wire.skin import SerialSource
@@ -218,6 +225,23 @@ def test_a_touch_is_never_shown_as_no_touch():
     seen = watch(lines(force(12, (6, 8, 4, 2.0))))
     touching = [verdict.state for _, verdict, _, _ in seen.said if verdict and verdict.contact is not None]
     assert set(touching) == {"touch"}
+
+
+@pytest.mark.parametrize(("fault", "late"), [("stuck", 5.5), ("dead", 0.5)])
+def test_a_channel_of_an_emulated_skin_that_fails_at_rest_or_later_is_unknown_and_named(fault, late):
+    """From 8 s on; touches begin at 14 s."""
+    written = []
+    port = SimpleNamespace(write=lambda data: written.append(data) or len(data), connected=lambda: True)
+    body = Sheet((0.16, 0.16), (16, 16), [{"material": "EcoFlex 00-30", "thickness": 0.005}])
+    device = Simulated(body=body, layout=Grid(3, 3), simulator=Naive, gestures=10)
+    emulator = Emulator(device, port, EmulatorSettings(speed=200.0, idle=14.0, since=8.0, **{fault: [4]}))
+    emulator.run(19.0)
+    frames = re.findall(rb"(?m)^\d.*\n", b"".join(written))
+    seen = watch(frames, scale=emulator.converter.scale)
+    assert seen.states(4, 8) == {"no touch"}
+    assert seen.states(8 + late, 14) == {"unknown"}
+    assert "no touch" not in seen.states(14, 19)
+    assert "sensor 4 stuck" in seen.loop.line
 
 
 def test_sensors_that_break_later_end_no_live_view():

@@ -1,10 +1,11 @@
 """Emulated skins that tests record from."""
 
+import os
 from threading import Thread
 
 import pytest
 
-from skin.wire.emulator import Emulator, EmulatorSettings, TcpPort
+from skin.wire.emulator import Emulator, EmulatorSettings, PtyPort, TcpPort
 
 
 @pytest.fixture
@@ -14,7 +15,8 @@ def emulate():
 
     def begin(device, count=7, **settings):
         chosen = EmulatorSettings(**{"speed": 40.0, "idle": 4.0, "rate": 40.0} | settings)
-        emulator = Emulator(device, TcpPort(0), chosen)
+        port = PtyPort(None) if hasattr(os, "openpty") else TcpPort(0)
+        emulator = Emulator(device, port, chosen)
         thread = Thread(target=emulator.run, kwargs={"count": count})
         thread.start()
         playing.append((emulator, thread))

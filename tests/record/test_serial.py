@@ -16,7 +16,7 @@ from skin.errors import InputError
 from skin.mechanics.simulator.naive import Naive
 from skin.record.serial import Serial
 from skin.wire.channels import unit_conversion
-from skin.wire.emulator import TcpPort, emulated_gestures
+from skin.wire.emulator import Emulator, emulated_gestures
 
 SHEET = Sheet((0.16, 0.16), (32, 32), [{"material": "EcoFlex 00-30", "thickness": 0.005}])
 LAYOUT = Grid(2, 3)
@@ -46,9 +46,9 @@ def test_it_reads_what_was_played(emulate):
 
 
 def test_counts_offsets_and_lost_frames_change_little(emulate, monkeypatch):
-    device, sent, write = skin(gain_spread=0.0, offset=0.5, noise=0.0, clip=10.0), count(), TcpPort.write
-    damage = lambda port, data: write(port, data[1:] if next(sent) % 97 == 50 else data)  # noqa: E731
-    monkeypatch.setattr(TcpPort, "write", damage)
+    device, sent, send = skin(gain_spread=0.0, offset=0.5, noise=0.0, clip=10.0), count(), Emulator._send
+    damage = lambda self, data: send(self, data[1:] if next(sent) % 97 == 50 else data)  # noqa: E731
+    monkeypatch.setattr(Emulator, "_send", damage)
     touches = serial(emulate(device), scale=20 / 512).touches("test")
     played = {
         str(list(one.labels.values())): one

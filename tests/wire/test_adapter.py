@@ -22,7 +22,6 @@ quickly = settings(
 OTHERS = {
     "pattern": Adapter(kind="text", pattern=r"<(?P<counter>\d+)\|(?P<values>[^>]*)>"),
     "decimal": Adapter(kind="text", decimal=",", separator=";"),
-    "endless": Adapter(kind="text", end="", length=11, separator=" "),
     "struct": Adapter(kind="binary", struct={"counter": "u1", "f": "(3,)<i2"}, head="aa 55"),
     "index": Adapter(kind="text", rows=0, index=0),
 }
@@ -47,7 +46,7 @@ def test_every_shipped_adapter_is_read_and_written(name, tmp_path):
         ({"kind": "text", "pattern": "(?P<a"}, "not a regular expression"),
         ({"kind": "text", "pattern": r"\d+"}, "needs a named group"),
         ({"kind": "text", "decimal": ",", "separator": ","}, "cannot separate fields"),
-        ({"kind": "text", "end": ""}, "needs its length"),
+        ({"kind": "text", "end": ""}, "end is empty: leave it out"),
         ({"kind": "binary"}, "need a struct"),
         ({"kind": "binary", "struct": {"f": "<u2"}}, "need a head or a tail"),
         ({"kind": "binary", "struct": {"f": "<q9"}, "head": "aa"}, "device.adapter.struct="),

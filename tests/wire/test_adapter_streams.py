@@ -93,7 +93,7 @@ STREAMS: dict[str, tuple[Callable, np.ndarray, float | None]] = {
         lambda n, r: b"%d,%s" % ((64_000 + 20 * n) % 65_536, joined(",")(n, r)), table(4), 0.02
     ),
     "time of day": (
-        lambda n, r: b"10:59:%06.3f %s" % (20 + n / RATE, joined(" ")(n, r)), table(4), 0.02
+        lambda n, r: b"10:59:%06.3f %s" % (20 + n / RATE, joined(" ")(n, r)), table(4), None
     ),
     "json object": (
         lambda n, r: json.dumps({f"s{k}": v for k, v in enumerate(r)}).encode() + b"\n", FLOATS, None
@@ -112,12 +112,8 @@ STREAMS: dict[str, tuple[Callable, np.ndarray, float | None]] = {
     "matrix, index from 1": (matrix(2, b"", index=1), table(8), None),
     "index and value": (pairs("{},{}\n"), table(6), None),
     "word index value": (pairs("ch{}={}\n"), table(8), None),
-    "no end": (lambda n, r: ",".join(f"{int(v):03d}" for v in r).encode(), table(5), None),
     "word at the end": (joined(",", "ZZ", before="QQ,"), table(5), None),
     "hex": (lambda n, r: " ".join(f"{int(v):03X}" for v in r).encode() + b"\n", table(5, 0, 500, 90), None),
-    "thousands": (
-        lambda n, r: ";".join(f"{int(v):,}" for v in r).encode() + b"\n", table(4, 0, 960, 40), None
-    ),
     "nul": (joined(",", end="\n\0"), table(4), None),
     "bytes before": (lambda n, r: b"\xff\xfe&" + joined(",")(n, r), table(4), None),
     "colours": (joined(", ", before="\x1b[0;33mW skin: ", after="\x1b[0m"), table(4), None),

@@ -7,13 +7,14 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import torch
 
 from skin.body.base import Sheet
 from skin.body.layout import Grid
 from skin.device.resampling import resample
 from skin.device.simulated import Simulated
+from skin.errors import InputError
 from skin.mechanics.simulator.naive import Naive
+from skin.wire.decoder import Decoder
 from skin.wire.emulator import Converter, Emulator, EmulatorSettings, TcpPort, upsample
 
 SHEET = Sheet((0.16, 0.16), (16, 16), [{"material": "EcoFlex 00-30", "thickness": 0.005}])
@@ -77,11 +78,24 @@ def test_it_stops_wherever_it_waits(waits_for):
     assert not thread.is_alive()
 
 
-@pytest.mark.parametrize(("name", "sent"), [("emulated-2", "emulated-2"), ("arm-L", "emulated-arm-L")])
-def test_its_header_says_that_it_is_emulated(name, sent):
-    """Nobody must check its scale, and no id may hide that."""
+def test_it_says_that_it_is_emulated_and_fails_when_it_should():
+    """Nobody must check its scale. Channel 1 sticks and 2 dies from 0.5 s on; nothing is sent for 0.3 s."""
     written = []
-    port = SimpleNamespace(write=written.append)
-    device = SimpleNamespace(sensors=[0], seed=0, constants=SimpleNamespace(clip=torch.ones(1)))
-    Emulator(device, port, EmulatorSettings(id=name))._header()
-    assert f"id={sent}" in written[0].decode().partition("*")[0].split()
+    port = SimpleNamespace(write=lambda data: written.append(data) or len(data), connected=lambda: True)
+    device = Simulated(body=SHEET, layout=Grid(2, 2), simulator=Naive, gestures=10, noise=0.3)
+    faults = {"stuck": [1], "dead": [2], "since": 0.5, "silence": [1.2], "away": 0.3}
+    Emulator(device, port, EmulatorSettings(speed=50.0, idle=2.0, **faults)).run(2.0)
+    decoder = Decoder(4)
+    frames = decoder.feed(b"".join(written))
+    assert decoder.header.id == "emulated"
+    assert {frame.seq for frame in frames} == {*range(120), *range(150, 200)}
+    before, after = (np.stack([f.values for f in frames if (f.seq > 50) == late]) for late in (False, True))
+    assert (np.ptp(before, axis=0) > 0).all()
+    assert (np.ptp(after, axis=0) > 0).tolist() == [True, False, False, True]
+    assert after[0, 1:3].tolist() == [before[-1, 1], 0]
+
+
+def test_a_channel_that_is_not_there():
+    device = Simulated(body=SHEET, layout=Grid(2, 2), simulator=Naive, gestures=10)
+    with pytest.raises(InputError, match=r"emulate.dead=\[4\] must be below 4"):
+        Emulator(device, SimpleNamespace(), EmulatorSettings(dead=[4]))

@@ -20,6 +20,7 @@ from skin.live.loop import LiveLoop
 from skin.touch.labels import TOUCH
 from skin.wire.channels import Reason
 from skin.wire.decoder import Decoder
+from skin.wire.emulator import PtyPort
 from skin.wire.protocol import Header, encode_header, encode_line
 from skin.wire.reader import SkinDisconnected, SkinTimeout, WireFeed
 from skin.wire.skin import open_skin
@@ -119,6 +120,23 @@ def test_unplugging_is_an_error(plug):
         for read in (lambda: skin.read(1, timeout=PATIENT), lambda: next(iter(skin))):
             with pytest.raises(SkinDisconnected, match="unplugged"):
                 read()
+
+
+def test_a_pseudo_terminal_is_unplugged_and_plugged_in_again(tmp_path):
+    port = PtyPort(str(tmp_path / "skin"))
+    try:
+        with open_skin(port.address, LAYOUT, reconnect=True, backoff=(0.01, 0.02)) as skin:
+            for connection in range(3):
+                wait_for(port.connected)
+                port.write(lines(*range(50)))
+                frames = skin.read(50, timeout=PATIENT)
+                assert frames[0].after == ("reconnect" if connection else "")
+                assert numbers(frames) == list(range(50))
+                port.unplug()
+                wait_for(lambda: skin.away)
+                port.plug()
+    finally:
+        port.unplug()
 
 
 def test_while_it_is_away_it_is_tried_again_and_said():

@@ -1,37 +1,59 @@
-"""The port of the emulator: who listens, what they hear, and what they see when it vanishes."""
+"""Ports of the emulator: who listens, what they hear, and what they see when one vanishes."""
 
+import os
 import time
+from functools import partial
 
 import pytest
 
+pytest.importorskip("termios", reason="pseudo-terminals need a POSIX system")
+
 from skin.errors import InputError
-from skin.wire.emulator import TcpPort
+from skin.wire.emulator import PtyPort, TcpPort
 from skin.wire.reader import PortStream
 
 
-def test_it_knows_who_listens_and_is_heard_and_is_plugged_in_at_the_same_address():
-    port = TcpPort(0)
+@pytest.mark.parametrize("kind", ["pty", "tcp"])
+def test_it_knows_who_listens_and_is_heard_and_is_plugged_in_at_the_same_address(kind, tmp_path):
+    link = str(tmp_path / "skin")
+    make = partial(PtyPort, link) if kind == "pty" else partial(TcpPort, 0)
+    port = make()
     assert not port.connected()
-    port.write(b"nobody hears this")
     stream, address, data = PortStream(port.address, 115200), port.address, bytes(range(256)) * 8
     try:
         deadline = time.monotonic() + 20
         while not port.connected():
             assert time.monotonic() < deadline
-        port.write(data)
+        assert port.write(data) == len(data)
         heard = b""
         while len(heard) < len(data) and time.monotonic() < deadline:
             heard += stream.read()
         assert heard == data
         port.unplug()
-        with pytest.raises(OSError, match="disconnected"):
+        with pytest.raises(OSError, match=r"disconnected|Input/output"):
             list(iter(stream.read, None))
-        with pytest.raises(InputError, match="cannot reach"):
+        with pytest.raises(InputError, match=r"cannot reach|no port"):
             PortStream(address, 115200)
         port.plug()
-        assert port.address == address
-        with pytest.raises(InputError, match=r"cannot listen on port=\d+: .*; give port=0"):
-            TcpPort(int(address.rpartition(":")[2]))
+        assert port.address == address == (link if kind == "pty" else address)
+        with pytest.raises(
+            InputError, match=r"cannot make link=.* another name|cannot listen .* give port=0"
+        ):
+            make() if kind == "pty" else TcpPort(int(address.rpartition(":")[2]))
+        PortStream(address, 115200).close()
     finally:
         stream.close()
         port.unplug()
+    assert not os.path.lexists(link)
+
+
+def test_a_file_is_left_alone_and_a_link_that_leads_nowhere_is_taken_over(tmp_path):
+    link = tmp_path / "skin"
+    link.write_text("keep")
+    with pytest.raises(InputError, match="cannot make link"):
+        PtyPort(str(link))
+    assert link.read_text() == "keep"
+    link.unlink()
+    link.symlink_to("/dev/pts/nothing")
+    PtyPort(str(link)).unplug()
+    assert not link.is_symlink()

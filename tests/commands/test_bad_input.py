@@ -34,7 +34,6 @@ PORT = "device.port=/dev/ttyACM77"
             "set simulator=solid, or layout.tilt=0",
         ),
         ("design out=x layout=grid layout.axes=two", "layout.axes=two must be 'normal' or 'three'"),
-        ("emulate format=xml", "format=xml must be 'text' or 'binary'"),
         ("emulate gestures=-1", "gestures=-1 is below 0: give a number above 0"),
         ("emulate emulate.rate=0", "emulate.rate=0 must be greater than 0"),
         ("export format=zip", "format=zip must be 'onnx', 'c', 'folder' or 'thresholds'"),

@@ -150,7 +150,7 @@ def test_another_device_is_refused_however_late_its_header_comes(record, recorde
 def test_another_device_at_the_port_is_not_recorded(record, tmp_path):
     with skin({"frames": 400}, {"id": "arm-R", "header": 100}) as port:
         done = record(*FREE, port, "seconds=30", "device.timeout=1", "device.silence=0.3")
-    assert re.search(r"another device is connected: proto=1 n=4 rate=100 unit=N id=arm-R\n", done.stderr)
+    assert "another device" in done.stderr
     assert not interruptions(tmp_path / "s")
 
 

@@ -106,7 +106,7 @@ def test_a_full_disk_is_one_sentence_and_there_is_room_again(record, begin, tmp_
     path = tmp_path / "s"
     with skin({}) as port:
         with begin(tmp_path, "record.py", "out=s", *FREE, port, "seconds=60") as full:
-            next(line for line in full.lines(errors=True) if line.startswith("2 of"))
+            next(line for line in full.lines(errors=True) if line.startswith("gesture 2"))
             resource.prlimit(full.pid, resource.RLIMIT_FSIZE, (2001, resource.RLIM_INFINITY))
             refused(
                 full.completed(), r"^cannot write s/\S+: File too large: .*; the gestures before are kept$"

@@ -9,7 +9,7 @@ from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import pairwise
+from itertools import pairwise, zip_longest
 from typing import Any
 
 import numpy as np
@@ -382,8 +382,7 @@ def _text(data: bytes) -> Iterator[Adapter]:
     if data.count(b"\n") + data.count(b"\r") >= _FRAMES:
         mark = b"\n" if b"\n" in data else b"\r"
         lines = (ANSI.sub(b"", line).strip(b"\r\n ") for line in data.split(mark)[1:-1])
-        yield from _lines([line for line in lines if line and not line.startswith(b"#")])
-        return
+        return (yield from _lines([line for line in lines if line and not line.startswith(b"#")]))
     # Text without lines: with a word at the end of each frame.
     for word, count in Counter(re.findall(rb"[^\d\s.,;+-]+", data)).most_common(2):
         if count >= _FRAMES and word.isascii():
@@ -392,13 +391,28 @@ def _text(data: bytes) -> Iterator[Adapter]:
 
 def _lines(lines: Sequence[bytes], end: str | None = None) -> Iterator[Adapter]:
     text = partial(Adapter, kind="text", end=end)
+    # The comma of 998;1,024 is between groups of digits: as a decimal sign, a press would read as no force.
+    columns = [
+        [word for word in column if re.fullmatch(rb"[-+]?\d[\d,]*", word)]
+        for column in zip_longest(*(re.split(rb"[;=:\t ]+", line) for line in lines), fillvalue=b"")
+    ]
+    signs: Any = (
+        "."
+        if any(
+            len({b"," in word for word in column}) == 2
+            and all(re.fullmatch(rb"[-+]?\d{1,3}(,\d{3})*", word) for word in column)
+            for column in columns
+        )
+        else ".,"
+    )
     yield Adapter(kind="json", end=end)
-    yield from (text(label=label, decimal=sign) for label in (":", "=") for sign in (".", ","))
+    yield from (text(label=label, decimal=sign) for label in (":", "=") for sign in signs)
     digits = re.split(rb"[,;\t ]+", b" ".join(lines).strip())
-    hexadecimal = all(re.fullmatch(rb"(?i)(0x)?[0-9a-f]{2,}", word) for word in digits)
-    if hexadecimal and any(not word.isdigit() for word in digits):
+    if not all(map(bytes.isdigit, digits)) and all(
+        re.fullmatch(rb"(?i)(0x)?[0-9a-f]{2,}", word) for word in digits
+    ):
         yield text(base=16)
-    yield from (text(decimal=sign) for sign in (".", ","))
+    yield from (text(decimal=sign) for sign in signs)
     yield text(rows=0, counter=None)
     firsts = [match[1].decode() for line in lines if (match := re.match(rb"\W*([A-Za-z_]\w*)", line))]
     if 2 * sum(before != word for before, word in pairwise(firsts)) > len(lines) and len(set(firsts)) <= 64:

@@ -225,6 +225,7 @@ REFUSED = {
         lambda n: f"pad 2 = {pressed(n, 2)}\n" if pressed(n, 2) > 300 else "",
         "let the firmware send every frame",
     ),
+    "groups of digits": (lambda n: f"{1024 if n % 40 > 20 else 998:,};{500 + n % 7}\n", "no adapter reads"),
     "nothing changes": (lambda n: "12,13,14\n", "no value ever changes"),
 }
 

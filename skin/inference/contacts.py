@@ -24,7 +24,9 @@ _SAMPLES = 10  # binary logarithm of the number of samples
 _WIDER = 1.1  # spread of the samples' proposal, relative to the posterior's
 _FREEDOM = 8.0  # degrees of freedom of the proposal, Student's distribution
 _MODES, _UNLIKELY, _ALIKE = 6, 6.0, 0.002  # modes that are sampled; log score below the best; m between two
-_WALKERS, _WALKS, _NARROWER = 64, 4, 0.6  # samples to start from, rounds, and spread, relative to the first
+_WALKERS, _WALKS, _NARROWER = 64, 4, 0.9
+"""Samples to start from, rounds, and spread relative to the first: at 0.6 / 0.9 / 1.2 regions of three
+contacts contain 84 / 87 / 86 % (seed 7 of the contact study)."""
 
 # A guess is (M, n, P): x, y, m, and scores whose prior is the standard normal distribution: of the radius,
 # which is uniform, of the force, which is log-normal (P = 4), and with friction of the tangential force along

@@ -56,14 +56,18 @@ def suggest(error: Exception, name: str) -> str | None:
     text = str(error).split("Config search path:")[0]
     if unknown := _UNKNOWN.search(text):
         with initialize_config_dir(str(CONF), version_base=_VERSION):
-            paths = [path for path, _ in walk_settings(OmegaConf.to_container(compose(name)))]
-        names = [*(folder.name for folder in CONF.iterdir() if folder.is_dir()), *map(".".join, paths)]
+            names = [
+                *(folder.name for folder in CONF.iterdir() if folder.is_dir()),
+                *(".".join(path) for path, _ in walk_settings(OmegaConf.to_container(compose(name)))),
+            ]
         group, _, key = unknown[1].partition(".")
         options = [path for path in sorted((CONF / group).glob("*.yaml")) if key in OmegaConf.load(path)]
         if options:
             return f"there is no setting or group {unknown[1]}, but {group}={options[0].stem} has it"
-        near = get_close_matches(unknown[1], names, 1, 0.8)
-        return f"there is no setting or group {unknown[1]}: did you mean {near[0]}?" if near else None
+        if near := get_close_matches(unknown[1], names, 1, 0.8):
+            return f"there is no setting or group {unknown[1]}: did you mean {near[0]}?"
+        # Of a group that exists, Hydra's own answer is of use: with + a setting reaches its class.
+        return None if group in names else f"there is no setting or group {unknown[1]}: --help lists them"
     chosen, listed = _NO_OPTION.search(text), _OPTIONS.search(text)
     if not chosen or not listed:
         return None

@@ -30,7 +30,9 @@ def refused(capsys, monkeypatch):
         ("simulator=xyz", "there is no simulator=xyz: there are fem, naive, solid\n"),
         ("out=bench (1).csv", "out=bench (1).csv cannot be read as an override, quote its value"),
         ("data.name=a,b", "Ambiguous value for argument 'data.name=a,b'"),
-        ("qqqq=3", "Could not override 'qqqq'"),  # of Hydra: nothing is near
+        ("qqqq=3", "there is no setting or group qqqq: --help lists them"),
+        ("qqqq.rate=3", "there is no setting or group qqqq.rate: --help lists them"),
+        ("trainer.qqqq=3", "Could not override 'trainer.qqqq'"),  # of Hydra: with + it reaches the class
     ],
 )
 def test_the_answer_names_what_was_meant(word, answer, refused):

@@ -132,7 +132,7 @@ def load_table(path: str | Path, what: str) -> tuple[pd.DataFrame, dict[str, Any
         InputError: no such file, another ending, unreadable, or no rows.
     """
     path = Path(path).expanduser()
-    path = path if path.is_dir() else tabular(path, f"a {what}")
+    path = path if path.is_dir() else tabular(path, f"a {what} is a folder of skin record that exists, or")
     try:
         if path.is_dir():
             metadata, table = _join(path)

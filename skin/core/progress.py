@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TimeRemainingColumn
 
-_CONSOLE = Console(stderr=True)  # one for all bars, which it shows one below the other
+CONSOLE = Console(stderr=True)  # one for all bars, which it shows one below the other
 
 
 class Steps(Progress):
@@ -22,9 +22,9 @@ class Steps(Progress):
         columns = "{task.description}", BarColumn(), TaskProgressColumn(), TimeRemainingColumn()
         super().__init__(
             *columns,
-            console=_CONSOLE,
+            console=CONSOLE,
             transient=True,
-            disable=not _CONSOLE.is_terminal,
+            disable=not CONSOLE.is_terminal,
             redirect_stdout=sys.stdout.isatty(),  # what is printed on a terminal goes above the bar
         )
         self._seconds, self._task = dict(seconds), self.add_task("", total=sum(seconds.values()))

@@ -194,11 +194,23 @@ def _explain_refusal(hint: Any, value: Any) -> str:
         # Of a union, the message for the closest member: the deepest, or one whose type fits.
         fits = ("value_error", "greater_than", "greater_than_equal", "less_than", "less_than_equal")
         nearest = max(error.errors(), key=lambda detail: (len(detail["loc"]), detail["type"] in fits))
+        words = [
+            detail["msg"].replace("Input should be", " or")
+            for detail in error.errors()
+            if nearest["type"] == "int_type" and detail["type"] == "literal_error"
+        ]
     if nearest["type"] in ("missing", "too_short", "too_long"):
         return f"has too {'many' if nearest['type'] == 'too_long' else 'few'} entries"
-    sentence = nearest["msg"].removeprefix("Value error, ").replace("Input should be", "must be")
-    sentence = sentence.replace("a valid array", "a list").replace("a valid integer", "a whole number")
-    return sentence + ", not text" * (isinstance(nearest["input"], str) and sentence.endswith("number"))
+    sentence = (
+        nearest["msg"]
+        .removeprefix("Value error, ")
+        .replace("Input should be", "must be")
+        .replace("a valid array", "a list")
+        .replace("a valid integer", "a whole number")
+    )
+    return sentence + (
+        "".join(words) or ", not text" * (isinstance(nearest["input"], str) and sentence.endswith("number"))
+    )
 
 
 def _to_plain(value: Any) -> Any:

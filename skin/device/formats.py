@@ -271,14 +271,18 @@ def _read(path: Path, options: Mapping[str, Any]) -> pd.DataFrame:
         if path.suffix.lower() in (".xlsx", ".xlsm", ".xls", ".ods"):
             table = pd.read_excel(path, **options)
         else:
-            usual = {"encoding": "utf-8-sig", "skipinitialspace": True, "low_memory": False}
+            usual = {"encoding": "utf-8-sig", "skipinitialspace": True} | (
+                {"low_memory": False}
+                if {"engine", "skipfooter"}.isdisjoint(options) and len(options.get("sep", ",") or "any") == 1
+                else {"engine": "python"}  # the other parser knows neither patterns nor a footer
+            )
             table = pd.read_csv(path, **usual | dict(options))
     except ImportError as error:
         raise InputError(f"{path}: spreadsheets need openpyxl: pip install 'tactile-skin[data]'") from error
     except (OSError, ValueError, TypeError, LookupError, AttributeError, zipfile.BadZipFile) as error:
         raise InputError(
-            f"cannot read {path}: {' '.join(str(error).split())}; table= has options of pandas, such as "
-            "skiprows, the lines before the table"
+            f"cannot read {path}: {' '.join(str(error).split())}; table has options of pandas, such as "
+            "skiprows, the lines above it, sep: '\\s+' for blanks, or header: null, with columns from 0"
         ) from error
     table.columns = pd.Index([str(name).strip() for name in table.columns])
     if table.columns.has_duplicates:
@@ -328,7 +332,7 @@ def parse_numbers(table: pd.DataFrame, name: Column, path: Path, what: str) -> n
         raise InputError(
             f"{path}: column {name} has {text!r} in row {wrong[0] + 1}, no number: list it in "
             "table.na_values unless it stands for a value over the range, or correct table.decimal, "
-            "table.skiprows or, for dates, table.parse_dates"
+            "table.skiprows or, for dates, table.parse_dates and date_format"
         )
     array = values.to_numpy(dtype=float, na_value=np.nan)
     return np.where(np.isfinite(array), array, np.nan)

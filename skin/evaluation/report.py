@@ -14,11 +14,13 @@ import pyarrow as pa
 import pyarrow.csv
 import torch
 from rich.console import Console
+from rich.progress import track
 from rich.table import Table
 from torch import Tensor
 
 from skin.body.layout import Scattered
 from skin.core.files import whole, write
+from skin.core.progress import CONSOLE
 from skin.device.base import AbstractDevice
 from skin.device.simulated import Simulated
 from skin.device.touches import Touches
@@ -105,7 +107,12 @@ def evaluate(
     scored = {"same": (probabilities, same.known_labels)}
     for column, sets in touch_sets(device, settings).items():
         try:
-            pairs = [(learner.probabilities(touches), touches.known_labels) for touches in sets]
+            pairs = [
+                (learner.probabilities(touches), touches.known_labels)
+                for touches in track(
+                    sets, column, console=CONSOLE, transient=True, disable=not CONSOLE.is_terminal
+                )
+            ]
         except InputError as reason:
             cannot[column] = str(reason)
             continue

@@ -12,7 +12,7 @@ from skin.core.progress import Steps
 @pytest.mark.parametrize("terminal", [True, False])
 def test_a_bar_of_steps_is_shown_on_a_terminal_only(monkeypatch, terminal):
     file = io.StringIO()
-    monkeypatch.setattr(progress, "_CONSOLE", Console(file=file, force_terminal=terminal, width=80))
+    monkeypatch.setattr(progress, "CONSOLE", Console(file=file, force_terminal=terminal, width=80))
     with Steps({"load": 10, "evaluate": 30}) as steps:
         steps.begin("evaluate")
         steps.refresh()

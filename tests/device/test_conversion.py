@@ -135,7 +135,7 @@ PRESS = {"press": {"column": "label", "values": {"press": 1, "none": 0}}}
         ({"groups": ["session"]}, "has no column session, which groups.session names"),
         ({"groups": ["label"]}, "each touch needs one label, got none and press"),
         ({"reader": "os.system"}, "map.yaml has no setting reader"),
-        ({"table": {"skip": 1}}, "cannot read .*unexpected keyword argument 'skip'; table= has options"),
+        ({"table": {"skip": 1}}, "cannot read .*unexpected keyword argument 'skip'; table has options"),
         ({"rate": 50000.0}, r"rows are 0.1 s apart \(10 Hz\), rate is 50000 Hz: is the time in us\?"),
         ({"time": {"column": "person", "unit": "s"}}, "'anna' in row 1, no number: .*table.parse_dates"),
         ({"fields": "(?P<a"}, "fields is no regular expression"),
@@ -175,6 +175,8 @@ def lines(*rows: str, first: str = "t,s0,s1", name: str = "{},{},{}") -> str:
         ({}, {"a.csv": lines()}),
         ({"table": {"encoding": "utf-16"}}, {"a.csv": lines().encode("utf-16")}),
         ({"table": {"skiprows": 2}}, {"a.csv": lines("maker: X", "t0; 1, 2, 3")}),
+        ({"table": {"sep": "[;|]"}}, {"a.csv": lines(first="t;s0|s1", name="{};{}|{}")}),
+        ({"table": {"skipfooter": 1}}, {"a.csv": lines() + "\nend"}),
         ({"table": {"skiprows": [1]}}, {"a.csv": lines(first="t,s0,s1\nms,g,g")}),
         (
             {
@@ -197,7 +199,18 @@ def lines(*rows: str, first: str = "t,s0,s1", name: str = "{},{},{}") -> str:
         ),
         ({"time": {"column": "t", "unit": "ns"}}, {"a.csv": lines(name="17643{:03d}000000,{},{}")}),
     ],
-    ids=["plain", "utf-16", "header lines", "row of units", "no header", "date times", "local format", "ns"],
+    ids=[
+        "plain",
+        "utf-16",
+        "above",
+        "pattern",
+        "footer",
+        "units",
+        "no header",
+        "dates",
+        "local format",
+        "ns",
+    ],
 )
 def test_the_same_readings_are_read_from_every_plain_file(tmp_path, changes, files):
     touches = convert(tmp_path, plain(**changes), **files).touches

@@ -44,6 +44,13 @@ def tried(device):
     return evaluate(learner, device, SETTINGS, POINT), learner.asked
 
 
+def test_the_columns_are_shown_while_they_are_evaluated(device, monkeypatch):
+    file = io.StringIO()
+    monkeypatch.setattr("skin.evaluation.report.CONSOLE", Console(file=file, force_terminal=True, width=80))
+    evaluate(Knows(), device, SETTINGS, POINT)
+    assert "device_shift" in file.getvalue()
+
+
 def test_who_knows_the_labels_is_right_everywhere(tried):
     found = tried[0].metrics
     assert [len(touches) for touches in tried[1]] == [48, 8, 24, 24, 24, 24]

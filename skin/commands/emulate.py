@@ -19,7 +19,7 @@ from skin.runs.configuration import Config
 @command("emulate")
 def main(
     config: Config,
-    port: Literal["pty"] | Annotated[int, Ge(0), Le(65535)],
+    port: Annotated[int, Ge(0), Le(65535)] | Literal["pty"],
     link: str | None,
     seconds: float | None,
     gestures: int | None,

@@ -44,11 +44,10 @@ _PATIENCE = 60.0  # s in which a further load must be put down
 
 
 _BLOCK = 0.2  # s, whose median is one value
-_LEVEL = 3  # blocks that do not differ from the one before are a level
+_FIRST, _FOLLOW = 5, 0.2  # blocks of the first rest; part of a block by which the rest follows the skin
 _LOADED = 6.0  # standard deviations of a block: no noise of 100 channels and ten minutes reaches it
 _STEPS = 2.0  # steps of the converter, likewise
-_CREEP = 0.02  # of a channel's range: a skin that creeps changes less from block to block
-_LIFTED = 0.15  # of the largest change of a load: below, it is lifted, and the skin recovers
+_LIFTED = 0.15  # of the largest change of a channel: below, it is at rest, and the skin recovers
 _SETTLE, _REST = 2, 4  # blocks after a load is lifted that are not used, and that are its rest
 _SHORTEST = 1.0  # s of a load: less is a touch
 _STEADY = 0.4, 0.9  # part of a load that is used: a hand no longer guides it, and has not come back
@@ -90,20 +89,18 @@ def find_placements(session: BenchSession) -> Placements:
     steps = np.array([find_quantum(column[np.isfinite(column)]) for column in session.raw.T])
     noise = MAD / np.sqrt(2) * np.median(np.abs(np.diff(values, axis=0)), axis=0)
     noise = np.maximum(noise, steps / np.sqrt(12))
-    limits = np.maximum(_LOADED * noise, _STEPS * steps)
-    loaded, resting = _find_loads(values, limits)
+    loaded = _find_loads(values, np.maximum(_LOADED * noise, _STEPS * steps))
+    # From the block before a load to those in which the skin settles after it.
+    resting = np.convolve(loaded, np.ones(2 + _SETTLE))[1:-_SETTLE] == 0
     rows, spans, unsteady = [], [], 0
-    for _, load in pd.Series(loaded)[~resting].groupby(resting.cumsum()[~resting]):
-        levels = load.index[load] if load.any() else load.index  # a load may change all the time
-        begin, end = levels[0], levels[-1]
+    for _, load in pd.Series(np.flatnonzero(loaded)).groupby((~loaded).cumsum()[loaded]):
+        begin, end = load.iloc[0], load.iloc[-1]
         if starts[end] - starts[begin] < _SHORTEST:
             continue
         low, high = (begin + round(fraction * (end + 1 - begin)) for fraction in _STEADY)
         steady = values[low : max(high, low + 3)]
-        after = values[end:][resting[end:]][_SETTLE : _SETTLE + _REST]
-        change = np.median(steady, axis=0) - np.vstack(
-            [values[:begin][resting[:begin]][-_REST:], after]
-        ).mean(axis=0)
+        rests = values[:begin][resting[:begin]][-_REST:], values[end:][resting[end:]][:_REST]
+        change = np.median(steady, axis=0) - np.vstack(rests).mean(axis=0)
         if (np.ptp(steady, axis=0) > _UNSTEADY * np.abs(change).max() + _LOADED * noise).any():
             unsteady += 1
             continue
@@ -114,22 +111,15 @@ def find_placements(session: BenchSession) -> Placements:
     return Placements(change, np.array(spans).reshape(-1, 2), resting[block], error, unsteady, reached)
 
 
-def _find_loads(values: np.ndarray, limits: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return which blocks (N,) are of levels under a load, and which of levels at rest, as the first is."""
-    still = np.maximum(limits, _CREEP * np.ptp(values, axis=0))
-    level = np.append(0, (np.abs(np.diff(values, axis=0)) > still).any(axis=1).cumsum())
-    levels = np.bincount(level) >= _LEVEL
-    loaded, rest, peak = (
-        np.zeros(len(values), dtype=bool),
-        np.median(values[level == levels.argmax()], axis=0),
-        0.0,
-    )
-    for number in np.flatnonzero(levels):
-        middle = np.median(values[level == number], axis=0)
-        change = np.abs(middle - rest)
-        loaded[level == number] = under = (change > np.maximum(limits, _LIFTED * peak)).any()
-        rest, peak = (rest, max(peak, change.max())) if under else (middle, 0.0)
-    return loaded, levels[level] & ~loaded
+def _find_loads(values: np.ndarray, limits: np.ndarray) -> np.ndarray:
+    """Return which blocks (N,) are under a load: they differ from the rest, which follows slow changes."""
+    rest, loaded = np.median(values[:_FIRST], axis=0), np.zeros(len(values), dtype=bool)
+    away = np.maximum(limits, _LIFTED * np.abs(values - rest).max(axis=0))
+    for number, value in enumerate(values):
+        loaded[number] = (np.abs(value - rest) > away).any()
+        if not loaded[number]:
+            rest = rest + _FOLLOW * (value - rest)
+    return loaded
 
 
 @dataclass(frozen=True)

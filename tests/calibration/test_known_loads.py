@@ -122,3 +122,13 @@ def test_loads_are_found_on_a_skin_that_creeps_and_recovers(noise):
     found = find_placements(BenchSession(time, raw, "N"))
     assert (len(found.change), found.unsteady) == (5, 0)
     np.testing.assert_allclose(np.diagonal(found.change), 2.95, atol=0.04)
+
+
+def test_a_load_that_a_weak_sensor_feels_more_and_more_is_found():
+    time = np.arange(0, 20, 0.01)
+    ramps = [np.interp(time, begin + np.array([0, 0.8, 2.8, 2.9]), [0, 1, 1, 0]) for begin in (4, 9, 14)]
+    raw = np.column_stack(ramps) * [1.0, 0.3, 1.0]
+    raw = raw + 0.1 * np.random.default_rng(0).standard_normal(raw.shape)
+    found = find_placements(BenchSession(time, raw, "N"))
+    assert found.reached.all()
+    np.testing.assert_allclose(np.diagonal(found.change), [1.0, 0.3, 1.0], atol=0.05)

@@ -14,7 +14,7 @@ import pyarrow as pa
 import pyarrow.parquet
 import torch
 from annotated_types import Ge, Le
-from pydantic import NonNegativeInt, PositiveFloat
+from pydantic import NegativeFloat, NonNegativeInt, PositiveFloat
 
 from skin.body.base import AbstractBody, require_memory
 from skin.core.files import tabular, whole
@@ -79,7 +79,7 @@ class BenchSettings:
     indenter: str = "disc"
     radius: PositiveFloat = 0.01
     unit: Literal["N", "adc"] | None = None
-    force_scale: float | None = None
+    force_scale: PositiveFloat | NegativeFloat | None = None
     time_scale: PositiveFloat | None = None
     delay: float = 0.0
     places: Turn = "as_given"

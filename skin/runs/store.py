@@ -121,10 +121,9 @@ class Store:
         if not self.experiment:
             return []
         terms = [f"tags.`{name}` = '{value}'" for name, value in tags.items()]
-        terms += [f"attributes.status = '{status}'"] if status else []
         return self.client.search_runs(
             [self.experiment],
-            " and ".join(terms),
+            " and ".join([*terms, *([f"attributes.status = '{status}'"] if status else [])]),
             ViewType.ACTIVE_ONLY,
             max_results=SEARCH_MAX_RESULTS_THRESHOLD,
             order_by=["attributes.start_time DESC"],
@@ -228,9 +227,14 @@ class Store:
 
 def _experiment(client: MlflowClient, name: str, location: str | None) -> str:
     """Return the id of an experiment, made if it is missing."""
-    if (experiment := client.get_experiment_by_name(name)) is not None:
-        return str(experiment.experiment_id)
-    return client.create_experiment(name, artifact_location=location, tags=_TAGS)
+    if (experiment := client.get_experiment_by_name(name)) is None:
+        try:
+            return client.create_experiment(name, artifact_location=location, tags=_TAGS)
+        except MlflowException:
+            # Perhaps another process has made it at the same time.
+            if (experiment := client.get_experiment_by_name(name)) is None:
+                raise
+    return str(experiment.experiment_id)
 
 
 def database_uri(path: Path) -> str:

@@ -6,7 +6,7 @@ import shutil
 import signal
 import subprocess
 import sys
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from select import select
 from time import monotonic, sleep
 
@@ -81,7 +81,8 @@ def terminal(folder, *words):
         try:
             yield Terminal(process, file)
         finally:
-            os.killpg(process.pid, signal.SIGKILL)
+            with suppress(ProcessLookupError):  # it has ended
+                os.killpg(process.pid, signal.SIGKILL)
             process.wait()
     os.close(file)
 
@@ -191,7 +192,7 @@ def test_a_board_of_nine_sensors_is_read_mapped_and_calibrated(board, tmp_path, 
         os.killpg(person.process.pid, signal.SIGINT)  # as Ctrl-C at a terminal
         person.until("5 of 7: calibrate")
         person.types("", "2 20")
-        person.until("placements 9, weight 2.0, base 0.02")
+        person.until("placements 9, weight 2, base 0.02")
         person.until("6 of 7: check")
         person.types("q")
         person.until("to continue: skin setup device.port=")

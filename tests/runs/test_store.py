@@ -11,6 +11,7 @@ from http.server import BaseHTTPRequestHandler, HTTPServer
 from threading import Thread
 
 import pytest
+from mlflow import MlflowClient
 
 from skin.core.files import ROOT
 from skin.errors import InputError
@@ -204,3 +205,15 @@ def test_a_pretrained_model_needs_no_database(tmp_path, monkeypatch):
         window = load_run("any_skin").window
     assert window == 30
     assert not list(tmp_path.glob("mlflow.db*"))
+
+
+def test_two_tasks_make_an_experiment_at_the_same_time(settings, store, monkeypatch):
+    look, looked = MlflowClient.get_experiment_by_name, []
+
+    def missing_at_first(client, name):
+        looked.append(name)
+        return look(client, name) if len(looked) > 1 else None
+
+    monkeypatch.setattr(MlflowClient, "get_experiment_by_name", missing_at_first)
+    assert Store.open(settings).experiment == store.experiment
+    assert len(looked) == 2

@@ -10,6 +10,7 @@ from time import monotonic
 import pytest
 
 pytest.importorskip("termios", reason="pseudo-terminals need a POSIX system")
+import termios
 import tty
 
 from skin.wire.protocol import encode_line
@@ -53,6 +54,8 @@ class Plug:
             yield
         finally:
             stop.set()
+            if self._open:
+                termios.tcflush(self.slave, termios.TCIFLUSH)  # lets a write end that nobody reads
             self.unplug()
             thread.join(5)
 

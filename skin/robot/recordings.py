@@ -274,6 +274,7 @@ def live_messages(
         frames: deque of :class:`skin.wire.channels.NewtonFrame`, the oldest first, which are taken.
         epoch: s from 1970 to the beginning of the host's monotonic clock.
     """
+    moment = 0
     for verdict in verdicts:
         while frames:
             readings = frames.popleft()
@@ -286,7 +287,8 @@ def live_messages(
                     "device_time": readings.frame.t,
                 },
             )
-        moment = pd.Timestamp(verdict["time"]).value
+        # Two events of one verdict may be some milliseconds apart; readers sort messages by time.
+        moment = max(moment, pd.Timestamp(verdict["time"]).value)
         yield "contacts", moment, verdict.pop("contacts")
         yield "verdict", moment, verdict
 

@@ -353,6 +353,13 @@ def test_a_live_view_is_recorded_as_it_happens(tmp_path, read):
         pass
 
 
+def test_messages_of_a_live_view_keep_their_order():
+    times = ("2026-01-01T00:00:00.002Z", "2026-01-01T00:00:00.001Z", "2026-01-01T00:00:00.003Z")
+    verdicts = [{"time": text, "contacts": {}} for text in times]
+    moments = [moment for topic, moment, _ in live_messages(verdicts, deque(), 0.0) if topic == "verdict"]
+    assert [moment // 1_000_000 % 1000 for moment in moments] == [2, 2, 3]
+
+
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no processes of POSIX")
 def test_a_killed_process_leaves_all_complete_chunks(tmp_path):
     writer = pytest.importorskip("mcap.writer")

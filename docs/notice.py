@@ -51,7 +51,9 @@ def licence(name: str) -> str:
     try:
         stated = metadata(name).json
     except PackageNotFoundError:
-        raise InputError(f"{name} of constraints.txt is not installed: run make install") from None
+        raise InputError(
+            f"{name} is not installed: .venv/bin/pip install -c constraints.txt {name}"
+        ) from None
     expression, text = (str(stated.get(key, "")).strip() for key in ("license_expression", "license"))
     classes = [each.rpartition(" :: ")[2] for each in stated.get("classifier", []) if "License ::" in each]
     # Some packages contain or publish a licence that their metadata do not name.

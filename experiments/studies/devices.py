@@ -15,7 +15,7 @@ from scipy.stats import binomtest
 
 from experiments.studies.measures import Subject
 from skin.calibration.bench import BenchSession
-from skin.calibration.known_loads import KnownLoad, emulate_placements, fit_known_load
+from skin.calibration.known_loads import GRAVITY, KnownLoad, emulate_placements, fit_known_load
 from skin.core.rng import Stream, generator
 from skin.device.resampling import Frame
 from skin.device.simulated import Simulated
@@ -277,7 +277,7 @@ def weight_pressure(skin: Simulated, rounds: int, draw: np.random.Generator) -> 
     shapes = Shapes(["disc"], skin.body)
     scale = np.full(count, WEIGHT.base / (np.ptp(shapes.hulls[0], axis=0).max() / 2))
     images = shapes.render(np.zeros(count, dtype=int), np.zeros(count), scale, positions)
-    pressure = WEIGHT.force * images / float(np.prod(skin.body.cell))
+    pressure = GRAVITY * WEIGHT.weight * images / float(np.prod(skin.body.cell))
     # Random factors, 10 % rms, that change over 10 mm; the force stays.
     cells = 0.01 / np.array(skin.body.cell)[::-1]
     waves = np.stack([gaussian_filter(draw.standard_normal(skin.body.shape), cells) for _ in pressure])

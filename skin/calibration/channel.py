@@ -29,12 +29,12 @@ _SUDDEN = (
     2,
 )  # of the peak, a change between frames; frames beside it, which an error of the clocks shifts
 _REACHED = 0.05  # of the strongest press of a sensor: a weaker one says nothing that can be relied on
-_MODEL = 0.01  # of a value: error of the simulated shape of a press, added to the noise
-_FACTOR = 0.05  # of the factors of the nearest presses: what sensors misplaced by 1 mm cause
+# Of a value: error of the simulated shape of a press, added to the noise. Of the factors of the nearest
+# presses: what sensors misplaced by 1 mm cause.
+_MODEL, _FACTOR = 0.01, 0.05
 _FEWEST, _BELOW = 10, 3  # frames that determine anything; frames of a rising force below the limit
-_KNOTS = 8  # of a table
 _MOST = 40  # evaluations of a solution: a curve that wavers between two knots needs no more
-_STORED = 33  # columns of a table
+_KNOTS, _STORED = 8, 33  # of a table that is fitted; columns of one that is stored
 _GOOD, _BETTER = 0.3, 0.5  # loss per frame of a curve that needs no other; part of it that another may leave
 _RISE = 0.005  # of a limit: a response that flattens rises by more in the upper half of its frames
 _SURE = 6.0  # standard errors: a slope of noise alone exceeds them in 2 of 1e9 channels
@@ -209,8 +209,7 @@ class _Model:
     def _is_flat(self, value: np.ndarray, shown: np.ndarray, limit: float) -> bool:
         """Return whether values do not rise although they would without the limit, ``shown``."""
         upper = shown > np.median(shown)
-        fewer = max(min(upper.sum(), (~upper).sum()), 1)
-        margin = max(_RISE * limit, 5 * self.noise / np.sqrt(fewer))
+        margin = max(_RISE * limit, 5 * self.noise / np.sqrt(max(min(upper.sum(), (~upper).sum()), 1)))
         return not upper.any() or bool(np.median(value[upper]) - np.median(value[~upper]) < margin)
 
     def seen(self, solution: np.ndarray) -> np.ndarray:
@@ -276,11 +275,9 @@ def _prepare(
     seen = low if low.sum() >= _FEWEST else seen
     if seen.sum() < _FEWEST:
         return None
-    middle = float(np.median(np.log(true[seen])))
-    ratio = float(np.median(np.log(value[seen] / true[seen])))
+    middle, ratio = (float(np.median(np.log(part))) for part in (true[seen], value[seen] / true[seen]))
     felt = CubicSpline(np.arange(_LAGS), loads.lagged[..., rows])
-    scale = np.sqrt(noise**2 + (_MODEL * value) ** 2)
-    spread = _FACTOR * each[used].max() / each[used]
+    scale, spread = np.hypot(noise, _MODEL * value), _FACTOR * each[used].max() / each[used]
     model = _Model(felt, np.log(each[used][press]) - middle, press, value, scale, spread, loading, noise)
     # The limit begins below the largest values, where frames move it either way.
     start = np.r_[ratio + middle, np.log(0.95 * value.max()), 1.0, 0.01, np.zeros(len(used))]
@@ -295,8 +292,7 @@ def _describe(
     middle: float,
 ) -> Channel:
     """Return what a solution means, and how well it is determined."""
-    count, limit = len(model.spread), float(np.exp(best.x[1]))
-    solution = best.x
+    count, limit, solution = len(model.spread), float(np.exp(best.x[1])), best.x
     shown = model.curve(solution, edges)
     below = model.loading & (shown < 0.95 * limit)
     above = model.loading & (shown > 1.02 * limit + 2 * model.noise)

@@ -25,11 +25,11 @@ from skin.device.calibration import BROKEN, QUANTITIES, Calibration, Curves, Tab
 from skin.device.imperfection import Imperfection
 from skin.errors import InputError
 
-_PRESSED = 0.05  # of the largest true reading: less determines no gain
-_LIMIT = 0.95  # of the largest reading of all: a channel that is always there is saturated
-_RESPONDING = 0.05  # of the press's strongest reading: sensors that count
+# Of the largest true reading: less determines no gain. Of the strongest one of a press: sensors that count.
+_PRESSED, _RESPONDING = 0.05, 0.05
 _LOADED = 0.2  # of a press's peak: frames in which its force is estimated
-_CLIPPED = 0.95  # of the limit: a reading above may be cut off
+# Of the largest reading of all: a channel that is always there is saturated. Of the limit of a channel.
+_LIMIT, _CLIPPED = 0.95, 0.95
 _TOO_FAR = 0.25  # error of a held-out force; positions off by 2 mm cause less
 _WEAK = 0.05  # of the median gain: such a channel has 20 times the noise of others
 _GAUGES, _LIKE = {"kg": 9.80665, "g": 0.00980665}, 1.5  # N; factor within which a unit explains
@@ -120,8 +120,15 @@ def _describe(
         curves = Curves(values["exponent"].fillna(1.0).to_numpy(), np.full(len(values), at), tables)
         for n in bent:
             values.loc[n, "noise"] = _curved_noise(bench, curves, n, changes[:, n])
-    metadata = {"presses": len(bench.gauge), "frames": len(bench.session.time)}
-    return convert_to_newton(bench.session, values, polarity, broken, metadata, at if bent else None, tables)
+    return convert_to_newton(
+        bench.session,
+        values,
+        polarity,
+        broken,
+        {"presses": len(bench.gauge), "frames": len(bench.session.time)},
+        at if bent else None,
+        tables,
+    )
 
 
 def convert_to_newton(
@@ -206,12 +213,11 @@ def evaluate_held_out(bench: BenchData, fraction: float) -> HeldOutErrors:
     Raises:
         InputError: no sensor has two presses.
     """
-    strongest = pd.Series(bench.each.argmax(axis=1))
     # Each has an earlier press at the same strongest sensor.
-    spare = np.flatnonzero(strongest.duplicated())
+    spare = np.flatnonzero(pd.Series(bench.each.argmax(axis=1)).duplicated())
     if not len(spare):
         raise InputError("no press can be held out: press near every sensor at least twice")
-    count = min(len(spare), max(1, round(fraction * len(strongest))))
+    count = min(len(spare), max(1, round(fraction * len(bench.gauge))))
     held = spare[np.linspace(0, len(spare) - 1, count).round().astype(int)].tolist()
     calibration = fit_calibration(bench, set(range(len(bench.gauge))) - set(held))
     answers, simulated = bench.each[bench.applied[1]], predict_session(bench, calibration)
@@ -219,8 +225,10 @@ def evaluate_held_out(bench: BenchData, fraction: float) -> HeldOutErrors:
     alive = ~calibration.values()["dead"] & np.isfinite(bench.session.raw)
     counted = np.isin(bench.applied[1], held)[:, None] & responding & alive
     measured, tared = calibration.newtons(bench.session.raw), bench.true + calibration.values()["offset"]
-    sides = {"simulated": bench.true, "tared": tared, "calibrated": simulated}
-    rmse = {name: float(np.sqrt(np.mean((side - measured)[counted] ** 2))) for name, side in sides.items()}
+    rmse = {
+        name: float(np.sqrt(np.mean((side - measured)[counted] ** 2)))
+        for name, side in (("simulated", bench.true), ("tared", tared), ("calibrated", simulated))
+    }
     shown = simulated / (calibration.scale * calibration.signs) + calibration.zero
     loaded, ratios = bench.loading & (bench.applied[0] > _LOADED * bench.gauge.force.max()), list[float]()
     for number in held:
@@ -235,9 +243,8 @@ def predict_session(bench: BenchData, calibration: Calibration) -> np.ndarray:
     imperfection = Imperfection(calibration=calibration)
     randomness = np.random.default_rng(0)
     constants = imperfection.constants(bench.each.shape[1], randomness)._replace(noise=torch.zeros(()))
-    time = torch.from_numpy(bench.session.time).float()
-    true = torch.from_numpy(bench.true)[None].float()
-    return imperfection.raw(true, constants, randomness, time)[0].double().numpy()
+    true, time = (torch.from_numpy(values).float() for values in (bench.true, bench.session.time))
+    return imperfection.raw(true[None], constants, randomness, time)[0].double().numpy()
 
 
 def estimate_force(raw: np.ndarray, each: np.ndarray, calibration: Calibration) -> np.ndarray:

@@ -19,6 +19,7 @@ from skin.calibration.bench import (
     Gauge,
     check_channels,
     per_newton,
+    pressed_images,
     write_bench_session,
 )
 from skin.calibration.fit import convert_to_newton
@@ -33,9 +34,10 @@ from skin.wire.emulator import Converter
 
 GRAVITY = 9.80665  # m/s2
 _HEAVIEST = 50.0  # kg: nobody puts more on a skin by hand
-_SPREAD = 0.35  # of gains and model together, in assigning placements to sensors
-_FLOOR = 0.03  # of the largest reading: what a model leaves beside a base
+_SPREAD, _FLOOR = 0.35, 0.03  # of gains and model together; of the largest reading, beside a base
 _QUIETER = 200.0  # times that the noise of sensors may be below that of the simulated device
+_INCLINED = "incline=20 downhill=[45,225] height=0.01"
+_ALONG = 0.1  # of the reading inwards: cross-talk of a fiftieth would change less by a fifth
 _MISSED = 0.25  # fraction of the sensors that may have no gain
 _PATIENCE = 60.0  # s in which a further load must be put down
 
@@ -43,13 +45,12 @@ _PATIENCE = 60.0  # s in which a further load must be put down
 # Steady loads in a session without a gauge: a weight put down and lifted again.
 
 
-_BLOCK = 0.2  # s, whose median is one value
+_BLOCK, _SHORTEST = 0.2, 1.0  # s, whose median is one value; of a load: less is a touch
 _FIRST, _FOLLOW = 5, 0.2  # blocks of the first rest; part of a block by which the rest follows the skin
-_LOADED = 6.0  # standard deviations of a block: no noise of 100 channels and ten minutes reaches it
-_STEPS = 2.0  # steps of the converter, likewise
+# Standard deviations of a block, steps of the converter: noise of 100 channels in ten minutes stays below.
+_LOADED, _STEPS = 6.0, 2.0
 _LIFTED = 0.15  # of the largest change of a channel: below, it is at rest, and the skin recovers
 _SETTLE, _REST = 2, 4  # blocks after a load is lifted that are not used, and that are its rest
-_SHORTEST = 1.0  # s of a load: less is a touch
 _STEADY = 0.4, 0.9  # part of a load that is used: a hand no longer guides it, and has not come back
 _UNSTEADY = 0.2  # of the largest change: a load that changes more was touched or slid
 
@@ -129,17 +130,32 @@ class KnownLoad:
     Attributes:
         weight: kg.
         base: radius of the weight's round base, m.
+        incline: of the skin to the horizontal, degrees.
+        downhill: directions of the chart that point downhill, one after the other, degrees from x towards y.
+        height: of the weight's centre of gravity above its base, m.
     """
 
     weight: float
     base: float
+    incline: float = 0.0
+    downhill: Sequence[float] = ()
+    height: float = 0.0
 
     @classmethod
-    def of(cls, weight: float | None, base: float | None, size: tuple[float, float]) -> "KnownLoad":
+    def of(
+        cls,
+        weight: float | None,
+        base: float | None,
+        size: tuple[float, float],
+        incline: float | None = None,
+        downhill: Sequence[float] | None = None,
+        height: float | None = None,
+    ) -> "KnownLoad":
         """Return a load that a skin of this size, m, can carry.
 
         Raises:
-            InputError: no mass or no base, or one that is too large or not above 0.
+            InputError: no mass or no base, one that is too large or not above 0, an incline that is not
+                completely described, or on which the load would tip.
         """
         if not (weight and base and 0 < weight <= _HEAVIEST and 0 < base <= min(size) / 2):
             raise InputError(
@@ -147,12 +163,20 @@ class KnownLoad:
                 f"the radius in m of its round base, which lies on the skin, up to {min(size) / 2:g}: as in "
                 "weight=2.0 base=0.02"
             )
-        return cls(weight, base)
-
-    @property
-    def force(self) -> float:
-        """N."""
-        return GRAVITY * self.weight
+        if len({value is None for value in (incline, downhill, height)}) > 1:
+            raise InputError(
+                f"got incline={incline} downhill={downhill} height={height}: an incline needs its angle and "
+                "directions downhill, degrees, and the height of the weight's centre of gravity, m, as in "
+                f"{_INCLINED}"
+            )
+        # At this height, the pressure at the upper edge is 0.
+        if incline and height and height * math.tan(math.radians(incline)) > base / 4:
+            raise InputError(
+                f"on incline={incline:g} a weight with its centre of gravity height={height:g} m above its "
+                f"base={base:g} lifts its upper edge: take a flatter one, or incline it by up to "
+                f"{math.degrees(math.atan(base / height / 4)):.1f} degrees"
+            )
+        return cls(weight, base, incline or 0.0, downhill or (), height or 0.0)
 
 
 def fit_known_load(device: Simulated, session: BenchSession, load: KnownLoad) -> Calibration:
@@ -160,7 +184,8 @@ def fit_known_load(device: Simulated, session: BenchSession, load: KnownLoad) ->
 
     Args:
         device: with the skin as designed.
-        session: idle, and placements in any order, with the skin untouched between them.
+        session: idle, and placements in any order, with the skin untouched between them; those of one
+            direction downhill after those of another.
         load: what was put on it.
 
     Raises:
@@ -174,14 +199,10 @@ def fit_known_load(device: Simulated, session: BenchSession, load: KnownLoad) ->
             f"no placement in the session{touched * bool(placements.unsteady)}: leave the skin untouched for "
             "3 s, put the load down, let go of it for 2 s, lift it for 2 s, and so on"
         )
-    expected = load.force * base_readings(device.model, device.body, device.sensors, load.base)
-    signs, reached = _find_signs(placements), placements.reached
-    sensor = _assign(expected, placements, signs)
-    at_sensor = signs[sensor] * placements.change[np.arange(len(sensor)), sensor]
-    ratios = pd.Series(at_sensor / np.diagonal(expected)[sensor]).groupby(sensor)
-    gains = ratios.median().reindex(range(len(expected)))
-    gains = gains.where((gains > 0) & reached)
-    if len(missed := np.flatnonzero(gains.isna())) > _MISSED * len(gains):
+    gains, signs, loaded = _fit_gains(
+        base_readings(device.model, device.body, device.sensors, load), placements
+    )
+    if len(missed := np.flatnonzero(np.isnan(gains) & loaded)) > _MISSED * loaded.sum():
         raise InputError(
             f"sensors {list_numbers(missed)} were never loaded, or do not respond: put the load on every "
             "sensor and record again, or check the wiring"
@@ -189,45 +210,105 @@ def fit_known_load(device: Simulated, session: BenchSession, load: KnownLoad) ->
     # Slow drift is left to the tare: placements move the rest a little, too.
     time = session.time - session.time[placements.idle].mean()
     rests = measure_rests(replace(session, time=time), placements.idle).drop(columns="drift")
-    quiet = float(np.hypot(rests["noise"], rests["quantum"] / math.sqrt(12)).median() / gains.median())
+    quiet = float(np.hypot(rests["noise"], rests["quantum"] / math.sqrt(12)).median() / np.nanmedian(gains))
     usual = float(device.constants.noise.median())
     if quiet < usual / _QUIETER:  # a load in another unit makes the noise that of no sensor
         raise InputError(
             f"weight={load.weight:g} (kg) would mean a noise of {quiet:.2g} N, device.noise is {usual:g}: "
             "give the load in this unit, or device.noise= if the sensors are so quiet"
         )
-    metadata = {"placements": len(placements.change), "weight": load.weight, "base": load.base}
-    broken = {"dead": np.flatnonzero(~reached).tolist()}
-    return convert_to_newton(session, rests.assign(gain=gains), signs, broken, metadata)
+    return convert_to_newton(
+        session,
+        rests.assign(gain=gains),
+        signs,
+        {"dead": np.flatnonzero(loaded & ~placements.reached).tolist()},
+        {"placements": len(placements.change)}
+        | {name: part for name, part in vars(load).items() if part}
+        | (
+            {}
+            if loaded.all()
+            else {"along the surface": f"gains unknown, as inwards; {_INCLINED} gives them"}
+        ),
+    )
 
 
-def base_readings(model: AbstractSimulator, body: AbstractBody, sensors: Sensors, base: float) -> np.ndarray:
-    """Return the readings (S, S), N, under 1 N on a round base over each sensor.
+@torch.no_grad()
+def base_readings(
+    model: AbstractSimulator, body: AbstractBody, sensors: Sensors, load: KnownLoad
+) -> np.ndarray:
+    """Return the readings under a load over each of N sites, for each direction downhill, (D, N, S), N.
 
-    Near the rim the base is as far inside as it needs to be to lie on the skin.
+    Near the rim the base is as far inside as it needs to be to lie on the skin. Friction holds the load: its
+    traction is the pressure times the slope. The pressure increases linearly downhill, by the moment of the
+    weight: that of a bar under an eccentric force.
+
+    Raises:
+        InputError: an incline that leaves a direction of sensors without load, or without such sensors.
     """
-    positions = np.clip(sensors.positions[:, :2], base, np.array(body.size) - base)
-    return per_newton(model, body, stair_gauge(positions, indenter="disc", radius=base))
+    positions = np.clip(sensors.positions[:: sensors.axes, :2], load.base, np.array(body.size) - load.base)
+    images = torch.cat([*pressed_images(body, stair_gauge(positions, indenter="disc", radius=load.base))])
+    x, y = (
+        size * (torch.arange(count) + 0.5) - torch.from_numpy(places)[:, None]
+        for size, count, places in zip(body.cell, body.cells, positions.T, strict=True)
+    )
+    angle, readings = math.radians(load.incline), []
+    slope, force = math.tan(angle), math.cos(angle) * GRAVITY * load.weight  # N, inwards
+    for down in torch.deg2rad(torch.tensor([*load.downhill] or [0.0])):
+        below = down.cos() * x[:, None, :] + down.sin() * y[:, :, None]  # m, downhill of the middle
+        pressure = force * images * (1 + 4 * load.height * slope / load.base**2 * below).float()
+        friction = slope * torch.stack([down.cos(), down.sin()])[None] if slope else None
+        readings.append(model(pressure, friction).readings.double().numpy())
+    expected = np.stack(readings)
+    if load.incline and (sensors.axes == 1 or not _find_own(expected)[1].all()):
+        raise InputError(
+            "this incline does not load each axis along the surface, of layout.axes=three, by "
+            f"{_ALONG:.0%} of the one inwards: give directions between the axes, as in {_INCLINED}, "
+            "a steeper incline or a flatter weight; leave it out where sensors have one axis"
+        )
+    return expected
 
 
-def _assign(expected: np.ndarray, placements: Placements, signs: np.ndarray) -> np.ndarray:
-    """Return the sensor (P,) below each placement: that whose pattern of readings is the most likely.
+def _find_own(expected: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return readings at the loaded site itself, (D, N, axes), of all, (D, N, S); which count, (N, axes)."""
+    own = np.einsum("dnna->dna", expected.reshape(*expected.shape[:2], expected.shape[1], -1))
+    size = np.abs(own).min(axis=0)
+    return own, size >= _ALONG * size[:, -1:]
+
+
+def _fit_gains(expected: np.ndarray, placements: Placements) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return gains (NaN: none) and signs of the channels, and which the load determines, (S,)."""
+    own, loaded = _find_own(expected)
+    directions, sites, axes = own.shape
+    strongest = placements.change[np.abs(placements.change).argmax(axis=0), np.arange(sites * axes)]
+    inwards = np.arange(sites * axes) % axes == axes - 1
+    used, signs = inwards & placements.reached, np.where(strongest < 0, -1.0, 1.0)
+    signs[~used] = -1.0 if signs[used].sum() < 0 else 1.0  # as most others
+    change = signs * placements.change
+    site = _assign(expected[0], change, placements.noise, inwards, used)
+    # The directions follow each other.
+    placed = pd.Series(site).groupby(site)
+    direction = (placed.cumcount() * directions // placed.transform("size")).to_numpy()
+    at_site = change.reshape(-1, sites, axes)[np.arange(len(site)), site]
+    ratios = pd.DataFrame(at_site / np.where(loaded, own, np.nan)[direction, site])
+    # In two opposite directions, cross-talk of the force inwards and errors of the position cancel.
+    medians = ratios.groupby([site, direction]).median().groupby(level=0)
+    agreed = medians.mean().where(medians.min() * medians.max() > 0).reindex(range(sites)).to_numpy().ravel()
+    gains = np.where(placements.reached & ((agreed > 0) | ~inwards), np.abs(agreed), np.nan)
+    return gains, np.where((agreed < 0) & ~inwards, -signs, signs), loaded.ravel()
+
+
+def _assign(
+    expected: np.ndarray, change: np.ndarray, noise: np.ndarray, inwards: np.ndarray, used: np.ndarray
+) -> np.ndarray:
+    """Return the site (P,) below each placement: that whose pattern of readings is the most likely.
 
     Gains are unknown, so a reading is its expectation within a third. A dead sensor is found by the readings
     of its neighbours.
     """
-    typical = float(np.median(np.abs(placements.change).max(axis=1)) / np.median(np.diagonal(expected)))
-    measured, noise = signs * placements.change[:, None, :] / typical, placements.noise / typical
-    variance = (_SPREAD * expected) ** 2 + noise**2 + (_FLOOR * expected.max()) ** 2
-    cost = (measured - expected) ** 2 / variance + np.log(variance)
-    return np.asarray(cost[..., placements.reached].sum(axis=-1).argmin(axis=1))
-
-
-def _find_signs(placements: Placements) -> np.ndarray:
-    """Return 1 or -1 per channel, (S,): whether it rises under load; as most others, if it is silent."""
-    strongest = np.abs(placements.change).argmax(axis=0)
-    signs = np.where(placements.change[strongest, np.arange(len(strongest))] < 0, -1.0, 1.0)
-    return np.where(placements.reached, signs, -1.0 if signs[placements.reached].sum() < 0 else 1.0)
+    typical = float(np.median(change[:, inwards].max(axis=1)) / np.median(expected[:, inwards].max(axis=1)))
+    variance = (_SPREAD * expected) ** 2 + (noise / typical) ** 2 + (_FLOOR * expected.max()) ** 2
+    cost = (change[:, None] / typical - expected) ** 2 / variance + np.log(variance)
+    return np.asarray(cost[..., used].sum(axis=-1).argmin(axis=1))
 
 
 # A second load, measured while it is put on three sensors.
@@ -247,7 +328,7 @@ def measure_ratios(
         frames: of the skin, from now on.
         first: frames of the untouched skin before.
         conversion: of values to N.
-        expected: readings (S, S), N, under the load on each sensor.
+        expected: readings (N, S), N, under the load on each site.
         seconds: for which each load must lie.
         say: called with each message for the user.
 
@@ -271,14 +352,15 @@ def measure_ratios(
             )
         counted = np.ptp(found.span, axis=1) >= seconds
         for change in found.change[counted]:
-            # The pattern identifies the sensor for any scale and sign.
-            sensor = int(np.abs(shapes @ change).argmax())
+            # The pattern identifies the site for any scale and sign.
+            site = int(np.abs(shapes @ change).argmax())
+            sensor = expected.shape[1] // len(expected) * (site + 1) - 1  # inwards
             if str(sensor) not in ratios:
                 say(
-                    f"sensor {sensor}: {change[sensor]:.3g} N, predicted {expected[sensor, sensor]:.3g} N; "
+                    f"sensor {sensor}: {change[sensor]:.3g} N, predicted {expected[site, sensor]:.3g} N; "
                     f"{len(ratios) + 1} of {enough}, lift it"
                 )
-            ratios[str(sensor)] = float(change[sensor] / expected[sensor, sensor])
+            ratios[str(sensor)] = float(change[sensor] / expected[site, sensor])
         if len(ratios) >= enough and lying == 0:
             return ratios
         if time[-1] - found.span[counted].min(axis=1).max(initial=0.0) > _PATIENCE + seconds:
@@ -325,8 +407,9 @@ def stair_gauge(
     levels = [0.0, *steps, *list(steps)[-2::-1], steps[-1]]
     corners = np.cumsum([0.0, *[_RAMP, hold] * (len(levels) - 1)])
     inside = np.arange(0, corners[-1], 1 / rate)
-    press = np.interp(inside, corners, peak * np.repeat(levels, 2)[1:])
-    press = np.append(press, np.zeros(max(2, round(0.2 * rate))))
+    press = np.r_[
+        np.interp(inside, corners, peak * np.repeat(levels, 2)[1:]), np.zeros(max(2, round(0.2 * rate)))
+    ]
     starts = round(idle * rate) + np.arange(len(positions)) * (len(press) + round(rest * rate))
     presses = pd.DataFrame({"indenter": indenter, "x_m": positions[:, 0], "y_m": positions[:, 1]})
     return Gauge(
@@ -360,14 +443,14 @@ def emulate_session(
         bits: of the converter; None: N are sent.
         each: true readings per N of each press, (P, S); None: those of the device.
     """
-    step = float(np.median(np.diff(gauge.time)))
-    time = np.arange(0.0, gauge.time[-1] + 2.0, step)
+    time = np.arange(0.0, gauge.time[-1] + 2.0, float(np.median(np.diff(gauge.time))))
     each = per_newton(device.model, device.body, gauge) if each is None else each
     force, press = gauge.at(time)
     true = torch.from_numpy(force[:, None] * each[press])[None].float()
     readings = device.imperfection.raw(true, device.constants, generator, torch.from_numpy(time).float())
-    measured = readings[0].numpy() * device.imperfection.signs(true.shape[2])
-    sent = Converter(bits, device.imperfection.clip)(measured)
+    sent = Converter(bits, device.imperfection.clip)(
+        readings[0].numpy() * device.imperfection.signs(true.shape[2])
+    )
     return BenchSession(time, sent, "N" if bits is None else "adc", gauge, bits)
 
 
@@ -392,7 +475,7 @@ def emulate_placements(
 
 
 def write_demo(device: Simulated, load: KnownLoad | None, bits: int | None, path: str) -> str:
-    """Write a simulated session of presses, or of a load on every sensor twice; return a summary.
+    """Write a simulated session of presses, or of a load on every site twice; return a summary.
 
     Args:
         device: the skin.
@@ -400,11 +483,12 @@ def write_demo(device: Simulated, load: KnownLoad | None, bits: int | None, path
         bits: of the converter; None: N are sent.
         path: .csv or .parquet.
     """
-    randomness, count = np.random.default_rng(device.seed), len(device.sensors)
+    randomness = np.random.default_rng(device.seed)
     if load is None:
-        session = emulate_session(device, stair_gauge(choose_presses(device, randomness)), randomness, bits)
+        loads = choose_presses(device, randomness)
+        session = emulate_session(device, stair_gauge(loads), randomness, bits)
     else:
-        order = np.concatenate([randomness.permutation(count) for _ in range(2)])
-        readings = load.force * base_readings(device.model, device.body, device.sensors, load.base)[order]
-        session = emulate_placements(device, readings, randomness, bits)
-    return f"{write_bench_session(session, path)}: {2 * count} presses in {session.time[-1]:.0f} s"
+        expected = base_readings(device.model, device.body, device.sensors, load)
+        loads = np.vstack([*map(randomness.permutation, expected.repeat(max(1, 2 // len(expected)), axis=0))])
+        session = emulate_placements(device, loads, randomness, bits)
+    return f"{write_bench_session(session, path)}: {len(loads)} presses in {session.time[-1]:.0f} s"

@@ -77,15 +77,20 @@ def measure_rest(time: np.ndarray, values: np.ndarray, step: float) -> dict[str,
         ``noise``: standard deviation, without outliers and without the variance of the steps. ``quantum``:
         the step.
     """
-    spread = max(median_abs_deviation(values, scale="normal"), step)
-    inside = np.abs(values - np.median(values)) <= _INSIDE * spread
+    inside = np.abs(values - np.median(values)) <= _INSIDE * max(
+        median_abs_deviation(values, scale="normal"), step
+    )
     time, values = time[inside], values[inside]
     line = linregress(time, values)
     drift = float(line.slope) if abs(line.slope) > 2 * line.stderr else 0.0
     steady = values - drift * time
-    # Rounding adds the variance of a step (Sheppard's correction).
-    noise = math.sqrt(max(steady.var() - step**2 / 12, 0.0))
-    return {"offset": float(steady.mean()), "drift": drift, "noise": noise, "quantum": step}
+    return {
+        "offset": float(steady.mean()),
+        "drift": drift,
+        # Rounding adds the variance of a step (Sheppard's correction).
+        "noise": math.sqrt(max(steady.var() - step**2 / 12, 0.0)),
+        "quantum": step,
+    }
 
 
 @dataclass(frozen=True)
@@ -160,8 +165,7 @@ def match_channels(responses: Responses, per_newton: np.ndarray) -> tuple[np.nda
     residual[strength[:, None] > _STRONGER * strength.max() * expected] = 1.0
     sign = np.where(best < 0, -1.0, 1.0)
     # Beside a press the surface may rise: a channel that is inverse alone has to fit better.
-    nearest = sign[np.arange(len(sign)), residual.argmin(axis=1)]
-    usual = sign == _sign_of_most(nearest, responses)
+    usual = sign == _sign_of_most(sign[np.arange(len(sign)), residual.argmin(axis=1)], responses)
     return np.where(usual, residual, np.minimum(_INVERSE * residual, 1.0)), sign, expected
 
 
@@ -178,9 +182,9 @@ def find_polarity(responses: Responses, per_newton: np.ndarray) -> np.ndarray:
     return np.where(responses.responding, signs, _sign_of_most(signs, responses))
 
 
-_FITS = 0.45  # residual: sensors misplaced by 5 mm leave 0.25, another sensor 0.6 and more
-_WELL = 0.15  # residual: a channel that is called exchanged has to fit its new place at least as well
-_NO_FIT = 0.5  # residual of a channel that fits no better
+# Residuals. Sensors misplaced by 5 mm leave 0.25, another sensor 0.6 and more. A channel that is called
+# exchanged has to fit its new place at least well. The last is that of a channel that fits no better.
+_FITS, _WELL, _NO_FIT = 0.45, 0.15, 0.5
 _CLEARLY, _BETTER = 0.3, 0.2  # less residual of all channels, and of one, that another explanation leaves
 _MOST = 0.25  # fraction of the responding channels that an explanation may leave, and of unusable sensors
 _PRESSED = 0.2  # of the largest prediction: a sensor with less was not pressed, so it identifies no channel
@@ -300,8 +304,10 @@ def _describe_mismatch(
     if straight is not None:
         least = np.minimum(clear[0].residual + _BETTER, _FITS) if clear else _FITS
         wrong = np.flatnonzero(straight.residual > least)
-        listed = list_numbers(np.sort(order[wrong]))
-        trouble = f"channels respond, but not to the presses near their sensors ({listed})"
+        trouble = (
+            "channels respond, but not to the presses near their sensors "
+            f"({list_numbers(np.sort(order[wrong]))})"
+        )
     if clear:
         return f"{trouble}: {' Or '.join(entry.words(settings, order) for entry in clear[:2])}"
     return (
@@ -328,7 +334,7 @@ def _explain(turn: Turn, responses: Responses, per_newton: np.ndarray) -> list[_
     # Of two silent channels, nothing says which is where.
     known = bool(sure[moved & settled].all()) and (moved & ~settled).sum() <= 1
     found = [_Explanation(turn, channels, straight), _Explanation(turn, sensors, permuted, known)]
-    return found if moved.any() else found[:1]
+    return found[: 1 + moved.any()]
 
 
 def check_usable(calibration: Calibration) -> None:

@@ -2,6 +2,7 @@
 
     skin calibrate session=bench.csv presses=gauge.csv
     skin calibrate session=bench.csv weight=2.0 base=0.02
+    skin calibrate session=bench.csv weight=2.0 base=0.04 incline=20 downhill=[45,225] height=0.02
     skin calibrate session=demo.csv calibrate.demo=true
 
 A known weight (kg) on a round base (radius, m) that lay on every sensor replaces the gauge. Writes out=, for
@@ -10,8 +11,11 @@ calibrate.demo=true first writes the session of an emulated device: no hardware 
 """
 
 import sys
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Annotated, Any
+
+from annotated_types import Ge, Gt, Lt
 
 from skin.commands._command import command
 from skin.errors import InputError
@@ -25,13 +29,16 @@ def main(
     presses: str | None,
     weight: float | None,
     base: float | None,
+    incline: Annotated[float, Gt(0), Lt(45)] | None,
+    downhill: Sequence[float] | None,
+    height: Annotated[float, Ge(0)] | None,
     out: str,
     calibrate: dict[str, Any],
 ) -> None:
     """Print the errors on held-out presses, or what a known load gives, and write the calibration."""
     if session is None:
         raise InputError("which session? add session=bench.csv, or try session=demo.csv calibrate.demo=true")
-    by_load = weight is not None or base is not None
+    by_load = any(value is not None for value in (weight, base, incline, downhill, height))
     if by_load and presses is not None:
         raise InputError("a known load replaces the gauge: leave out presses=, or weight= and base=")
 
@@ -44,14 +51,13 @@ def main(
 
     settings = BenchSettings.of(calibrate, "calibrate")
     device = build_device(config).simulated("a calibration fits the simulation to a skin")
-    load = KnownLoad.of(weight, base, device.size) if by_load else None
+    load = KnownLoad.of(weight, base, device.size, incline, downhill, height) if by_load else None
     if calibrate["demo"]:
         print(write_demo(device, load, calibrate["bits"], session))
         settings = replace(settings, unit="adc" if calibrate["bits"] else settings.unit)
     recorded = read_bench_session(session, settings, presses)
-    errors = None
     if load is not None:
-        calibration = fit_known_load(device, ordered(recorded, settings), load)
+        calibration, errors = fit_known_load(device, ordered(recorded, settings), load), None
     else:
         clip = device.imperfection.clip if settings.force_scale is None else None
         calibration, errors = fit_presses(
@@ -66,5 +72,8 @@ def main(
         sys.exit(1)
     about = {**calibration.about, "session": session, "presses_file": presses}
     channels = list(ordered(recorded, settings).channels or ())
-    channels = [] if channels == sorted(channels) else channels
-    print(write_calibration(replace(calibration, about=about, channels=channels), out))
+    print(
+        write_calibration(
+            replace(calibration, about=about, channels=channels * (channels != sorted(channels))), out
+        )
+    )

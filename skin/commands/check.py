@@ -30,7 +30,7 @@ def main(config: Config, weight: float | None, base: float | None, seconds: Anno
     device = require_port(build_device(config))
     load = KnownLoad.of(weight, base, device.size)
     model = build_skin(config).simulator(device.body, device.sensors)
-    expected = load.force * base_readings(model, device.body, device.sensors, load.base)
+    expected = base_readings(model, device.body, device.sensors, load)[0]
     try:
         with device.wire.open() as skin:
             first, conversion = device.wire.warm_up(skin, notify)

@@ -4,16 +4,22 @@ import numpy as np
 import pytest
 import torch
 
+from skin.body.base import Sensors, Sheet
+from skin.body.layout import Grid
 from skin.calibration.bench import BenchSession
 from skin.calibration.fit import print_calibration
 from skin.calibration.known_loads import (
+    GRAVITY,
     KnownLoad,
     base_readings,
     emulate_placements,
     find_placements,
     fit_known_load,
 )
+from skin.device.simulated import Simulated
 from skin.errors import InputError
+from skin.mechanics.simulator.solid import Solid
+from tests.budget import free
 from tests.calibration.test_fit import device, solid
 
 WEIGHT = KnownLoad(2.0, 0.02)
@@ -21,7 +27,7 @@ ORDER = [3, 0, 5, 1, 4, 2]
 
 
 def weight_readings(skin) -> np.ndarray:
-    return WEIGHT.force * base_readings(skin.model, skin.body, skin.sensors, WEIGHT.base)
+    return base_readings(skin.model, skin.body, skin.sensors, WEIGHT)[0]
 
 
 def weighed(skin, order, bits=None) -> BenchSession:
@@ -63,6 +69,76 @@ def test_half_a_session_is_refused_and_names_the_sensors():
     skin = solid()
     with pytest.raises(InputError, match="sensors 8, 9, 10, 11, 12, 13, 14 and 15 were never loaded"):
         fit_known_load(solid(), weighed(skin, list(range(8))), WEIGHT)
+
+
+INCLINED = KnownLoad.of(4.0, 0.02, (0.16, 0.16), 20, [45, 225], 0.005)
+
+
+def test_sensors_that_cover_a_plane_feel_the_weight_along_and_across_an_incline(monkeypatch):
+    monkeypatch.setattr(
+        "skin.calibration.known_loads._ALONG", 0.0
+    )  # a base near the rim is far from the sensor
+    places = np.stack(np.meshgrid(*2 * [0.01 * np.arange(6) + 0.005]), axis=-1).reshape(-1, 2)
+    positions = np.column_stack([places, np.full(36, 0.009)]).repeat(3, axis=0)
+    sensors = Sensors(positions, (0.01, 0.01), directions=np.tile(np.eye(3), (36, 1)))
+    body = Sheet([0.06, 0.06], [12, 12], [{"material": "EcoFlex 00-30", "thickness": 0.01}])
+    load = KnownLoad(2 / GRAVITY, 0.02, 30, [45, 120])
+    sums = base_readings(Solid(body, sensors), body, sensors, load)[:, 14].reshape(2, 36, 3).sum(axis=1)
+    slope = np.radians([45, 120])
+    expected = np.column_stack([np.cos(slope), np.sin(slope), np.full(2, 3**0.5)])  # 2 N sin 30, 2 N cos 30
+    np.testing.assert_allclose(sums, expected, atol=0.02)
+
+
+def three_axes(**hidden) -> Simulated:
+    body = Sheet([0.16, 0.16], [16, 16], [{"material": "EcoFlex 00-30", "thickness": 0.015}])
+    layout = Grid(3, 3, depth=0.005, axes="three")
+    return Simulated(body=body, layout=layout, simulator=Solid, noise=0.02, **hidden)
+
+
+def test_a_weight_gives_normal_gains_and_one_on_an_incline_those_along_the_surface():
+    """One axis of a site is inverse."""
+    skin, turned = three_axes(gain_spread=0.3), np.where(np.arange(27) == 3, -1, 1)
+    for load, axes in ((WEIGHT, slice(2, 3)), (INCLINED, slice(0, 3))):
+        with free():  # the operator
+            expected = base_readings(skin.model, skin.body, skin.sensors, load)
+        rows = np.vstack([np.random.default_rng(0).permutation(turn) for turn in expected])
+        session = emulate_placements(skin, rows, np.random.default_rng(0))
+        session.raw[:] *= turned
+        found = fit_known_load(three_axes(), session, load)
+        gains = np.array(found.sensors["gain"], dtype=float)
+        errors = (gains / skin.constants.gain.numpy() - 1).reshape(9, 3)
+        assert np.sqrt((errors[:, axes] ** 2).mean(axis=0)).max() < 0.04
+        assert np.isnan(gains).sum() == 18 * (load is WEIGHT)
+        assert ("along the surface" in found.about) == (load is WEIGHT)
+        assert not found.broken["dead"]
+    assert found.signs.tolist() == turned.tolist()
+
+
+@pytest.mark.parametrize(
+    ("incline", "axes", "reason"),
+    [
+        (
+            (20, None, 0.005),
+            "three",
+            "got incline=20 downhill=None height=0.005: an incline needs its angle and",
+        ),
+        ((None, [45], None), "three", "got incline=None"),
+        (
+            (20, [45], 0.02),
+            "three",
+            "lifts its upper edge: take a flatter one, or incline it by up to 14.0 deg",
+        ),
+        ((20, [45, 180], 0.005), "three", "does not load each axis along the surface"),
+        ((20, [45], 0.005), "normal", "of layout.axes=three"),
+    ],
+)
+def test_inclines_that_give_no_gains_are_refused(incline, axes, reason):
+    skin = three_axes()
+    sensors = Grid(3, 3, depth=0.005, axes=axes).sensors(skin.body)
+    with free():
+        model = Solid(skin.body, sensors)
+    with pytest.raises(InputError, match=reason):
+        base_readings(model, skin.body, sensors, KnownLoad.of(2.0, 0.02, skin.size, *incline))
 
 
 def test_an_untouched_session_has_no_placement():

@@ -8,7 +8,7 @@ import pytest
 
 pytest.importorskip("termios", reason="pseudo-terminals need a POSIX system")
 
-from skin.calibration.known_loads import GRAVITY, base_readings
+from skin.calibration.known_loads import KnownLoad, base_readings
 from skin.runs.build import build_skin
 from skin.wire.protocol import Header, encode_header, encode_line
 from tests.wire.conftest import Plug
@@ -22,7 +22,7 @@ def port(configured):
     """Serve a skin in counts of 0.02 N, on which 0.5 kg lies on three sensors, one after the other."""
     model = build_skin(configured(*SKIN))
     simulator = model.simulator(model.body, model.sensors)
-    expected = 0.5 * GRAVITY * base_readings(simulator, model.body, model.sensors, 0.006)
+    expected = base_readings(simulator, model.body, model.sensors, KnownLoad(0.5, 0.006))[0]
     plug, noise = Plug(), np.random.default_rng(0)
     now, sent = 0.0, monotonic()
 

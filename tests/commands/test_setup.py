@@ -17,7 +17,7 @@ from omegaconf import OmegaConf
 
 pytest.importorskip("termios", reason="pseudo-terminals need a POSIX system")
 
-from skin.calibration.known_loads import GRAVITY, base_readings
+from skin.calibration.known_loads import KnownLoad, base_readings
 from skin.device.calibration import read_calibration
 from skin.runs.build import build_skin
 from tests.wire.conftest import Plug
@@ -171,7 +171,7 @@ layout:
 def test_a_board_of_nine_sensors_is_read_mapped_and_calibrated(board, tmp_path, configured):
     model = build_skin(configured("simulator=naive", "layout=grid", "layout.rows=3", "layout.columns=3"))
     simulator, folder = model.simulator(model.body, model.sensors), tmp_path / "my-skin"
-    loads = 2.0 * GRAVITY * base_readings(simulator, model.body, model.sensors, 0.02)
+    loads = base_readings(simulator, model.body, model.sensors, KnownLoad(2.0, 0.02))[0]
     (folder / "body").mkdir(parents=True)
     (folder / "body" / "mine.yaml").write_text(NAIVE)
     rows = [f"{x:.6f},{y:.6f}" for x, y in model.sensors.positions[:, :2]]

@@ -31,8 +31,7 @@ Written by `python -m experiments.studies.reproduce` from the statements of stud
 - Differences are in percentage points, ± [margin](protocol.md#intervals-and-comparisons). *agree* and
   *disagree* need three seeds, or devices of one training. Margins over test gestures are here only where they
   decide. With so many statements, some verdicts are due to chance.
-- `temporal_head_image`, `image_size` and `image_representation` have a tenth of the gestures, from which a
-  GRU or LSTM alone learns nothing.
+- Studies of images have a tenth of the gestures: too few for a GRU or LSTM alone.
 """
 
 

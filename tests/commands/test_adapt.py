@@ -12,11 +12,7 @@ from skin.device.files import read_recording, write_recording
 
 SKIN = ["layout=grid", "layout.rows=3", "layout.columns=3", "simulator=naive"]
 NETWORK = ["representation=features", "model=mlp", "model.widths=[]", "fusion.head=residual"]
-SMALL = [
-    "evaluation.devices=0",
-    "evaluation.layouts=0",
-    "evaluation.safe_gestures=64",
-]
+SMALL = ["evaluation.devices=0", "evaluation.layouts=0", "evaluation.safe_gestures=64"]
 TEST = "device.test_gestures=160"
 RECORDED = ["device=recording", "device.path=session.parquet"]
 QUICK = ["adapt.layers=[all]", "adapt.lr=[0.001]", "adapt.epochs=12", "adapt.scratch=[]", *SMALL]

@@ -23,10 +23,7 @@ PORT = "device.port=/dev/ttyACM77"
             "out=x.txt must be a .parquet file or a .csv file or a .mcap file or a folder",
         ),
         ("convert from=none.yaml out=x.csv", "cannot read the mapping none.yaml"),
-        (
-            "convert from=efles out=x.csv",
-            "from=efles is no format: give map.yaml, or one of folder, sdu",
-        ),
+        ("convert from=efles out=x.csv", "from=efles is no format: give map.yaml, or one of folder, sdu"),
         ("convert from=sdu out=x.csv", "from=sdu needs path=FOLDER"),
         ("design out=x design.radii=[0.01,0.002]", "must be a range [minimum, maximum]"),
         (

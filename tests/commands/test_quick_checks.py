@@ -7,11 +7,7 @@ from skin.wire.reader import check_port
 
 
 @pytest.mark.parametrize(
-    ("port", "message"),
-    [
-        ("/dev/none", "no port /dev/none"),
-        ("./skin-port", "no port ./skin-port"),
-    ],
+    ("port", "message"), [("/dev/none", "no port /dev/none"), ("./skin-port", "no port ./skin-port")]
 )
 def test_a_wrong_port_is_refused(port, message):
     with pytest.raises(InputError, match=message):

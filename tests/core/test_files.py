@@ -68,10 +68,7 @@ def test_a_full_disk_leaves_what_was_there(name, tmp_path, made_up_device):
     path = tmp_path / "folder" / name
     path.parent.mkdir()
     path.write_text("before")
-    with (
-        full(),
-        pytest.raises(InputError, match=rf"^cannot write .*{name}: File too large: .* as in"),
-    ):
+    with full(), pytest.raises(InputError, match=rf"^cannot write .*{name}: File too large: .* as in"):
         WRITERS[name](path, made_up_device)
     assert path.read_text() == "before"
     assert list(path.parent.iterdir()) == [path]

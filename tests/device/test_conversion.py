@@ -71,12 +71,7 @@ def test_a_folder_has_contacts_and_persons(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("baseline", "first"),
-    [
-        (None, [7, 7, 9, 7]),
-        (2, [0, 0, 2, 0]),
-        ("idle", [0, 0, 2, 0]),
-    ],
+    ("baseline", "first"), [(None, [7, 7, 9, 7]), (2, [0, 0, 2, 0]), ("idle", [0, 0, 2, 0])]
 )
 def test_a_baseline_is_subtracted(tmp_path, baseline, first):
     text = "t,s0\n" + "".join(f"{100 * n},{value}\n" for n, value in enumerate([7, 7, 9, 7]))

@@ -17,12 +17,7 @@ from hypothesis import strategies as st
 from skin.body.layout import Scattered
 from skin.body.sheet import Sheet
 from skin.core.safe_loading import limited_memory
-from skin.device.files import (
-    DataSet,
-    read_description,
-    read_recording,
-    write_recording,
-)
+from skin.device.files import DataSet, read_description, read_recording, write_recording
 from skin.device.simulated import Simulated
 from skin.device.touches import Recording, Touches, concatenate
 from skin.errors import InputError

@@ -5,14 +5,7 @@ import pytest
 import torch
 from PIL import Image
 
-from skin.plot.figures import (
-    confusions,
-    images,
-    misclassified,
-    misclassified_fractions,
-    save_figure,
-    traces,
-)
+from skin.plot.figures import confusions, images, misclassified, misclassified_fractions, save_figure, traces
 
 
 def test_a_confusion_matrix_shows_shares_of_each_true_class():

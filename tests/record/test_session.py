@@ -288,10 +288,7 @@ def test_a_full_disk_keeps_what_was_finished_and_goes_on(tmp_path, size):
         with room(min(size, 1000)):
             segmented(log, [frame(n) for n in range(11, 30)], CONVERSION)
 
-    with (
-        pytest.raises(InputError, match=r"cannot write \S+: File too large") as refused,
-        room(size),
-    ):
+    with pytest.raises(InputError, match=r"cannot write \S+: File too large") as refused, room(size):
         attempt()
     assert "\n" not in str(refused.value)
     assert not [path for path in tmp_path.rglob("*") if path.name.startswith(".")]

@@ -15,17 +15,7 @@ from skin.core.safe_loading import load_yaml
 from skin.errors import InputError
 from skin.evaluation.alarm import THRESHOLDS
 from skin.evaluation.operating_point import LABEL
-from skin.runs.run import (
-    CARD,
-    CONFIG,
-    MODELS,
-    RECORD,
-    SUMS,
-    checksums,
-    find_pretrained,
-    is_name,
-    model_card,
-)
+from skin.runs.run import CARD, CONFIG, MODELS, RECORD, SUMS, checksums, find_pretrained, is_name, model_card
 from tests.damage import DAMAGED_FILES, mutated, opened
 
 NAMES = sorted(path.name for path in (ROOT / MODELS).iterdir())

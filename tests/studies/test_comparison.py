@@ -7,12 +7,7 @@ import pandas as pd
 import pytest
 from scipy.stats import ttest_rel
 
-from experiments.studies.comparison import (
-    Estimate,
-    combine_verdicts,
-    compare_samples,
-    judge,
-)
+from experiments.studies.comparison import Estimate, combine_verdicts, compare_samples, judge
 from experiments.studies.study import Statement
 from skin.errors import InputError
 

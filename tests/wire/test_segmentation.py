@@ -12,12 +12,7 @@ from skin.errors import InputError
 from skin.touch.labels import TOUCH, TOUCH_OR_NOT
 from skin.wire.decoder import Decoder
 from skin.wire.protocol import Announcement, crc16, encode_announcement, encode_line, parse_announcement
-from skin.wire.segmentation import (
-    AnnouncedSegmenter,
-    ContinuousSegmenter,
-    PromptedSegmenter,
-    label_plan,
-)
+from skin.wire.segmentation import AnnouncedSegmenter, ContinuousSegmenter, PromptedSegmenter, label_plan
 
 LABELS = {"big": 1, "dynamic": 0, "press": 1, "dangerous": 0}
 

@@ -77,7 +77,6 @@ def test_the_weights_reproduce_the_card_on_400_touches(name, tmp_path):
 
 @pytest.fixture
 def model(tmp_path, monkeypatch):
-    """Return the folder of a copy of a model, with few bytes of weights, in the current folder."""
     monkeypatch.chdir(tmp_path)
     folder = tmp_path / MODELS / "mine"
     shutil.copytree(ROOT / MODELS / "default_skin", folder)

@@ -43,11 +43,8 @@ class Browser:
     def __init__(self, driver: str, binary: str, size: tuple[int, int] = (1100, 860)) -> None:
         self._process = subprocess.Popen([driver, "--port=0"], stdout=subprocess.PIPE, text=True)
         assert self._process.stdout is not None
-        found = next(
-            found
-            for line in self._process.stdout
-            if (found := re.search(r"successfully on port (\d+)", line))
-        )
+        search = (re.search(r"successfully on port (\d+)", line) for line in self._process.stdout)
+        found = next(filter(None, search))
         self._address = f"http://127.0.0.1:{found[1]}/session"
         options = [*_OPTIONS, f"--window-size={size[0]},{size[1]}"]
         chrome = {"goog:chromeOptions": {"binary": binary, "args": options}}
@@ -56,9 +53,8 @@ class Browser:
 
     def _ask(self, path: str, body: dict[str, Any] | None = None) -> Any:
         data = None if body is None else json.dumps(body).encode()
-        request = urllib.request.Request(
-            self._address + path, data, {"Content-Type": "application/json; charset=utf-8"}
-        )
+        head = {"Content-Type": "application/json; charset=utf-8"}
+        request = urllib.request.Request(self._address + path, data, head)
         with urllib.request.urlopen(request, timeout=_PATIENCE) as answer:
             return json.load(answer)["value"]
 

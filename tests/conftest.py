@@ -53,7 +53,6 @@ PATIENCE = 600  # s: machines are busy at times
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Limit the processor time of each case."""
     config.pluginmanager.register(Budget(), "budget")
 
 
@@ -190,8 +189,6 @@ def played() -> Iterator[Callable[[Callable[[socket.socket, threading.Event], No
 
 @pytest.fixture(scope="session")
 def configured() -> Callable[..., Config]:
-    """Return a function from overrides to the configuration of a training."""
-
     made = {}
 
     def make(*overrides: str) -> Config:
@@ -353,10 +350,8 @@ def run(begin, stores_are_copied) -> Callable[..., subprocess.CompletedProcess]:
     """
 
     def run(folder, script, *arguments, store=True, apart=False) -> subprocess.CompletedProcess:
-        settings = (
-            [f"tracking.uri=sqlite:///{folder}/m.db", f"tracking.artifacts={folder}/a"] if store else []
-        )
-        words = [*map(str, arguments), *settings]
+        settings = [f"tracking.uri=sqlite:///{folder}/m.db", f"tracking.artifacts={folder}/a"]
+        words = [*map(str, arguments), *(settings if store else [])]
         if apart or Path(script).suffix:
             return begin(folder, script, *words).completed()
         return run_here(folder, [str(script), *words])
@@ -379,10 +374,8 @@ def run_here(folder: Path, words: list[str]) -> subprocess.CompletedProcess:
     from skin.__main__ import main
 
     state, environment, here = Singleton.get_state(), dict(os.environ), Path.cwd()
-    threads, handlers = (
-        torch.get_num_threads(),
-        {n: signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)},
-    )
+    threads = torch.get_num_threads()
+    handlers = {n: signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)}
     root = logging.getLogger()
     levels, loggers = root.level, list(root.handlers)
     out, err, argv = StringIO(), StringIO(), sys.argv
@@ -420,7 +413,6 @@ def run_here(folder: Path, words: list[str]) -> subprocess.CompletedProcess:
 
 @pytest.fixture
 def made_up_device():
-    """Return a device that needs no simulator."""
     from tests.made_up import MadeUpDevice
 
     return MadeUpDevice()

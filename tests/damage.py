@@ -34,6 +34,8 @@ ODD_VALUES = st.sampled_from(
 )
 """Values that hardly any setting takes."""
 
+_KINDS = ("flip", "overwrite", "insert", "delete", "repeat", "truncate", "swap", "number")
+
 
 @st.composite
 def damaged(draw: Callable[..., Any], content: bytes) -> bytes:
@@ -64,9 +66,6 @@ def _damage(kind: str, draw: Callable[..., Any], content: bytes) -> bytes:
         start, end = draw(st.sampled_from(positions))
         return content[:start] + draw(st.sampled_from(_ODD)) + content[end:]
     return {"delete": before + after, "repeat": before + part + part + after, "truncate": before}[kind]
-
-
-_KINDS = ("flip", "overwrite", "insert", "delete", "repeat", "truncate", "swap", "number")
 
 
 @st.composite

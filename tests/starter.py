@@ -26,15 +26,11 @@ from typing import Any, TextIO
 
 __all__ = ["copying", "main", "remembering"]
 
-WARM = (
-    "alembic.command",
-    "mlflow.store.tracking.sqlalchemy_store",
-    "scipy.stats",
-    "skin.learning.boosted_trees",
-    "skin.learning.training",
-    "skin.evaluation.report",
-    "skin.runs.train",
-)
+WARM = ["alembic.command", "mlflow.store.tracking.sqlalchemy_store", "scipy.stats"]
+WARM += [
+    f"skin.{name}"
+    for name in ("learning.boosted_trees", "learning.training", "evaluation.report", "runs.train")
+]
 
 
 def main() -> None:

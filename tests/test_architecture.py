@@ -11,33 +11,16 @@ from omegaconf import OmegaConf
 from skin.core.files import CONF, ROOT
 
 # From the ground up.
-ROOMS = [
-    "errors",
-    "core",
-    "body",
-    "touch",
-    "mechanics",
-    "device",
-    "inference",
-    "learning",
-    "wire",
-    "plot",
-    "evaluation",
-    "runs",
-    "calibration",
-    "record",
-    "design",
-    "robot",
-    "live",
-    "commands",
-    "__main__",
-]
+FLOORS = """
+errors core body touch mechanics device inference learning wire plot evaluation runs calibration record
+design robot live commands __main__
+"""
+ROOMS = FLOORS.split()
 LEVEL = {room: number for number, room in enumerate(ROOMS)}
 
 
 @cache
 def trees() -> dict[Path, ast.Module]:
-    """Return the syntax tree of each module, by its path from the root."""
     paths = [path for folder in ("skin", "experiments") for path in (ROOT / folder).rglob("*.py")]
     return {path.relative_to(ROOT): ast.parse(path.read_text()) for path in paths}
 
@@ -56,7 +39,6 @@ def imports(path: Path) -> frozenset[str]:
 
 @pytest.fixture(scope="module", autouse=True)
 def parsed():
-    """Parse all modules once."""
     trees()
 
 
@@ -66,7 +48,6 @@ def dotted_name(path: Path) -> str:
 
 
 def library() -> dict[str, Path]:
-    """Return every module of ``skin/`` by its dotted name."""
     return {dotted_name(path): path for path in trees() if path.parts[0] == "skin"}
 
 

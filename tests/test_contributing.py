@@ -18,7 +18,6 @@ SMALL += ["evaluation.devices=0", "evaluation.layouts=0"]
 
 @pytest.fixture(scope="module")
 def own(tmp_path_factory):
-    """Return a folder with the files that CONTRIBUTING.md shows, from which modules are imported."""
     folder = tmp_path_factory.mktemp("own")
     for name, text in FILES.items():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
@@ -60,10 +59,7 @@ def test_help_lists_options_of_ones_own(run, own):
     ("overrides", "said"),
     [
         (["simulator=gaussian"], "there is no data=gaussian: there are fem, naive, solid"),
-        (
-            ["simulator=gaussian", "data=fem", "simulator.spread=-1"],
-            "simulator.spread=-1 must be greater than 0",
-        ),
+        (["simulator=gaussian", "data=fem", "simulator.spread=-1"], "spread=-1 must be greater than 0"),
         (["representation=readings", "model=gated", "+model.depth=3"], "model has no setting depth"),
         (["simulator=absent", "data=fem"], "simulator._target_=absent.Absent cannot be imported: No module"),
     ],

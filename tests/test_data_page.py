@@ -20,7 +20,6 @@ LINES = {
 
 @pytest.fixture(scope="module")
 def position(tmp_path_factory):
-    """Return a folder with a data set of three shards, ``touches``."""
     position = tmp_path_factory.mktemp("data")
     with initialize_config_dir(str(CONF), version_base="1.3"), pytest.MonkeyPatch.context() as patch:
         patch.setattr("skin.device.simulated._BATCH", 16)

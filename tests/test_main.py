@@ -13,6 +13,12 @@ from skin.core.files import ROOT
 
 VERBS = [name for name, module in verbs().items() if module.startswith("skin.")]
 HEAVY = {"hydra", "numpy", "torch", "mlflow", "pytorch_lightning"}
+COMPLETE = """
+eval "$(skin -sc install=bash)"
+COMP_LINE='{line}'; COMP_POINT=${{#COMP_LINE}}; COMP_WORDS=($COMP_LINE); COMP_CWORD=$((${{#COMP_WORDS[@]}}-1))
+_skin
+echo "${{COMPREPLY[@]}}"
+"""
 
 
 def test_the_verbs_are_listed_without_imports():
@@ -45,10 +51,8 @@ def test_what_only_the_repository_has_is_refused_elsewhere(tmp_path):
     (tmp_path / "x-1.dist-info" / "METADATA").write_text("Name: x\nVersion: 1\n")
     points = "[skin.verbs]\nstudies = nowhere.commands.study\n"
     (tmp_path / "x-1.dist-info" / "entry_points.txt").write_text(points)
-    code = (
-        f"import sys; sys.path.insert(0, {str(tmp_path)!r})\n"
-        "from skin.__main__ import main; main(['studies'])"
-    )
+    code = f"import sys; sys.path.insert(0, {str(tmp_path)!r})\n"
+    code += "from skin.__main__ import main; main(['studies'])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
     assert done.returncode == 2, done.stderr
     assert done.stderr == "skin studies needs files that an installed package lacks: clone the repository\n"
@@ -65,31 +69,6 @@ def test_a_mistyped_verb_is_told_the_right_one(verb, words, capsys):
     assert words in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(
-    ("override", "said"),
-    [
-        ("learner.rounds=20", "no setting or group learner.rounds, but learner=boosted_trees has it"),
-        ("model=cn", "there is no model=cn: did you mean "),
-        ("seed=[", "seed=["),
-    ],
-)
-def test_what_cannot_be_composed_is_one_sentence(override, said, capsys):
-    with pytest.raises(SystemExit) as stop:
-        main(["train", override])
-    assert stop.value.code == 2
-    text = capsys.readouterr().err
-    assert said in text
-    assert text.count("\n") == 1
-
-
-COMPLETE = """
-eval "$(skin -sc install=bash)"
-COMP_LINE='{line}'; COMP_POINT=${{#COMP_LINE}}; COMP_WORDS=($COMP_LINE); COMP_CWORD=$((${{#COMP_WORDS[@]}}-1))
-_skin
-echo "${{COMPREPLY[@]}}"
-"""
-
-
 @pytest.mark.skipif(shutil.which("bash") is None, reason="needs bash")
 @pytest.mark.parametrize(
     ("line", "choices"),
@@ -104,13 +83,9 @@ echo "${{COMPREPLY[@]}}"
 )
 def test_bash_completes_verbs_groups_options_and_settings(line, choices):
     script = COMPLETE.format(line=line)
-    environment = os.environ | {
-        "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}",
-        "PYTHONPATH": str(ROOT),
-    }
-    done = subprocess.run(
-        ["bash", "-c", script], env=environment, capture_output=True, text=True, timeout=120, check=True
-    )
+    path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
+    settings = {"env": os.environ | {"PATH": path, "PYTHONPATH": str(ROOT)}, "timeout": 120, "check": True}
+    done = subprocess.run(["bash", "-c", script], capture_output=True, text=True, **settings)
     assert set(done.stdout.split()) == choices
 
 

@@ -14,8 +14,6 @@ from skin.core.files import ROOT
 
 SMALL = ["simulator=naive", "data.gestures=200", "device.test_gestures=32", "evaluation.devices=0"]
 SMALL += ["evaluation.layouts=0", "evaluation.safe_gestures=64"]
-# A matter between MLflow and SQLAlchemy.
-pytestmark = pytest.mark.filterwarnings("ignore:The ``noload`` loader strategy")
 
 HEAVY = {"hydra", "numpy", "torch", "mlflow", "pytorch_lightning"}
 TRAINING = {"mlflow", "pytorch_lightning", "torchmetrics", "sklearn", "pandas", "matplotlib"}
@@ -30,6 +28,7 @@ from skin.__main__ import main
 main(["live", "run=any_skin", "simulator=naive", "seconds=0.3", "live.patience.above=0.5", "live.touch=0.3",
     "live.selftest=false", "live.contacts=false", "live.verdicts=stdout"])
 """
+WHICH = f"import sys; print(*sorted({TRAINING} & set(sys.modules)))"
 
 
 def test_there_are_sixteen_names_and_they_cost_nothing_yet():
@@ -56,11 +55,11 @@ def test_a_skin_is_described_simulated_and_differentiated():
 
 
 def test_a_run_is_loaded_and_predicts_a_recording(run, tmp_path):
-    for arguments in (
+    for verb, *words in (
         ["train", "experiment=rules", *SMALL],
-        ["generate", *SMALL[:1], "n=20", "out=x.parquet"],
+        ["generate", SMALL[0], "n=20", "out=x.parquet"],
     ):
-        done = run(tmp_path, *arguments, store="train" in arguments[0])
+        done = run(tmp_path, verb, *words, store=verb == "train")
         assert done.returncode == 0, done.stderr
     trained = skin.load_run("latest", f"sqlite:///{tmp_path}/m.db")
     touches = skin.read_recording(tmp_path / "x.parquet").touches
@@ -73,7 +72,6 @@ def test_a_run_is_loaded_and_predicts_a_recording(run, tmp_path):
 
 
 def run_example(page):
-    """Return the variables of the Python example of a page after it has run."""
     (code,) = re.findall(r"^```python\n(.*?)^```", (ROOT / page).read_text(), re.DOTALL | re.MULTILINE)
     variables = {}
     exec(code, variables)
@@ -83,20 +81,15 @@ def run_example(page):
 def python(code, folder):
     """Return what Python code prints in a process of its own, in lines; no database is written."""
     (folder / "mlflow.db").touch()
-    done = subprocess.run(
-        [sys.executable, "-c", code], cwd=folder, capture_output=True, text=True, timeout=300
-    )
+    line = [sys.executable, "-c", code]
+    done = subprocess.run(line, cwd=folder, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
     assert (folder / "mlflow.db").stat().st_size == 0
     return done.stdout.splitlines()
 
 
-WHICH = f"import sys; print(*sorted({TRAINING} & set(sys.modules)))"
-
-
 @pytest.fixture(scope="module")
 def readme(tmp_path_factory):
-    """Return what the example of the README prints, and then labels, probabilities and modules."""
     (code,) = re.findall(r"^```python\n(.*?)^```", (ROOT / "README.md").read_text(), re.DOTALL | re.MULTILINE)
     told = "\nprint(*run.labels); print(*run.predict(readings)[0])\n"
     return python(code + told + WHICH, tmp_path_factory.mktemp("readme"))

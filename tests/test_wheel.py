@@ -17,7 +17,6 @@ SMALL += ["evaluation.devices=0", "evaluation.layouts=0"]
 
 @pytest.fixture(scope="module")
 def unpacked(tmp_path_factory):
-    """Return a folder with the wheel's files."""
     built, folder = tmp_path_factory.mktemp("built"), tmp_path_factory.mktemp("unpacked")
     command = [sys.executable, "-m", "hatchling", "build", "--target", "wheel", "--directory", str(built)]
     subprocess.run(command, cwd=ROOT, check=True, capture_output=True, timeout=60)
@@ -47,13 +46,8 @@ def test_the_wheel_has_the_package_and_its_files(unpacked):
     package, metadata = sorted(unpacked.iterdir())
     assert (package.name, metadata.suffix) == ("skin", ".dist-info")
     assert "skin = skin.__main__:main" in (metadata / "entry_points.txt").read_text()
-    for folder, inside in [
-        ("skin", ""),
-        ("conf",) * 2,
-        ("models",) * 2,
-        ("data/shapes",) * 2,
-        ("data/layouts",) * 2,
-    ]:
+    for folder in ("skin", "conf", "models", "data/shapes", "data/layouts"):
+        inside = folder if folder != "skin" else ""
         paths = [path for path in (ROOT / folder).rglob("*") if path.is_file() and path.suffix != ".pyc"]
         assert paths
         for path in paths:
@@ -64,9 +58,7 @@ def test_the_wheel_has_the_package_and_its_files(unpacked):
 
 
 def test_the_repository_is_not_on_the_path(installed, unpacked):
-    code = (
-        "import sys, skin, skin.core.files; print(skin.__file__, skin.core.files.CONF, *sys.path, sep='\\n')"
-    )
+    code = "import sys, skin, skin.core.files as f; print(skin.__file__, f.CONF, *sys.path, sep='\\n')"
     file, conf, *path = installed("-c", code).splitlines()
     assert file == str(unpacked / "skin" / "__init__.py")
     assert conf == str(unpacked / "skin" / "conf")

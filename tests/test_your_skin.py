@@ -46,21 +46,12 @@ def follow(home, run, monkeypatch):
 
 def started(command: str, home: Path) -> str:
     """Run a command of the page as a user's shell would, and return what it prints."""
-    environment = {
-        **os.environ,
-        "HOME": str(home),
-        "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}",
-        "PYTHONPATH": str(ROOT),
+    path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
+    own = {
+        "cwd": home / "checkout",
+        "env": os.environ | {"HOME": str(home), "PATH": path, "PYTHONPATH": str(ROOT)},
     }
-    result = subprocess.run(
-        ["bash", "-ec", command],
-        cwd=home / "checkout",
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=300,
-        check=False,
-    )
+    result = subprocess.run(["bash", "-ec", command], capture_output=True, text=True, timeout=300, **own)
     assert result.returncode == 0, result.stdout + result.stderr
     return result.stdout
 
@@ -86,9 +77,8 @@ def test_the_configuration_of_the_page_is_the_users(home):
     body = instantiate(shown.body)
     assert (body.size, body.cells, len(body.layers)) == ((0.15, 0.10), (30, 20), 3)
     assert [layer.material.young for layer in body.layers] == [560e3, 40e3, 69e3]
-    assert (
-        shown.simulator._target_ == shown.device.simulator._target_ == "skin.mechanics.simulator.solid.Solid"
-    )
+    simulators = {shown.simulator._target_, shown.device.simulator._target_}
+    assert simulators == {"skin.mechanics.simulator.solid.Solid"}
     assert shown.layout._target_ == "skin.body.layout.File"
     depths = instantiate(OmegaConf.merge(shown.layout, {"path": str(home / "my-skin/sensors.csv")}))
     # Inside a layer, where only the solid has sensors.

@@ -34,9 +34,8 @@ def test_the_chart_is_a_grid_of_equal_cells(body):
 
 def test_the_axes_are_orthonormal_and_one_way_round(body):
     frame = body.frame(points(body, 50))
-    np.testing.assert_allclose(
-        frame @ frame.swapaxes(1, 2), np.broadcast_to(np.eye(3), (50, 3, 3)), atol=1e-14
-    )
+    product = frame @ frame.swapaxes(1, 2)
+    np.testing.assert_allclose(product, np.broadcast_to(np.eye(3), (50, 3, 3)), atol=1e-14)
     # x, y and outwards are right-handed on every body
     assert (np.linalg.det(frame) < 0).all()
 

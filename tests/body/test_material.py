@@ -8,6 +8,7 @@ from skin.body.material import MATERIALS, Material, Relaxation
 from skin.errors import InputError
 
 KSI = 6.894757e6
+ECOFLEX = {"name": "EcoFlex 00-30"}
 
 
 @pytest.mark.parametrize(
@@ -42,15 +43,12 @@ def test_a_name_is_read_as_people_write_it(name):
         ({"name": "foam", "young": float("nan"), "poisson": 0.3}, "young=nan must be a finite number"),
         ({"name": "foam", "young": 1e4, "poisson": 1.0}, "material.poisson=1.0 must be less than 1"),
         ({"name": "foam", "young": 1e4, "poisson": -1}, "material.poisson=-1 must be greater than -1"),
-        ({"name": "EcoFlex 00-30", "relaxation": 0.5}, "relaxation must be settings by name, got 0.5"),
-        ({"name": "EcoFlex 00-30", "relaxation": {"time": 0.5}}, "relaxation needs strength, got time"),
+        (ECOFLEX | {"relaxation": 0.5}, "relaxation must be settings by name, got 0.5"),
+        (ECOFLEX | {"relaxation": {"time": 0.5}}, "relaxation needs strength, got time"),
+        (ECOFLEX | {"relaxation": {"time": 0, "strength": 1}}, "relaxation.time=0 must be greater than 0"),
         (
-            {"name": "EcoFlex 00-30", "relaxation": {"time": 0, "strength": 1}},
-            "relaxation.time=0 must be greater than 0",
-        ),
-        (
-            {"name": "EcoFlex 00-30", "relaxation": {"time": 1, "strength": -0.1}},
-            "relaxation.strength=-0.1 must be greater than 0",
+            ECOFLEX | {"relaxation": {"time": 1, "strength": -1}},
+            "relaxation.strength=-1 must be greater than 0",
         ),
     ],
 )

@@ -51,10 +51,7 @@ def test_footprint_mean_is_the_integral_of_a_fine_raster():
         ({"cells": [8.0, 8]}, "body.cells=.* must be a whole number"),
         ({"layers": []}, "at least one layer"),
         ({"layers": [{"material": "EcoFlex 00-30"}]}, "body.layers.0 needs thickness, got material"),
-        (
-            {"layers": [LAYERS[0], {"material": "EcoFlex 00-30", "thickness": -1}]},
-            "body.layers.1.thickness=-1 must",
-        ),
+        ({"layers": [LAYERS[0], LAYERS[1] | {"thickness": -1}]}, "body.layers.1.thickness=-1 must"),
         ({"layers": [{"material": "rubber", "thickness": 0.01}]}, "unknown material rubber"),
     ],
 )

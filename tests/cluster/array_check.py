@@ -34,7 +34,6 @@ EXPERIMENT = "studies"  # as in conf/study.yaml
 
 
 def main() -> None:
-    """Run the check."""
     parser = argparse.ArgumentParser()
     parser.add_argument("folder", type=Path)
     parser.add_argument("uri")
@@ -131,7 +130,6 @@ def in_turn(script: Sequence[str], folder: Path, meanwhile: Callable[[], None]) 
 
 
 def environment() -> dict[str, str]:
-    """Return the variables of the commands: this interpreter and this code."""
     return os.environ | {"PYTHON": sys.executable, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
 
 

@@ -1,5 +1,8 @@
 """Commands as a person runs them."""
 
+import sqlite3
+from contextlib import closing
+
 import pytest
 
 
@@ -14,3 +17,9 @@ def run(run):
         return done
 
     return checked
+
+
+def query(folder, *statement):
+    """Return the rows that a statement finds in the store of a folder."""
+    with closing(sqlite3.connect(folder / "m.db")) as database, database:
+        return database.execute(*statement).fetchall()

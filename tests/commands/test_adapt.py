@@ -1,7 +1,5 @@
 """`skin adapt` makes a run of another skin from few gestures, which all commands take."""
 
-import sqlite3
-from contextlib import closing
 from dataclasses import replace
 
 import pytest
@@ -9,14 +7,11 @@ import pytest
 pytest.importorskip("termios", reason="pseudo-terminals need a POSIX system")
 
 from skin.device.files import read_recording, write_recording
+from tests.commands.conftest import query
 
 SKIN = ["layout=grid", "layout.rows=3", "layout.columns=3", "simulator=naive"]
 NETWORK = ["representation=features", "model=mlp", "model.widths=[]", "fusion.head=residual"]
-SMALL = [
-    "evaluation.devices=0",
-    "evaluation.layouts=0",
-    "evaluation.safe_gestures=64",
-]
+SMALL = ["evaluation.devices=0", "evaluation.layouts=0", "evaluation.safe_gestures=64"]
 TEST = "device.test_gestures=160"
 RECORDED = ["device=recording", "device.path=session.parquet"]
 QUICK = ["adapt.layers=[all]", "adapt.lr=[0.001]", "adapt.epochs=12", "adapt.scratch=[]", *SMALL]
@@ -25,7 +20,6 @@ OTHER = ["device.gain_spread=0.3", "device.time_constant=0.4", "device.seed=3"]
 
 @pytest.fixture(scope="module")
 def folder(run, tmp_path_factory):
-    """A folder with a finished run of a network."""
     folder = tmp_path_factory.mktemp("runs")
     quick = ["data.gestures=480", "trainer.max_epochs=15", "optimizer.lr=0.003", "fusion.hidden=16"]
     run(folder, "train", *NETWORK, *SKIN, *SMALL, TEST, *quick)
@@ -34,28 +28,21 @@ def folder(run, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def session(run, folder):
-    """Gestures of a skin with other gains and a lag."""
     run(folder, "generate", *SKIN, *OTHER, "n=208", "seed=5", "out=session.parquet", store=False)
     return folder / "session.parquet"
 
 
-def query(folder, statement, *values):
-    with closing(sqlite3.connect(folder / "m.db")) as database:
-        return database.execute(statement, values).fetchall()
-
-
 def runs(folder):
-    """Return the ids of the finished runs, oldest first."""
     found = query(folder, "select run_uuid from runs where status='FINISHED' order by start_time")
     return [identity for (identity,) in found]
 
 
 def metrics(folder, run):
-    return dict(query(folder, "select key, value from latest_metrics where run_uuid=?", run))
+    return dict(query(folder, "select key, value from latest_metrics where run_uuid=?", [run]))
 
 
 def tags(folder, run):
-    return dict(query(folder, "select key, value from tags where run_uuid=?", run))
+    return dict(query(folder, "select key, value from tags where run_uuid=?", [run]))
 
 
 @pytest.fixture(scope="module")
@@ -109,57 +96,39 @@ def test_a_learner_from_scratch_is_kept_where_it_is_better(run, folder, adapted,
     known = read_recording(session)[:60]
     turned = replace(known, touches=replace(known.touches, readings=-known.touches.readings))
     write_recording(turned, folder / "turned.parquet")
-    words = [
-        "device=recording",
-        "device.path=turned.parquet",
-        *QUICK,
-        "adapt.epochs=1",
-        "adapt.scratch=[extra_trees]",
-    ]
+    there = ["device=recording", "device.path=turned.parquet"]
+    words = [*there, *QUICK, "adapt.epochs=1", "adapt.scratch=[extra_trees]"]
     done = run(folder, "adapt", f"run={adapted[0]}", *words)
     made = runs(folder)[-1]
     assert tags(folder, made)["chosen"] == "extra_trees, from scratch"
     assert "chosen: extra_trees, from scratch" in done.stdout
     found = metrics(folder, made)
     assert found["validation/overall/accuracy"] > found["validation_before/overall/accuracy"]
-    run(
-        folder, "evaluate", f"run={made}", "device=recording", "device.path=turned.parquet", "device.test=all"
-    )
+    run(folder, "evaluate", f"run={made}", *there, "device.test=all")
     assert metrics(folder, runs(folder)[-1])["same/overall/accuracy"] > 0.95
 
 
 @pytest.fixture(scope="module")
-def bad(run, folder, session):
-    """A run of rules, and recordings without labels and with few gestures."""
+def rules(run, folder, session):
     run(folder, "train", "experiment=rules", *SKIN, *SMALL, TEST, "data.gestures=80")
-    known = read_recording(session)
-    unknown = replace(known, touches=replace(known.touches, labels=None))
-    return {
-        "rules": runs(folder)[-1],
-        "unlabelled": write_recording(unknown, folder / "unlabelled.parquet"),
-        "few": write_recording(known[:6], folder / "few.parquet"),
-        "enough": session,
-    }
+    return runs(folder)[-1]
 
 
 @pytest.mark.parametrize(
     ("row", "given", "reason"),
     [
-        ("rules", ["device=recording", "device.path={enough}"], "Rules has no network to fine-tune"),
-        (None, ["device=recording", "device.path={unlabelled}"], "record them with labels"),
-        (None, ["device=recording", "device.path={few}"], "6 gestures are too few"),
+        ("rules", RECORDED, "Rules has no network to fine-tune"),
         (None, [], "is adapted to gestures of one skin: add device=recording"),
         (None, ["adapt.gestures=7"], "adapt.gestures=7 must be greater than or equal to 8"),
-        (None, ["device=recording", "device.path={enough}", "adapt.gestures=209"], "use adapt.gestures=208"),
+        (None, [*RECORDED, "adapt.gestures=209"], "use adapt.gestures=208"),
         (None, ["adapt.rate=1"], "rate"),
         (None, ["adapt.scratch=[rules]"], "must be 'kernel_ridge' or 'extra_trees'"),
         (None, ["learner.dropout=0.5"], "learner.dropout was fixed when the run was trained"),
     ],
 )
 @pytest.mark.slow("trains and adapts a run")
-def test_bad_input_ends_with_2_and_one_sentence(run, folder, adapted, bad, row, given, reason):
+def test_bad_input_ends_with_2_and_one_sentence(run, folder, adapted, rules, row, given, reason):
     before = query(folder, "select count(*) from runs")
-    words = [one.format(**bad) for one in given]
-    done = run(folder, "adapt", f"run={bad['rules'] if row else adapted[0]}", *words, *SMALL, code=2)
+    done = run(folder, "adapt", f"run={rules if row else adapted[0]}", *given, *SMALL, code=2)
     assert reason in done.stderr
     assert query(folder, "select count(*) from runs") == before

@@ -13,9 +13,8 @@ NAIVE = ("animate", "simulator=naive")
 def test_a_drawn_touch_and_a_recorded_one(run, tmp_path, configured):
     done = run(tmp_path, *NAIVE, "out=hand.gif", "labels=[big,dynamic]", "shape=hand", "seed=3", store=False)
     assert done.stdout == "hand.gif: hand: big, dynamic, 30 frames at 10 Hz\n"
-    write_recording(
-        build_device(configured("simulator=naive", "data.gestures=16")).recording(), tmp_path / "x.parquet"
-    )
+    device = build_device(configured("simulator=naive", "data.gestures=16"))
+    write_recording(device.recording(), tmp_path / "x.parquet")
     recording = ["device=recording", "device.path=x.parquet", "index=5", "out=five.gif"]
     done = run(tmp_path, *NAIVE, *recording, store=False)
     assert done.stdout.startswith("five.gif: touch 5: ")
@@ -29,12 +28,3 @@ def test_a_drawn_touch_and_a_recorded_one(run, tmp_path, configured):
 def test_fingertips_are_shown_without_asking_for_labels(run, tmp_path):
     done = run(tmp_path, *NAIVE, "touch=fingertips", "out=tips.png", store=False)
     assert done.stdout == "tips.png: disc: dynamic, press, 30 frames at 10 Hz\n"
-
-
-@pytest.mark.slow("draws the arm in 3D")
-def test_a_still_of_the_arm(run, tmp_path):
-    arm = ["body=arm", "out=arm.png", "view=skin3d", "labels=[press]", "shape=disc"]
-    done = run(tmp_path, *NAIVE, *arm, store=False)
-    assert done.stdout == "arm.png: disc: press, 30 frames at 10 Hz\n"
-    with Image.open(tmp_path / "arm.png") as file:
-        assert file.size == (1140, 540)

@@ -20,7 +20,6 @@ OWN = ["simulator=solid", "simulator.divisions=1", "layout=file", "layout.path=n
 
 @pytest.fixture(scope="module")
 def folder(run, tmp_path_factory):
-    """A folder with a run of drawn skins and a layout of nine sensors."""
     folder = tmp_path_factory.mktemp("any")
     (folder / "nine.csv").write_text(NINE)
     run(folder, "train", *TRAINED)
@@ -45,11 +44,6 @@ def test_a_recording_with_one_of_the_labels_is_judged_by_it(run, folder):
     assert "press/accuracy" in done.stdout
     assert "big/accuracy" not in done.stdout
     assert "labels: the touches of the test tell nothing of big, dynamic, dangerous" in done.stdout
-    write_recording(replace(some, task=Task(("firm",))), folder / "other.parquet")
-    done = run(
-        folder, "evaluate", "device=recording", "device.path=other.parquet", "device.test=all", *OWN, code=2
-    )
-    assert "has the labels firm, and the run learned big, dynamic, press, dangerous" in done.stderr
 
 
 @pytest.mark.slow("trains and exports a run")

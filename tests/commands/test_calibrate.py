@@ -10,31 +10,15 @@ SMALL = ["layout=grid", "layout.rows=2", "layout.columns=2"]
 @pytest.mark.slow("fits and generates a data set")
 def test_from_a_bench_to_touches_of_the_calibrated_device(run, tmp_path):
     session, out = tmp_path / "bench.parquet", tmp_path / "mine.yaml"
-    done = run(
-        tmp_path,
-        "calibrate",
-        *SMALL,
-        f"session={session}",
-        f"out={out}",
-        "calibrate.demo=true",
-        "device.gain_spread=0.2",
-        store=False,
-    )
+    words = [*SMALL, f"session={session}", f"out={out}", "calibrate.demo=true", "device.gain_spread=0.2"]
+    done = run(tmp_path, "calibrate", *words, store=False)
     assert "Warning" not in done.stderr
     assert "8 presses" in done.stdout
     assert "RMSE on 2 held-out presses" in done.stdout
     assert len(read_calibration(out)) == 4
     touches = tmp_path / "touches.csv"
-    run(
-        tmp_path,
-        "generate.py",
-        *SMALL[:3],
-        "n=16",
-        f"out={touches}",
-        f"device.calibration={out}",
-        "device.randomise=true",
-        store=False,
-    )
+    words = [*SMALL, "n=16", f"out={touches}", f"device.calibration={out}", "device.randomise=true"]
+    run(tmp_path, "generate.py", *words, store=False)
     assert touches.is_file()
 
 

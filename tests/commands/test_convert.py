@@ -1,6 +1,5 @@
 """`skin convert` as a person runs it, and a training on what it wrote."""
 
-import sqlite3
 from dataclasses import replace
 from itertools import product
 
@@ -12,6 +11,7 @@ import yaml
 from skin.device.conversion import summarise_conversion
 from skin.device.files import read_recording
 from tests.budget import free
+from tests.commands.conftest import query
 
 MAPPING = {
     "files": "*/*.csv",
@@ -27,6 +27,8 @@ MAPPING = {
     "targets": {"force": {"column": "gauge", "unit": "N"}},
     "groups": ["person"],
 }
+TREES = ["experiment=features", "learner.rounds=5"]
+NETWORK = ["representation=readings", "model=mlp", "trainer.max_epochs=2"]
 
 
 def write(folder, persons=6, touches=24, **mapping):
@@ -62,10 +64,6 @@ def converted(run, tmp_path_factory):
     return convert
 
 
-TREES = ["experiment=features", "learner.rounds=5"]
-NETWORK = ["representation=readings", "model=mlp", "trainer.max_epochs=2"]
-
-
 @pytest.mark.parametrize("settings", [TREES, NETWORK], ids=["trees", "network"])
 def test_a_folder_is_converted_and_trained_on_by_person(run, converted, tmp_path, settings):
     path, said = converted()
@@ -79,10 +77,8 @@ def test_a_folder_is_converted_and_trained_on_by_person(run, converted, tmp_path
     train = ["device=recording", f"device.path={path}", "device.test_groups=[p1]", *settings]
     done = run(tmp_path, "train", *train)
     assert "split: by person: 4 to train (1 for validation), 1 to test (p1)\n" in done.stdout
-    database = sqlite3.connect(tmp_path / "m.db")
-    ((split,),) = database.execute("select value from tags where key = 'split'").fetchall()
-    losses = database.execute("select is_nan from latest_metrics where key = 'val_loss'").fetchall()
-    database.close()
+    ((split,),) = query(tmp_path, "select value from tags where key = 'split'")
+    losses = query(tmp_path, "select is_nan from latest_metrics where key = 'val_loss'")
     assert split.startswith("by person: ")
     assert losses == [(0,)] * (settings is NETWORK)
 

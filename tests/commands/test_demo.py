@@ -15,7 +15,6 @@ PATIENCE = 240  # s, on a machine that is busy with other things
 
 
 def page_of(demo):
-    """Return the address that the command prints."""
     deadline = monotonic() + PATIENCE
     while monotonic() < deadline and demo.poll() is None:
         if found := re.search(r"^page: (http://127\.0\.0\.1:\d+)$", demo.err, re.M):
@@ -25,7 +24,6 @@ def page_of(demo):
 
 
 def pictures(page):
-    """Yield the states that a browser is sent."""
     deadline = monotonic() + PATIENCE
     with urlopen(f"{page}/pictures", timeout=PATIENCE) as events:
         for line in events:
@@ -108,9 +106,8 @@ def test_the_shipped_threshold_is_of_the_emulated_device(run, tmp_path, monkeypa
 
 @pytest.mark.slow("starts the demo, with two processes")
 def test_what_is_killed_leaves_no_process_and_no_port(begin, tmp_path):
-    with begin(
-        tmp_path, "live", "demo=true", "live.web_port=0", "live.patience.above=0.97", "web=true"
-    ) as demo:
+    words = "demo=true", "live.web_port=0", "live.patience.above=0.97", "web=true"
+    with begin(tmp_path, "live", *words) as demo:
         page = page_of(demo)
         next(picture for picture in pictures(page) if not picture["stale"])
         children = psutil.Process(demo.pid).children()

@@ -23,7 +23,6 @@ def folder(run, tmp_path_factory):
 
 @pytest.fixture
 def model(folder, tmp_path):
-    """A folder with a copy of the model and no runs."""
     shutil.copytree(folder / "models" / "small", tmp_path / "models" / "small")
     return tmp_path / "models" / "small"
 

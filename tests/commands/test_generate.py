@@ -3,6 +3,7 @@
 from skin.device.files import read_recording
 
 NAIVE = ("generate", "simulator=naive")
+ONE_SIZE = ("touch.shapes=[disc,bar]", "touch.stretch=1", "touch.big_area=[0.45,0.7]")
 
 
 def test_writes_a_recording(run, tmp_path):
@@ -30,17 +31,7 @@ def test_a_folder_becomes_a_data_set_to_train_on(run, tmp_path):
         assert "delete it, and repeat the skin generate" in done.stderr
 
 
-ONE_SIZE = ("touch.shapes=[disc,bar]", "touch.stretch=1", "touch.big_area=[0.45,0.7]")
-
-
 def test_warns_where_a_shape_is_the_label(run, tmp_path):
     """Bars have no room as big touches unless they are stretched."""
     done = run(tmp_path, *NAIVE, "n=160", "out=x.csv", *ONE_SIZE, store=False)
     assert "warning: the shape alone predicts big (" in done.stderr
-
-
-def test_fingertips_are_written_with_their_contacts(run, tmp_path):
-    words = ["simulator=naive", "touch=fingertips", "n=16", "out=tips.parquet"]
-    run(tmp_path, "generate", *words, store=False)
-    contacts = read_recording(tmp_path / "tips.parquet").touches.contacts
-    assert contacts.shape == (16, 30, 3, 5)

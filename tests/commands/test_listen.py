@@ -13,14 +13,8 @@ LISTEN = "-m", "skin", "listen"
 
 
 def listen(*arguments):
-    return subprocess.run(
-        [sys.executable, *LISTEN, *arguments],
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
-        cwd=ROOT,
-    )
+    command = [sys.executable, *LISTEN, *arguments]
+    return subprocess.run(command, capture_output=True, text=True, timeout=120, cwd=ROOT)
 
 
 @pytest.fixture
@@ -55,9 +49,8 @@ def test_it_says_what_comes(address):
 
 def test_ctrl_c_ends_it_well(address):
     command = [sys.executable, *LISTEN, f"device.port={address}", "seconds=null"]
-    with subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT
-    ) as process:
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    with subprocess.Popen(command, text=True, cwd=ROOT, **pipes) as process:
         assert "text" in process.stdout.readline()
         process.send_signal(signal.SIGINT)
         out, said = process.communicate(timeout=120)
@@ -66,8 +59,6 @@ def test_ctrl_c_ends_it_well(address):
 
 @pytest.fixture
 def foreign(played):
-    """Return the address of a board of two sensors with a format of its own."""
-
     def say(reader, stop):
         for number in range(100_000):
             reader.sendall(b"<%d|%d|%d>\r" % (20_000 + 10 * number, 500 + number % 3, 700 - number % 2))

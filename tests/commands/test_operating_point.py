@@ -2,31 +2,27 @@
 
 import json
 import re
-import sqlite3
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
+
+from tests.commands.conftest import query
 
 SKIN = ["layout=grid", "layout.rows=2", "layout.columns=2", "simulator=naive"]
 SMALL = ["data.gestures=400", "device.test_gestures=96", "evaluation.devices=1", "evaluation.layouts=0"]
 SMALL += ["evaluation.safe_gestures=200"]
 FEW = "evaluation.devices=0"
+LIVE = ["live.touch=0.3", "live.selftest=false", "seconds=1.2"]  # a training of seconds finds little
 
 
 @pytest.fixture(scope="module")
 def folder(run, tmp_path_factory):
-    """A folder with one finished run of rules, and what its training said."""
     folder = tmp_path_factory.mktemp("runs")
     done = run(folder, "train", "experiment=rules", *SKIN, *SMALL)
     (folder / "said").write_text(done.stdout)
     (folder / "warned").write_text(done.stderr)
     return folder
-
-
-def query(folder, *statement):
-    with closing(sqlite3.connect(folder / "m.db")) as database, database:
-        return database.execute(*statement).fetchall()
 
 
 def tag(folder):
@@ -90,15 +86,10 @@ def test_another_rate_gets_another_threshold(run, folder):
     assert level < stored(folder)["threshold"]
 
 
-def threshold(text):
-    return float(re.search(r"alarm above (\d\.\d+), chosen on 200 fresh", text)[1])
-
-
 @pytest.fixture(scope="module")
 def found(run, folder):
-    """The threshold that an evaluation finds for a profile."""
     done = run(folder, "evaluate", FEW, "evaluation.profile=rough", f"out={folder}/profile")
-    return threshold(done.stdout)
+    return float(re.search(r"alarm above (\d\.\d+), chosen on 200 fresh", done.stdout)[1])
 
 
 def test_a_profile_gets_a_threshold_of_its_own(folder, found):
@@ -127,9 +118,6 @@ def port(played):
     return f"device.port={played(say)}"
 
 
-LIVE = ["live.touch=0.3", "live.selftest=false", "seconds=1.2"]  # a training of seconds finds little
-
-
 @pytest.mark.slow("starts a live view that waits for a tap")
 @pytest.mark.parametrize(("above", "alarm"), [("0.00001", True), ("0.9999", False)])
 def test_live_raises_the_alarm_where_it_is_told(run, folder, port, above, alarm):
@@ -140,9 +128,7 @@ def test_live_raises_the_alarm_where_it_is_told(run, folder, port, above, alarm)
 
 
 @pytest.mark.slow("draws and plays touches for three live views")
-def test_live_chooses_a_threshold_per_touch_for_the_profile_and_keeps_it(
-    run, folder, port, tmp_path, monkeypatch
-):
+def test_live_chooses_a_threshold_for_the_profile_and_keeps_it(run, folder, port, tmp_path, monkeypatch):
     monkeypatch.setenv("SKIN_CACHE", str(tmp_path))
     levels, few = [], "evaluation.safe_gestures=50"  # the time goes with their number
     for words in ([], ["evaluation.profile=rough"], ["evaluation.profile=rough"]):
@@ -151,9 +137,8 @@ def test_live_chooses_a_threshold_per_touch_for_the_profile_and_keeps_it(
         # A training of seconds may find too few dangerous touches.
         hides = re.search(r"it hides dangerous touches: train with more gestures, or give a lower", said)
         assert done.returncode == (2 if hides else 0), done.stderr
-        levels.append(
-            float(re.search(r"alarm above (\d\.\d+), chosen on 50 fresh safe touches at 10 Hz", said)[1])
-        )
+        above = re.search(r"alarm above (\d\.\d+), chosen on 50 fresh safe touches at 10 Hz", said)
+        levels.append(float(above[1]))
         assert ("choosing the alarm's threshold" in said) == (len(levels) < 3)
         assert ("devices of the profile rough" in said) == (len(levels) == 2)
     assert levels[0] != levels[1] == levels[2]

@@ -43,7 +43,6 @@ class Person:
         self.process, self._keyboard = process, keyboard
 
     def until(self, words):
-        """Read on until a line has some words; return it."""
         for line in self.process.lines(errors=True):
             if words in line:
                 return line.strip()
@@ -55,8 +54,6 @@ class Person:
 
 @pytest.fixture
 def person_at(begin):
-    """Return a function that starts a command on a terminal of its own."""
-
     @contextmanager
     def person_at(folder, script, *arguments):
         keyboard, terminal = os.openpty()
@@ -71,7 +68,6 @@ def person_at(begin):
 
 
 def ended(person):
-    """Return exit code and results of a command that ends by itself."""
     code = person.process.wait()
     assert "Traceback" not in person.process.err, person.process.err
     assert "Fatal" not in person.process.err, person.process.err

@@ -66,13 +66,11 @@ def skin(*lives):
 
 @pytest.fixture
 def record(run, tmp_path):
-    """Run record.py in a folder of its own."""
     return lambda *words, **code: run(tmp_path, "record.py", "out=s", *words, store=False, **code)
 
 
 @pytest.fixture(scope="module")
 def once(run, tmp_path_factory):
-    """Record a few gestures; give the folder."""
     folder = tmp_path_factory.mktemp("once")
     with skin({}) as port:
         run(folder, "record.py", "out=s", *FREE, port, "seconds=6", store=False)
@@ -108,9 +106,8 @@ def test_a_full_disk_is_one_sentence_and_there_is_room_again(record, begin, tmp_
         with begin(tmp_path, "record.py", "out=s", *FREE, port, "seconds=60") as full:
             next(line for line in full.lines(errors=True) if line.startswith("gesture 2"))
             resource.prlimit(full.pid, resource.RLIMIT_FSIZE, (2001, resource.RLIM_INFINITY))
-            refused(
-                full.completed(), r"^cannot write s/\S+: File too large: .*; the gestures before are kept$"
-            )
+            reason = r"^cannot write s/\S+: File too large: .*; the gestures before are kept$"
+            refused(full.completed(), reason)
         done, before = len(read_session(path).gestures), content(path)
         assert done >= 2
         assert len(before) == done + 1
@@ -123,9 +120,8 @@ def test_a_full_disk_is_one_sentence_and_there_is_room_again(record, begin, tmp_
 
 def test_a_session_that_is_being_recorded_is_left_alone(record, tmp_path):
     with locked(tmp_path / "s"), skin({}) as port:
-        refused(
-            record(*FREE, port, code=2), r"^s is being recorded by another process: end that, or give another"
-        )
+        reason = r"^s is being recorded by another process: end that, or give another"
+        refused(record(*FREE, port, code=2), reason)
     assert not (tmp_path / "s").exists()
 
 

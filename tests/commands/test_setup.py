@@ -24,6 +24,21 @@ from tests.wire.conftest import Plug
 
 GAINS = np.linspace(0.7, 1.3, 9)
 COUNT = 0.02  # N
+NAIVE = """\
+# @package _global_
+defaults:
+  - override /simulator: naive
+body:
+  _target_: skin.body.sheet.Sheet
+  _convert_: all
+  size: [0.16, 0.16]
+  cells: [32, 32]
+  layers:
+    - {material: Dragon Skin 10 Medium, thickness: 0.010}
+    - {material: EcoFlex 00-30, thickness: 0.005}
+layout:
+  path: my-skin/sensors.csv
+"""
 
 
 class Board:
@@ -88,7 +103,6 @@ def terminal(folder, *words):
 
 
 def asked(run, monkeypatch, folder, *answers, program="false", words=()):
-    """Answer the questions of a guide whose commands all fail, or succeed; return what it said."""
     given = iter(answers)
 
     def typed(question):
@@ -140,31 +154,12 @@ def test_its_commands_are_those_of_a_skin_as_described(run, monkeypatch, tmp_pat
     shown = OmegaConf.create(run(tmp_path, "design", *skin.split(), "--cfg", "job", store=False).stdout)
     body = instantiate(shown.body)
     assert (body.size, body.cells, shown.simulator._target_[-5:]) == ((0.2, 0.1), (40, 20), "Solid")
-    assert [(layer.thickness, layer.material.young) for layer in body.layers] == [
-        (0.008, 560e3),
-        (0.004, 70e3),
-    ]
+    layers = [(layer.thickness, layer.material.young) for layer in body.layers]
+    assert layers == [(0.008, 560e3), (0.004, 70e3)]
     monkeypatch.chdir(tmp_path)
     sensors = instantiate(shown.layout).sensors(body)
     assert sensors.footprint == (0.008, 0.006)
     assert sensors.positions[[0, 7]].tolist() == [[0.025, 0.025, 0.004], [0.175, 0.075, 0.004]]
-
-
-NAIVE = """\
-# @package _global_
-defaults:
-  - override /simulator: naive
-body:
-  _target_: skin.body.sheet.Sheet
-  _convert_: all
-  size: [0.16, 0.16]
-  cells: [32, 32]
-  layers:
-    - {material: Dragon Skin 10 Medium, thickness: 0.010}
-    - {material: EcoFlex 00-30, thickness: 0.005}
-layout:
-  path: my-skin/sensors.csv
-"""
 
 
 @pytest.mark.slow("runs commands in processes of their own, and waits for nine loads")

@@ -7,7 +7,6 @@ from skin.commands.train import main
 
 @pytest.fixture
 def refused(capsys, monkeypatch):
-    """Return a function that returns the sentence with which words are refused."""
     monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
 
     def refuse(*words):
@@ -28,6 +27,7 @@ def refused(capsys, monkeypatch):
         ("model.widths=[3]", "group model.widths, but model=gcn has it"),
         ("simulator=solit", "there is no simulator=solit: did you mean solid? There are fem, naive, solid"),
         ("simulator=xyz", "there is no simulator=xyz: there are fem, naive, solid\n"),
+        ("seed=[", "seed=["),
         ("out=bench (1).csv", "out=bench (1).csv cannot be read as an override, quote its value"),
         ("data.name=a,b", "Ambiguous value for argument 'data.name=a,b'"),
         ("qqqq=3", "there is no setting or group qqqq: --help lists them"),

@@ -13,6 +13,31 @@ from skin.core.files import ROOT
 
 # As early as the first import of ours, and in the middle of a heavy one.
 MOMENTS = ["skin.core.interrupt", "torch._C"]
+BUSY = """
+import hashlib, time
+from skin.core import interrupt
+interrupt._CLOSING = 1.5
+try:
+    with interrupt.ends_on_signal(lambda: print("last", flush=True)):
+        print("busy", flush=True)
+        {}
+finally:
+    print("closed", flush=True)
+"""
+NOTICED = """
+import signal, time
+from skin.core.interrupt import ends_on_signal
+
+try:
+    with ends_on_signal():
+        try:
+            signal.raise_signal(signal.SIGTERM)
+        finally:
+            time.sleep(0.2)  # the thread has read the first signal
+            signal.raise_signal(signal.SIGTERM)
+except SystemExit:
+    print("closed")
+"""
 
 
 @pytest.mark.slow("imports anew up to every moment")
@@ -30,19 +55,6 @@ def test_ctrl_c_among_imports(tmp_path, command, moment):
     assert "Traceback" not in said, said[-2000:]
     assert process.returncode == -signal.SIGINT
     assert not list(tmp_path.glob("x.csv*"))
-
-
-BUSY = """
-import hashlib, time
-from skin.core import interrupt
-interrupt._CLOSING = 1.5
-try:
-    with interrupt.ends_on_signal(lambda: print("last", flush=True)):
-        print("busy", flush=True)
-        {}
-finally:
-    print("closed", flush=True)
-"""
 
 
 @pytest.mark.parametrize(
@@ -119,24 +131,7 @@ def test_two_signals_end_a_process_once_everything_is_closed(times):
     assert Counter(done.stdout.splitlines()) == {"143 closed": times}
 
 
-NOTICED = """
-import signal, time
-from skin.core.interrupt import ends_on_signal
-
-try:
-    with ends_on_signal():
-        try:
-            signal.raise_signal(signal.SIGTERM)
-        finally:
-            time.sleep(0.2)  # the thread has read the first signal
-            signal.raise_signal(signal.SIGTERM)
-except SystemExit:
-    print("closed")
-"""
-
-
 def test_a_second_signal_is_not_complained_about():
-    done = subprocess.run(
-        [sys.executable, "-c", NOTICED], capture_output=True, text=True, cwd=ROOT, check=True
-    )
+    line = [sys.executable, "-c", NOTICED]
+    done = subprocess.run(line, capture_output=True, text=True, cwd=ROOT, check=True)
     assert (done.stdout, done.stderr) == ("closed\n", "")

@@ -12,6 +12,10 @@ from skin.core.settings import ONCE, RISING, check_groups, check_settings, check
 from skin.errors import InputError
 from skin.runs.build import build_data, build_device, build_learner
 
+FIT = {"count": 2, "share": 1, "width": None, "kind": "b", "widths": [1, 2], "name": "x", "copies": {"a": 1}}
+SMALL = ["simulator=naive", "data.gestures=20"]
+SERIAL = ["device=serial", "device.port=/dev/null"]
+
 
 class Thing:
     def __init__(
@@ -31,9 +35,6 @@ class Thing:
         labels: Annotated[Sequence[str], ONCE] = (),
     ) -> None:
         pass
-
-
-FIT = {"count": 2, "share": 1, "width": None, "kind": "b", "widths": [1, 2], "name": "x", "copies": {"a": 1}}
 
 
 def test_what_fits_is_taken():
@@ -116,10 +117,6 @@ def test_a_checked_class_refuses_what_a_script_gives_it():
         Pair(1, third=2)
 
 
-SMALL = ["simulator=naive", "data.gestures=20"]
-SERIAL = ["device=serial", "device.port=/dev/null"]
-
-
 @pytest.mark.parametrize(
     ("overrides", "said"),
     [
@@ -132,7 +129,7 @@ SERIAL = ["device=serial", "device.port=/dev/null"]
         (["device.dead=[4,2]"], r"device.dead=\[4, 2\] must be a range \[minimum, maximum\]"),
         (
             ["+device.noize=1"],
-            "device has no setting noize: did you mean noise[?] it has .*gain_spread, scale_spread, offset",
+            "no setting noize: did you mean noise[?] it has .*gain_spread, scale_spread, off",
         ),
         ([*SERIAL, "device.limits=[1023,0]"], r"device.limits=\[1023, 0\] must be \[smallest, largest\]"),
     ],

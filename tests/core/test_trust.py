@@ -15,6 +15,19 @@ from skin.mechanics.simulator.fem import PlatesAndBeams
 from skin.runs.configuration import settings_of
 
 OPTIONS = [(group, path.stem) for group in GROUPS for path in sorted((CONF / group).glob("*.yaml"))]
+PARTS = "torch.optim.AdamW", "torch.optim.adamw.AdamW"
+PARTS += "torch_geometric.nn.aggr.Set2Set", "torch_geometric.nn.GCNConv"
+OTHERS = """
+pandas.read_pickle shutil.copyfile torch.load torch.nn.Linear hydra.utils.get_object
+torch.optim.optimizer.torch.load torch.optim.optimizer.torch.nn.Linear torch_geometric.nn.Sequential
+torch_geometric.nn.models.BasicGNN.from_pretrained torch_geometric.nn.aggr.base.Path
+skin skin. skin..learner skin.x.os.system skinny.Learner
+skin.device.files.read_recording skin.device.files.os.system skin.device.files.Path
+skin.learning.network.torch.load skin.learning.network.torch.optim.Adam
+skin.learning.learner.AbstractLearner skin.learning.learner.Rules.load skin.device.base.AbstractDevice
+experiments.peers.rocket.AbstractLearner experiments.peers.rocket.subprocess.Popen
+experiments.studies.study.Study
+"""
 
 
 def refuse(name):
@@ -29,53 +42,13 @@ def test_every_option_may_be_built_and_has_types(configured, group, option):
     signature(import_target(settings[group]["_target_"], group), eval_str=True)
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "torch.optim.AdamW",
-        "torch.optim.adamw.AdamW",
-        "torch_geometric.nn.aggr.Set2Set",
-        "torch_geometric.nn.GCNConv",
-    ],
-)
+@pytest.mark.parametrize("name", PARTS)
 @pytest.mark.filterwarnings("ignore:`torch.jit")  # of PyTorch Geometric's import
 def test_parts_of_libraries_may_be_built(name):
     check_targets({"model": [{"_target_": name, "_partial_": True}]}, "a run")
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "pandas.read_pickle",
-        "shutil.copyfile",
-        "torch.load",
-        "torch.nn.Linear",
-        "torch.optim.optimizer.torch.load",
-        "torch.optim.optimizer.torch.nn.Linear",
-        "torch_geometric.nn.Sequential",
-        "torch_geometric.nn.models.BasicGNN.from_pretrained",
-        "torch_geometric.nn.aggr.base.Path",
-        "hydra.utils.get_object",
-        "skin",
-        "skin.",
-        "skin..learner",
-        "skin.x.os.system",
-        "skin.device.files.read_recording",
-        "skin.device.files.os.system",
-        "skin.device.files.Path",
-        "skin.learning.network.torch.load",
-        "skin.learning.network.torch.optim.Adam",
-        "skin.learning.learner.AbstractLearner",
-        "skin.learning.learner.Rules.load",
-        "skin.device.base.AbstractDevice",
-        "skinny.Learner",
-        "experiments.peers.rocket.AbstractLearner",
-        "experiments.peers.rocket.subprocess.Popen",
-        "experiments.studies.study.Study",
-        None,
-        ["skin.learning.learner.Rules"],
-    ],
-)
+@pytest.mark.parametrize("name", [*OTHERS.split(), None, ["skin.learning.learner.Rules"]])
 def test_nothing_else_may_be_built(name):
     refuse(name)
 

@@ -41,10 +41,8 @@ def test_a_raster_is_centred(raster, counts):
 
 
 def test_no_footprint_lies_in_a_polygon():
-    triangle, box = (
-        [(0.0, 0.0), (0.04, 0.0), (0.0, 0.04)],
-        [(0.1, 0.03), (0.12, 0.03), (0.12, 0.06), (0.1, 0.06)],
-    )
+    triangle = [(0.0, 0.0), (0.04, 0.0), (0.0, 0.04)]
+    box = [(0.1, 0.03), (0.12, 0.03), (0.12, 0.06), (0.1, 0.06)]
     found = positions(forbidden=keep_out([triangle, box], SIZE))
     upper_left = found - 0.005
     # The corner of the footprint that is nearest to a zone, with 0.5 mm for the pixels of its outline.
@@ -72,9 +70,8 @@ def test_transparent_pixels_forbid_nothing(tmp_path):
 
 def test_a_picture_of_another_aspect_is_refused(tmp_path):
     Image.new("L", (60, 60), 255).save(tmp_path / "square.png")
-    with pytest.raises(
-        InputError, match=r"60 x 60 pixels, but the surface has 0\.12 x 0\.06 m: give a picture"
-    ):
+    match = r"60 x 60 pixels, but the surface has 0\.12 x 0\.06 m: give a picture"
+    with pytest.raises(InputError, match=match):
         keep_out(str(tmp_path / "square.png"), SIZE)
     Image.new("L", (61, 30), 255).save(tmp_path / "near.png")
     assert keep_out(str(tmp_path / "near.png"), SIZE).shape == (30, 61)

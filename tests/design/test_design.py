@@ -44,22 +44,14 @@ def test_a_skin_without_mechanics_has_a_posterior_too(run, tmp_path):
 
 @pytest.mark.slow("solves a sweep of thicknesses and grids")
 def test_a_sweep_has_a_line_for_each_thickness_and_grid(run, tmp_path):
-    given = (
-        "design=sweep",
-        "design.thicknesses=[0.015,0.03]",
-        "design.grids=[[2,4],[2,6]]",
-        "design.margin=0.02",
-    )
-    done = run(tmp_path, *SMALL, *given, "simulator=solid", "simulator.divisions=2", "out=x", store=False)
+    sizes = "design.thicknesses=[0.015,0.03]", "design.grids=[[2,4],[2,6]]", "design.margin=0.02"
+    given = "design=sweep", *sizes, "simulator=solid", "simulator.divisions=2"
+    done = run(tmp_path, *SMALL, *given, "out=x", store=False)
     assert done.returncode == 0, done.stderr
     with (tmp_path / "x" / "design_sweep.csv").open(newline="") as file:
         lines = [{name: float(value) for name, value in line.items()} for line in csv.DictReader(file)]
-    assert [(line["thickness_m"], line["columns"]) for line in lines] == [
-        (0.015, 4),
-        (0.015, 6),
-        (0.03, 4),
-        (0.03, 6),
-    ]
+    skins = [(line["thickness_m"], line["columns"]) for line in lines]
+    assert skins == [(0.015, 4), (0.015, 6), (0.03, 4), (0.03, 6)]
     assert lines[0]["pitch_m"] == pytest.approx(0.05)
     assert lines[1]["place_m"] < lines[0]["place_m"]
     assert (tmp_path / "x" / "design_sweep.png").is_file()
@@ -68,10 +60,7 @@ def test_a_sweep_has_a_line_for_each_thickness_and_grid(run, tmp_path):
 @pytest.mark.parametrize(
     ("given", "words"),
     [
-        (
-            ["design.margin=0.04"],
-            "design.margin=0.04 m leaves no place on 0.24 x 0.08 m: give less than 0.04",
-        ),
+        (["design.margin=0.04"], "margin=0.04 m leaves no place on 0.24 x 0.08 m: give less than 0.04"),
         (["design.touches=3"], "design.touches=3 must be"),
         (["design.noise=0"], "design.noise=0 must be greater than 0"),
         (["design.radii=[0.01,0.002]"], "must be a range [minimum, maximum]"),

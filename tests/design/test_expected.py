@@ -15,11 +15,8 @@ from skin.inference.posterior import Posterior
 from skin.mechanics.simulator.solid import Solid
 from tests.budget import free
 
-BODY = Sheet(
-    (0.12, 0.08),
-    (24, 16),
-    [{"material": {"name": "EcoFlex 00-30", "young": 170e3, "poisson": 0.49}, "thickness": 0.02}],
-)
+ECOFLEX = {"name": "EcoFlex 00-30", "young": 170e3, "poisson": 0.49}
+BODY = Sheet((0.12, 0.08), (24, 16), [{"material": ECOFLEX, "thickness": 0.02}])
 
 
 @cache
@@ -41,7 +38,6 @@ def per_axis(errors):
 
 
 def standard_error(values, statistic):
-    """Return the standard error of a statistic of values, by the bootstrap."""
     rng = np.random.default_rng(1)
     return np.std([statistic(rng.choice(values, len(values))) for _ in range(300)])
 
@@ -109,10 +105,8 @@ def test_a_map_shows_from_which_force_a_touch_is_felt(capsys):
     *rows, named = capsys.readouterr().out.splitlines()[2:]
     cells = [row.split() for row in rows]
     assert {len(row) for row in cells} == {20}
-    assert [[row[3], row[10], row[16]] for row in cells if "s0" in row or "s3" in row] == [
-        ["s0", "s1", "s2"],
-        ["s3", "s4", "s5"],
-    ]
+    shown = [[row[3], row[10], row[16]] for row in cells if "s0" in row or "s3" in row]
+    assert shown == [["s0", "s1", "s2"], ["s3", "s4", "s5"]]
     assert {text for row in cells for text in row if text[0] != "s"} == {"5", "20", "##"}
     assert named == "A fingertip of 5 N is not felt between sensors 0, 1, 3, 4; 1, 2, 4, 5."
 

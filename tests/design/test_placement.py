@@ -29,7 +29,6 @@ def placed(signal, count, near, fixed=()):
 
 
 def optimum(signal, count, near, fixed=()):
-    """Return the largest information of all admissible choices."""
     rest = [site for site in range(len(signal)) if site not in fixed]
     values = [-np.inf]
     for some in combinations(rest, count - len(fixed)):
@@ -46,9 +45,8 @@ def test_gain_is_the_difference_of_log_determinants(seed):
     for number in range(5):
         before = chosen[:number]
         values = {site: mutual_information(signal, [*before, site]) for site in set(range(12)) - set(before)}
-        assert mutual_information(signal, chosen[: number + 1]) == pytest.approx(
-            max(values.values()), rel=1e-12
-        )
+        best = pytest.approx(max(values.values()), rel=1e-12)
+        assert mutual_information(signal, chosen[: number + 1]) == best
     matrix = np.eye(5) + signal[np.ix_(chosen, chosen)]
     assert mutual_information(signal, chosen) == pytest.approx(0.5 * np.log(np.linalg.det(matrix)), rel=1e-9)
 

@@ -8,7 +8,6 @@ from skin.device.touches import Recording
 
 
 def write_data_set(recording: Recording, folder: Path, counts: tuple[int, ...] = (20, 20, 10)) -> Path:
-    """Write a recording as shards of some gestures each."""
     source = {"seed": 0, "source_commit": "a", "source_dirty": "false", "config_hash": "1", "config": {}}
     write_manifest(folder, describe_recording(recording), counts, **source)
     data_set = DataSet(folder, complete=False)

@@ -88,11 +88,11 @@ def test_a_device_of_ones_own_needs_touches_alone(made_up_device, capsys):
         (open_source, "can be watched: give device=serial"),
         (
             lambda device: measure_margins(None, device, 20, POINT),
-            "MadeUpDevice has none: .* add device=simulated",
+            "has none: .* add device=simulated",
         ),
         (
             lambda device: evaluate_windows(None, device, None, POINT),
-            "MadeUpDevice has none: .* add device=simulated",
+            "has none: .* add device=simulated",
         ),
     ],
 )

@@ -172,16 +172,11 @@ def test_a_share_of_devices_has_no_lag_and_each_has_one_scale():
 
 
 def test_independent_ranges_are_not_correlated():
-    ranges = {
-        "noise": (0.0, 0.1),
-        "time_constant": (0.0, 0.1),
-        "hysteresis": (0.0, 0.1),
-        "rate": (10.0, 1000.0),
-    }
+    names = ("noise", "time_constant", "hysteresis", "rate")
+    ranges = dict.fromkeys(names[:3], (0.0, 0.1)) | {"rate": (10.0, 1000.0)}
     for independent in (False, True):
         device = Imperfection(independent=independent, **ranges)
         constants = device.constants(4, np.random.default_rng(0), 2000)
-        names = ("noise", "time_constant", "hysteresis", "rate")
         values = np.stack([getattr(constants, name).double().numpy().ravel() for name in names])
         correlation = np.corrcoef(values[:3])[np.triu_indices(3, 1)]
         assert (np.abs(correlation) < 0.1).all() if independent else (correlation > 0.99).all()

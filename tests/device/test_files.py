@@ -7,7 +7,6 @@ from pathlib import Path
 
 import pyarrow as pa
 import pyarrow.csv
-import pyarrow.parquet
 import pyarrow.parquet as pq
 import pytest
 import torch
@@ -17,12 +16,7 @@ from hypothesis import strategies as st
 from skin.body.layout import Scattered
 from skin.body.sheet import Sheet
 from skin.core.safe_loading import limited_memory
-from skin.device.files import (
-    DataSet,
-    read_description,
-    read_recording,
-    write_recording,
-)
+from skin.device.files import DataSet, read_description, read_recording, write_recording
 from skin.device.simulated import Simulated
 from skin.device.touches import Recording, Touches, concatenate
 from skin.errors import InputError
@@ -40,23 +34,13 @@ def recording(**changes) -> Recording:
     readings = torch.randn(BATCH, TIME, SENSORS, generator=generator) * 10 ** torch.linspace(-10, 10, SENSORS)
     valid = torch.ones(BATCH, TIME, SENSORS, dtype=torch.bool)
     valid[2, 1, 0], readings[2, 1, 0] = False, 0.0
-    touches = Touches(
-        readings,
-        valid,
-        torch.rand(SENSORS, 3, generator=generator),
-        (torch.rand(BATCH, 4, generator=generator) > 0.5).float(),
-        12.5,
-    )
-    parts = {
-        "touches": touches,
-        "task": TOUCH,
-        "size": (0.16, 0.1),
-        "footprint": (0.01, 0.02),
-        "force": torch.rand(BATCH, TIME, generator=generator),
-        "displacement": torch.rand(BATCH, TIME, SENSORS, 2, generator=generator),
-        "parameters": {"force": torch.rand(BATCH), "speed": torch.rand(BATCH)},
-        "metadata": {"seed": 3, "note": "ü"},
-    }
+    positions = torch.rand(SENSORS, 3, generator=generator)
+    labels = (torch.rand(BATCH, 4, generator=generator) > 0.5).float()
+    parts = {"touches": Touches(readings, valid, positions, labels, 12.5), "task": TOUCH}
+    parts |= {"size": (0.16, 0.1), "footprint": (0.01, 0.02), "metadata": {"seed": 3, "note": "ü"}}
+    parts |= {"force": torch.rand(BATCH, TIME, generator=generator)}
+    parts |= {"displacement": torch.rand(BATCH, TIME, SENSORS, 2, generator=generator)}
+    parts |= {"parameters": {"force": torch.rand(BATCH), "speed": torch.rand(BATCH)}}
     return Recording(**(parts | changes))
 
 
@@ -71,18 +55,13 @@ def same(one, other) -> bool:
 
 
 def variants() -> dict[str, Recording]:
-    full = recording()
+    full, task = recording(), Task(("dynamic", "cos", "sin"), direction=True)
+    labels = torch.cat([torch.rand(BATCH, 1).round(), torch.rand(BATCH, 2) - 0.5], 1)
     return {
         "full": full,
         "readings only": recording(force=None, displacement=None, parameters={}, metadata={}),
         "unlabelled": replace(full, touches=replace(full.touches, labels=None)),
-        "direction": replace(
-            full,
-            task=Task(("dynamic", "cos", "sin"), direction=True),
-            touches=replace(
-                full.touches, labels=torch.cat([torch.rand(BATCH, 1).round(), torch.rand(BATCH, 2) - 0.5], 1)
-            ),
-        ),
+        "direction": replace(full, task=task, touches=replace(full.touches, labels=labels)),
     }
 
 
@@ -97,7 +76,7 @@ def test_rows_are_the_reports(tmp_path, suffix):
     """Read without this project's code."""
     kept = recording()
     path = write_recording(kept, tmp_path / f"x.{suffix}", first=5000)
-    table = pa.csv.read_csv(path) if suffix == "csv" else pa.parquet.read_table(path)
+    table = pa.csv.read_csv(path) if suffix == "csv" else pq.read_table(path)
     readings = [f"reading_0{number}" for number in range(SENSORS)]
     moves = [f"{name}_0{number}" for name in ("D_s", "D_t") for number in range(SENSORS)]
     ids = ["simulation", "frame", *TOUCH.names]
@@ -109,7 +88,7 @@ def test_rows_are_the_reports(tmp_path, suffix):
     assert row["D_t_01"] == pytest.approx(float(kept.displacement[4, 3, 1, 1]))
     assert table["reading_00"][2 * TIME + 1].as_py() is None
     if suffix == "parquet":
-        about = json.loads(pa.parquet.read_schema(path).metadata[b"skin"])
+        about = json.loads(pq.read_schema(path).metadata[b"skin"])
         assert about["units"]["reading"] == "N"
         assert about["positions"] == kept.touches.positions.tolist()
         assert about["metadata"]["seed"] == 3
@@ -139,7 +118,7 @@ def test_files_that_are_no_recordings_are_refused(tmp_path):
         write_recording(recording(), tmp_path / "x.txt")
     with pytest.raises(InputError, match=r"s\.csv is a table without layout and rate: give \S+s\.parquet"):
         read_recording(tmp_path / "s.csv")  # also a session of skin record
-    pa.parquet.write_table(pa.table({"a": [1]}), tmp_path / "z.parquet")
+    pq.write_table(pa.table({"a": [1]}), tmp_path / "z.parquet")
     with pytest.raises(InputError, match=r"z.parquet is damaged or no recording .* its schema has no units"):
         read_recording(tmp_path / "z.parquet")
     path = write_recording(recording(), tmp_path / "cut.parquet")
@@ -149,12 +128,11 @@ def test_files_that_are_no_recordings_are_refused(tmp_path):
 
 
 def changed(path: Path, change=None, rows=None) -> Path:
-    """Write a file again without checksums, with another description or other rows."""
-    table = pyarrow.parquet.read_table(path)
+    table = pq.read_table(path)
     about = json.loads(table.schema.metadata[b"skin"])
     text = json.dumps(change(about) if change else about)
     table = table if rows is None else table.take(rows)
-    pyarrow.parquet.write_table(table.replace_schema_metadata({"skin": text}), path)
+    pq.write_table(table.replace_schema_metadata({"skin": text}), path)
     return path
 
 
@@ -166,11 +144,7 @@ def changed(path: Path, change=None, rows=None) -> Path:
         (lambda about: about | {"parameters": ["force", "size"]}, None, r"no recording.*gesture_size"),
         (lambda about: about | {"units": {"reading": "kgf"}}, None, r"has the units .*kgf"),
         (lambda about: about | {"format": 2}, None, r"has format 2, this version reads format 1"),
-        (
-            lambda about: about | {"gestures": 0},
-            None,
-            r"description.gestures=0 must be greater than or equal",
-        ),
+        (lambda about: about | {"gestures": 0}, None, r"description.gestures=0 must be greater than or equ"),
         (lambda about: about | {"frames": 0}, None, r"description.frames=0 must be greater than or equal"),
     ],
 )

@@ -12,6 +12,11 @@ from skin.device.sampling import measure
 from skin.errors import InputError
 
 NONE = {"gain_spread": 0.0, "offset": 0.0, "noise": 0.0}
+CALIBRATION = Calibration(
+    {"gain": [0.8, 1.2, None], "offset": [0.1, -0.2, 0.3], "clip": [9.0, 5.0, None]},
+    {"stuck": [2]},
+    {"gain": [0.5, 1.5], "dead": [0, 2]},
+)
 
 
 def generator(seed: int = 0) -> np.random.Generator:
@@ -70,10 +75,8 @@ def test_every_device_draws_its_own_number_of_dead_sensors():
     counts = constants.dead.sum(-1).flatten()
     assert counts.unique().tolist() == [1, 2, 3, 4]
     assert ((counts.bincount()[1:] / 3000 - 0.25).abs() < 0.032).all()
-    one = Imperfection(dead=[3, 3]).constants(25, generator())
-    assert all(
-        torch.equal(*both) for both in zip(one, Imperfection(dead=3).constants(25, generator()), strict=True)
-    )
+    pairs = zip(*(Imperfection(dead=dead).constants(25, generator()) for dead in ([3, 3], 3)), strict=True)
+    assert all(torch.equal(*both) for both in pairs)
 
 
 def test_living_sensors_at_their_limit_are_saturated():
@@ -132,19 +135,11 @@ def test_a_tare_is_taken_after_the_converter():
     torch.testing.assert_close(steps, steps.round(), rtol=0, atol=1e-4)
 
 
-CALIBRATION = Calibration(
-    {"gain": [0.8, 1.2, None], "offset": [0.1, -0.2, 0.3], "clip": [9.0, 5.0, None]},
-    {"stuck": [2]},
-    {"gain": [0.5, 1.5], "dead": [0, 2]},
-)
-
-
 def test_a_calibrated_device_is_the_real_one_whatever_the_seed():
     imperfection = Imperfection(gain_spread=3, noise=3, offset=3, dead=0, calibration=CALIBRATION)
     for seed in (0, 1):
-        said, valid, _ = imperfection.apply(
-            torch.full((1, 2, 3), 10.0), imperfection.constants(3, generator(seed)), generator()
-        )
+        constants = imperfection.constants(3, generator(seed))
+        said, valid, _ = imperfection.apply(torch.full((1, 2, 3), 10.0), constants, generator())
         torch.testing.assert_close(said[0, 0], torch.tensor([8.1, 4.8, 0]))
         assert valid[0, 0].tolist() == [True, True, False]
 

@@ -15,6 +15,18 @@ from skin.device.formats import read_format
 from skin.errors import InputError
 
 REAL = ROOT.parent / "shared" / "real"
+OWN = """
+import numpy as np
+from skin.device.conversion import build_recording
+
+
+def read(path, scale: float = 1.0):
+    return build_recording(scale * np.load(path), 20.0, labels={"press": [1, 0]})
+
+
+def nothing(path):
+    return path
+"""
 
 
 def test_the_reader_of_the_page_has_the_captures_of_cost(tmp_path):
@@ -25,10 +37,8 @@ def test_the_reader_of_the_page_has_the_captures_of_cost(tmp_path):
         counts = random.integers(0, 1024, (int(random.integers(10, 40)), 64))
         counts[:, 61:] = gesture, variant, subject
         captures[gesture, variant, subject] = counts
-        lines += [
-            f"{subject},{variant},{gesture},{n}," + ",".join(map(str, row))
-            for n, row in enumerate(counts.tolist(), start=1)
-        ]
+        numbered = enumerate(counts.tolist(), start=1)
+        lines += [f"{subject},{variant},{gesture},{n}," + ",".join(map(str, row)) for n, row in numbered]
     (tmp_path / "CoST.csv").write_text("\n".join(lines))
     names = {}
     exec(re.search(r"```py\n(.*?)```", (ROOT / "docs" / "data.md").read_text(), re.S)[1], names)
@@ -37,12 +47,9 @@ def test_the_reader_of_the_page_has_the_captures_of_cost(tmp_path):
         f"{a}_{b}" for a in ("grab", "hit") for b in ("gentle", "normal", "rough")
     )
     assert len(recording) == 12
-    for readings, labels, number in zip(
-        recording.touches.readings.numpy(),
-        recording.touches.labels,
-        recording.parameters["group_subject"].int().tolist(),
-        strict=True,
-    ):
+    subjects = recording.parameters["group_subject"].int().tolist()
+    given = recording.touches.readings.numpy(), recording.touches.labels, subjects
+    for readings, labels, number in zip(*given, strict=True):
         key = tuple((readings[0, 61:] / 0.0097752).round().astype(int).tolist())
         assert int(labels.argmax()) == 3 * (key[0] - 1) + key[1] - 1
         assert recording.metadata["groups"]["subject"][number] == str(key[2])
@@ -118,20 +125,6 @@ def test_real_recordings_are_converted():
     known = [int((~recording.touches.labels[:, 0].isnan()).sum()) for recording in recordings]
     assert known == [5580, 9610, 15376]
     assert all(recording.touches.valid.all() for recording in recordings)
-
-
-OWN = """
-import numpy as np
-from skin.device.conversion import build_recording
-
-
-def read(path, scale: float = 1.0):
-    return build_recording(scale * np.load(path), 20.0, labels={"press": [1, 0]})
-
-
-def nothing(path):
-    return path
-"""
 
 
 def test_a_function_of_ones_own_reads_what_it_likes(tmp_path, monkeypatch):

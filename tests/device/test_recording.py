@@ -63,12 +63,16 @@ def test_another_skin_is_refused(request, stored, body, layout, message):
         Recorded(body, layout, request.getfixturevalue(stored))
 
 
-def test_no_file_and_too_few_touches_are_refused(simulated, tmp_path):
+def test_no_file_too_few_touches_and_more_than_memory_are_refused(simulated, tmp_path, folder, monkeypatch):
     with pytest.raises(InputError, match=r"add device.path=x.parquet"):
         Recorded(BODY, LAYOUT)
     few = write_recording(simulated[:9], tmp_path / "few.parquet")
     with pytest.raises(InputError, match=r"has 9 touches: 80/10/10 needs at least 10"):
         Recorded(BODY, LAYOUT, str(few))
+    device = Recorded(BODY, LAYOUT, folder)
+    monkeypatch.setattr("skin.device.recording._BYTES", 1e12)
+    with pytest.raises(InputError, match=r"touches, 40 gestures at once, needs about .* GB of memory"):
+        device.touches("train")
 
 
 def test_no_more_is_held_out_than_needed(folder, monkeypatch):
@@ -83,13 +87,6 @@ def test_all_of_a_data_set_may_be_the_test(folder, simulated):
     whole = device.recording()
     assert torch.equal(whole.parameters["peak"], simulated.parameters["peak"])
     assert "summary" not in whole.metadata
-
-
-def test_more_than_memory_is_refused_before_it_is_read(folder, monkeypatch):
-    device = Recorded(BODY, LAYOUT, folder)
-    monkeypatch.setattr("skin.device.recording._BYTES", 1e12)
-    with pytest.raises(InputError, match=r"touches, 40 gestures at once, needs about .* GB of memory"):
-        device.touches("train")
 
 
 def test_a_converted_recording_brings_its_sensors(simulated, tmp_path):
@@ -112,9 +109,8 @@ def test_classes_and_targets_replace_the_labels(simulated, tmp_path):
         "group_person": torch.arange(count).float() % 5,
     }
     about = {"groups": {"person": list("abcde")}, "classes": ["pat", "rub", "tap"]}
-    stored = str(
-        write_recording(replace(simulated, parameters=parameters, metadata=about), tmp_path / "x.parquet")
-    )
+    known = replace(simulated, parameters=parameters, metadata=about)
+    stored = str(write_recording(known, tmp_path / "x.parquet"))
     classes = Recorded(BODY, LAYOUT, stored, task="classes", test_groups="a")
     assert classes.task == Task(("pat", "rub", "tap"), "exclusive")
     assert (classes.all_touches().labels.argmax(1) == parameters["class"]).all()
@@ -136,9 +132,8 @@ def test_one_class_or_value_to_train_on_is_refused(simulated, tmp_path, name):
     person = torch.arange(len(simulated)) % 2
     parameters = {name: person.float(), "group_person": person.float()}
     about = {"groups": {"person": ["a", "b"]}, "classes": ["pat", "rub"]}
-    stored = str(
-        write_recording(replace(simulated, parameters=parameters, metadata=about), tmp_path / "x.parquet")
-    )
+    known = replace(simulated, parameters=parameters, metadata=about)
+    stored = str(write_recording(known, tmp_path / "x.parquet"))
     task = {"class": "classes", "x": "regression"}[name]
     message = {"class": "pat lacks a class", "x": "x has less than two values"}[name]
     with pytest.raises(InputError, match=f"{message} in the touches to train on"):

@@ -10,14 +10,12 @@ SENSORS = 5
 
 
 def frame(t, values, valid=None, **more):
-    """Return a frame at a device's time."""
     values = np.asarray(values, dtype=float)
     valid = np.ones(len(values), bool) if valid is None else np.asarray(valid)
     return Frame(None, t, t, values, valid, **more)
 
 
 def stream(rate, count, seed=0):
-    """Return frames of noise at a rate."""
     values = np.random.default_rng(seed).random((count, SENSORS))
     return [frame(number / rate, row) for number, row in enumerate(values)]
 

@@ -157,10 +157,7 @@ def test_the_summary_counts(plain):
         ({"test_gestures": 0}, r"device.test_gestures=0 must be greater than or equal to 1"),
         ({"position_error": -0.1}, r"position_error"),
         ({"rate": 0}, r"device.rate"),
-        (
-            {"rate": 9.0},
-            r"sends 9 frames a second, the model needs 10: raise device.rate, or lower",
-        ),
+        ({"rate": 9.0}, r"sends 9 frames a second, the model needs 10: raise device.rate, or lower"),
         ({"dead": 25}, r"device.dead"),
         ({"seed": -1}, r"from 0 up"),
         ({"touch": {"shapes": ["potato"]}}, r"no shape potato"),

@@ -152,9 +152,8 @@ def test_a_skin_that_reads_forces_between_layers_is_described_as_a_solid(distrib
             top = skin.body.layers[-1].thickness
             assert (skin.layout.sensors(skin.body).positions[:, 2] == top).all()
         else:
-            assert getattr(skin.simulator, "func", skin.simulator) is getattr(
-                former.simulator, "func", former.simulator
-            )
+            kind, before = (getattr(one.simulator, "func", one.simulator) for one in (skin, former))
+            assert kind is before
     assert min(kinds.values()) > 10
 
 
@@ -167,7 +166,5 @@ def test_what_is_outside_is_named(distribution):
     (shallow,) = distribution.outside(known, grid(5, depth=0.002).sensors(known))[:1]
     assert shallow == "least depth over upper layer 0.2 (0.5 to 1)"
     large = Sheet((0.5, 0.5), (16, 16), layers[:1])
-    assert distribution.outside(large, grid(5).sensors(large)) == [
-        "longer side 0.5 m (0.08 to 0.32 m)",
-        "number of layers 1 (2 to 2)",
-    ]
+    expected = ["longer side 0.5 m (0.08 to 0.32 m)", "number of layers 1 (2 to 2)"]
+    assert distribution.outside(large, grid(5).sensors(large)) == expected

@@ -56,7 +56,6 @@ def test_only_a_task_with_a_gate_has_a_learned_one(noisy):
     found = gates(ContactThreshold(0.5), TOUCH_OR_NOT)
     probabilities = torch.zeros(40, 5)
     probabilities[7, 4] = 0.6
-    said = {
-        name: gate(touches(noisy), probabilities).nonzero().flatten().tolist() for name, gate in found.items()
-    }
+    open_at = lambda gate: gate(touches(noisy), probabilities).nonzero().flatten().tolist()  # noqa: E731
+    said = {name: open_at(gate) for name, gate in found.items()}
     assert said == {"none": list(range(40)), "threshold": [3], "learned": [7]}

@@ -5,7 +5,6 @@ from functools import partial
 
 import numpy as np
 import pytest
-import torch
 from scipy.stats import beta, binom
 
 from skin.core.rng import Stream, generator
@@ -15,25 +14,12 @@ from skin.evaluation.decisions import LiveConditions
 from skin.evaluation.guarantee import anytime_bound, threshold_for_misses
 from skin.runs.build import build_device
 from skin.touch.movie import balanced
-
-
-class Largest:
-    """The probability of every label grows with the largest reading of the window."""
-
-    def probabilities(self, touches):
-        return torch.sigmoid(touches.readings.flatten(1).amax(1) - 5)[:, None].expand(-1, 4)
+from tests.evaluation.test_operating_point import Largest
 
 
 @pytest.mark.parametrize(
     ("touches", "rate", "allowed"),
-    [
-        (2994, 0.001, -1),
-        (2995, 0.001, 0),
-        (20_000, 0.001, 12),
-        (3000, 0.005, 8),
-        (58, 0.05, -1),
-        (59, 0.05, 0),
-    ],
+    [(2994, 1e-3, -1), (2995, 1e-3, 0), (20_000, 1e-3, 12), (3000, 0.005, 8), (58, 0.05, -1), (59, 0.05, 0)],
 )
 def test_as_many_misses_are_allowed_as_the_binomial_tail_says(touches, rate, allowed):
     assert guarantee.allowed_misses(touches, rate) == allowed
@@ -85,9 +71,8 @@ def test_too_few_touches_or_presses_are_told_how_many_are_needed():
     assert f"{needed} of {needed}, 0 missed" in guarantee.describe_presses(*pressed, 0.05)[0]
     with pytest.raises(InputError, match=f"0 misses of {needed - 1} presses .* {needed} presses are needed"):
         guarantee.describe_presses(*(values[1:] for values in pressed), 0.05)
-    with pytest.raises(
-        InputError, match=r"2994 touches cannot show at most 0.1 % missed, .* 2995 are needed"
-    ):
+    match = r"2994 touches cannot show at most 0.1 % missed, .* 2995 are needed"
+    with pytest.raises(InputError, match=match):
         threshold_for_misses(np.ones(2994), 0.001)
     with pytest.raises(InputError, match="4 of 300 dangerous touches on a sensor are not felt"):
         threshold_for_misses(np.repeat([0.0, 0.5], [4, 296]), 0.027)

@@ -20,7 +20,6 @@ class Sure:
         self.but = but
 
     def probabilities(self, touches: Touches) -> torch.Tensor:
-        """Return probabilities near 0 and 1."""
         assert touches.labels is not None
         return ((touches.labels > 0.5) != self.but).float() * 0.8 + 0.1
 
@@ -46,7 +45,6 @@ def device(configured) -> AbstractDevice:
 
 
 def measured(device, but, point=POINT):
-    """Return the spans and the groups by reading, each with numbers, and the alarms."""
     frame, reached = measure_margins(Sure(but), device, 200, point)
     frame = frame.assign(low=frame.low.astype(float), high=frame.high.astype(float))
     assert (frame.groupby(["label", "by"]).touches.sum() == 200).all()

@@ -7,16 +7,8 @@ import pytest
 import torch
 from sklearn.metrics import accuracy_score, balanced_accuracy_score, confusion_matrix
 
-from skin.evaluation.metrics import (
-    calibration_error,
-    compute_metrics,
-    count_confusions,
-    decode,
-    disagreement,
-    encode,
-    measure_angles,
-    vote,
-)
+from skin.evaluation import metrics
+from skin.evaluation.metrics import compute_metrics, count_confusions, decode, encode
 from skin.evaluation.operating_point import OperatingPoint
 from skin.touch.labels import TOUCH, TOUCH_OR_NOT, TOUCH_SLIDING, Task
 
@@ -70,9 +62,8 @@ def test_angles_are_measured_on_touches_that_have_a_direction(scored):
     slides = torch.stack([truth.cos(), truth.sin()], dim=1)
     slides[::3] = 0
     said = 0.3 * torch.stack([(truth + error).cos(), (truth + error).sin()], dim=1)
-    found = compute_metrics(
-        torch.cat([probabilities, said], 1), torch.cat([labels, slides], 1), TOUCH_SLIDING
-    )
+    given = torch.cat([probabilities, said], 1), torch.cat([labels, slides], 1)
+    found = compute_metrics(*given, TOUCH_SLIDING)
     # The short way round; -3 + -4 and 3 + 4 pass behind the back.
     sizes = [min(abs(one), 2 * math.pi - abs(one)) for n, one in enumerate(error.tolist()) if n % 3]
     assert found["direction/degrees"] == pytest.approx(math.degrees(sum(sizes) / len(sizes)), rel=1e-5)
@@ -83,7 +74,7 @@ def test_angles_are_measured_on_touches_that_have_a_direction(scored):
     assert len(found) == len(alone) + 2
     # No direction is as wrong as a blind guess.
     label = torch.tensor([[1.0, 0.0]]).repeat(1, 3)
-    assert measure_angles(torch.zeros(1, 6), label, TOUCH_SLIDING).tolist() == [90.0]
+    assert metrics.measure_angles(torch.zeros(1, 6), label, TOUCH_SLIDING).tolist() == [90.0]
 
 
 @pytest.mark.parametrize("dangerous", [0.0, 1.0])
@@ -111,10 +102,12 @@ def test_calibration_error_in_bins_of_equal_numbers_is_that_of_plain_python():
     for start in range(0, 1500, 100):
         part = pairs[start : start + 100]
         gaps.append(abs(sum(said for said, _ in part) - sum(true for _, true in part)))
-    assert calibration_error(probability, label) == pytest.approx(sum(gaps) / 1500, abs=1e-3)
-    assert calibration_error(probability, (probability > 0.5).long()) > 0.1
+    assert metrics.calibration_error(probability, label) == pytest.approx(sum(gaps) / 1500, abs=1e-3)
+    assert metrics.calibration_error(probability, (probability > 0.5).long()) > 0.1
     # Equal probabilities share a bin.
-    assert calibration_error(torch.full((100,), 0.5), torch.tensor([1, 0] * 50)) == pytest.approx(0, abs=1e-9)
+    assert metrics.calibration_error(torch.full((100,), 0.5), torch.tensor([1, 0] * 50)) == pytest.approx(
+        0, abs=1e-9
+    )
 
 
 def test_means_over_gestures_are_the_metrics():
@@ -124,10 +117,8 @@ def test_means_over_gestures_are_the_metrics():
     known = compute_metrics(probabilities, labels, TOUCH, POINT)
     codes = encode(probabilities, labels, TOUCH, POINT)
     assert codes.dtype == np.uint8
-    for metric in (
-        "overall/accuracy", "big/accuracy", "dangerous/accuracy", "dangerous/alarm_recall",
-        "dangerous/false_alarm_rate",
-    ):  # fmt: skip
+    dangerous = (f"dangerous/{kind}" for kind in ("accuracy", "alarm_recall", "false_alarm_rate"))
+    for metric in ("overall/accuracy", "big/accuracy", *dangerous):
         assert np.nanmean(decode(codes, metric, TOUCH)) == pytest.approx(known[metric], abs=1e-6), metric
     for metric in ("overall/ece", "made_up/accuracy", "dangerous/degrees"):
         with pytest.raises(ValueError, match=metric):
@@ -146,7 +137,7 @@ def test_a_vote_is_the_outcome_of_the_answers_of_most_models(members):
     probabilities = torch.rand(members, 400, 4, generator=generator)
     labels = (torch.rand(400, 4, generator=generator) > 0.4).float()
     codes = np.stack([encode(one, labels, TOUCH, POINT) for one in probabilities])
-    found, answers = vote(codes), (probabilities > 0.5).float().mean(0)
+    found, answers = metrics.vote(codes), (probabilities > 0.5).float().mean(0)
     known = compute_metrics(answers, labels, TOUCH)
     for label in ("overall", *TOUCH.names):
         assert decode(found, f"{label}/accuracy", TOUCH).mean() == pytest.approx(known[f"{label}/accuracy"])
@@ -155,7 +146,7 @@ def test_a_vote_is_the_outcome_of_the_answers_of_most_models(members):
     recall = np.nanmean(decode(found, "dangerous/alarm_recall", TOUCH))
     assert recall == pytest.approx(float(alarms[dangerous].float().mean()))
     differ = ((probabilities > 0.5).any(0) & ~(probabilities > 0.5).all(0)).any(1)
-    assert disagreement(codes) == pytest.approx(float(differ.float().mean()))
+    assert metrics.disagreement(codes) == pytest.approx(float(differ.float().mean()))
 
 
 def test_unknown_labels_do_not_count(scored):

@@ -37,7 +37,6 @@ CONTACT = 0.5  # N
 
 
 def choose(learner, device, settings, live=None):
-    """Return the operating point of a new learner on a device."""
     return choose_alarm_threshold(AlarmSource("new", settings, learner, device=device), live, anew=True)
 
 
@@ -187,11 +186,9 @@ def test_a_damaged_one_is_refused(text):
 @pytest.mark.parametrize(
     ("name", "value", "better"),
     [
-        ("false_alarm_rate", 0.0, 0.02),
-        ("false_alarm_rate", 1.0, 0.02),
+        *(("false_alarm_rate", value, 0.02) for value in (0.0, 1.0)),
+        *(("miss_rate", value, 0.001) for value in (0.0, 0.5)),
         ("safe_gestures", 0, 2000),
-        ("miss_rate", 0.0, 0.001),
-        ("miss_rate", 0.5, 0.001),
     ],
 )
 def test_what_cannot_be_chosen_is_refused(name, value, better):
@@ -216,7 +213,7 @@ def watching(rate, **changes):
     return LiveConditions(rate, CONTACT, 2.0, **{"patience": 0.1, "column": 3, **changes})
 
 
-def engine_windows(drawn, readings, valid, ends, rate):
+def engine_windows(readings, valid, ends, rate):
     """Return the windows and contacts of the engine at the decisions of one touch (F, S)."""
     windows, sensors = [], readings.shape[1]
 
@@ -236,7 +233,6 @@ def engine_windows(drawn, readings, valid, ends, rate):
 
 
 def decide(drawn, learner, rate, **changes):
-    """Return the scores of some touches by a learner alone."""
     labels = balanced(64, generator(Stream.TEST, 8))
     return touch_scores.decide_touches(learner, drawn, watching(rate, **changes), labels, 9).scores(None)
 
@@ -254,9 +250,8 @@ def test_the_windows_are_those_that_the_engine_decides_on(drawn, rate):
     ends = touch_scores._draw_decisions(readings.shape, round(30 * rate / 10), step, same[1])
     longest = 0
     for touch in sorted(range(16), key=lambda touch: -int(contact[touch].sum()))[::3]:
-        found, felt = engine_windows(
-            drawn, readings[touch].double().numpy(), valid[touch].numpy(), ends[touch].numpy(), rate
-        )
+        given = readings[touch].double().numpy(), valid[touch].numpy(), ends[touch].numpy()
+        found, felt = engine_windows(*given, rate)
         assert felt == contact[touch].tolist()
         shown = contact[touch].numpy()
         np.testing.assert_allclose(found[shown], windows[touch][shown].numpy(), atol=1e-5)
@@ -283,9 +278,8 @@ def test_the_misses_of_touches_that_count_are_those_that_were_asked_for(drawn):
     promise = point.guarantee
     assert (promise.touches, promise.misses) == (point.dangerous, point.dangerous - point.found)
     assert promise.misses == allowed_misses(promise.touches, 0.05) > 0
-    assert f"on a sensor: at most 5 % missed, 95 %, {promise.touches} touches, this device, 20 Hz" in (
-        point.sentence()
-    )
+    said = f"on a sensor: at most 5 % missed, 95 %, {promise.touches} touches, this device, 20 Hz"
+    assert said in point.sentence()
     assert f"{100 * point.raised / 64:.1f} % of 64 safe touches raise it" in point.sentence()
     labels = balanced(1600, generator(Stream.TEST, 8))
     others = touch_scores.decide_touches(Largest(), drawn, watching(20.0), labels[labels[:, 3]], 99)

@@ -2,6 +2,7 @@
 
 import io
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -39,7 +40,6 @@ def device(configured):
 
 @pytest.fixture(scope="module")
 def tried(device):
-    """Return what an evaluation found, and its touches: same, holdout, two devices, two layouts."""
     learner = Knows()
     return evaluate(learner, device, SETTINGS, POINT), learner.asked
 
@@ -107,18 +107,16 @@ def test_predictions_tell_of_every_test_gesture(device, tried):
     assert table.num_rows == 48
     for i, name in enumerate(TOUCH.names):
         assert table[name].to_pylist() == test.touches.labels[:, i].int().tolist()
-        assert table[f"p_{name}"].to_pylist() == pytest.approx(
-            (test.touches.labels[:, i] * 0.8 + 0.1).tolist()
-        )
+        probabilities = test.touches.labels[:, i] * 0.8 + 0.1
+        assert table[f"p_{name}"].to_pylist() == pytest.approx(probabilities.tolist())
     assert table["speed"].to_pylist() == test.parameters["speed"].tolist()
 
 
 def test_a_layout_of_a_prime_number_of_sensors_makes_no_grid(configured, tmp_path):
     path = tmp_path / "seven.csv"
     path.write_text("x_m,y_m\n" + "".join(f"{0.02 * i + 0.01},0.05\n" for i in range(7)))
-    device = build_device(
-        configured("simulator=naive", f"layout.path={path}", "data.gestures=80", "device.test_gestures=48")
-    )
+    small = "simulator=naive", "data.gestures=80", "device.test_gestures=48"
+    device = build_device(configured(*small, f"layout.path={path}"))
     assert "unseen_layout" in evaluate(Knows(), device, SETTINGS, POINT).unavailable
 
 
@@ -141,19 +139,13 @@ def test_what_is_not_defined_has_a_reason_and_is_shown_as_a_dash(made_up_device,
     assert "| dangerous/false_alarm_rate | - | - |" in evaluation_markdown(found, TOUCH, "title", "about")
 
 
-class Constant:
-    """Answers 0.9 to everything."""
-
-    def probabilities(self, touches):
-        return torch.full((len(touches), 4), 0.9)
-
-
 def test_labels_that_nobody_knows_have_a_sentence_instead_of_figures(made_up_device, monkeypatch):
     touches = made_up_device.touches("test")
     labels = touches.labels.clone()
     labels[:, [0, 3]] = torch.nan
     monkeypatch.setattr(made_up_device, "touches", lambda *_: replace(touches, labels=labels))
-    report = evaluate(Constant(), made_up_device, SETTINGS, POINT)
+    constant = SimpleNamespace(probabilities=lambda touches: torch.full((len(touches), 4), 0.9))
+    report = evaluate(constant, made_up_device, SETTINGS, POINT)
     assert not [name for name in report.metrics if name.split("/")[1] in ("big", "dangerous")]
     assert {"same/press/accuracy", "same/overall/accuracy"} <= set(report.metrics)
     assert report.unavailable["labels"] == "the touches of the test tell nothing of big, dangerous"

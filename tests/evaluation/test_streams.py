@@ -50,13 +50,11 @@ def streamed(device):
 
 @pytest.fixture(scope="module")
 def knew(streamed):
-    """What is found of a learner of windows that knows the labels."""
     return evaluate_windows(Knows(TOUCH_OR_NOT), streamed, ONLY_ALARMS, POINT)
 
 
 @pytest.fixture(scope="module")
 def whole(device):
-    """A learner of whole touches that knows the labels but takes no 60 frames, and what is found of it."""
     learner = Knows(TOUCH, refuses=60)
     return learner, evaluate_windows(learner, device, COURSE, POINT)
 

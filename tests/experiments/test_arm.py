@@ -9,14 +9,8 @@ import torch
 from skin.device.files import read_recording
 from skin.runs.build import build_data, build_device
 
-SOLID = (
-    "simulator=solid",
-    "simulator.divisions=1",
-    "body.cells=[10,10]",
-    "layout=grid",
-    "data.gestures=16",
-    "device.test_gestures=16",
-)
+SOLID = "simulator=solid", "simulator.divisions=1", "body.cells=[10,10]", "layout=grid"
+FEW = "data.gestures=16", "device.test_gestures=16"
 
 
 @pytest.mark.slow("generates and trains on an arm")
@@ -38,9 +32,8 @@ def test_without_mechanics_an_arm_shows_what_a_sheet_of_its_size_shows(configure
     """Touches, labels and pictures live in the chart, so nothing but mechanics can tell the two apart."""
     shown = []
     for body in ("sheet", "arm"):
-        config = configured(
-            f"body={body}", "simulator=naive", "data.gestures=16", f"representation={representation}"
-        )
+        words = f"body={body}", f"representation={representation}", "simulator=naive", FEW[0]
+        config = configured(*words)
         device = build_device(config)
         frames, labels = build_data(config, device).frames(device.touches("holdout"))
         shown.append([labels, frames.x] + [frames.adjacency] * (representation == "graph"))
@@ -50,7 +43,7 @@ def test_without_mechanics_an_arm_shows_what_a_sheet_of_its_size_shows(configure
 
 def test_sensors_on_the_arm_move_and_graphs_follow_them(configured):
     graph = "representation=graph", "representation.positions=deformed"
-    config = configured("body=arm", *SOLID, *graph, "fusion=late", "model=gcn")
+    config = configured("body=arm", *SOLID, *FEW, *graph, "fusion=late", "model=gcn")
     device = build_device(config)
     movie = device.sampler.sample(16, np.random.default_rng(0))
     motion = device.model.motion(movie.frames)[movie.index] * movie.scale[..., None, None]

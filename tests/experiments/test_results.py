@@ -1,8 +1,6 @@
 """One command makes every published file, and goes on where it was killed."""
 
 import re
-import sqlite3
-from contextlib import closing
 from shlex import split
 
 import pytest
@@ -14,9 +12,7 @@ from experiments.studies.study import chosen_studies
 from skin.core.files import CONF, ROOT
 from skin.runs.configuration import shorten, validate_config
 from skin.runs.sweep import sweep_jobs
-
-# MLflow's own business with SQLAlchemy.
-pytestmark = pytest.mark.filterwarnings("ignore:The ``noload`` loader strategy")
+from tests.commands.conftest import query
 
 SMALL = ["simulator=naive", "data.gestures=160", "device.test_gestures=64", "evaluation.devices=0",
          "evaluation.layouts=0", "evaluation.safe_gestures=64", "trainer.max_epochs=1"]  # fmt: skip
@@ -25,20 +21,15 @@ PARTS = [
     "['study study=table study.rows=[rules] study.seeds=[0,1,2,3]', 1]]",
     "results.parts.studies=[['study study=models study.part=ensemble study.rows=[rules] study.seeds=[0,1] "
     "study.train=false', 1]]",
-    *(
-        f"results.parts.{part}=[]"
-        for part in ("table_solid", "best_fresh_solid", "sensors", "any_skin", "design")
-    ),
-    "results.parts.best_fresh=[]",
     "out=docs",
 ]
+OTHERS = ("table_solid", "best_fresh", "best_fresh_solid", "sensors", "any_skin", "design")
+PARTS += [f"results.parts.{part}=[]" for part in OTHERS]
+LINES = [run for steps in OmegaConf.load(CONF / "results.yaml").results.parts.values() for run, _ in steps]
 
 
-def runs(folder, name="m.db"):
-    """Return name and status of each training."""
-    with closing(sqlite3.connect(folder / name)) as store:
-        found = store.execute("select name, status from runs where name like 'rules naive%'")
-        return sorted(found.fetchall())
+def runs(folder):
+    return sorted(query(folder, "select name, status from runs where name like 'rules naive%'"))
 
 
 @pytest.mark.slow("trains rows, twice")
@@ -99,9 +90,6 @@ def test_bad_settings_are_refused(run, tmp_path, words, reason):
     assert (done.returncode, done.stderr.count("\n")) == (2, 1), done.stderr
     assert reason in done.stderr
     assert not list(tmp_path.iterdir())
-
-
-LINES = [run for steps in OmegaConf.load(CONF / "results.yaml").results.parts.values() for run, _ in steps]
 
 
 @pytest.mark.parametrize("line", LINES)

@@ -8,13 +8,21 @@ import pytest
 from skin.__main__ import verbs
 from skin.core.files import ROOT
 
+WRONG = [*((verb, "typo=1", "typo") for verb in verbs()), ("train", "model=cn", "cn")]
 
-@pytest.mark.parametrize("verb", verbs())
-def test_a_mistake_waits_for_no_heavy_import(verb, light, tmp_path):
-    done = light(tmp_path, verb, "typo=1")
+
+@pytest.mark.parametrize(("verb", "word", "said"), WRONG)
+def test_a_mistake_waits_for_no_heavy_import(verb, word, said, light, tmp_path):
+    done = light(tmp_path, verb, word)
     assert (done.returncode, done.stdout) == (2, "\n"), done.stderr
-    assert "typo" in done.stderr
+    assert said in done.stderr
     assert "Traceback" not in done.stderr
+    assert not list(tmp_path.iterdir())
+
+
+def test_help_waits_for_none(light, tmp_path):
+    done = light(tmp_path, "train", "--help")
+    assert (done.returncode, done.stdout.splitlines()[-1]) == (0, ""), done.stderr
 
 
 @pytest.mark.parametrize("script", ["train", "evaluate", "generate", "record", "live", "reproduce_table"])

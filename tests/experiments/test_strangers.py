@@ -17,10 +17,16 @@ from skin.runs.configuration import Tracking, settings_of
 from skin.runs.run import FinishedRun, find_run
 from skin.runs.store import Store
 
-# MLflow's own business with SQLAlchemy.
-pytestmark = pytest.mark.filterwarnings("ignore:The ``noload`` loader strategy")
-
 SKIN = ["simulator=naive", "layout=grid", "layout.rows=2", "layout.columns=2", "data.gestures=20"]
+TEXTS = [
+    "row: !!python/object/apply:os.mkdir [MARKER]\n",
+    "a: &a [x, x]\nb: &b [*a, *a]\nrow: [*b, *b]\n",
+    "row: " + 2000 * "[",
+    "- row\n",
+    "row: \0",
+    "row: x/../../marker\n",
+]
+PLAYED = ["generate.py", *SKIN, "device=recording", "out=y.csv"]
 
 
 class Payload:
@@ -30,7 +36,6 @@ class Payload:
         self.marker = marker
 
     def __reduce__(self):
-        """Unpickle by making a folder."""
         return os.mkdir, (str(self.marker),)
 
 
@@ -41,19 +46,16 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def store(folder):
-    """Return a store as commands find it in the folder."""
     return Store.open(Tracking(f"sqlite:///{folder}/m.db", f"{folder}/a", "skin", True, None))
 
 
 @pytest.fixture
 def marker(tmp_path):
-    """Return the path of a file that only a payload makes."""
     return tmp_path / "marker"
 
 
 @pytest.fixture
 def bait(tmp_path, marker):
-    """Return a pickle with a payload."""
     path = tmp_path / "bait.pkl"
     path.write_bytes(pickle.dumps(Payload(marker)))
     return path
@@ -61,8 +63,6 @@ def bait(tmp_path, marker):
 
 @pytest.fixture
 def put(store, configured, tmp_path):
-    """Return a function that stores a finished run and returns its id."""
-
     def put(change=None, *overrides, text=None, learned=None):
         config = settings_of(configured(*SKIN, "learner=rules", *overrides))
         config.pop("tracking")
@@ -136,22 +136,11 @@ def test_a_stored_configuration_cannot_say_that_it_is_trusted(run, folder, put, 
     assert marker.exists()
 
 
-TEXTS = [
-    "row: !!python/object/apply:os.mkdir [MARKER]\n",
-    "a: &a [x, x]\nb: &b [*a, *a]\nrow: [*b, *b]\n",
-    "row: " + 2000 * "[",
-    "- row\n",
-    "row: \0",
-    "row: x/../../marker\n",
-]
-
-
 @pytest.mark.parametrize("text", TEXTS)
 def test_yaml_makes_no_objects_does_not_grow_and_leads_out_of_no_folder(text, store, put, marker):
     whole = {"row": "x/../../marker"} if text == TEXTS[-1] else None
-    found = find_run(
-        Tracking(store.uri), put(whole, text=None if whole else text.replace("MARKER", str(marker)))
-    )
+    identity = put(whole, text=None if whole else text.replace("MARKER", str(marker)))
+    found = find_run(Tracking(store.uri), identity)
     with pytest.raises(InputError, match="row" if whole else found.identity):
         found.stored  # noqa: B018 - raises
     assert not marker.exists()
@@ -178,14 +167,10 @@ def test_a_calibration_makes_no_objects(run, tmp_path, marker):
 
 @pytest.fixture(scope="module")
 def recording(run, tmp_path_factory):
-    """Return a recording in both formats' folder."""
     folder = tmp_path_factory.mktemp("recording")
     for name in ("x.parquet", "x.csv"):
         assert run(folder, "generate.py", *SKIN, "n=20", f"out={name}", store=False).returncode == 0
     return folder
-
-
-PLAYED = ["generate.py", *SKIN, "device=recording", "out=y.csv"]
 
 
 def test_a_recording_makes_no_objects(run, recording, tmp_path, marker):

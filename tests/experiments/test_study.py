@@ -1,8 +1,6 @@
 """The command finds finished runs, trains what is missing, measures, and gives verdicts."""
 
 import csv
-import sqlite3
-from contextlib import closing
 
 import pandas as pd
 import pytest
@@ -11,33 +9,17 @@ from PIL import Image
 from skin.core.files import write
 from skin.runs.configuration import fingerprint
 from skin.runs.store import Store
-
-# MLflow's own business with SQLAlchemy.
-pytestmark = pytest.mark.filterwarnings("ignore:The ``noload`` loader strategy")
+from tests.commands.conftest import query
 
 SMALL = ["data.gestures=160", "device.test_gestures=64", "evaluation.devices=0", "evaluation.layouts=0",
          "evaluation.safe_gestures=64"]  # fmt: skip
 NAIVE = ["simulator=naive", *SMALL]
 ACCURACY = "same/overall/accuracy"
-
-
-def ask(folder, question):
-    with closing(sqlite3.connect(folder / "m.db")) as store:
-        return store.execute(question).fetchall()
+WITHOUT_METRIC = "study.statements=[{id: a, says: b}]"
 
 
 def runs(folder):
-    """Return the names and statuses of all runs."""
-    return ask(folder, "select name, status from runs order by start_time")
-
-
-def evaluated_accuracy(folder):
-    """Return the accuracy of the first evaluation."""
-    return ask(
-        folder,
-        "select value from latest_metrics join runs using (run_uuid) where name like 'evaluation of%' "
-        f"and key = '{ACCURACY}'",
-    )[0][0]
+    return query(folder, "select name, status from runs order by start_time")
 
 
 def lines(path):
@@ -47,8 +29,6 @@ def lines(path):
 
 @pytest.fixture(scope="module")
 def command(run):
-    """Return a function that runs a command, which succeeds, in a folder, and returns it."""
-
     def command(folder, verb, *words, **how):
         done = run(folder, verb, *words, **how)
         assert done.returncode == 0, done.stderr
@@ -92,7 +72,7 @@ def test_finished_runs_are_found_and_judged(command, folder):
     [
         ((), "which study"),
         (["study=margin"], "margins"),
-        (["study=models", "study.statements=[{id: a, says: b}]"], "study.statements[0]"),
+        (["study=models", WITHOUT_METRIC], "study.statements[0]"),
     ],
 )
 def test_bad_input_ends_with_code_2_and_imports_nothing_heavy(arguments, named, light, tmp_path):
@@ -109,10 +89,8 @@ def test_what_is_missing_is_trained_and_what_failed_is_told(run, tmp_path):
     done = run(tmp_path, "study", "study=models", "study.part=transformer", *few)
     assert done.returncode == 1, done.stderr
     assert done.stdout.count(": done") == 1
-    assert all(
-        setting in done.stdout.replace("\n", "")
-        for setting in ("data.gestures=80", "device.test_gestures=48")
-    )
+    said = done.stdout.replace("\n", "")
+    assert all(setting in said for setting in ("data.gestures=80", "device.test_gestures=48"))
     page = (tmp_path / "r" / "smoke" / "study_transformer.md").read_text()
     assert "SMOKE" in done.stdout
     assert "SMOKE" in page
@@ -123,7 +101,6 @@ def test_what_is_missing_is_trained_and_what_failed_is_told(run, tmp_path):
 
 @pytest.fixture(scope="module")
 def trained(command, tmp_path_factory):
-    """A folder with finished runs of two rows."""
     folder = tmp_path_factory.mktemp("finished")
     for words in (["experiment=rules"], ["experiment=temporal_graph", "trainer.max_epochs=1"]):
         command(folder, "train", *words, *NAIVE)
@@ -159,7 +136,9 @@ def test_a_condition_changes_the_device_as_an_evaluation_does(command, trained):
     found = {line["condition"]: line for line in lines(trained / "misplaced" / "study_misplaced.csv")}
     device = ["device.seed=1", "device.position_error=0.005", "device.test_gestures=48"]
     command(trained, "evaluate", f"run={found['5 mm']['run']}", *device, *SMALL[2:4], "out=e")
-    assert float(found["5 mm"][ACCURACY]) == pytest.approx(evaluated_accuracy(trained))
+    question = "select value from latest_metrics join runs using (run_uuid) where name like 'evaluation of%'"
+    ((evaluated,),) = query(trained, f"{question} and key = '{ACCURACY}'")[:1]
+    assert float(found["5 mm"][ACCURACY]) == pytest.approx(evaluated)
     assert found["5 mm"][ACCURACY] != found["0 mm"][ACCURACY]
 
 

@@ -15,6 +15,8 @@ from skin.learning.representation import Readings
 from skin.runs.build import build_data, build_device
 from skin.touch.labels import TOUCH_SLIDING
 
+CUTS = [(0, 7), (7, 19), (19, 23)]
+
 
 class Numbered(AbstractDevice):
     """Yields touches whose readings are their number, plus 1000 times the epoch."""
@@ -42,9 +44,6 @@ class InParts(Numbered):
 
     def touches(self, split, epoch=0):
         raise AssertionError("its touches do not fit into memory")
-
-
-CUTS = [(0, 7), (7, 19), (19, 23)]
 
 
 class Trainer:
@@ -143,7 +142,7 @@ def test_without_a_trainer_each_pass_is_the_next_epoch(make, fresh):
     assert all(frames.x.shape[1:] == (6, 2) for frames, _ in alone.val_dataloader())
 
 
-def test_what_cannot_be_batched_is_refused(make):
+def test_what_cannot_be_batched_is_refused(make, made_up_device):
     with pytest.raises(InputError, match=r"data\.batch_size=64"):
         make(batch_size=0)
     with pytest.raises(InputError, match="positions per frame"):
@@ -151,9 +150,6 @@ def test_what_cannot_be_batched_is_refused(make):
     readings = torch.zeros(1, 6, 2)
     with pytest.raises(InputError, match="without labels"):
         make().frames(Touches(readings, readings == 0, torch.rand(2, 3), None, 10.0))
-
-
-def test_time_that_runs_backwards_is_refused_where_touches_have_a_direction(made_up_device):
     made_up_device.task = TOUCH_SLIDING
     with pytest.raises(InputError, match=r"set data.augment.reverse=false"):
         TouchData(made_up_device, Readings, augmentation=Augmentation(reverse=True))
@@ -215,11 +211,8 @@ def test_every_second_touch_runs_backwards(touches):
     assert 16 < back.sum() < 48
 
 
-def test_gain_is_one_factor_per_sensor_and_touch(touches):
+def test_gain_is_one_factor_per_sensor_and_touch_and_noise_has_its_deviation(touches):
     factor = changed(touches, gain=0.1).readings / touches.readings
     torch.testing.assert_close(factor, factor[:, :1].expand_as(factor))
     assert factor[:, 0].log().std() == pytest.approx(0.1, rel=0.15)
-
-
-def test_noise_has_the_deviation_that_was_asked_for(touches):
     assert (changed(touches, noise=0.2).readings - touches.readings).std() == pytest.approx(0.2, rel=0.05)

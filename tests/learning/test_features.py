@@ -10,6 +10,8 @@ from skin.device.touches import Touches
 from skin.learning.features import above_idle, direction_features, engineered_features, estimate_noise
 
 PLACES = torch.tensor([[0.02, 0.02, 0.0], [0.06, 0.02, 0.0], [0.10, 0.02, 0.0], [0.06, 0.08, 0.0]])
+GRID = torch.cartesian_prod(torch.linspace(0.01, 0.15, 8), torch.linspace(0.01, 0.15, 8))
+POSITIONS = torch.cat([GRID, torch.full((64, 1), 0.005)], dim=1)
 
 
 def touch(*forces, offset=0.0):
@@ -85,15 +87,15 @@ def test_runs_and_counts_are_those_that_plain_python_finds():
     idle = raw.quantile(0.2, dim=1, keepdim=True) + 0.8416 * noises[:, None, None]
     for position, (rows, noise) in enumerate(zip((raw - idle) * touches.valid, noises, strict=True)):
         peak, total, more = rows.amax(dim=1), rows.sum(dim=1), 3 * (noise - 0.05).clamp(min=0)
-        for series, level, name in (
-            (peak, 1.0 + more, "longest run above 1.0 N"),
-            (peak, torch.maximum(0.3 * peak.max(), 3 * noise), "longest run above 0.3 of the peak"),
-            (
+        levels = {
+            "longest run above 1.0 N": (peak, 1.0 + more),
+            "longest run above 0.3 of the peak": (peak, torch.maximum(0.3 * peak.max(), 3 * noise)),
+            "longest run of the sum above 0.7 of its peak": (
                 total,
                 torch.maximum(0.7 * total.max(), 6 * noise),
-                "longest run of the sum above 0.7 of its peak",
             ),
-        ):
+        }
+        for name, (series, level) in levels.items():
             runs = [len(list(run)) for on, run in groupby((series > level).tolist()) if on]
             assert found[name][position] == max(runs, default=0), name
         at_once = max(sum(force > 2.0 + more for force in row) for row in rows)
@@ -109,10 +111,6 @@ def test_the_noise_of_a_device_is_found_beside_a_touch(spread):
     touches = Touches(readings, torch.ones_like(readings, dtype=torch.bool), torch.rand(25, 3), None, 10.0)
     assert estimate_noise(touches).mean().item() == pytest.approx(spread, rel=0.2, abs=1e-6)
     assert above_idle(touches)[:, :, 6:].mean().item() == pytest.approx(0, abs=0.1 * spread + 1e-6)
-
-
-GRID = torch.cartesian_prod(torch.linspace(0.01, 0.15, 8), torch.linspace(0.01, 0.15, 8))
-POSITIONS = torch.cat([GRID, torch.full((64, 1), 0.005)], dim=1)
 
 
 def slide(angle: float, order: torch.Tensor | None = None) -> Touches:
@@ -136,9 +134,9 @@ def test_every_vector_points_where_the_touch_goes(angle):
         x, y = (float(found[f"{name}, cosine with {axis}"]) for axis in "xy")
         assert math.cos(math.atan2(y, x) - angle) > 0.99, name
     assert found["lean, x"] == 0
-    way = math.hypot(*(float(found[f"way of the centre 1 beyond 0.1 of the peak, {axis}"]) for axis in "xy"))
-    assert way == pytest.approx(0.072, rel=0.05)
-    slope = math.hypot(
-        *(float(found[f"slope of the centre 2 beyond 0.25 of the peak, {axis}"]) for axis in "xy")
-    )
-    assert slope == pytest.approx(0.008, rel=0.05)
+    for name, length in (
+        ("way of the centre 1 beyond 0.1", 0.072),
+        ("slope of the centre 2 beyond 0.25", 0.008),
+    ):
+        x, y = (float(found[f"{name} of the peak, {axis}"]) for axis in "xy")
+        assert math.hypot(x, y) == pytest.approx(length, rel=0.05)

@@ -39,7 +39,6 @@ def model(structure: Structure, pressure: np.ndarray) -> "FEModel3D":
 
 
 def solve(built: "FEModel3D") -> None:
-    """Analyse one load case."""
     built.analyze_linear(check_stability=False)
 
 
@@ -65,7 +64,6 @@ def _add_nodes(built: "FEModel3D", structure: Structure) -> None:
 
 
 def _add_material(built: "FEModel3D", name: str, material: Material) -> str:
-    """Add a material and return its name."""
     built.add_material(name, material.young, material.shear, material.poisson, rho=1.0)
     return name
 

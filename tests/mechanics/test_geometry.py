@@ -16,11 +16,8 @@ from skin.mechanics.simulator.solid import Solid
 
 @pytest.fixture(scope="module")
 def body():
-    return Sheet(
-        (0.2, 0.16),
-        (40, 32),
-        [Layer(Material("hard", 2e5, 0.49), 0.01), Layer(Material("soft", 1e5, 0.49), 0.01)],
-    )
+    layers = [Layer(Material("hard", 2e5, 0.49), 0.01), Layer(Material("soft", 1e5, 0.49), 0.01)]
+    return Sheet((0.2, 0.16), (40, 32), layers)
 
 
 def column(geometry, name):
@@ -41,9 +38,8 @@ def test_without_mechanics_a_sensor_reads_the_pressure_above_it(body):
 def test_places_and_sizes_are_those_of_the_skin(body):
     sensors = Grid(2, 3, (0.008, 0.006), depth=0.004).sensors(body)
     geometry = sensor_geometry(body, sensors, Naive(body, sensors))
-    torch.testing.assert_close(
-        geometry[:, :3].double(), torch.from_numpy(sensors.positions), rtol=1e-6, atol=0
-    )
+    positions = torch.from_numpy(sensors.positions)
+    torch.testing.assert_close(geometry[:, :3].double(), positions, rtol=1e-6, atol=0)
     for name, value in {"footprint_x": 0.008, "footprint_y": 0.006, "width": 0.2, "height": 0.16}.items():
         torch.testing.assert_close(column(geometry, name), torch.full((6,), value))
     torch.testing.assert_close(column(geometry, "thickness"), torch.full((6,), body.thickness))

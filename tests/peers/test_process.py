@@ -49,12 +49,8 @@ def test_it_learns(fitted, data):
 
 def test_touches_of_another_shape_are_refused(fitted, data):
     touches = data.touches("test")
-    fewer = replace(
-        touches,
-        readings=touches.readings[..., 1:],
-        valid=touches.valid[..., 1:],
-        positions=touches.positions[1:],
-    )
+    parts = {"readings": touches.readings[..., 1:], "valid": touches.valid[..., 1:]}
+    fewer = replace(touches, **parts, positions=touches.positions[1:])
     with pytest.raises(InputError, match="as many sensors and frames"):
         fitted.probabilities(fewer)
     with pytest.raises(RuntimeError, match="fit or load"):
@@ -77,9 +73,7 @@ def test_a_model_of_other_labels_is_refused(fitted, data, tmp_path):
         ({"first": np.array([{}], dtype=object)}, ValueError, "Object arrays cannot be loaded"),
     ],
 )
-def test_a_damaged_file_is_refused_and_an_error_of_the_worker_passed_on(
-    own_python, data, tmp_path, arrays, error, message
-):
+def test_a_damaged_file_is_refused_and_an_error_passed_on(own_python, data, tmp_path, arrays, error, message):
     np.savez(tmp_path / "model.npz", **arrays)
     with pytest.raises(error, match=message):
         Rocket(transform="flat").load(data, tmp_path / "model.npz")

@@ -14,16 +14,8 @@ from skin.runs.build import build_learner
 from skin.runs.configuration import Tracking, fingerprint, settings_of, validate_config
 from skin.runs.store import Store
 
-# MLflow's own business with SQLAlchemy.
-pytestmark = pytest.mark.filterwarnings("ignore:The ``noload`` loader strategy")
-
-SMALL = [
-    "data.gestures=160",
-    "device.test_gestures=96",
-    "evaluation.devices=1",
-    "evaluation.layouts=1",
-    "evaluation.safe_gestures=64",
-]
+SMALL = ["data.gestures=160", "device.test_gestures=96", "evaluation.devices=1", "evaluation.layouts=1"]
+SMALL += ["evaluation.safe_gestures=64"]
 
 
 def composed(row, *words):
@@ -42,7 +34,6 @@ def test_every_row_is_built_and_may_be_loaded(row):
 
 @pytest.fixture(scope="module")
 def ran(run, tmp_path_factory):
-    """Train the peer that needs no other environment, and evaluate it in a study."""
     folder = tmp_path_factory.mktemp("peers")
 
     def command(verb, *words):

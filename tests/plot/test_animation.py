@@ -57,18 +57,13 @@ def test_the_pressure_is_shown_where_it_is(tmp_path):
 
 
 def test_long_and_fast_touches_are_thinned_out(tmp_path):
-    shown, seconds = frames_of(
-        write_animation(made(frames=7, sensors=2, rate=50.0), "flat", tmp_path / "x.gif")
-    )
+    scene = made(frames=7, sensors=2, rate=50.0)
+    shown, seconds = frames_of(write_animation(scene, "flat", tmp_path / "x.gif"))
     assert len(shown) == 4
     assert seconds == pytest.approx(0.04)
     # the corpus of social touch: up to 1747 frames at 135 Hz
-    assert [thinning(*known) for known in ((30, 10.0), (100, 25.0), (101, 10.0), (1747, 135.0))] == [
-        1,
-        1,
-        2,
-        18,
-    ]
+    touches = (30, 10.0), (100, 25.0), (101, 10.0), (1747, 135.0)
+    assert [thinning(*known) for known in touches] == [1, 1, 2, 18]
 
 
 def test_a_simulated_touch_is_what_was_asked_for(configured):
@@ -82,10 +77,8 @@ def test_a_simulated_touch_is_what_was_asked_for(configured):
     # the surface moves in these frames, and most where the pressure is
     assert (np.abs(scene.moved).max(axis=(1, 2)) > 1e-6).tolist() == pressed.tolist()
     frame = int(scene.pressure.max(axis=(1, 2)).argmax())
-    deepest = np.unravel_index(scene.moved[frame].argmax(), (33, 33))
-    near = scene.pressure[
-        frame, max(0, deepest[0] - 2) : deepest[0] + 2, max(0, deepest[1] - 2) : deepest[1] + 2
-    ]
+    row, column = np.unravel_index(scene.moved[frame].argmax(), (33, 33))
+    near = scene.pressure[frame, max(0, row - 2) : row + 2, max(0, column - 2) : column + 2]
     assert near.max() > 0.3 * scene.pressure[frame].max()
     again = simulate_scene(device, ["press", "dynamic"], "bar", 5, field=False)
     assert (again.readings == scene.readings).all()

@@ -10,10 +10,7 @@ from skin.errors import InputError
 from skin.plot.animation import VIEWS
 from skin.plot.plot3d import Scene
 
-LAYERS = [
-    {"material": "Dragon Skin 10 Medium", "thickness": 0.010},
-    {"material": "EcoFlex 00-30", "thickness": 0.005},
-]
+LAYERS = [{"material": "EcoFlex 00-30", "thickness": 0.015}]
 ARM = Arm(radius=0.05, length=0.12, angle=3.0, cells=[10, 6], layers=LAYERS)
 # On top, at the left edge, and far around towards the right one.
 PLACES = np.array([[0.075, 0.06, 0.005], [0.001, 0.06, 0.005], [0.12, 0.02, 0.005]])
@@ -34,7 +31,6 @@ def moved() -> np.ndarray:
 
 
 def drawn(view, known: Scene, frame: int):
-    """Return what stands in space, by kind."""
     figure = Figure()
     VIEWS[view](figure, known)(frame)
     return [figure.axes[0].findobj(kind) for kind in (Line3DCollection, Path3DCollection, Poly3DCollection)]

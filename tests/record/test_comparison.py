@@ -104,7 +104,7 @@ def test_what_a_person_did_is_compared_with_gestures_of_the_same_labels(device, 
     assert publish_comparison(comparison, [], "Here.", 2, tmp_path)[1].stat().st_size > 10_000
 
 
-def test_other_gestures_layouts_and_windows_are_refused(device, tmp_path):
+def test_other_gestures_layouts_and_windows_and_no_labels_are_refused(device, tmp_path):
     path = session(device, tmp_path / "s", "announced")
     with pytest.raises(InputError, match=r"emulate\.seed as compare\.seed"):
         compare_gestures(device, path, 1)
@@ -112,9 +112,6 @@ def test_other_gestures_layouts_and_windows_are_refused(device, tmp_path):
         compare_gestures(device.replace(layout=Grid(1, 9)), path, 0)
     with pytest.raises(InputError, match=r"30 frames at 10 Hz, .* at 5 Hz: give .*touch\.rate=10"):
         compare_gestures(device.replace(touch={"rate": 5.0, "tap": [0.2, 0.4], "press": [0.6, 2.0]}), path, 0)
-
-
-def test_gestures_without_labels_are_refused(device, tmp_path):
     path = session(device, tmp_path / "s", "none", known=False)
     with pytest.raises(InputError, match=r"no gesture with labels.*device\.labels=prompted"):
         compare_gestures(device, path, 0)

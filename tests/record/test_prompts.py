@@ -34,27 +34,13 @@ def recorded(emulate, tmp_path, monkeypatch, capfd):
     """
 
     def record(count, stream=False, dead=()):
-        device = Simulated(
-            body=BODY,
-            layout=LAYOUT,
-            simulator=Naive,
-            gestures=10,
-            touch={"window": 1.0, "press": [0.8, 0.95], "radius": [0.006, 0.012]},
-            noise=NOISE,
-        )
+        tips = {"window": 1.0, "press": [0.8, 0.95], "radius": [0.006, 0.012]}
+        skin = {"body": BODY, "layout": LAYOUT, "simulator": Naive, "touch": tips}
+        device = Simulated(**skin, gestures=10, noise=NOISE)
         emulator = emulate(device, count=40, rate=100.0, speed=5.0, idle=IDLE, gap=0.1, dead=dead)
-        reader = Serial(
-            body=BODY,
-            layout=LAYOUT,
-            port=emulator.port.address,
-            labels="prompted",
-            gestures=count,
-            timeout=20.0,
-            touch={"window": 1.0},
-            tare=1.0,
-            scale=emulator.converter.scale,
-            stream=stream,
-        )
+        there = {"port": emulator.port.address, "scale": emulator.converter.scale, "timeout": 20.0}
+        asked = {"labels": "prompted", "gestures": count, "stream": stream, "tare": 1.0}
+        reader = Serial(body=BODY, layout=LAYOUT, touch={"window": 1.0}, **there, **asked)
         typed, keyboard = os.pipe()
         os.write(keyboard, b"\n" * 60)
         with os.fdopen(typed) as lines:

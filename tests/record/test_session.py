@@ -26,15 +26,8 @@ from skin.wire.channels import UnitConversion
 from skin.wire.segmentation import ContinuousSegmenter
 from tests.damage import DAMAGED_FILES, damaged, opened
 
-METADATA = {
-    "positions": [[0.0, 0.0, 0.0]] * 2,
-    "unit": "adc",
-    "bits": 10,
-    "id": "arm-L",
-    "window": 5,
-    "rate": 50.0,
-    "started_unix": 1.0,
-}
+METADATA = {"positions": [[0.0, 0.0, 0.0]] * 2, "unit": "adc", "bits": 10, "id": "arm-L"}
+METADATA |= {"window": 5, "rate": 50.0, "started_unix": 1.0}
 CONVERSION = UnitConversion(np.array([0.1, 0.2]), np.array([512.0, 500.0]), np.array([False, False]))
 BENT = Curves(np.array([0.5, 1.0]), np.array([2.0, 3.0]), {1: [[0.0, 1.0], [0.0, 2.0]]})
 OTHER = UnitConversion(np.array([0.3, -0.4]), np.array([300.0, 2.0]), np.array([False, True]), curves=BENT)
@@ -74,22 +67,16 @@ def segmented(log, frames, conversion, pause=0):
 
 
 def everything(gestures):
-    """Return what gestures mean, by their numbers."""
     content = {}
     for number, (gesture, conversion) in gestures.items():
         window = gesture.resampled
-        arrays = (
-            *conversion(window.values, window.valid),
-            window.saturated,
-            conversion.zero,
-            conversion.broken,
-        )
+        arrays = [*conversion(window.values, window.valid), window.saturated]
+        arrays += conversion.zero, conversion.broken
         content[number] = gesture.lost, gesture.labels, [array.tolist() for array in arrays]
     return content
 
 
 def frames_of(folder):
-    """Return the frames of a session in order of time."""
     rows = [row for table in read_session(folder).tables for row in table.to_pylist()]
     return sorted(rows, key=lambda row: row["time"])
 
@@ -288,10 +275,7 @@ def test_a_full_disk_keeps_what_was_finished_and_goes_on(tmp_path, size):
         with room(min(size, 1000)):
             segmented(log, [frame(n) for n in range(11, 30)], CONVERSION)
 
-    with (
-        pytest.raises(InputError, match=r"cannot write \S+: File too large") as refused,
-        room(size),
-    ):
+    with pytest.raises(InputError, match=r"cannot write \S+: File too large") as refused, room(size):
         attempt()
     assert "\n" not in str(refused.value)
     assert not [path for path in tmp_path.rglob("*") if path.name.startswith(".")]

@@ -17,6 +17,7 @@ from skin.robot.mujoco_skin import Press, Pressing
 
 THICKNESS, YOUNG, POISSON, EXTENT = 0.03, 170e3, 0.499, 0.0339
 LAYER = [{"material": "EcoFlex 00-30", "thickness": THICKNESS}]
+CELLS = 24  # of 2.5 mm; the reference is a cylinder of the same area
 
 
 class Indentation(NamedTuple):
@@ -75,9 +76,6 @@ def indent(sphere: float, approach: float) -> Indentation:
         active = after
     pressure = np.where(active, reaction / share, 0)
     return Indentation(radii, pressure, float(reaction[active].sum()), float(radii[active].max()))
-
-
-CELLS = 24  # of 2.5 mm; the reference is a cylinder of the same area
 
 
 @pytest.fixture(scope="module")

@@ -1,7 +1,5 @@
 """Touches that MuJoCo presses, as a device: labels, forces, splits, and a run that is tested on them."""
 
-import sys
-
 import numpy as np
 import pytest
 import torch
@@ -75,12 +73,6 @@ def test_a_curved_body_and_unknown_objects_are_refused(configured):
         build_device(configured(*SMALL, "device.objects=[foot]"))
     with pytest.raises(InputError, match="flat"):
         build_device(configured("device=mujoco", "body=arm"))
-
-
-def test_without_the_package_one_sentence_says_what_to_install(configured, monkeypatch):
-    monkeypatch.setitem(sys.modules, "mujoco", None)
-    with pytest.raises(InputError, match="mujoco is not installed: pip install"):
-        build_device(configured(*SMALL))
 
 
 @pytest.mark.slow("loads a pretrained network and simulates for it")

@@ -14,6 +14,8 @@ from skin.errors import InputError
 from skin.mechanics.simulator.solid import Solid
 from skin.robot import MujocoSkin
 from skin.robot.mujoco_skin import MujocoSurface, Pressing
+from skin.robot.recordings import write_mcap
+from skin.runs.build import build_device
 from tests.mechanics.contact.test_rigid import BODY as HALF_SPACE
 from tests.mechanics.contact.test_rigid import HalfSpace
 
@@ -120,6 +122,24 @@ def test_a_reading_of_25_sensors_takes_at_most_5_ms(world):
 
 
 @pytest.mark.parametrize(
+    ("package", "extra", "make"),
+    [
+        ("mujoco", "mujoco", lambda configured, path: MujocoSkin(None, "skin", BODY, Grid(5, 5))),
+        ("mujoco", "mujoco", lambda configured, path: build_device(configured("device=mujoco"))),
+        ("mcap.writer", "robot", lambda configured, path: write_mcap(None, path)),
+    ],
+)
+def test_without_a_package_one_sentence_says_what_to_install(
+    configured, monkeypatch, tmp_path, package, extra, make
+):
+    monkeypatch.setitem(sys.modules, package, None)
+    match = rf"^{package[:4]}\S* is not installed: pip install 'tactile-skin\[{extra}\]'$"
+    with pytest.raises(InputError, match=match):
+        make(configured, tmp_path / "x.mcap")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
     ("site", "said"),
     [
         ("skn", r"^the model has no site 'skn': .*'above', 'free', 'skin'"),
@@ -130,9 +150,3 @@ def test_a_reading_of_25_sensors_takes_at_most_5_ms(world):
 def test_what_cannot_carry_a_skin_is_refused_in_a_sentence(world, covered, site, said):
     with pytest.raises(InputError, match=said):
         covered(world()[0], site)
-
-
-def test_without_the_package_one_sentence_says_what_to_install(monkeypatch):
-    monkeypatch.setitem(sys.modules, "mujoco", None)
-    with pytest.raises(InputError, match=r"^mujoco is not installed: pip install 'tactile-skin\[mujoco\]'$"):
-        MujocoSkin(None, "skin", BODY, Grid(5, 5))

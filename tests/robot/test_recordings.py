@@ -3,7 +3,6 @@
 import json
 import os
 import signal
-import sys
 from collections import deque
 from contextlib import suppress
 from dataclasses import replace
@@ -39,10 +38,13 @@ from skin.touch.labels import Task
 from skin.wire.channels import UnitConversion
 
 CASES = ["plain", "everything"]
+SENSORS = Sensors(
+    np.array([[0.02, 0.02, 0], [0.06, 0.02, 0], [0.02, 0.06, 0], [0.06, 0.06, 0]]), (0.01, 0.01)
+)
+ROWS, INFO = "data/chunk-000/file-000.parquet", "meta/info.json"
 
 
 def recording(case="everything", batch=3, frames=4, sensors=5):
-    """Return touches: readings alone, or with all that a recording may have."""
     draw = torch.Generator().manual_seed(0)
     shape = batch, frames, sensors
     valid = torch.ones(shape, dtype=torch.bool)
@@ -52,18 +54,11 @@ def recording(case="everything", batch=3, frames=4, sensors=5):
     if case == "plain":
         return plain
     valid[1, 2:, 3] = False
-    touches = replace(
-        touches,
-        readings=touches.readings * valid,
-        labels=torch.tensor([[1.0, 0.0], [nan, 1.0], [0.0, nan]]),
-        rate=33.3,
-        saturated=torch.rand(shape, generator=draw) > 0.5,
-        contacts=torch.where(
-            torch.rand(batch, frames, 2, 1, generator=draw) > 0.5,
-            torch.rand(batch, frames, 2, 5, generator=draw),
-            nan,
-        ),
-    )
+    saturated, there = (torch.rand(*size, generator=draw) > 0.5 for size in (shape, (batch, frames, 2, 1)))
+    contacts = torch.where(there, torch.rand(batch, frames, 2, 5, generator=draw), nan)
+    labels = torch.tensor([[1.0, 0.0], [nan, 1.0], [0.0, nan]])
+    more = {"labels": labels, "rate": 33.3, "saturated": saturated, "contacts": contacts}
+    touches = replace(touches, readings=touches.readings * valid, **more)
     normals = torch.nn.functional.normalize(torch.randn(sensors, 3, generator=draw), dim=1)
     return replace(
         plain,
@@ -76,7 +71,6 @@ def recording(case="everything", batch=3, frames=4, sensors=5):
 
 
 def same(first, second):
-    """Assert that two recordings are equal to the last bit."""
     for name in ("readings", "valid", "positions", "labels", "saturated", "contacts", "rate"):
         np.testing.assert_array_equal(getattr(first.touches, name), getattr(second.touches, name), name)
     for name in ("force", "displacement"):
@@ -150,21 +144,11 @@ def foreign(folder, lengths=(7, 3), shape=(2, 2)):
         values = np.arange(4.0 * length).reshape(length, *shape) + 100 * number
         path = folder / f"data/chunk-000/file-00{1 - number}.parquet"
         path.parent.mkdir(parents=True, exist_ok=True)
-        pd.DataFrame(
-            {
-                "observation.grid": values.tolist(),
-                "index": np.arange(begin, begin + length),
-                "episode_index": number,
-                "frame_index": np.arange(length),
-            }
-        ).to_parquet(path)
+        rows = {"observation.grid": values.tolist(), "index": np.arange(begin, begin + length)}
+        rows |= {"episode_index": number, "frame_index": np.arange(length)}
+        pd.DataFrame(rows).to_parquet(path)
         begin += length
     return folder
-
-
-SENSORS = Sensors(
-    np.array([[0.02, 0.02, 0], [0.06, 0.02, 0], [0.02, 0.06, 0], [0.06, 0.06, 0]]), (0.01, 0.01)
-)
 
 
 @pytest.mark.parametrize(("frames", "starts"), [(None, [0, 100]), (3, [0, 12, 24, 100])])
@@ -182,35 +166,28 @@ def test_an_episode_of_another_set_is_a_touch_or_several(tmp_path, frames, start
     np.testing.assert_allclose(touches.positions, SENSORS.positions, rtol=1e-6)
 
 
-def cut(folder):
-    path = folder / "data/chunk-000/file-000.parquet"
-    path.write_bytes(path.read_bytes()[:-20])
-
-
-def shortened(folder):
-    path = folder / "data/chunk-000/file-000.parquet"
-    pq.write_table(pq.read_table(path).slice(0, 11), path)
-
-
-def unlike(folder):
-    path = folder / "meta/info.json"
+def unlike(path):
     info = json.loads(path.read_text())
     info["features"][TACTILE]["skin"]["positions"] = [[0.0, 0.0, 0.0]]
     path.write_text(json.dumps(info))
 
 
 @pytest.mark.parametrize(
-    ("damage", "message"),
+    ("name", "damage", "message"),
     [
-        (cut, "is damaged"),
-        (shortened, "it has 11 rows, not 3 touches of 4 frames"),
-        (unlike, "is damaged"),
-        (lambda folder: (folder / "meta/info.json").write_text("[1"), "is damaged"),
+        (ROWS, lambda path: path.write_bytes(path.read_bytes()[:-20]), "is damaged"),
+        (
+            ROWS,
+            lambda path: pq.write_table(pq.read_table(path)[:11], path),
+            "it has 11 rows, not 3 touches of 4",
+        ),
+        (INFO, unlike, "is damaged"),
+        (INFO, lambda path: path.write_text("[1"), "is damaged"),
     ],
 )
-def test_a_damaged_set_is_one_sentence(tmp_path, damage, message):
+def test_a_damaged_set_is_one_sentence(tmp_path, name, damage, message):
     write_lerobot(recording(), tmp_path / "set")
-    damage(tmp_path / "set")
+    damage(tmp_path / "set" / name)
     with pytest.raises(InputError, match=message) as refused:
         read_lerobot(tmp_path / "set")
     assert "\n" not in str(refused.value)
@@ -241,9 +218,6 @@ def test_the_command_writes_and_reads_them(run, tmp_path):
     (tmp_path / "layout.csv").write_text("x_m,y_m\n.02,.02\n.06,.02\n.02,.06\n.06,.06\n")
     convert(*words, "layout=file", "layout.path=layout.csv", "body.size=[0.08,0.08]")
     assert read_recording(tmp_path / "other.parquet").metadata["positions"] == "layout"
-
-
-# MCAP.
 
 
 @pytest.fixture
@@ -300,21 +274,11 @@ def test_a_recording_is_read_back_by_the_reader_of_mcap(tmp_path, read, case):
         assert len(touch[0]["saturated"]) == 5
 
 
-def test_without_the_package_one_sentence_says_what_to_install(monkeypatch, tmp_path):
-    monkeypatch.setitem(sys.modules, "mcap.writer", None)
-    with pytest.raises(InputError, match=r"^mcap.* is not installed: pip install 'tactile-skin\[robot\]'$"):
-        write_mcap(recording(), tmp_path / "x.mcap")
-    assert not list(tmp_path.iterdir())
-
-
 def frame(number, newtons):
     unit = UnitConversion(np.ones(2), np.zeros(2), np.zeros(2, bool))
     valid = np.array([True, number % 2 == 0])
-    moment = monotonic()
-    sent = Frame(
-        number, 0.01 * number, moment, np.array(newtons), valid, saturated=np.array([number > 2, False])
-    )
-    return unit.convert(sent)
+    sent = Frame(number, 0.01 * number, monotonic(), np.array(newtons), valid)
+    return unit.convert(sent._replace(saturated=np.array([number > 2, False])))
 
 
 def test_a_live_view_is_recorded_as_it_happens(tmp_path, read):
@@ -333,9 +297,8 @@ def test_a_live_view_is_recorded_as_it_happens(tmp_path, read):
         for number in range(1, 4):
             shown.add(frame(number, [number, 0.5]))
         labels = {"big": True, "dangerous": True}
-        shown.set_verdict(
-            Verdict(0.03, monotonic(), {"big": 0.75, "dangerous": nan}, True, labels, True), monotonic()
-        )
+        probabilities = {"big": 0.75, "dangerous": nan}
+        shown.set_verdict(Verdict(0.03, monotonic(), probabilities, True, labels, True), monotonic())
         shown.add(frame(4, [4.0, 0.5]))
     messages, _ = read(path)
     readings = [(when, content) for topic, when, content in messages if topic == "/skin/readings"]

@@ -7,11 +7,9 @@ from skin.runs.store import Store
 
 
 def tracking(folder):
-    """Return where the commands of ``run`` log in a folder."""
     return Tracking(f"sqlite:///{folder}/m.db", f"{folder}/a", "skin", True, None)
 
 
 @pytest.fixture(scope="session")
 def opened():
-    """Return a function that opens the store of a folder."""
     return lambda folder: Store.open(tracking(folder))

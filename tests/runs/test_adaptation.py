@@ -30,6 +30,7 @@ from skin.runs.run import FinishedRun
 from tests.made_up import MadeUpDevice
 
 NAIVE = ["simulator=naive", "layout=grid", "layout.rows=2", "layout.columns=2"]
+SMALL = FineTuning(layers=["all"], lr=[3e-3], epochs=15, patience=5)
 
 
 def test_a_part_of_a_recording_is_chosen_and_the_rest_is_reported(made_up_device):
@@ -52,9 +53,7 @@ def test_a_part_of_a_recording_is_chosen_and_the_rest_is_reported(made_up_device
         (lambda touches: replace(touches, labels=None), None, "record them with labels"),
     ],
 )
-def test_too_few_gestures_or_gestures_without_labels_are_refused(
-    made_up_device, monkeypatch, change, wanted, reason
-):
+def test_too_few_or_unlabelled_gestures_are_refused(made_up_device, monkeypatch, change, wanted, reason):
     touches = change(made_up_device.all_touches())
     monkeypatch.setattr(made_up_device, "all_touches", lambda: touches)
     with pytest.raises(InputError, match=reason):
@@ -77,12 +76,8 @@ def test_the_threshold_of_the_alarm_may_be_for_a_profile(configured, tmp_path):
     assert config.evaluation.profile == "rough"
 
 
-SMALL = FineTuning(layers=["all"], lr=[3e-3], epochs=15, patience=5)
-
-
 @pytest.fixture(scope="module")
 def once(configured):
-    """Return a learner that has learnt the touches of the made-up device, and its data."""
     config = configured(
         "representation=features", "model=mlp", "model.widths=[]", "fusion.head=residual",
         "fusion.hidden=16", "optimizer.lr=0.003", "trainer.max_epochs=15",
@@ -94,7 +89,6 @@ def once(configured):
 
 @pytest.fixture
 def trained(once):
-    """Return a copy of the learner, and the data."""
     return deepcopy(once[0]), once[1]
 
 
@@ -115,7 +109,6 @@ def equal(one, other):
 
 
 def adapted(learner, data, touches, settings):
-    """Return the candidates, the chosen one, and the judged probabilities; train the learner with it."""
     candidates = fine_tune(learner, data, touches, settings)
     best, judged = choose_candidate(candidates, touches, data.task, settings)
     best.train()
@@ -148,9 +141,7 @@ def test_a_fold_is_judged_by_the_choice_of_the_others(trained):
     right, held = touches.known_labels.numpy() * 0.96 + 0.02, (fold == 0).numpy()[:, None]
     first = np.where(held, 1 - right, right)
     lucky = np.where(held, right, 0.9 * right + 0.05)
-    candidates = [
-        Candidate(name, probabilities, None) for name, probabilities in (("", first), ("lucky", lucky))
-    ]
+    candidates = [Candidate("", first, None), Candidate("lucky", lucky, None)]
     assert choose_candidate(candidates, touches, data.task, SMALL)[0].name == ""
 
 
@@ -163,9 +154,8 @@ def test_gestures_are_held_out_of_what_predicts_them(trained):
     candidates = fine_tune(learner, data, touches, long)
     assert len(candidates) == 21
     assert ((candidates[-1].probabilities > 0.5) == (labels.numpy() > 0.5)).mean() < 0.65
-    (scratch,) = learn_from_scratch(
-        touches, data.task, long, {"kernel_ridge": default_option("learner", "kernel_ridge")}
-    )
+    options = {"kernel_ridge": default_option("learner", "kernel_ridge")}
+    (scratch,) = learn_from_scratch(touches, data.task, long, options)
     assert ((scratch.probabilities > 0.5) == (labels.numpy() > 0.5)).mean() < 0.65
 
 

@@ -20,21 +20,18 @@ from skin.runs.configuration import validate_config
 from skin.runs.run import TAG, FinishedRun
 
 SMALL = ["simulator=naive", "data.gestures=40", "evaluation.safe_gestures=16"]
+SKINS = ("device=skins", "device.count=1")
+STORED = OperatingPoint(0.875, 0.02, 5000, 99, 0)
 
 
 @pytest.fixture
 def hydra():
-    """Compose configurations, as commands do."""
     with initialize_config_dir(str(CONF), version_base="1.3"):
         yield lambda *words: validate_config(compose("train", [*SMALL, *words]))
 
 
 def threshold_device(stored, config):
-    """Return the device on which the threshold of a run is chosen."""
     return alarm.threshold_device(alarm_source(run_of(stored, STORED), None, config))
-
-
-SKINS = ("device=skins", "device.count=1")
 
 
 def test_a_profile_replaces_the_imperfections_of_the_training(hydra, tmp_path):
@@ -69,9 +66,8 @@ def test_a_profile_counts_at_the_rate_and_alignment_of_the_evaluated_device(hydr
     assert frames.without_lag == 0.0
     sampled = hydra("device.rate=100", "device.aligned=false", "evaluation.profile=calibrated")
     assert (threshold_device(stored, sampled).rate, threshold_device(stored, sampled).aligned) == (100, False)
-    unknown = threshold_device(
-        stored, hydra("device=recording", "device.path=x", "evaluation.profile=calibrated")
-    )
+    other = hydra("device=recording", "device.path=x", "evaluation.profile=calibrated")
+    unknown = threshold_device(stored, other)
     assert (unknown.rate, unknown.framed, unknown.without_lag) == ([10, 1000], 0.0, 0.0)
 
 
@@ -88,9 +84,6 @@ class Quiet:
 
     def probabilities(self, touches):
         return torch.full((len(touches), 4), 0.25)
-
-
-STORED = OperatingPoint(0.875, 0.02, 5000, 99, 0)
 
 
 def alarm_point(stored, config, *live, **how):
@@ -124,7 +117,6 @@ def test_a_profile_is_refused_where_the_device_draws_many_skins(hydra):
 
 @pytest.fixture
 def device_of(tmp_path, monkeypatch):
-    """Return a function that gives the device on which the threshold for touches is chosen."""
     devices = []
 
     def choose(device, learner, live, target, count):
@@ -141,16 +133,13 @@ def device_of(tmp_path, monkeypatch):
 
 
 def calibrated(hydra, path, **sensors):
-    """Return the configuration of a device with a calibration of 25 sensors, with a noise of 0.03."""
     values = {"gain": 1.0, "noise": 0.03} | sensors
     calibration = Calibration({name: [value] * 25 for name, value in values.items()}, exponent_at=4.0)
     path = write_calibration(calibration, path)
     return hydra("device=serial", "device.port=x", f"device.calibration={path}")
 
 
-def test_the_noise_of_sensors_that_follow_the_root_of_the_force_is_that_of_the_force(
-    hydra, device_of, tmp_path
-):
+def test_the_noise_of_sensors_that_follow_the_root_of_force_is_that_of_force(hydra, device_of, tmp_path):
     device = device_of(hydra(), calibrated(hydra, tmp_path / "fsr.yaml", exponent=0.5))
     assert device.imperfection.noise == pytest.approx(0.06, rel=0.01)  # N, at 4 N
 

@@ -1,8 +1,6 @@
 """The configuration mirrors the package, refuses what it does not know, and tells which runs are the same."""
 
 import csv
-import subprocess
-import sys
 from dataclasses import FrozenInstanceError
 from importlib import import_module
 from inspect import isabstract
@@ -136,29 +134,7 @@ def test_a_run_is_found_by_its_simulator_or_else_its_device(configured, word):
         config.seed = 1
 
 
-HEAVY = """
-import atexit, sys
-from skin.__main__ import main
-atexit.register(lambda: print(*{"torch", "mlflow", "pytorch_lightning", "numpy", "scipy"} & set(sys.modules)))
-main(["train", *sys.argv[1:]])
-"""
-
-
-@pytest.mark.parametrize(
-    ("argument", "said"), [("--help", ""), ("+typo=1", "typo"), ("model=cn", "cn"), ("sede=1", "sede")]
-)
-def test_help_and_mistakes_wait_for_no_heavy_import(argument, said, tmp_path):
-    command = [sys.executable, "-c", HEAVY, argument]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120, cwd=tmp_path)
-    assert (done.returncode, done.stdout.splitlines()[-1]) == (2 if said else 0, "")
-    assert said in done.stderr
-    assert "Traceback" not in done.stderr
-    assert not list(tmp_path.iterdir())
-
-
 def built(word):
-    """Compose the configuration of a training with an override, and build its parts, as a command does."""
-
     def task(config):
         build_device(config)
         build_learner(config)

@@ -18,6 +18,9 @@ from skin.runs.build import alarm_source, build_data, build_device, build_learne
 from skin.runs.configuration import Config, Tracking
 from skin.runs.run import TAG, FinishedRun, find_run
 
+RECORDED = Config(device={"_target_": "skin.device.recording.Recorded"})
+SKIN = ["simulator=naive", "layout=grid", "layout.rows=2", "layout.columns=2", "data.gestures=20"]
+
 
 @pytest.fixture(scope="module")
 def store(tmp_path_factory, opened):
@@ -43,11 +46,7 @@ def test_a_run_is_latest_or_begins_with_an_id(store):
             find_run(Tracking(store.uri), name)
 
 
-RECORDED = Config(device={"_target_": "skin.device.recording.Recorded"})
-
-
 def stored_point(text=None, rate=0.02):
-    """Return the operating point of a run on a recording with this tag, for a false-alarm rate."""
     data = SimpleNamespace(tags={} if text is None else {TAG: text})
     run = FinishedRun(None, SimpleNamespace(data=data, info=SimpleNamespace(run_id="abc")))
     run.__dict__["stored"] = RECORDED
@@ -74,9 +73,6 @@ def test_a_run_on_a_recording_says_where_its_threshold_is_not_for_the_wanted_rat
     assert "chosen on 300 safe validation gestures for 2 % false alarms" in other
 
 
-SKIN = ["simulator=naive", "layout=grid", "layout.rows=2", "layout.columns=2", "data.gestures=20"]
-
-
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory, configured):
     """What learners save: the name of the file -> its content."""
@@ -95,8 +91,6 @@ def whole(tmp_path_factory, configured):
 
 
 def stored(change):
-    """Return a function of a file of trees that gives one of the same models, changed."""
-
     def damage(content):
         models = sio.loads(content, trusted=sio.get_untrusted_types(data=content))
         return sio.dumps(change(models) or models)

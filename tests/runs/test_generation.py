@@ -101,15 +101,12 @@ def test_other_settings_and_other_code_are_refused(tmp_path, monkeypatch, overri
     assert contents(tmp_path) == before
 
 
-def test_a_folder_with_other_things_is_refused(tmp_path):
+def test_other_folders_and_files_larger_than_memory_are_refused(tmp_path):
     (tmp_path / "mine").write_text("x")
     for path in (tmp_path, tmp_path / "mine"):
         with pytest.raises(InputError, match=r"exists and has no manifest\.json: add out= with a new"):
             generate(path)
     assert [path.name for path in tmp_path.iterdir()] == ["mine"]
-
-
-def test_a_file_larger_than_memory_is_refused(tmp_path):
     with pytest.raises(InputError, match=r"n=100000000 in one file needs about .* GB .*: add out=FOLDER"):
         generate(tmp_path / "x.parquet", "n=100000000")
 

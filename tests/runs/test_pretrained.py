@@ -15,17 +15,7 @@ from skin.core.safe_loading import load_yaml
 from skin.errors import InputError
 from skin.evaluation.alarm import THRESHOLDS
 from skin.evaluation.operating_point import LABEL
-from skin.runs.run import (
-    CARD,
-    CONFIG,
-    MODELS,
-    RECORD,
-    SUMS,
-    checksums,
-    find_pretrained,
-    is_name,
-    model_card,
-)
+from skin.runs.run import CARD, CONFIG, MODELS, RECORD, SUMS, checksums, find_pretrained, is_name, model_card
 from tests.damage import DAMAGED_FILES, mutated, opened
 
 NAMES = sorted(path.name for path in (ROOT / MODELS).iterdir())
@@ -87,7 +77,6 @@ def test_the_weights_reproduce_the_card_on_400_touches(name, tmp_path):
 
 @pytest.fixture
 def model(tmp_path, monkeypatch):
-    """Return the folder of a copy of a model, with few bytes of weights, in the current folder."""
     monkeypatch.chdir(tmp_path)
     folder = tmp_path / MODELS / "mine"
     shutil.copytree(ROOT / MODELS / "default_skin", folder)

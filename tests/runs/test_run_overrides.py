@@ -8,6 +8,21 @@ from skin.errors import InputError
 from skin.runs.build import build_device, build_skin, with_axes_of
 from skin.runs.configuration import recompose, settings_of
 
+SEQUENCE = ("experiment=sequence_graph", "simulator=naive", "device.offset=0.3", "seed=4")
+OWN = """\
+# @package _global_
+defaults:
+  - override /simulator: solid
+body:
+  _target_: skin.body.base.Sheet
+  _convert_: all
+  size: [0.30, 0.10]
+  cells: [30, 20]
+  layers: [{material: EcoFlex 00-30, thickness: 0.004}]
+layout: {path: mine.csv, footprint: [0.008, 0.008]}
+touch: {spare: 0.005}
+"""
+
 
 @pytest.fixture
 def bring_back(configured):
@@ -19,9 +34,6 @@ def bring_back(configured):
             return settings_of(recompose(run, overrides))
 
     return bring_back
-
-
-SEQUENCE = ("experiment=sequence_graph", "simulator=naive", "device.offset=0.3", "seed=4")
 
 
 def test_only_what_is_named_changes(bring_back, configured):
@@ -42,9 +54,7 @@ def test_only_what_is_named_changes(bring_back, configured):
         (("device.noise=0.3",), "profile=mild", "noise", 0.05),
     ],
 )
-def test_the_device_has_what_was_named_for_it_and_what_it_had_of_its_own(
-    bring_back, trained, override, part, expected
-):
+def test_the_device_has_what_was_named_for_it_or_its_own(bring_back, trained, override, part, expected):
     found = bring_back(trained, override)["device"][part]
     assert (found["_target_"] if part == "simulator" else found) == expected
 
@@ -59,21 +69,6 @@ def test_another_device_replaces_the_whole_group(bring_back):
 def test_what_the_weights_depend_on_is_refused_by_name(bring_back, override):
     with pytest.raises(InputError, match=override.split("=")[0].replace(".", r"\.")):
         bring_back((), override)
-
-
-OWN = """\
-# @package _global_
-defaults:
-  - override /simulator: solid
-body:
-  _target_: skin.body.base.Sheet
-  _convert_: all
-  size: [0.30, 0.10]
-  cells: [30, 20]
-  layers: [{material: EcoFlex 00-30, thickness: 0.004}]
-layout: {path: mine.csv, footprint: [0.008, 0.008]}
-touch: {spare: 0.005}
-"""
 
 
 @pytest.fixture

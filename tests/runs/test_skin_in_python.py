@@ -16,14 +16,10 @@ LAYERS = [
 ]
 
 
-@pytest.mark.parametrize(
-    "body",
-    [
-        Sheet((0.2, 0.1), (20, 10), LAYERS),
-        Arm(cells=(20, 10), layers=LAYERS, radius=0.05, length=0.1, angle=2.0),
-    ],
-    ids=["sheet", "arm"],
-)
+BODIES = Sheet((0.2, 0.1), (20, 10), LAYERS), Arm((20, 10), LAYERS, radius=0.05, length=0.1, angle=2.0)
+
+
+@pytest.mark.parametrize("body", BODIES, ids=["sheet", "arm"])
 @pytest.mark.parametrize(
     "layout", [Grid(2, 3, (0.008, 0.006), tilt=0.3), Random(5, 1), File("data/layouts/tilted_5x5.csv")]
 )

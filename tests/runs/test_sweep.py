@@ -23,7 +23,6 @@ SMALL = [
 
 
 def named(seed, more=""):
-    """Return the name of a run of ``SMALL``."""
     name = f"rules naive gestures=64 test_gestures=32 devices=1 layouts=1 safe_gestures=64{more}"
     return shorten(name, f" seed {seed}")
 
@@ -63,7 +62,6 @@ def test_a_title_tells_what_is_swept():
 
 
 def sweep(folder, *overrides):
-    """Return the arguments of a sweep."""
     own = [f"tracking.uri=sqlite:///{folder}/m.db", f"tracking.artifacts={folder}/a"]
     return ["train.py", "-m", *SMALL, *own, *overrides, f"hydra.sweep.dir={folder}/out"]
 
@@ -75,7 +73,6 @@ def runs(store):
 
 
 def parents(store):
-    """Return the parent runs of sweeps, newest first."""
     return [run for run in store.find() if "sweep" in run.data.tags]
 
 
@@ -95,9 +92,7 @@ def test_a_sweep_that_was_killed_goes_on_where_it_was(run, begin, tmp_path, open
 
 
 @pytest.mark.slow("trains several runs")
-def test_a_run_is_named_by_its_changes_and_logs_them_and_a_skipped_one_prints_its_scores(
-    run, tmp_path, opened
-):
+def test_a_run_is_named_by_its_changes_and_a_skipped_one_prints_its_scores(run, tmp_path, opened):
     words = ["train", *SMALL, "device.offset=0.2", "layout=grid", "model=mlp"]
     first = run(tmp_path, *words)
     assert first.returncode == 0, first.stderr

@@ -4,11 +4,11 @@ The values were computed once. They are compared to four digits, because process
 """
 
 import json
-import sqlite3
-from contextlib import closing
 
 import numpy as np
 import pytest
+
+from tests.commands.conftest import query
 
 SKIN = ("layout=grid", "layout.rows=2", "layout.columns=2", "simulator=naive")
 MODEL = ("representation=readings", "model=mlp", "fusion=early", "trainer.max_epochs=8")
@@ -17,45 +17,26 @@ SMALL = ("data.gestures=400", "device.test_gestures=48", "evaluation.devices=0",
 FEW = "evaluation.safe_gestures=60"
 ROUGH = "evaluation.profile=rough"
 EXPECTED = {
-    "train": 0.93601,
-    "evaluate": 0.93601,
-    "rate": 0.64427,
-    "profile": 0.99672,
-    "device": 0.96371,
-    "adapt": 0.93601,
-    "adapt profile": 0.74935,
-    "train profile": 0.95305,
-    "shipped": 1.0,
-    "drawn": 0.3427,
-    "live": [0.99511],
-    "live profile": [0.83851],
-    "live rate": [0.51107],
-    "export": [0.97152, 0.98918, 0.99129],
-    "export drawn": [0.92096],
+    "train": 0.93601, "evaluate": 0.93601, "rate": 0.64427, "profile": 0.99672, "device": 0.96371,
+    "adapt": 0.93601, "adapt profile": 0.74935, "train profile": 0.95305, "shipped": 1.0, "drawn": 0.3427,
+    "live": [0.99511], "live profile": [0.83851], "live rate": [0.51107],
+    "export": [0.97152, 0.98918, 0.99129], "export drawn": [0.92096],
     "written": [0.93601, 1.0, 1.0, 1.0, 0.43095, 0.92096],
-}
-
-
-def query(folder, statement):
-    with closing(sqlite3.connect(folder / "m.db")) as database:
-        return [value for (value,) in database.execute(f"{statement} order by start_time")]
+}  # fmt: skip
 
 
 @pytest.fixture(scope="module")
 def found(run, tmp_path_factory):
-    """The thresholds of all paths by name."""
     folder = tmp_path_factory.mktemp("thresholds")
     out, values = f"out={folder}/out", {}
 
     def stored(*words):
-        """Return the threshold that a verb stores with its run."""
         done = run(folder, *words)
         assert done.returncode == 0, done.stderr
         points = "select value from tags join runs using (run_uuid) where key='operating_point'"
-        return json.loads(query(folder, points)[-1])["threshold"]
+        return json.loads(query(folder, f"{points} order by start_time")[-1][0])["threshold"]
 
     def per_touch(*words):
-        """Return the thresholds for touches that a verb chooses, in its order."""
         cache = folder / f"cache{len(values)}"
         patch.setenv("SKIN_CACHE", str(cache))
         assert run(folder, *words).returncode in (0, 2)
@@ -77,11 +58,10 @@ def found(run, tmp_path_factory):
         values["device"] = stored("evaluate", out, *words)
         values["adapt"] = stored(*adapted, "adapt.scratch=[]")
         values["adapt profile"] = stored(*adapted, "adapt.scratch=[extra_trees]", ROUGH)
-        own = "run=" + query(folder, "select run_uuid from runs")[0]
+        own = "run=" + query(folder, "select run_uuid from runs order by start_time")[0][0]
         values["train profile"] = stored("train", *MODEL, *SKIN, *SMALL, ROUGH)
-        values["shipped"] = stored(
-            "evaluate", "run=default_skin", out, SKIN[3], *tests, "evaluation.profile=mild"
-        )
+        shipped = ("run=default_skin", SKIN[3], *tests, "evaluation.profile=mild")
+        values["shipped"] = stored("evaluate", out, *shipped)
         values["drawn"] = stored("evaluate", "run=any_skin", out, "device=simulated", *SKIN, *tests)
         still = ("live.selftest=false", "live.contacts=false", "seconds=0.1", "live.touch=0.3")
         live = ("live.py", own, *still, FEW)
@@ -92,7 +72,7 @@ def found(run, tmp_path_factory):
         values["export"] = per_touch(*export, own, FEW, "export.rates=[10,47,500]")
         values["export drawn"] = per_touch(*export, "run=any_skin", *SKIN, FEW, "export.rates=[100]")
     values["written"] = [
-        threshold for model in described for threshold in (model.threshold, *model.thresholds.values())
+        each for model in described for each in (model.threshold, *model.thresholds.values())
     ]
     return values
 

@@ -21,12 +21,10 @@ SMALL = (
 
 @pytest.fixture
 def config(configured, tmp_path):
-    """Return a small training that logs to a folder of its own."""
     return configured(*SMALL, f"tracking.uri=sqlite:///{tmp_path}/m.db", f"tracking.artifacts={tmp_path}/a")
 
 
 def name_of(*changes):
-    """Return the name of the run of a command."""
     with initialize_config_dir(str(CONF), version_base="1.3"):
         composed = compose("train", list(changes), return_hydra_config=True)
         HydraConfig.instance().set_config(composed)
@@ -76,9 +74,8 @@ def test_an_objective_that_is_no_metric_of_the_validation_is_refused(objective, 
     """Before anything is trained; the gestures of the test must not choose settings."""
     given = ["experiment=rules", *SMALL[1:3], f"tracking.uri=sqlite:///{tmp_path}/m.db"]
     config = configured(*given, f"tracking.objective={objective}")
-    with pytest.raises(
-        InputError, match=rf"^tracking.objective={objective} is not a metric .* best_val_ece_big, "
-    ):
+    match = rf"^tracking.objective={objective} is not a metric .* best_val_ece_big, "
+    with pytest.raises(InputError, match=match):
         skin.runs.train.train(config)
     assert not list(tmp_path.iterdir())
 
@@ -118,15 +115,10 @@ def test_a_run_stays_open_until_its_results_are_logged(config, monkeypatch):
 
 def logged(store):
     """Return (name, status, losses of validation by epoch) of every run that is no sweep, oldest first."""
-    return [
-        (
-            run.info.run_name,
-            run.info.status,
-            [each.value for each in store.client.get_metric_history(run.info.run_id, "val_loss")],
-        )
-        for run in store.find()[::-1]
-        if "sweep" not in run.data.tags
-    ]
+    runs = [run.info for run in store.find()[::-1] if "sweep" not in run.data.tags]
+    histories = (store.client.get_metric_history(run.run_id, "val_loss") for run in runs)
+    losses = [[each.value for each in history] for history in histories]
+    return [(run.run_name, run.status, values) for run, values in zip(runs, losses, strict=True)]
 
 
 @pytest.mark.slow("trains in two processes that import anew")
@@ -158,9 +150,8 @@ def test_two_processes_make_one_run(run, tmp_path, opened):
     ],
 )
 def test_processes_that_cannot_train_together_are_refused(run, tmp_path, opened, given, said):
-    done = run(
-        tmp_path, "train", *given, *SMALL, "trainer.devices=2", f"hydra.sweep.dir={tmp_path}/out", apart=True
-    )
+    words = [*given, *SMALL, "trainer.devices=2", f"hydra.sweep.dir={tmp_path}/out"]
+    done = run(tmp_path, "train", *words, apart=True)
     assert done.returncode in (1, 2)
     assert said in done.stderr
     assert "Traceback" not in done.stderr

@@ -100,15 +100,12 @@ class Server:
 
 
 def on_server(server):
-    """Return the only run of a server and the steps of its metrics."""
     with server:
         store = Store.open(Tracking(server.uri))
         (run,) = store.find()
         of = run.info.run_id
-        history = {
-            name: [each.step for each in store.client.get_metric_history(of, name)]
-            for name in ("train_loss", "val_loss")
-        }
+        names = ("train_loss", "val_loss")
+        history = {name: [each.step for each in store.client.get_metric_history(of, name)] for name in names}
         files = {one.path for one in store.client.list_artifacts(run.info.run_id)}
     assert {"weights.pt", "predictions.parquet", "config.yaml"} <= files
     return run, history

@@ -29,7 +29,6 @@ SLOW = {"ensemble": pytest.mark.slow("trains all members, and asks each of them 
 
 @pytest.fixture(scope="module", params=[pytest.param(name, marks=SLOW.get(name, ())) for name in LEARNERS])
 def trained(request, configured):
-    """Return a small run that has learned what touch is, and its device."""
     config = configured(*SMALL, *LEARNERS[request.param], "data.stream=true")
     device, learner = build_device(config), build_learner(config)
     data = build_data(config, device)
@@ -39,7 +38,6 @@ def trained(request, configured):
 
 @pytest.fixture(scope="module", params=[None, 0.3], ids=["learned", "threshold"])
 def engine(request, trained):
-    """Return a live engine with each gate, and the device."""
     of, device = trained
     return engine_settings(of, DebounceSettings(), request.param), device
 

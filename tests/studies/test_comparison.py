@@ -7,14 +7,17 @@ import pandas as pd
 import pytest
 from scipy.stats import ttest_rel
 
-from experiments.studies.comparison import (
-    Estimate,
-    combine_verdicts,
-    compare_samples,
-    judge,
-)
+from experiments.studies.comparison import Estimate, combine_verdicts, compare_samples, judge
 from experiments.studies.study import Statement
 from skin.errors import InputError
+
+INF = math.inf
+VERDICTS = [
+    (0, INF, 2.1, 2.0, "agree"), (0, INF, 1.9, 2.0, "undecided"), (0, INF, -1.9, 2.0, "undecided"),
+    (0, INF, -2.1, 2.0, "disagree"), (-INF, 0, -2.1, 2.0, "agree"), (-INF, 0, 2.1, 2.0, "disagree"),
+    (-2, 2, 0.9, 1.0, "agree"), (-2, 2, 1.1, 1.0, "undecided"), (-2, 2, -3.1, 1.0, "disagree"),
+    (5, 20, 12.0, 2.0, "agree"), (5, 20, 5.5, 1.0, "undecided"), (5, 20, 4.0, 0.4, "disagree"),
+]  # fmt: skip
 
 
 def paired(one, other, ratio=False, across=None, gestures=(None, None)):
@@ -41,15 +44,6 @@ def test_a_ratio_is_taken_seed_by_seed():
 def test_one_seed_has_no_known_error_and_none_no_difference():
     assert paired({"0": 2.0}, {"0": 1.0}) == Estimate(1.0, math.inf, math.inf, 1)
     assert paired({"0": 2.0}, {"1": 1.0}) is None
-
-
-INF = math.inf
-VERDICTS = [
-    (0, INF, 2.1, 2.0, "agree"), (0, INF, 1.9, 2.0, "undecided"), (0, INF, -1.9, 2.0, "undecided"),
-    (0, INF, -2.1, 2.0, "disagree"), (-INF, 0, -2.1, 2.0, "agree"), (-INF, 0, 2.1, 2.0, "disagree"),
-    (-2, 2, 0.9, 1.0, "agree"), (-2, 2, 1.1, 1.0, "undecided"), (-2, 2, -3.1, 1.0, "disagree"),
-    (5, 20, 12.0, 2.0, "agree"), (5, 20, 5.5, 1.0, "undecided"), (5, 20, 4.0, 0.4, "disagree"),
-]  # fmt: skip
 
 
 @pytest.mark.parametrize(("minimum", "maximum", "mean", "margin", "said"), VERDICTS)

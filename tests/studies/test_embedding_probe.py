@@ -5,13 +5,13 @@ import pytest
 
 from experiments.studies.embeddings import FRAME, Embeddings, explained, svm_accuracy
 from skin.runs.build import build_device
+from skin.touch.labels import TOUCH
 
 SMALL = {"train": 160, "test": 80, "seeds": [4], "epochs": 60, "width": 32, "layouts": 2}
 
 
 @pytest.fixture(scope="module")
 def found(configured):
-    """Everything that a small probe of the naive skin finds."""
     device = build_device(configured("simulator=naive"))
     return {(one["attribute"], one["name"]): one for one in Embeddings(**SMALL).probe(device, None)}
 
@@ -38,9 +38,7 @@ def test_degrees_tell_the_layout_and_nothing_else(found):
         one = found["degree", name]
         assert one["variance layout"] > 0.9
         assert one["accuracy layout"] == 1
-        assert all(
-            abs(one[f"accuracy {label}"] - 0.5) < 0.17 for label in ("big", "dynamic", "press", "dangerous")
-        )
+        assert all(abs(one[f"accuracy {label}"] - 0.5) < 0.17 for label in TOUCH.names)
     assert not any(found["degree", "IGE"]["plane"])
 
 

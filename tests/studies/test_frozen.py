@@ -25,7 +25,6 @@ WORDS = "simulator=naive", "data.gestures=10", "device.test_gestures=64", "devic
 
 @pytest.fixture
 def subject(configured, tmp_path, monkeypatch):
-    """A small set, its hash, and a module of predictors."""
     (tmp_path / "guesses.py").write_text(MODULE)
     monkeypatch.syspath_prepend(str(tmp_path))
     sys.modules.pop("guesses", None)

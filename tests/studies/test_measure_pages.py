@@ -9,11 +9,9 @@ from skin.evaluation.operating_point import OperatingPoint
 from skin.evaluation.streams import Alarms, Bin, WindowReport
 
 NAMES = ("big", "dynamic", "press", "dangerous")
+HALF, MORE, MOST = (dict.fromkeys(NAMES, fraction) for fraction in (0.5, 0.625, 0.9))
 FOUND = WindowReport(
-    bins=[
-        Bin("0-0.2", 40, dict.fromkeys(NAMES, 0.5), dict.fromkeys(NAMES, 0.625)),
-        Bin("whole", 160, dict.fromkeys(NAMES, 0.9), dict.fromkeys(NAMES, 0.5)),
-    ],
+    bins=[Bin("0-0.2", 40, HALF, MORE), Bin("whole", 160, MOST, HALF)],
     gates={"threshold": torch.tensor([[90, 10], [20, 180]])},
     threshold=0.31,
     alarms={"none": Alarms(0.5, 3, 8, 7, 9, 1), "threshold": Alarms(0.5, 0, 8, 6, 9, 0)},

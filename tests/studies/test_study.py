@@ -57,7 +57,6 @@ def composing(*words):
 
 
 def chosen(*words):
-    """Return the last chosen study."""
     with composing(*words) as study:
         return study
 
@@ -83,9 +82,8 @@ def test_a_study_composes_and_says_what_it_is_about(composed, name, part):
         assert judge(said, Estimate(0.0, 1e9, 4e9, 3)) == "undecided"
         assert said.minimum < said.maximum
         assert bool(said.others) != (said.level is not None)
-        lines = [
-            one.chosen | {"condition": condition} for one in every for condition in study.conditions or ("",)
-        ]
+        conditions = study.conditions or ("",)
+        lines = [one.chosen | {"condition": condition} for one in every for condition in conditions]
         lines += [{"name": "vote"}] if study.vote else []
         if not study.trainings:  # finished runs of any row
             rows = [path.stem for path in (CONF / "experiment").glob("*.yaml")] + peers.ROWS
@@ -97,14 +95,10 @@ def test_a_study_composes_and_says_what_it_is_about(composed, name, part):
 
 def test_variants_are_named_by_what_tells_them_apart(composed):
     _, every = composed("study=models", "study.part=image_representation", "study.seeds=[0,1]")
-    assert [one.name for one in every][1:3] == [
-        "sequence_image representation=fourier",
-        "interp method=nearest",
-    ]
+    names = [one.name for one in every][1:3]
+    assert names == ["sequence_image representation=fourier", "interp method=nearest"]
     assert {tuple(one.configs) for one in every} == {("0", "1")}
-    _, every = composed(
-        "study=mechanics", "study.part=crosscheck", "study.seeds=[0]", "study.rows=[features,gru]"
-    )
+    _, every = composed(*words("mechanics", "crosscheck"), "study.rows=[features,gru]")
     assert [one.name for one in every][:3] == ["naive features", "naive gru", "fem, equation 10 features"]
 
 

@@ -23,9 +23,6 @@ from skin.runs.configuration import fingerprint
 from skin.runs.run import FinishedRun
 from skin.runs.store import Store
 
-# MLflow's own business with SQLAlchemy.
-pytestmark = pytest.mark.filterwarnings("ignore:The ``noload`` loader strategy")
-
 
 def measured_frame():
     frame = pd.DataFrame([{"same/overall/accuracy": 0.5, "outcomes": b"\x00\x01"}])
@@ -61,8 +58,6 @@ def test_lists_of_different_lengths_are_refused():
 
 @dataclass(frozen=True)
 class Counted:
-    """A measure that counts its calls."""
-
     gestures: int = 1
     calls: ClassVar = []
 

@@ -18,8 +18,5 @@ def test_pressure_has_the_force_and_the_centre_of_the_touch():
     x, y = (torch.arange(count) * 0.005 + 0.0025 for count in (24, 16))
     assert ((force.sum(1) @ x.double()) / force.sum((1, 2))).numpy() == pytest.approx([0.05, 0.1], abs=2e-4)
     assert ((force.sum(2) @ y.double()) / force.sum((1, 2))).numpy() == pytest.approx([0.03, 0.06], abs=2e-4)
-
-
-def test_the_pressure_under_a_hard_disc_is_the_force_over_its_area():
     pressure = Fingertip(SHEET, 2e-4)(torch.tensor([[0.06, 0.04, 0.02, 3.0]], dtype=torch.float64))
     assert pressure.max().item() == pytest.approx(3 / (torch.pi * 0.02**2), rel=0.01)

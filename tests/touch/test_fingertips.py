@@ -40,11 +40,8 @@ def test_the_pressure_is_that_of_the_contacts(sampled):
     x, y, _, force, _ = contacts.unbind(-1)
     np.testing.assert_allclose(pressure.sum((2, 3)) * width * height, force.sum(2), atol=1e-4)
     np.testing.assert_allclose(movie.force, force.sum(2), rtol=1e-5)
-    centres = (
-        (torch.arange(count) + 0.5) * size
-        for count, size in zip(source.body.cells, (width, height), strict=True)
-    )
-    along, down = (centre.double() for centre in centres)
+    cells = zip(source.body.cells, (width, height), strict=True)
+    along, down = ((torch.arange(count) + 0.5).double() * size for count, size in cells)
     touched = force.sum(2) > 0
     for moments, positions in ((pressure.sum(2) @ along, x), (pressure.sum(3) @ down, y)):
         middle = moments * width * height / force.sum(2)

@@ -26,16 +26,10 @@ def test_the_shipped_shapes_are_what_the_script_draws():
 
 
 @pytest.mark.parametrize(
-    "pixels",
-    [
-        np.array([[0, 128], [255, 64], [0, 0]], np.uint8),
-        np.array([[0, 32896], [65535, 16448], [0, 0]], np.uint16),
-        np.array([[0, 128 / 255], [1, 64 / 255], [0, 0]], np.float32) * 7,
-    ],
-    ids=["8 bits", "16 bits", "float"],
+    ("kind", "unit", "suffix"), [(np.uint8, 1, "png"), (np.uint16, 257, "png"), (np.float32, 7 / 255, "tiff")]
 )
-def test_any_depth(tmp_path, pixels):
-    suffix = "tiff" if pixels.dtype == np.float32 else "png"
+def test_any_depth(tmp_path, kind, unit, suffix):
+    pixels = (unit * np.array([[0, 128], [255, 64], [0, 0]])).astype(kind)
     image = load_image(save(tmp_path / f"mine.{suffix}", pixels))
     np.testing.assert_allclose(image, [[0, 128 / 255], [1, 64 / 255], [0, 0]], atol=1e-3)
 
@@ -43,24 +37,18 @@ def test_any_depth(tmp_path, pixels):
 def test_transparent_means_no_force(tmp_path):
     pixels = np.full((4, 4, 4), 255, np.uint8)
     pixels[:2, :, 3] = 0
-    np.testing.assert_array_equal(
-        load_image(save(tmp_path / "mine.png", pixels)), [[0] * 4] * 2 + [[1] * 4] * 2
-    )
+    image = load_image(save(tmp_path / "mine.png", pixels))
+    np.testing.assert_array_equal(image, [[0] * 4] * 2 + [[1] * 4] * 2)
 
 
 def test_refusals_name_the_picture(tmp_path):
     with pytest.raises(InputError, match=r"no shape nothing: touch.shapes takes bar, .*square"):
         load_image("nothing")
-    (tmp_path / "text.png").write_text("no picture")
-    with pytest.raises(InputError, match=r"cannot read the shape .*text.png"):
-        load_image(str(tmp_path / "text.png"))
-    (tmp_path / "empty.png").touch()
-    with pytest.raises(InputError, match=r"cannot read the shape .*empty.png"):
-        load_image(str(tmp_path / "empty.png"))
     good = (DATA / "shapes" / "hand.png").read_bytes()
-    (tmp_path / "cut.png").write_bytes(good[: len(good) // 2])
-    with pytest.raises(InputError, match=r"cannot read the shape .*cut.png"):
-        load_image(str(tmp_path / "cut.png"))
+    for name, content in (("text", b"no picture"), ("empty", b""), ("cut", good[: len(good) // 2])):
+        (tmp_path / f"{name}.png").write_bytes(content)
+        with pytest.raises(InputError, match=rf"cannot read the shape .*{name}.png"):
+            load_image(str(tmp_path / f"{name}.png"))
     with pytest.raises(InputError, match=r"black.png must be .* got \(5, 5\) pixels from 0 to 0"):
         load_image(save(tmp_path / "black.png", np.zeros((5, 5), np.uint8)))
     with pytest.raises(InputError, match=r"nan.tiff must be .* finite values .* from nan"):

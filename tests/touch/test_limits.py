@@ -16,6 +16,8 @@ from skin.touch.labels import Limits
 BODY = Sheet((0.16, 0.16), (16, 16), [{"material": "EcoFlex 00-30", "thickness": 0.005}])
 FORCE = {"limit": 65, "unit": "N", "source": "a table"}
 PRESSURE = {"limit": 1.4, "unit": "MPa", "source": "a table"}
+SMALL = ["device.test_gestures=32", "evaluation.safe_gestures=32"]
+SMALL += ["evaluation.devices=0", "evaluation.layouts=0"]
 
 
 def drawn(count: int = 64, **limits):
@@ -85,10 +87,7 @@ def test_presses_at_the_limit_follow_it():
         ({"pressure": 90.5e3}, r"limits.pressure must be settings by name"),
         ({"force": FORCE, "press_force": FORCE}, r"limits has no setting press_force"),
         ({"tap_force": FORCE}, r"limits must give pressure, force or both"),
-        (
-            {"force": FORCE, "human_force": FORCE},
-            r"limits.human_force=65 N must be above the limits of force",
-        ),
+        ({"force": FORCE, "human_force": FORCE}, r"human_force=65 N must be above the limits of force"),
     ],
 )
 def test_a_table_without_unit_or_source_is_refused(table, reason):
@@ -119,12 +118,6 @@ def own(tmp_path):
     table.write_text("force: {limit: 65, unit: N, source: a table}\n")
     words = "--config-dir", "conf", "limits=mine", "experiment=rules", "simulator=naive", "data.gestures=96"
     return table, words
-
-
-SMALL = (
-    *("device.test_gestures=32", "evaluation.safe_gestures=32"),
-    *("evaluation.devices=0", "evaluation.layouts=0"),
-)
 
 
 @pytest.mark.slow("trains a run, evaluates it, and imports what both need")

@@ -38,9 +38,8 @@ def test_cells_hold_the_area_that_a_disc_covers(size, cells):
     inside = (x[None] - position[0]) ** 2 + (y[:, None] - position[1]) ** 2 < radius**2
     fraction = inside.reshape(cells[1], fine, cells[0], fine).mean((1, 3))
     fraction /= fraction.sum()
-    assert (
-        np.abs(frame.numpy() - fraction).max() < 0.2 * fraction.max()
-    )  # at the rim, from the texture's own blur
+    # At the rim, from the texture's own blur.
+    assert np.abs(frame.numpy() - fraction).max() < 0.2 * fraction.max()
     assert np.abs(frame.numpy() - fraction).sum() < 0.08
 
 

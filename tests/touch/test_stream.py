@@ -13,11 +13,7 @@ from skin.touch.gestures import GestureSettings
 from skin.touch.labels import TOUCH_OR_NOT
 from tests.touch.movie_labels import movie_labels
 
-LAYERS = [
-    {"material": "Dragon Skin 10 Medium", "thickness": 0.010},
-    {"material": "EcoFlex 00-30", "thickness": 0.005},
-]
-BODY = Sheet([0.16, 0.16], [32, 32], LAYERS)
+BODY = Sheet([0.16, 0.16], [32, 32], [{"material": "EcoFlex 00-30", "thickness": 0.005}])
 PERFECT = {"gain_spread": 0.0, "offset": 0.0, "noise": 0.0, "clip": 1e9}
 
 
@@ -63,9 +59,8 @@ def test_labels_and_shares_are_those_of_the_dense_movie(dense, window):
     windows = strip.cut(starts, window)
     touched = stream.flatten(1).amax(1) > 0
     seen_parts = 0
-    for start, labels, fraction in zip(
-        starts, windows.touches.labels, windows.parameters["share"], strict=True
-    ):
+    known = windows.touches.labels, windows.parameters["share"]
+    for start, labels, fraction in zip(starts, *known, strict=True):
         shown = owner[start : start + window]
         if not touched[start : start + window].any():
             assert labels.tolist() == [0] * 5

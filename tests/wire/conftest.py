@@ -60,7 +60,6 @@ class Plug:
             thread.join(5)
 
     def sending(self, values: Callable[[int], Sequence[float]], rate: float = 200.0):
-        """Send frames in the background."""
         start = monotonic()
         line = lambda number: encode_line(values(number), number, round((monotonic() - start) * 1e6))  # noqa: E731
         return self.streaming(line, 1 / rate)
@@ -68,7 +67,6 @@ class Plug:
 
 @pytest.fixture
 def plug():
-    """Return a cable that is plugged in."""
     cable = Plug()
     yield cable
     cable.unplug()

@@ -1,10 +1,19 @@
 """Streams of bytes from memory in place of ports."""
 
-from time import sleep
+from time import monotonic, sleep
 
 from skin.device.resampling import FrameError
 from skin.wire.adapter import Adapter
 from skin.wire.skin import open_skin
+
+PATIENT = 60.0  # s: machines are busy at times
+
+
+def wait_for(condition):
+    deadline = monotonic() + PATIENT
+    while not condition():
+        assert monotonic() < deadline
+        sleep(0.005)
 
 
 class Sent:
@@ -40,7 +49,6 @@ class Sent:
 
 
 def opened(*pieces, layout=4, end=False, **settings):
-    """Return a skin that reads pieces from memory."""
     return open_skin("memory", range(layout), opener=lambda: Sent(*pieces, end=end), **settings)
 
 

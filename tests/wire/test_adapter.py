@@ -14,7 +14,6 @@ from skin.wire.decoder import Decoder
 from skin.wire.proposal import propose
 from skin.wire.reader import Port, WireFeed
 
-PATIENT = 60.0  # s: machines are busy at times
 SHIPPED = sorted(path.stem for path in (CONF / "adapters").glob("*.yaml"))
 quickly = settings(
     max_examples=60, deadline=None, derandomize=True, database=None, suppress_health_check=list(HealthCheck)
@@ -26,6 +25,13 @@ OTHERS = {
     "index": Adapter(kind="text", rows=0, index=0),
 }
 ALL = {name: read_adapter(name) for name in SHIPPED} | OTHERS | {"protocol": Adapter()}
+TEXTS = st.one_of(
+    st.binary(max_size=200),
+    st.text(alphabet='0123456789,.;:-+eE \t\r\n"{}[]<>|nafov', max_size=300).map(str.encode),
+    st.lists(st.lists(st.integers(-9, 2000), min_size=1, max_size=5), max_size=30).map(
+        lambda rows: b"".join(b",".join(b"%d" % value for value in row) + b"\n" for row in rows)
+    ),
+)
 
 
 @pytest.mark.parametrize("name", SHIPPED)
@@ -78,15 +84,6 @@ def test_lines_that_do_not_match_are_shown_with_the_field_that_failed():
     assert "adapter=auto" in error
 
 
-TEXTS = st.one_of(
-    st.binary(max_size=200),
-    st.text(alphabet='0123456789,.;:-+eE \t\r\n"{}[]<>|nafov', max_size=300).map(str.encode),
-    st.lists(st.lists(st.integers(-9, 2000), min_size=1, max_size=5), max_size=30).map(
-        lambda rows: b"".join(b",".join(b"%d" % value for value in row) + b"\n" for row in rows)
-    ),
-)
-
-
 @pytest.mark.parametrize("name", ALL)
 @given(pieces=st.lists(TEXTS, max_size=10), sensors=st.sampled_from([None, 1, 3]))
 @quickly
@@ -109,7 +106,6 @@ def test_a_proposal_of_anything_is_one_or_a_sentence(pieces):
 
 
 def encoded(name, n, row):
-    """Return a frame of three values as an adapter describes it."""
     values = [str(value) for value in row]
     if name == "struct":
         return b"\xaa\x55" + bytes([n % 256]) + np.array(row, "<i2").tobytes()
@@ -156,11 +152,7 @@ class Board:
 @pytest.mark.parametrize(
     ("adapter", "answer", "told"),
     [
-        (
-            {"start": "go\r", "stop": "halt\r"},
-            lambda data: b"7,8,5\n" * 40 * (data == b"go\r"),
-            b"go\rhalt\r",
-        ),
+        ({"start": "go\r", "stop": "end\r"}, lambda data: b"7,8,5\n" * 40 * (data == b"go\r"), b"go\rend\r"),
         ({"poll": "?"}, lambda data: b"1,2,3\n", b"?" * 60),
         ({"start": "go"}, lambda data: b"type go\n", b"go" * 6),
         ({"poll": "go"}, lambda data: b"", b"go" * 20),

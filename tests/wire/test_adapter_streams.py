@@ -14,6 +14,9 @@ from skin.wire.proposal import propose
 
 RATE = 50.0  # Hz
 COUNT = 250
+SHIPPED = dict.fromkeys(("csv", "matrix_rows", "protocol"), b"%d,2,3\n")
+SHIPPED |= {"anyskin": b"25.00%d.00-1.250.17\n", "anyskin_binary": b"%d"}
+SHIPPED |= {"arduino_plotter": b"a:%d,b:2\n", "json_lines": b'{"a":%d,"b":2}\n'}
 
 
 def table(sensors, digits=0, base=300.0, spread=4.0):
@@ -74,7 +77,7 @@ STREAMS: dict[str, tuple[Callable, np.ndarray, float | None]] = {
     "semicolons trailing": (joined(";", after=";"), table(5), None),
     "one channel": (joined(","), table(1), None),
     "sixty-four channels": (joined(","), table(64), None),
-    "negative exponents": (joined(",", shape="%.3e"), table(4, 0, -300.0, 5.0), None),
+    "signs and exponents": (joined(",", shape="%+.3e"), np.c_[table(2, 0, -300, 5), table(2)], None),
     "parentheses": (joined(",", before="(", after=")"), table(4), None),
     "word before": (joined(",", before="DATA,"), table(4), None),
     "nmea-like": (joined(",", before="$FSR,", end="\r\n"), table(6), None),
@@ -342,17 +345,6 @@ def test_fields_are_kept_dropped_and_marked_invalid():
     assert {frame.valid[1] for frame in frames if frame.seq % 5 == 0} == {False}
     frames = Decoder(adapter=Adapter(kind="text", values=(4, 1))).feed(lines)
     assert frames[-1].values.tolist() == [300, 514]
-
-
-SHIPPED = {
-    "arduino_plotter": b"a:%d,b:2\n",
-    "anyskin": b"25.00%d.00-1.250.17\n",
-    "csv": b"%d,2,3\n",
-    "json_lines": b'{"a":%d,"b":2}\n',
-    "matrix_rows": b"%d,2,3\n",
-    "protocol": b"%d,2,3\n",
-    "anyskin_binary": b"%d",
-}
 
 
 @pytest.mark.parametrize("adapter", SHIPPED)

@@ -1,7 +1,6 @@
 """The emulator: its gestures, its converter, and how it ends."""
 
 import socket
-import time
 from threading import Thread
 from types import SimpleNamespace
 
@@ -16,6 +15,7 @@ from skin.errors import InputError
 from skin.mechanics.simulator.naive import Naive
 from skin.wire.decoder import Decoder
 from skin.wire.emulator import Converter, Emulator, EmulatorSettings, TcpPort, upsample
+from tests.wire.memory import wait_for
 
 SHEET = Sheet((0.16, 0.16), (16, 16), [{"material": "EcoFlex 00-30", "thickness": 0.005}])
 RATE = 10.0
@@ -68,9 +68,8 @@ def test_it_stops_wherever_it_waits(waits_for):
         if waits_for != "a reader":
             with socket.create_connection(("127.0.0.1", int(port.address.rpartition(":")[2]))) as reader:
                 assert reader.recv(1)
-                deadline = time.monotonic() + 20
-                while waits_for == "its power" and port.connected():
-                    assert time.monotonic() < deadline
+                if waits_for == "its power":
+                    wait_for(lambda: not port.connected())
     finally:
         emulator.stop()
         thread.join(20)
@@ -93,9 +92,5 @@ def test_it_says_that_it_is_emulated_and_fails_when_it_should():
     assert (np.ptp(before, axis=0) > 0).all()
     assert (np.ptp(after, axis=0) > 0).tolist() == [True, False, False, True]
     assert after[0, 1:3].tolist() == [before[-1, 1], 0]
-
-
-def test_a_channel_that_is_not_there():
-    device = Simulated(body=SHEET, layout=Grid(2, 2), simulator=Naive, gestures=10)
     with pytest.raises(InputError, match=r"emulate.dead=\[4\] must be below 4"):
         Emulator(device, SimpleNamespace(), EmulatorSettings(dead=[4]))

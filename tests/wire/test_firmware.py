@@ -28,7 +28,6 @@ RUN = '#include "skin.ino"\nint main() { setup(); while (seq < 1200) loop(); }\n
 
 @pytest.fixture(scope="module")
 def said(tmp_path_factory):
-    """Return what the sketch sends in 1200 frames."""
     compiler = shutil.which("g++") or shutil.which("clang++")
     if compiler is None:
         pytest.skip("no C++ compiler")
@@ -54,9 +53,7 @@ def test_every_frame_of_the_sketch_is_read(said):
     assert values[:, 5] - values[:, 0] == pytest.approx(500, abs=97)
     steps = np.diff([frame.t for frame in frames])
     assert steps == pytest.approx(0.01, abs=2e-4)
-
-
-def test_the_header_comes_each_second(said):
+    # The header comes each second.
     lines = said.splitlines()
     positions = [position for position, line in enumerate(lines) if line.startswith(b"# skin ")]
     assert positions[0] == 0

@@ -9,7 +9,6 @@ OK, SATURATED, STUCK, DEAD = 0, Reason.SATURATED, Reason.STUCK, Reason.DEAD
 
 
 def check(health, frames, start=0.0):
-    """Return the masks (F, S) of frames."""
     frames = np.asarray(frames, dtype=float)
     return np.array([health.check(row, start + position * 0.01) for position, row in enumerate(frames)])
 
@@ -21,11 +20,8 @@ def noisy(count, sensors=5):
 def test_a_value_at_a_limit_is_saturated():
     frames = noisy(3)
     frames[1, 2] = 1023
-    assert check(ChannelHealth((None, 1023)), frames).tolist() == [
-        [OK] * 5,
-        [OK, OK, SATURATED, OK, OK],
-        [OK] * 5,
-    ]
+    expected = [[OK] * 5, [OK, OK, SATURATED, OK, OK], [OK] * 5]
+    assert check(ChannelHealth((None, 1023)), frames).tolist() == expected
     assert check(ChannelHealth((0, None)), [[0.0, 1.0]]).tolist() == [[SATURATED, OK]]
 
 

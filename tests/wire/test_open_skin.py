@@ -25,10 +25,9 @@ from skin.wire.protocol import Header, encode_header, encode_line
 from skin.wire.reader import SkinDisconnected, SkinTimeout, WireFeed
 from skin.wire.skin import open_skin
 from skin.wire.tare import Tare
-from tests.wire.memory import Sent, opened
+from tests.wire.memory import PATIENT, Sent, opened, wait_for
 
 LAYOUT = range(4)
-PATIENT = 60.0  # s: machines are busy at times
 
 
 def line(number, values=(500, 501, 502, 503), check="crc16", period=10_000):
@@ -41,13 +40,6 @@ def lines(*numbers, **how):
 
 def numbers(frames):
     return [frame.seq for frame in frames]
-
-
-def wait_for(condition):
-    deadline = monotonic() + PATIENT
-    while not condition():
-        assert monotonic() < deadline
-        sleep(0.005)
 
 
 def test_frames_of_a_serial_port(plug):

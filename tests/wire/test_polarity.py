@@ -39,14 +39,9 @@ def test_a_person_may_write_one_polarity_for_all(tmp_path):
     path = tmp_path / "mine.yaml"
     path.write_text("format: 1\ncount: 3\nsensors: {gain: 1}\npolarity: -1\n")
     assert read_calibration(path).signs.tolist() == [-1, -1, -1]
-    for line in (
-        "polarity: [[1]]",
-        "polarity: up",
-        "polarity: [1, 1, x]",
-        "channels: 2",
-        "channels: [0, 1, a]",
-    ):
-        path.write_text(f"format: 1\ncount: 3\nsensors: {{gain: 1}}\n{line}\n")
+    odd = "polarity: [[1]]", "polarity: up", "polarity: [1, 1, x]", "channels: 2", "channels: [0, 1, a]"
+    for wrong in odd:
+        path.write_text(f"format: 1\ncount: 3\nsensors: {{gain: 1}}\n{wrong}\n")
         with pytest.raises(InputError):
             read_calibration(path)
 
@@ -105,11 +100,7 @@ def test_both_ends_of_the_converter_saturate_a_channel_whose_values_fall():
     data += b"".join(encode_line(row, n, 1000 * n) for n, row in enumerate(rows))
     with opened(data, layout=2, polarity=[1, -1]) as skin:
         frames = skin.read(len(rows), timeout=20)
-    assert [frame.saturated.tolist() for frame in frames[-3:]] == [
-        [False, True],
-        [True, True],
-        [False, False],
-    ]
+    assert [(*frame.saturated,) for frame in frames[-3:]] == [(False, True), (True, True), (False, False)]
     assert all(frame.valid.all() for frame in frames)
 
 

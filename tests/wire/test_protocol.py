@@ -19,14 +19,6 @@ def test_a_line_as_the_protocol_writes_it():
 
 
 @pytest.mark.parametrize(
-    "line",
-    [b"1,2,3", b"1;2;3", b"1\t2\t3", b"1 2 3", b"1,2,3,", b" 1 , 2,3 ", b"1   2 3", b"1.0,2e0,+3"],
-)
-def test_separators_and_numbers_that_people_use(line):
-    assert parse_line(line).fields == [1, 2, 3]
-
-
-@pytest.mark.parametrize(
     ("line", "reason"),
     [
         *((b"1,%s,3" % word, "number") for word in (b"x", b"nano", b"---", b"1.2.3", b"ov f", b"A0: 1")),

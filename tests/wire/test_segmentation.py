@@ -12,14 +12,10 @@ from skin.errors import InputError
 from skin.touch.labels import TOUCH, TOUCH_OR_NOT
 from skin.wire.decoder import Decoder
 from skin.wire.protocol import Announcement, crc16, encode_announcement, encode_line, parse_announcement
-from skin.wire.segmentation import (
-    AnnouncedSegmenter,
-    ContinuousSegmenter,
-    PromptedSegmenter,
-    label_plan,
-)
+from skin.wire.segmentation import AnnouncedSegmenter, ContinuousSegmenter, PromptedSegmenter, label_plan
 
 LABELS = {"big": 1, "dynamic": 0, "press": 1, "dangerous": 0}
+MANY = np.zeros((3, 101, 5)).tolist()
 
 
 def frames(numbers, rate=100.0, segment=0):
@@ -35,7 +31,6 @@ def shown(segmenter, sequence):
 
 
 def announced(sequence, *said, seconds=0.3, task=TOUCH):
-    """Return the gestures of a stream with announcements."""
     return shown(AnnouncedSegmenter(window(seconds), deque(said), task), sequence)
 
 
@@ -84,13 +79,8 @@ def test_every_combination_once_per_repetition_in_another_order():
 
 def test_a_person_begins_skips_and_ends():
     said = []
-    segmenter = PromptedSegmenter(
-        window(0.1),
-        enumerate(label_plan(TOUCH.names, 1, 0)),
-        said.append,
-        lambda seen: True,
-        iter(["\n", "s\n", "\n"]),
-    )
+    plan, typed = enumerate(label_plan(TOUCH.names, 1, 0)), iter(["\n", "s\n", "\n"])
+    segmenter = PromptedSegmenter(window(0.1), plan, said.append, lambda seen: True, typed)
     gestures = []
     for frame in frames(range(2000)):
         if gesture := segmenter.add(frame):
@@ -133,9 +123,6 @@ def test_an_announcement_comes_back_among_frames_and_not_damaged():
         line = bytearray(text)
         line[position] ^= 1
         assert parse_announcement(bytes(line)) is None
-
-
-MANY = np.zeros((3, 101, 5)).tolist()
 
 
 @pytest.mark.parametrize(

@@ -14,21 +14,22 @@ from skin.wire.tare import SkinTouched, Tare, take_baseline
 
 REST = np.array([512.0, 300.0, 40.0])
 RATE = 10.0  # Hz, of the model
+FAST = 100.0  # Hz, of the device
+PRESS = np.concatenate([np.zeros(50), 80 * np.sin(np.linspace(0, 3 * np.pi, 370)) ** 2, np.zeros(2580)])
+RNG = np.random.default_rng(3)
+VALID = np.ones((100, 6), dtype=bool)
 
 
 def frames(values, start=0.0, rate=100.0):
-    """Return frames of counts."""
     times = start + np.arange(len(values)) / rate
     return [Frame(None, t, t, row, np.ones(3, bool)) for t, row in zip(times, values, strict=True)]
 
 
 def noisy(count, seed=0):
-    """Return counts of an untouched skin."""
     return REST + np.random.default_rng(seed).integers(-1, 2, (count, 3))
 
 
 def watched(scale=None, tare=1.0, known=None, header=None):
-    """Return the tare of three sensors."""
     conversion = lambda baseline, told: unit_conversion(3, baseline, scale, known, told)  # noqa: E731
     return Tare(conversion, tare, RATE, lambda: header)
 
@@ -86,9 +87,6 @@ def test_a_calibration_gives_scale_gains_and_broken_sensors():
     assert one.usable.tolist() == [True, True, False]
 
 
-FAST = 100.0  # Hz, of the device
-
-
 class Played:
     """Hands out frames made before, as a skin does: ``force`` (F,) on the first of two channels."""
 
@@ -112,9 +110,6 @@ def settled(force, seconds, **how):
     said, source = [], SerialSource(Port(scale=1.0, tare=seconds), 2, RATE)
     frames, conversion = source.warm_up(Played(force, **how), said.append)
     return frames, conversion.zero, said[1:]
-
-
-PRESS = np.concatenate([np.zeros(50), 80 * np.sin(np.linspace(0, 3 * np.pi, 370)) ** 2, np.zeros(2580)])
 
 
 @pytest.mark.parametrize(
@@ -158,7 +153,6 @@ def later(stream, seconds=2):
 
 
 def limited(values, channels, limit=1023.0):
-    """Return frames of which some channels are at their limit."""
     rows = []
     for frame in frames(values):
         full = np.isin(np.arange(3), channels)
@@ -224,10 +218,6 @@ def test_few_frames_are_waited_for():
         for one in frames(noisy(25)):
             watch.add(one._replace(t=0.5 * burst + 0.5, t_host=0.5 * burst + 0.5))
     assert watch.status == "taking the baseline: waiting for more frames"
-
-
-RNG = np.random.default_rng(3)
-VALID = np.ones((100, 6), dtype=bool)
 
 
 def idle(sigma=0.6):

@@ -10,21 +10,18 @@ from skin.body.sheet import Sheet
 from skin.errors import InputError
 from tests.damage import DAMAGED_FILES, damaged, opened
 
-LAYERS = [
-    {"material": "Dragon Skin 10 Medium", "thickness": 0.010},
-    {"material": "EcoFlex 00-30", "thickness": 0.005},
-]
-BODY = Sheet([0.16, 0.16], [32, 32], LAYERS)
-
-
+BODY = Sheet([0.16, 0.16], [32, 32], [{"material": "EcoFlex 00-30", "thickness": 0.015}])
 FACING = "x_m,y_m,normal_x,normal_y,normal_z\n"
 ALONG = "x_m,y_m,direction_x,direction_y,direction_z\n"
+MINE = b"""x_m, y_m, depth_m, normal_x, normal_y, normal_z
+0.02, 0.03, 0.004, 0, 0, 1
+0.08, 0.031, 0.004, 0.5, 0, 1
+0.15, 0.12, 0.005, 0, -1, 2
+"""
 
 
 @pytest.fixture
 def sensors(tmp_path):
-    """Write a layout file and read its sensors."""
-
     def read(text: str | bytes):
         path = tmp_path / "layout.csv"
         path.write_bytes(text.encode() if isinstance(text, str) else text)
@@ -33,18 +30,12 @@ def sensors(tmp_path):
     return read
 
 
-def test_order_depth_and_other_columns(sensors):
+def test_order_numbers_depth_other_columns_and_encodings(sensors):
     """The rows keep their order; columns may come in any, with spaces, a byte order mark, blank lines."""
     read = sensors("\ufeffname, depth_m, y_m, x_m\nb, 0, 0.02, 0.15\n\na, 0.005, 0.01, 0.03\n")
     np.testing.assert_allclose(read.positions, [[0.15, 0.02, 0], [0.03, 0.01, 0.005]])
-
-
-def test_numbers_order_the_rows(sensors):
     read = sensors("sensor,x_m,y_m\n3,0.15,0.02\n1,0.03,0.01\n2,0.1,0.05\n")
     np.testing.assert_array_equal(read.positions[:, 0], [0.03, 0.1, 0.15])
-
-
-def test_a_file_of_utf_16_is_read(sensors):
     assert len(sensors("x_m,y_m\n0.1,0.1\n".encode("utf-16"))) == 1
 
 
@@ -85,23 +76,14 @@ def test_a_relative_path_is_looked_for_here_first(tmp_path, monkeypatch):
         ("x_m,y_m,depth_m\n0.1,0.1,\n", "line 2: depth_m must be a number in m, got ''"),
         ("x_m,y_m\n0.1,0.1\n80,40\n", "1 of 2 sensors lie outside.*sensor 2 at x = 80 m.*in metres"),
         ("x_m,y_m,depth_m\n0.1,0.1,0.02\n", "outside the body.*depth = 0.02 m"),
-        (
-            "x_m,y_m\n0.1,0.1\n0.05,0.1\n0.1,0.1\n",
-            "sensors 1 and 3 are at one position, x = 0.1 m, y = 0.1 m",
-        ),
+        ("x_m,y_m\n.1,.1\n.05,.1\n.1,.1\n", "sensors 1 and 3 are at one position, x = 0.1 m, y = 0.1 m"),
         ("x_m,y_m,depth_m\n0.1,0.1,0\n0.1,0.1,0.005\n", "sensors 1 and 2 are at one position"),
-        (
-            "x_m,y_m,normal_x,normal_z\n0.1,0.1,0,1\n",
-            "no column normal_y, found x_m, y_m, normal_x, normal_z",
-        ),
+        ("x_m,y_m,normal_x,normal_z\n.1,.1,0,1\n", "no column normal_y, found x_m, y_m, normal_x, normal_z"),
         (FACING + "0.1,0.1,0,0,1\n0.1,0.05,0,0,0\n", "line 3: a normal of length 0 has no direction"),
         (FACING + "0.1,0.1,1e-300,0,0\n", "a normal of length 0"),
         (FACING + "0.1,0.1,0,up,1\n", "line 2: normal_y must be a number, got 'up'"),
         ("x_m,y_m,x_m\n0.1,0.1,0.2\n", "the column x_m is there twice"),
-        (
-            ALONG + "0.1,0.1,1,0,0\n" * 2 + "0.1,0.1,0,0,2\n",
-            "direction of sensor 3 has length 2, but must be",
-        ),
+        (ALONG + ".1,.1,1,0,0\n" * 2 + ".1,.1,0,0,2\n", "direction of sensor 3 has length 2, but must be"),
         (ALONG + "0.1,0.1,1,0,0\n0.1,0.1,0,0,1\n", "of three axes has three rows.*; got 2 rows"),
         (ALONG + "0.1,0.1,1,0,0\n" * 2 + "0.1,0.1,0,0,1\n", "at right angles, .*got 3 rows with"),
         (b"x_m,y_m\n\xff\xfe,0.1\n", "cannot read the layout"),
@@ -121,13 +103,6 @@ def test_what_is_no_layout_is_refused_by_name(sensors, text, says):
 def test_a_missing_file_is_refused_with_where_it_was_looked_for(path):
     with pytest.raises(InputError, match=r"no layout file .*: looked for .*layout.path=FILE.csv"):
         File(path)
-
-
-MINE = b"""x_m, y_m, depth_m, normal_x, normal_y, normal_z
-0.02, 0.03, 0.004, 0, 0, 1
-0.08, 0.031, 0.004, 0.5, 0, 1
-0.15, 0.12, 0.005, 0, -1, 2
-"""
 
 
 @DAMAGED_FILES

@@ -17,40 +17,7 @@ from skin.learning.model import Gcn, Mlp
 from skin.learning.representation import Frames
 
 PAIR = np.array([[0.0, 0.5], [0.5, 0.0]])
-
-
-def test_two_sensors_and_three_frames_by_hand():
-    # rows of A + I with the edge from the frame before: 1.5 in the first frame, 2.5 in the others
-    a, b, c = 1.5, 2.5, np.sqrt(1.5 * 2.5)
-    wanted = np.array(
-        [
-            [1 / a, 0.5 / a, 0, 0, 0, 0],
-            [0.5 / a, 1 / a, 0, 0, 0, 0],
-            [1 / c, 0, 1 / b, 0.5 / b, 0, 0],
-            [0, 1 / c, 0.5 / b, 1 / b, 0, 0],
-            [0, 0, 1 / b, 0, 1 / b, 0.5 / b],
-            [0, 0, 0, 1 / b, 0.5 / b, 1 / b],
-        ]
-    )
-    np.testing.assert_allclose(link(torch.from_numpy(normalised(PAIR)), 3), wanted)
-
-
-def test_news_travel_forward_in_time_only():
-    torch.manual_seed(0)
-    model = partial(Gcn, widths=[3, 3], pooling="mean", activation="silu")
-    fusion = Linked(model, "graph", (2, 1), 5)
-    x = torch.zeros(1, 5, 2, 1, requires_grad=True)
-    nodes = []
-    fusion.model.norms[0].register_forward_hook(lambda *call: nodes.append(call[-1]))
-    fusion(Frames(x, torch.from_numpy(normalised(PAIR)).float()))
-    hidden = nodes[0].unflatten(0, (5, 2))  # frames, sensors, windows, features after one convolution
-    hidden[2].sum().backward()
-    assert (x.grad[0, :, :, 0] != 0).any(dim=1).tolist() == [False, True, True, False, False]
-
-
 # What every fusion must do, whatever model it holds.
-
-
 OPTIONS = sorted((Path(__file__).parents[3] / "conf" / "fusion").glob("*.yaml"))
 MODELS = {
     "readings": partial(Mlp, widths=[8]),
@@ -65,6 +32,33 @@ VARIANTS = [
     for extra in ([{"head": head} for head in HEADS] if path.stem == "late" else [{}])
     for kind in (["graph"] if path.stem == "linked" else MODELS)
 ]
+
+
+def test_two_sensors_and_three_frames_by_hand():
+    # rows of A + I with the edge from the frame before: 1.5 in the first frame, 2.5 in the others
+    a, b, c = 1.5, 2.5, np.sqrt(1.5 * 2.5)
+    wanted = [
+        [1 / a, 0.5 / a, 0, 0, 0, 0],
+        [0.5 / a, 1 / a, 0, 0, 0, 0],
+        [1 / c, 0, 1 / b, 0.5 / b, 0, 0],
+        [0, 1 / c, 0.5 / b, 1 / b, 0, 0],
+        [0, 0, 1 / b, 0, 1 / b, 0.5 / b],
+        [0, 0, 0, 1 / b, 0.5 / b, 1 / b],
+    ]
+    np.testing.assert_allclose(link(torch.from_numpy(normalised(PAIR)), 3), wanted)
+
+
+def test_news_travel_forward_in_time_only():
+    torch.manual_seed(0)
+    model = partial(Gcn, widths=[3, 3], pooling="mean", activation="silu")
+    fusion = Linked(model, "graph", (2, 1), 5)
+    x = torch.zeros(1, 5, 2, 1, requires_grad=True)
+    nodes = []
+    fusion.model.norms[0].register_forward_hook(lambda *call: nodes.append(call[-1]))
+    fusion(Frames(x, torch.from_numpy(normalised(PAIR)).float()))
+    hidden = nodes[0].unflatten(0, (5, 2))  # frames, sensors, windows, features after one convolution
+    hidden[2].sum().backward()
+    assert (x.grad[0, :, :, 0] != 0).any(dim=1).tolist() == [False, True, True, False, False]
 
 
 def windows(kind, length=WINDOW):
@@ -85,12 +79,6 @@ def given(request):
     return make, kind
 
 
-def test_a_window_becomes_one_embedding(given):
-    make, kind = given
-    fusion = make()
-    assert fusion(windows(kind)).shape == (5, fusion.width)
-
-
 def test_a_gradient_reaches_every_parameter(given):
     make, kind = given
     fusion = make()
@@ -105,6 +93,7 @@ def test_windows_do_not_see_each_other(given):
     make, kind = given
     fusion, (x, adjacency, _) = make().eval(), windows(kind)
     together = fusion(Frames(x, adjacency))
+    assert together.shape == (5, fusion.width)
     assert torch.equal(fusion(Frames(x, adjacency)), together)
     torch.testing.assert_close(fusion(Frames(x[1:3], adjacency)), together[1:3])
 

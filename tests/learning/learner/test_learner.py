@@ -8,9 +8,7 @@ from hydra.utils import instantiate
 from skin.errors import InputError
 from skin.learning.boosted_trees import BoostedTrees
 from skin.learning.data import TouchData
-from skin.learning.learner import Ensemble, Rules, _threshold
-from skin.learning.representation import Readings
-from skin.touch.labels import Task
+from skin.learning.learner import Ensemble, _threshold
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -22,12 +20,6 @@ def test_the_threshold_is_the_best_of_all(seed):
     assert accuracy == pytest.approx(((scores > threshold) == truth).mean())
     between = np.unique(scores)[:-1] + 0.05
     assert accuracy == pytest.approx(max(((scores > cut) == truth).mean() for cut in between))
-
-
-def test_other_labels_are_refused(made_up_device):
-    made_up_device.task = Task(("grab", "hit"), "exclusive")
-    with pytest.raises(InputError, match="got grab, hit: use learner=boosted_trees"):
-        Rules().fit(TouchData(made_up_device, Readings))
 
 
 def test_it_says_the_mean_of_what_its_members_say(configured, made_up_device):

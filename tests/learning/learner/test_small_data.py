@@ -23,6 +23,22 @@ from skin.touch.labels import TOUCH, Task
 PLACE = Task(("x", "force"), "regression")
 GESTURES = Task(("pat", "hold", "tap"), "exclusive")
 FewTrees = partial(ExtraTrees, 30)  # those of 300 take minutes
+FORGED = [
+    (FewTrees, "children", np.zeros_like),  # a circle
+    (FewTrees, "children", lambda array: array - 1),
+    (FewTrees, "children", lambda array: array + 10**6),
+    (FewTrees, "feature", lambda array: array + 1000),
+    (FewTrees, "roots", lambda array: array + 10**6),
+    (FewTrees, "values", lambda array: array[:-1]),
+    (FewTrees, "values", lambda array: array * np.inf),
+    (FewTrees, "values", lambda array: np.hstack([array, array])),
+    (FewTrees, "threshold", lambda array: array.astype(str)),
+    (FewTrees, "n_features_in_", lambda count: count + 1),
+    (KernelRidge, "weights", lambda array: array[:-1]),
+    (KernelRidge, "vectors", lambda array: array[:, 1:]),
+    (KernelRidge, "mean", lambda array: array * np.nan),
+    (KernelRidge, "typical", lambda array: array.astype(str)),
+]
 
 
 @dataclass
@@ -34,7 +50,6 @@ class Presses(AbstractDevice):
     configured = False
 
     def touches(self, split: str, epoch: int = 0) -> Touches:
-        """Return 100 presses to train on, 40 else."""
         source = torch.Generator().manual_seed(sum(map(ord, split)))
         count = 100 if split == "train" else 40
         x, force = 0.04 * torch.rand(count, generator=source), 1 + 4 * torch.rand(count, generator=source)
@@ -43,11 +58,8 @@ class Presses(AbstractDevice):
         time = torch.arange(30)
         course = torch.stack([(time % 6 < 2).float(), torch.ones(30), (time == 9).float()])[gesture]
         course = course * ((time > 3) & (time < 24))
-        readings = (
-            force[:, None, None]
-            * course[..., None]
-            * torch.exp(-(((x[:, None] - sites) / 0.01) ** 2))[:, None]
-        )
+        bump = torch.exp(-(((x[:, None] - sites) / 0.01) ** 2))[:, None]
+        readings = force[:, None, None] * course[..., None] * bump
         readings = readings + 0.01 * torch.randn(readings.shape, generator=source)
         labels = torch.stack([x, force], dim=1) if self.task == PLACE else one_hot(gesture.float(), 3)
         labels[::10] = torch.nan
@@ -94,9 +106,8 @@ def test_the_leave_one_out_errors_are_those_of_trainings_without_the_touch(monke
     centred = labels[:, 0] - labels.mean()
     for left in (0, 17):
         rest = np.delete(np.arange(30), left)
-        plain = SklearnKernelRidge(alpha=0.1, kernel="precomputed").fit(
-            gram[np.ix_(rest, rest)], centred[rest]
-        )
+        plain = SklearnKernelRidge(alpha=0.1, kernel="precomputed")
+        plain.fit(gram[np.ix_(rest, rest)], centred[rest])
         expected = plain.predict(gram[left, rest][None])[0] + labels.mean()
         assert outputs[0][left, 0] == pytest.approx(expected)
 
@@ -143,27 +154,8 @@ def test_damaged_and_foreign_files_are_refused(make, other, tmp_path):
             make().load(data, path)
 
 
-FORGED = [
-    (FewTrees, "children", np.zeros_like),  # a circle
-    (FewTrees, "children", lambda array: array - 1),
-    (FewTrees, "children", lambda array: array + 10**6),
-    (FewTrees, "feature", lambda array: array + 1000),
-    (FewTrees, "roots", lambda array: array + 10**6),
-    (FewTrees, "values", lambda array: array[:-1]),
-    (FewTrees, "values", lambda array: array * np.inf),
-    (FewTrees, "values", lambda array: np.hstack([array, array])),
-    (FewTrees, "threshold", lambda array: array.astype(str)),
-    (FewTrees, "n_features_in_", lambda count: count + 1),
-    (KernelRidge, "weights", lambda array: array[:-1]),
-    (KernelRidge, "vectors", lambda array: array[:, 1:]),
-    (KernelRidge, "mean", lambda array: array * np.nan),
-    (KernelRidge, "typical", lambda array: array.astype(str)),
-]
-
-
 @pytest.fixture(scope="module")
 def learned():
-    """Return learners of a position by their maker."""
     data = TouchData(Presses(PLACE), Readings)
     learners = {make: make() for make in (FewTrees, KernelRidge)}
     for learner in learners.values():
@@ -192,9 +184,8 @@ def test_losses_leave_out_what_is_unknown():
     losses = touch_losses(np.full((2, 4), 0.5), labels, TOUCH)
     assert losses.tolist() == pytest.approx([np.log(2), 0])
     position = np.array([[0.0, 1.0], [2.0, np.nan], [4.0, 3.0]])
-    assert touch_losses(np.nan_to_num(position) + 1, position, PLACE)[1] == pytest.approx(
-        1 / np.var([0, 2, 4])
-    )
+    losses = touch_losses(np.nan_to_num(position) + 1, position, PLACE)
+    assert losses[1] == pytest.approx(1 / np.var([0, 2, 4]))
 
 
 def test_a_touch_from_the_first_frame_on_has_its_idle_level_at_its_end():

@@ -95,10 +95,6 @@ def test_without_imagenet_a_sentence_says_where_to_put_it(tmp_path, monkeypatch)
         assert words in str(error.value)
 
 
-def cut_off(path):
-    path.write_bytes(path.read_bytes()[:1_000_000])
-
-
 class Code:
     """An object whose unpickling runs code."""
 
@@ -109,7 +105,7 @@ class Code:
 @pytest.mark.parametrize(
     "spoil",
     [
-        cut_off,
+        lambda path: path.write_bytes(path.read_bytes()[:1_000_000]),
         lambda path: path.write_text("<html>404: no such file</html>"),
         lambda path: torch.save({"features.0.0.weight": Code()}, path),
     ],
@@ -117,15 +113,10 @@ class Code:
 )
 def test_a_file_that_cannot_be_read_is_refused_and_runs_nothing(spoil, file):
     spoil(file)
-    with pytest.raises(
-        InputError, match=rf"cannot read the weights file {file}: it is damaged, .*get it again"
-    ) as error:
+    match = rf"cannot read the weights file {file}: it is damaged, .*get it again"
+    with pytest.raises(InputError, match=match) as error:
         loaded(file)
     assert "weights_only" not in str(error.value)
-
-
-def lacking(state):
-    return {name: tensor for name, tensor in state.items() if not name.startswith("features.7")}
 
 
 def altered(name, tensor):
@@ -135,14 +126,14 @@ def altered(name, tensor):
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (lacking, r"Missing key.*features\.7"),
+        (lambda state: {name: state[name] for name in [*state][:-20]}, r"Missing key.*features\.7"),
         (altered("layer4.bias", torch.zeros(3)), r"Unexpected key.*layer4\.bias"),
         (lambda state: {"state_dict": state}, "Missing key.*features"),
         (lambda state: list(state), "does not fit: .*items"),
         (lambda state: {}, "Missing key.*features"),
         (
-            altered("features.0.0.weight", torch.zeros(40, 3, 3, 3)),
-            r"size mismatch for features\.0\.0\.weight: .*40, 3, 3, 3.*32, 3, 3, 3",
+            altered("features.0.0.weight", torch.zeros(40, 3)),
+            r"size mismatch for features\.0\.0\.w.*40, 3.*32, 3",
         ),
         (altered("features.0.1.bias", torch.full((32,), math.nan)), r"features\.0\.1\.bias.* not finite"),
     ],

@@ -10,7 +10,7 @@ import torch
 from torch.nn import functional as F
 
 from skin.learning.graph import adjacency, neighbours, normalised
-from skin.learning.model import POOLINGS, Gcn, Transformer, _InstanceNorm
+from skin.learning.model import POOLINGS, Gcn, Pyg, Transformer, _InstanceNorm
 
 PLACES = 0.1 * np.random.default_rng(0).random((8, 3))
 EDGES = adjacency(PLACES, neighbours(PLACES, "knn", 3), "exp")
@@ -43,6 +43,15 @@ def test_one_convolution_is_that_of_pytorch_geometric(features, width):
     index = weights.nonzero().T
     wanted = theirs(x, index, weights[index[0], index[1]]).relu().amax(dim=0)
     torch.testing.assert_close(model(x[None], MATRIX)[0], wanted)
+
+
+def test_one_layer_of_gcn_is_the_dense_product_with_the_adjacency():
+    with quiet():
+        from torch_geometric.nn.models import GCN
+    model, x = Pyg("graph", (8, 2), GCN, width=4, layers=1, pooling="mean"), torch.randn(3, 8, 2)
+    convolution = model.network.convs[0]
+    expected = (MATRIX @ x @ convolution.lin.weight.T + convolution.bias).mean(dim=1)
+    torch.testing.assert_close(model(x, MATRIX), expected)
 
 
 def plain(nodes):

@@ -19,12 +19,11 @@ from skin.learning.model import Gcn
 POINTS = np.array([[0, 0], [1, 0], [0, 1], [1, 1], [1.9, 0.6], [5, 1.1]]) * 0.01
 POINTS = np.hstack([POINTS, np.zeros((6, 1))])
 
-
 # 3-4 is shorter than 1-4 and 2-3 than 0-2; point 5 is nobody's neighbour, but has one
 TIE_FREE = POINTS + 1e-4 * np.array([[0, 0, 0], [1, 0, 0], [0, 2, 0], [1, 3, 0], [0, 0, 0], [0, 0, 0]])
-TILTED = POINTS + 1e-3 * np.array(
-    [[0, 0, 0]] * 3 + [[1, 1, 0]] + [[0, 0, 0]] * 2
-)  # 1-2 is then a Delaunay edge
+TILTED = POINTS + 1e-3 * np.outer(np.eye(6)[3], [1, 1, 0])  # 1-2 is then a Delaunay edge
+BODY = Sheet([0.16, 0.16], [32, 32], [{"material": "EcoFlex 00-30", "thickness": 0.005}])
+PLACES = torch.from_numpy(Grid(3, 3).sensors(BODY).positions).float()
 
 
 @pytest.mark.parametrize(
@@ -45,15 +44,11 @@ def test_neighbours(points, edges, count, expected):
 def test_weights_of_edges():
     points = np.array([[0, 0, 0], [1, 0, 0], [3, 0, 0]]) * 0.01
     linked = neighbours(points, "knn", 1)  # 0-1 and 1-2; the nearest are 1, 1 and 2 cm away: d0 = 1 cm
-    e = np.exp
-    np.testing.assert_allclose(
-        adjacency(points, linked, "exp"), [[0, e(-1), 0], [e(-1), 0, e(-2)], [0, e(-2), 0]]
-    )
-    np.testing.assert_allclose(adjacency(points, linked, "distance"), [[0, 1, 0], [1, 0, 2], [0, 2, 0]])
-    np.testing.assert_allclose(adjacency(points, linked, "none"), [[0, 1, 0], [1, 0, 1], [0, 1, 0]])
-    np.testing.assert_allclose(
-        adjacency(10 * points, linked, "distance"), adjacency(points, linked, "distance")
-    )
+    for law, a, b in (("exp", np.exp(-1), np.exp(-2)), ("distance", 1, 2), ("none", 1, 1)):
+        for unit in (1, 10):
+            np.testing.assert_allclose(
+                adjacency(unit * points, linked, law), [[0, a, 0], [a, 0, b], [0, b, 0]]
+            )
 
 
 def test_normalised_by_hand():
@@ -61,13 +56,6 @@ def test_normalised_by_hand():
     edges = np.array([[0, 2, 0], [2, 0, 1], [0, 1, 0]])
     a, b = 2 / np.sqrt(12), 1 / np.sqrt(8)
     np.testing.assert_allclose(normalised(edges), [[1 / 3, a, 0], [a, 1 / 4, b], [0, b, 1 / 2]])
-
-
-LAYERS = [
-    {"material": "Dragon Skin 10 Medium", "thickness": 0.010},
-    {"material": "EcoFlex 00-30", "thickness": 0.005},
-]
-BODY = Sheet([0.16, 0.16], [32, 32], LAYERS)
 
 
 def test_coordinates_are_the_last_two_features():
@@ -78,9 +66,6 @@ def test_coordinates_are_the_last_two_features():
     assert x.shape == (2, 4, 3, 4)
     torch.testing.assert_close(x[..., 0], readings / 10)
     torch.testing.assert_close(x[..., 2:], torch.tensor([[0.25, 0.25], [1, 1], [0, 0.5]]).expand(2, 4, 3, 2))
-
-
-PLACES = torch.from_numpy(Grid(3, 3).sensors(BODY).positions).float()
 
 
 def touches(motion=None, positions=PLACES):

@@ -22,13 +22,14 @@ from skin.learning.representation import (
     weights,
 )
 
+# Interpolation against planes and brute force.
+SIZE = (0.16, 0.12)
+
 
 def image(positions, readings, **options):
-    positions = torch.tensor(positions)
-    readings = torch.tensor(readings)[None, None]
-    return Image(positions, (0.16, 0.08), **options)(readings, torch.ones_like(readings, dtype=torch.bool)).x[
-        0, 0, 0
-    ]
+    given = torch.tensor(readings)[None, None]
+    represent = Image(torch.tensor(positions), (0.16, 0.08), **options)
+    return represent(given, torch.ones_like(given, dtype=torch.bool)).x[0, 0, 0]
 
 
 def test_x_is_the_column_and_y_the_row_also_on_an_oblong_sheet():
@@ -75,36 +76,15 @@ def test_readings_then_their_mask():
     assert x.tolist() == [[[0.5, 0.0, 1.5, 0.0, 1.0, 0.0]]]
 
 
-# Readings above their idle level, beside engineered features.
-
-
-TIME, SENSORS = 30, 5
-
-
-@pytest.fixture
-def made():
-    generator = torch.Generator().manual_seed(3)
-    readings = 0.05 * torch.randn(6, TIME, SENSORS, generator=generator)
-    readings[:, 10:18] += torch.rand(6, 1, SENSORS, generator=generator)
-    positions = torch.rand(SENSORS, 3, generator=generator)
-    return Features(positions, (1.0, 1.0)), readings, torch.ones_like(readings, dtype=torch.bool)
-
-
-def test_both_views_of_one_newton_above_idle(made):
-    represent = made[0]
-    readings = torch.zeros(1, TIME, SENSORS)
+def test_both_views_of_one_newton_above_idle():
+    readings = torch.zeros(1, 30, 5)
     readings[0, 20, 2] = 1.0
+    represent = Features(torch.rand(5, 3), (1.0, 1.0))
     x = represent(readings, torch.ones_like(readings, dtype=torch.bool)).x[0, 20]
     assert x[2] == pytest.approx(1 / 3)
     # asinh(1 / 0.2) = ln(5 + sqrt(26))
-    assert x[SENSORS + 2] == pytest.approx(2.3124383 / 2)
+    assert x[5 + 2] == pytest.approx(2.3124383 / 2)
     assert x.count_nonzero() == 2
-
-
-# Interpolation against planes and brute force.
-
-
-SIZE = (0.16, 0.12)
 
 
 @pytest.fixture
@@ -171,14 +151,8 @@ def test_the_shape_does_not_depend_on_the_sensors(touches):
 
 def test_the_order_of_sensors_does_not_matter(touches):
     order = torch.randperm(9, generator=torch.Generator().manual_seed(1))
-    other = replace(
-        touches,
-        readings=touches.readings[..., order],
-        valid=touches.valid[..., order],
-        saturated=touches.saturated[..., order],
-        positions=touches.positions[order],
-        geometry=touches.geometry[order],
-    )
+    series = {name: getattr(touches, name)[..., order] for name in ("readings", "valid", "saturated")}
+    other = replace(touches, **series, positions=touches.positions[order], geometry=touches.geometry[order])
     for found, expected in zip(shown(other)[::2], shown(touches)[::2], strict=True):
         torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)
 
@@ -199,11 +173,8 @@ def test_a_dead_sensor_changes_nothing(touches, filled):
 
 
 def test_each_touch_may_have_a_skin_of_its_own(touches):
-    each = replace(
-        touches,
-        positions=touches.positions.expand(5, 9, 3),
-        geometry=touches.geometry.expand(5, 9, len(GEOMETRY)).clone(),
-    )
+    geometry = touches.geometry.expand(5, 9, len(GEOMETRY)).clone()
+    each = replace(touches, positions=touches.positions.expand(5, 9, 3), geometry=geometry)
     torch.testing.assert_close(shown(each).x, shown(touches).x)
     each.geometry[2, :, 0] /= 2
     moved = (shown(each).x - shown(touches).x).abs().amax((1, 2))
@@ -213,14 +184,12 @@ def test_each_touch_may_have_a_skin_of_its_own(touches):
 def test_a_reading_appears_at_the_site_where_its_sensor_is(touches):
     readings = torch.zeros(1, 12, 9)
     readings[:, 11, 4] = 2.0
-    one = replace(
-        touches[:1], readings=readings, saturated=None, valid=torch.ones(1, 12, 9, dtype=torch.bool)
-    )
+    valid = torch.ones(1, 12, 9, dtype=torch.bool)
+    one = replace(touches[:1], readings=readings, saturated=None, valid=valid)
     linear = shown(one).x[0, 11, : 36 * 4].view(36, 4)[:, 0]
     x, y = one.positions[4, :2] / torch.tensor([0.2, 0.1])
-    sites = torch.stack(
-        torch.meshgrid((torch.arange(6) + 0.5) / 6, (torch.arange(6) + 0.5) / 6, indexing="xy"), -1
-    )
+    middles = (torch.arange(6) + 0.5) / 6
+    sites = torch.stack(torch.meshgrid(middles, middles, indexing="xy"), -1)
     distance = (sites.flatten(0, 1) - torch.stack([x, y])).norm(dim=1)
     assert distance[linear.argmax()] < 0.35
     assert linear.max() <= 2.0 / 3.0 + 1e-6

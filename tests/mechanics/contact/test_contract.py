@@ -21,15 +21,13 @@ def device(request, configured):
 def test_touches_are_made_of_pressures_that_carry_their_force(device):
     movie = device.sampler.sample(16, np.random.default_rng(0))
     width, height = device.body.cell
-    torch.testing.assert_close(
-        movie.pressure().sum((2, 3)) * width * height, movie.force, rtol=1e-3, atol=1e-3
-    )
+    force = movie.pressure().sum((2, 3)) * width * height
+    torch.testing.assert_close(force, movie.force, rtol=1e-3, atol=1e-3)
     assert (movie.frames >= 0).all()
 
 
 @pytest.mark.parametrize("simulator", ["naive", "fem"])
 def test_rigid_objects_need_a_surface_that_gives_way(configured, simulator):
-    with pytest.raises(
-        InputError, match=f"simulator={simulator}: set simulator=solid, or contact=prescribed"
-    ):
+    match = f"simulator={simulator}: set simulator=solid, or contact=prescribed"
+    with pytest.raises(InputError, match=match):
         build_device(configured("contact=rigid", f"simulator={simulator}"))

@@ -31,11 +31,9 @@ class HalfSpace(AbstractSimulator):
     """A surface of known compliance, and nothing below it."""
 
     def forward(self, pressure: torch.Tensor, shear: torch.Tensor | None = None) -> Response:
-        """Read nothing."""
         return Response(pressure.new_zeros(*pressure.shape[:-2], len(SENSORS)), None)
 
     def compliance(self) -> torch.Tensor:
-        """Return that of a half-space, in closed form."""
         return COMPLIANCE
 
 
@@ -54,27 +52,14 @@ def problem(**settings) -> ContactProblem:
     return ContactProblem(shapes, torch.from_numpy(BODY.footprints(SENSORS)).float(), given)
 
 
-def still(
-    scale: float, position=(0.08, 0.08), peak: float = 50e3, fractions=(1.0,), wanted=(0, 0, 0, 0)
-) -> Trajectories:
+def still(scale: float, peak: float = 50e3, fractions=(1.0,), wanted=(0, 0, 0, 0)) -> Trajectories:
     """Return one gesture of the first shape that stands still, at several shares of its force."""
     count = len(fractions)
-    return Trajectories(
-        np.zeros(count, int),
-        Pose(
-            np.zeros(count, int),
-            np.zeros(count),
-            np.full(count, scale),
-            np.tile(position, (count, 1)),
-            np.ones(count),
-        ),
-        np.array(fractions),
-        torch.arange(count)[None],
-        torch.tensor([fractions]),
-        np.array([peak]),
-        np.array([wanted], bool),
-        *(np.zeros((count, 2)), np.zeros(1, int), np.zeros((1, 2)), np.zeros(1)),
-    )
+    zeros, position = np.zeros(count, int), np.full((count, 2), 0.08)
+    poses = Pose(zeros, np.zeros(count), np.full(count, scale), position, np.ones(count))
+    shown = np.array(fractions), torch.arange(count)[None], torch.tensor([fractions])
+    rest = np.zeros((count, 2)), np.zeros(1, int), np.zeros((1, 2)), np.zeros(1)
+    return Trajectories(zeros, poses, *shown, np.array([peak]), np.array([wanted], bool), *rest)
 
 
 @pytest.fixture(scope="module")

@@ -87,9 +87,8 @@ def test_interface_reading_is_the_force_of_the_beams_under_the_footprint(cache):
     """Two of a layer's beams and a half: E A / h times their shortening, by hand."""
     body = Sheet([0.06, 0.06], [6, 6], THREE)
     pressure = torch.rand(body.shape, generator=torch.Generator().manual_seed(0)) * 1e5
-    skin = PlatesAndBeams(
-        body, at((0.03, 0.02, 0.003), footprint=(0.02, 0.01)), reading="interface", cache=cache
-    )
+    sensor = at((0.03, 0.02, 0.003), footprint=(0.02, 0.01))
+    skin = PlatesAndBeams(body, sensor, reading="interface", cache=cache)
     lower, upper = (
         build(Structure(body), at((0.02, 0.02, z), (0.03, 0.02, z), (0.04, 0.02, z))).sensor
         @ pressure.double().numpy().ravel()

@@ -22,6 +22,12 @@ BODIES = {
     "4x5, three layers": Sheet([0.06, 0.05], [4, 5], [DRAGON, ECOFLEX, FOAM]),
 }
 LOADS = ("one cell off the centre", "random")
+# Every body with either constraint and with either load, and every constraint with either load.
+CASES = [
+    (name, constraint, LOADS[(number + turn) % 2])
+    for number, name in enumerate(BODIES)
+    for turn, constraint in enumerate(("vertical", "free"))
+]
 
 
 def load(body: Sheet, kind: str) -> np.ndarray:
@@ -37,14 +43,6 @@ def solved(structure: Structure, pressure: np.ndarray):
     model = pynite_model.model(structure, pressure)
     pynite_model.solve(model)
     return model, pynite_model.displacements(model, structure)
-
-
-# Every body with either constraint and with either load, and every constraint with either load.
-CASES = [
-    (name, constraint, LOADS[(number + turn) % 2])
-    for number, name in enumerate(BODIES)
-    for turn, constraint in enumerate(("vertical", "free"))
-]
 
 
 @pytest.fixture(scope="module", params=CASES, ids=" ".join)
@@ -82,9 +80,8 @@ def test_pynite_agrees_with_the_cached_operator_on_sensors_at_every_interface(ca
 
     def moved(dof: int, sign: int, levels: np.ndarray) -> np.ndarray:
         into = [RegularGridInterpolator(lines, sign * layer[..., dof]) for layer in expected]
-        return np.array(
-            [into[level](position[[1, 0]])[0] for level, position in zip(levels, where, strict=True)]
-        )
+        given = zip(levels, where[:, ::-1], strict=True)
+        return np.array([into[level](position)[0] for level, position in given])
 
     top = np.full(count, len(body.layers) - 1)
     at_sensor, at_surface = moved(2, -1, levels), moved(2, -1, top)

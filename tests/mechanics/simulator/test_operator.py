@@ -22,7 +22,6 @@ def same(first, second) -> bool:
 
 @pytest.fixture
 def built(monkeypatch) -> list:
-    """Count how often an operator is built."""
     calls: list = []
 
     def counted(*args):

@@ -26,8 +26,6 @@ def sensors(*positions, normals=(0.0, 0.0, 1.0)):
 
 
 MIDDLE = sensors((0.04, 0.04, 0.005))
-
-
 TWO = sensors((0.021, 0.035, 0.005), (0.06, 0.02, 0.009), normals=[(0.3, 0.1, 0.9), (0, 0, 1)])
 
 
@@ -100,12 +98,9 @@ def test_sensors_of_three_axes_read_what_endless_layers_do():
     sheet, middle, rim = Sheet([0.09, 0.09], [18, 18], [LAYERS[1] | {"thickness": 0.01}]), 0.045, 0.0015
     skin = Solid(sheet, Sensors(np.array([[middle, middle, 0.0055]] * 3), FOOTPRINT, directions=np.eye(3)))
     fingertips = middle + np.array([[0, 0], [0.004, 0.002], [-0.007, 0.006], [0.002, -0.015]])
-    loads = Fingertip(sheet, rim, smooth=True)(
-        torch.tensor([[x, y, 0.009, 1.0] for x, y in fingertips.tolist()])
-    )
-    ours = np.stack(
-        [skin.press(loads, torch.tensor(way)).readings for way in ([1.0, 0], [0, 1.0], [0, 0.0])], -1
-    )
+    touches = torch.tensor([[x, y, 0.009, 1.0] for x, y in fingertips.tolist()])
+    loads, ways = Fingertip(sheet, rim, smooth=True)(touches), torch.tensor([[1.0, 0], [0, 1], [0, 0]])
+    ours = np.stack([skin.press(loads, way).readings for way in ways], -1)
     ours[..., :2] -= ours[..., 2:]
     edges = rim * np.log(np.arange(1, 32, 2) / np.arange(31, 0, -2))  # a soft rim is a mean of discs
     table = Discs([Slab(0.01, 170e3, 0.499)], 0.0055, (0.008, 0.01), 0.05, edges.tolist())
@@ -118,9 +113,8 @@ def test_sensors_of_three_axes_read_what_endless_layers_do():
 
 def test_simulators_of_one_body_share_its_factors(tmp_path, monkeypatch):
     made, kept = [], {"cache": tmp_path}
-    monkeypatch.setattr(
-        "skin.mechanics.simulator.solid.Cholesky", lambda *given: made.append(given) or Cholesky(*given)
-    )
+    counted = lambda *given: made.append(given) or Cholesky(*given)  # noqa: E731
+    monkeypatch.setattr("skin.mechanics.simulator.solid.Cholesky", counted)
     coarse, fine = (Sheet([0.06, 0.06], [count, count], LAYERS) for count in (6, 12))
     skins = [solid(sensors((x, 0.03, 0.005)), coarse, **kept) for x in (0.03, 0.02)]
     assert len(made) == 2  # a fine and a coarse mesh
@@ -167,17 +161,13 @@ def test_what_no_solid_can_be(settings, reason):
 
 
 def test_the_measured_ratio_of_dragon_skin_is_replaced_in_python_as_in_the_configuration():
-    where, settings = sensors((0.06, 0.06, 0.005)), {"divisions": 1}
-    made = [
-        Solid(Sheet([0.12, 0.12], [12, 12], [{"material": material, "thickness": 0.01}]), where, **settings)
-        for material in (
-            "Dragon Skin 10 Medium",
-            {"name": "Dragon Skin 10 Medium", "poisson": 0.49},
-            {"name": "other", "young": 560e3, "poisson": 0.49},
-        )
-    ]
-    assert torch.equal(made[0].transfer, made[1].transfer)
-    assert torch.equal(made[0].transfer, made[2].transfer)
+    dragon, other = "Dragon Skin 10 Medium", {"name": "other", "young": 560e3, "poisson": 0.49}
+    transfers = []
+    for material in (dragon, {"name": dragon, "poisson": 0.49}, other):
+        sheet = Sheet([0.12, 0.12], [12, 12], [{"material": material, "thickness": 0.01}])
+        transfers.append(solid(sensors((0.06, 0.06, 0.005)), sheet, divisions=1).transfer)
+    assert torch.equal(transfers[0], transfers[1])
+    assert torch.equal(transfers[0], transfers[2])
 
 
 def test_an_impossible_ratio_is_refused_by_name():

@@ -28,6 +28,7 @@ LAYERS = [
     {"material": {"name": "muscle", "young": 560e3, "poisson": 0.49}, "thickness": 0.010},
     {"material": {"name": "skin", "young": 170e3, "poisson": 0.499}, "thickness": 0.005},
 ]
+_GAUSS = (np.array([-1, 1]) / np.sqrt(3) + 1) / 2
 
 
 @pytest.mark.parametrize(("seed", "shear"), [(0, 0.0), (1, 0.5)])
@@ -49,35 +50,20 @@ def test_the_operator_agrees_with_scikit_fem_on_single_frames(seed, shear):
     assert ours == pytest.approx([theirs.reading, theirs.sensor, theirs.surface], rel=1e-8)
 
 
-_GAUSS = (np.array([-1, 1]) / np.sqrt(3) + 1) / 2
-
-
 @dataclass(frozen=True)
 class FrameSolution:
-    """The solution of one frame.
-
-    Attributes:
-        reading: normal force on a rectangle of whole cells, N.
-        sensor: displacement into the skin of the node in its middle, m.
-        surface: the same of the node above, m.
-    """
-
-    reading: float
-    sensor: float
-    surface: float
+    reading: float  # normal force on a rectangle of whole cells, N
+    sensor: float  # displacement into the skin of the node in its middle, m
+    surface: float  # the same of the node above, m
 
 
 def solve_frame(
     mesh: Hexahedra, pressure: np.ndarray, shear: float, position: np.ndarray, extent: float
 ) -> FrameSolution:
-    """Solve a flat skin under one frame in the mixed form, with one pressure unknown per element.
+    """Solve a flat skin under a pressure (H, W), Pa, in the mixed form: one pressure unknown per element.
 
-    Args:
-        mesh: gives points, cells and materials.
-        pressure: (H, W), Pa.
-        shear: tangential traction along x divided by the pressure.
-        place: (3,), m: a node between two rows of elements.
-        extent: side of the sensor's footprint, m: whole cells about the node.
+    ``shear`` is the traction along x by the pressure; ``position`` (3,), m, is a node between two rows of
+    elements, and ``extent`` the side of the sensor's footprint, m, of whole cells about the node.
     """
     points = MeshHex(mesh.nodes.T.copy(), mesh.corners.T.copy())
     basis = CellBasis(points, ElementVector(ElementHex1()), intorder=2)
@@ -86,9 +72,8 @@ def solve_frame(
     lam, mu = (constant.repeat(columns * rows) for constant in mesh.lame)
     shape = basis.dx.shape
     fields = {"mu": np.broadcast_to(mu[:, None], shape), "lam": np.broadcast_to(lam[:, None], shape)}
-    elastic = BilinearForm(lambda u, v, w: 2 * w.mu * ddot(sym_grad(u), sym_grad(v))).assemble(
-        basis, **fields
-    )
+    stiff = BilinearForm(lambda u, v, w: 2 * w.mu * ddot(sym_grad(u), sym_grad(v)))
+    elastic = stiff.assemble(basis, **fields)
     grown = BilinearForm(lambda u, q, w: div(u) * q).assemble(basis, inner)
     squeezed = BilinearForm(lambda p, q, w: p * q / w.lam).assemble(inner, **fields)
     whole = sp.block_array([[elastic, grown.T], [grown, -squeezed]]).tocsr()
@@ -107,9 +92,8 @@ def solve_frame(
     below = np.array([position[0], position[1], -position[2]])
     above = np.array([position[0], position[1], 0.0])
     sensor, surface = (-_at(points, basis, moved, spot)[2] for spot in (below, above))
-    return FrameSolution(
-        _reading(points, basis, moved, squeeze, fields["mu"], mesh, position, extent), sensor, surface
-    )
+    reading = _reading(points, basis, moved, squeeze, fields["mu"], mesh, position, extent)
+    return FrameSolution(reading, sensor, surface)
 
 
 def _solve(matrix, right, whole, free) -> np.ndarray:
@@ -122,7 +106,6 @@ def _solve(matrix, right, whole, free) -> np.ndarray:
 
 
 def _at(points: MeshHex, basis: CellBasis, moved: np.ndarray, spot: np.ndarray) -> np.ndarray:
-    """Return the displacement (3,) of the node at a place."""
     node = np.linalg.norm(points.p - spot[:, None], axis=0).argmin()
     return moved[basis.nodal_dofs[:, node]]
 

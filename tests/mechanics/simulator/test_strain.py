@@ -9,9 +9,7 @@ from skin.mechanics.simulator.fem import PlatesAndBeams
 from skin.mechanics.simulator.solid import Solid
 
 SOFT = {"name": "soft", "young": 1e5, "poisson": 0.3}
-BODY = Sheet(
-    [0.2, 0.2], [10, 10], [{"material": SOFT, "thickness": 0.01}, {"material": SOFT, "thickness": 0.005}]
-)
+BODY = Sheet([0.2, 0.2], [10, 10], [{"material": SOFT, "thickness": high} for high in (0.01, 0.005)])
 SENSORS = Sensors(np.array([[0.1, 0.1, 0.005]]), (0.01, 0.01))
 
 

@@ -13,8 +13,6 @@ SMALL = ["simulator=naive", "layout=grid", "layout.rows=2", "layout.columns=3", 
 
 @pytest.fixture(scope="session")
 def untrained(configured):
-    """Return a function that builds a run of a learner without training it."""
-
     def build(*overrides: str) -> TorchModel:
         config = configured(*SMALL, *overrides)
         device, learner = build_device(config), build_learner(config)

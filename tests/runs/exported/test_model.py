@@ -19,6 +19,13 @@ from tests.damage import DAMAGED_FILES, damaged, mutated, opened
 onnx = pytest.importorskip("onnx")
 pytest.importorskip("onnxruntime")
 
+SIZES = ("simulator=naive", "layout=grid", "layout.rows=2", "layout.columns=3")
+ABOUT = ModelMetadata(
+    "abc", "title", "1", ["a", "b"], "binary", None, False, 10.0, 3, [(0.0, 0.0, 0.0)] * 4, (0.1, 0.1),
+    10.0, 0.5, 0.3, False, 3.0,
+)  # fmt: skip
+WINDOW = np.ones((1, 3, 4), np.float32), np.ones((1, 3, 4), bool)
+
 
 def test_it_describes_itself(exported):
     of, path = exported
@@ -40,7 +47,6 @@ def test_positions_stay_where_a_process_gets_the_tensors_of_a_run(exported):
 
 
 def changed(path, folder, change):
-    """Return a copy of a model with a changed description."""
     model = onnx.load(path)
     (entry,) = [one for one in model.metadata_props if one.key == KEY]
     known = json.loads(entry.value)
@@ -71,11 +77,12 @@ def test_other_files_are_refused(tmp_path):
     (tmp_path / "text.onnx").write_text("no model")
     with pytest.raises(InputError, match=r"cannot read the model .*text.onnx"):
         OnnxModel(tmp_path / "text.onnx")
+    os.mkfifo(tmp_path / "pipe.onnx")
+    for path in (tmp_path / "pipe.onnx", Path("/dev/zero"), tmp_path):
+        with pytest.raises(InputError, match="it is not a regular file"):
+            OnnxModel(path)
     with pytest.raises(InputError, match="was not written by skin export"):
         ModelMetadata.parse({}, "x.onnx")
-
-
-SIZES = ("simulator=naive", "layout=grid", "layout.rows=2", "layout.columns=3")
 
 
 @pytest.mark.parametrize(
@@ -100,13 +107,6 @@ def test_a_skin_is_described_unless_its_sensors_are_those_of_a_recording(untrain
     assert described == {name: settings[name] for name in described}
     assert set(described) == {"body", "layout", "simulator", "touch", "evaluation"}
     assert describe_skin(settings, np.zeros((4, 3))) is None
-
-
-ABOUT = ModelMetadata(
-    "abc", "title", "1", ["a", "b"], "binary", None, False, 10.0, 3, [(0.0, 0.0, 0.0)] * 4, (0.1, 0.1),
-    10.0, 0.5, 0.3, False, 3.0,
-)  # fmt: skip
-WINDOW = np.ones((1, 3, 4), np.float32), np.ones((1, 3, 4), bool)
 
 
 def model(nodes="", constants="", domains=""):
@@ -138,10 +138,6 @@ def written(tmp_path_factory):
     return write(model(), tmp_path_factory.mktemp("onnx") / "skin.onnx")
 
 
-def test_a_sealed_file_is_used(written):
-    assert OnnxModel(written).probabilities(*WINDOW).shape == (1, 2)
-
-
 @DAMAGED_FILES
 @given(data=st.data())
 def test_damage_never_passes_for_a_network(written, data):
@@ -164,7 +160,6 @@ def huge(size):
 
 
 def outside():
-    """Return a model with weights in another file."""
     made = model()
     weights = made.graph.initializer[1]
     weights.ClearField("float_data")
@@ -186,13 +181,6 @@ def outside():
 def test_what_no_network_needs_is_refused(tmp_path, made):
     with pytest.raises(InputError, match="ONNX Runtime cannot load"):
         OnnxModel(write(made(), tmp_path / "skin.onnx"))
-
-
-def test_what_is_no_file_is_refused(tmp_path):
-    os.mkfifo(tmp_path / "pipe.onnx")
-    for path in (tmp_path / "pipe.onnx", Path("/dev/zero"), tmp_path):
-        with pytest.raises(InputError, match="it is not a regular file"):
-            OnnxModel(path)
 
 
 def test_outputs_that_are_no_probabilities_are_refused(tmp_path):

@@ -109,40 +109,26 @@ class Operators(nn.Module):
     """Every operator that has a translation."""
 
     def forward(self, rows, counts, pairs, matrices):
-        strength = torch.linalg.svdvals(matrices)[:, :4]
-        return (
-            rows.nanmedian(dim=1).values.nan_to_num(-1),
-            counts.cummax(dim=1).values,
-            torch.linalg.eigvalsh(pairs),
-            strength,
-        )
+        medians, maxima = rows.nanmedian(dim=1).values.nan_to_num(-1), counts.cummax(dim=1).values
+        return medians, maxima, torch.linalg.eigvalsh(pairs), torch.linalg.svdvals(matrices)[:, :4]
 
 
 @pytest.fixture(scope="module")
 def translated(tmp_path_factory):
-    """Return a function that computes the operators with ONNX Runtime."""
     path = tmp_path_factory.mktemp("operators") / "operators.onnx"
     example = torch.rand(3, 9), torch.ones(3, 6, 2, dtype=torch.int32), torch.eye(2)[None].repeat(3, 1, 1)
-    batch = {0: torch.export.Dim("batch")}
+    names = ["rows", "counts", "pairs", "matrices"]
+    settings = {"dynamo": True, "opset_version": 20, "verbose": False, "input_names": names}
+    settings |= {"dynamic_shapes": ({0: torch.export.Dim("batch")},) * 4}
+    settings |= {"custom_translation_table": TRANSLATIONS}
     with warnings.catch_warnings(action="ignore"):
-        torch.onnx.export(
-            Operators(),
-            (*example, torch.rand(3, 8, 5)),
-            path,
-            dynamo=True,
-            dynamic_shapes=(batch,) * 4,
-            input_names=["rows", "counts", "pairs", "matrices"],
-            opset_version=20,
-            custom_translation_table=TRANSLATIONS,
-            verbose=False,
-        )
+        torch.onnx.export(Operators(), (*example, torch.rand(3, 8, 5)), path, **settings)
     session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
     names = [given.name for given in session.get_inputs()]
     return lambda *given: session.run(None, dict(zip(names, [one.numpy() for one in given], strict=True)))
 
 
 def rank(values, seed):
-    """Return a matrix (8, 5) with given singular values."""
     generator = np.random.default_rng(seed)
     left, right = (np.linalg.qr(generator.normal(size=(n, n)))[0] for n in (8, 5))
     return (left[:, :5] * values) @ right

@@ -33,7 +33,7 @@ with chdir(folder):
     run = skin.load_run("latest")
 recording = run.device.recording("test", complete=False)
 true = recording.touches.labels.numpy() > 0.5
-predicted = run.predict(recording.touches).numpy() > 0.5
+predicted = run.predict(recording.touches.readings) > 0.5
 
 # %%
 # Shares of the safe and of the dangerous touches, and their numbers.

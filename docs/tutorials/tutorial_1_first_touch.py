@@ -73,8 +73,8 @@ with chdir(folder):
 with chdir(folder):
     run = skin.load_run("latest")
 touches = run.device.touches("test")[:5]
-probabilities = run.predict(touches)
-alarms = run.point.alarm(probabilities[:, run.labels.index("dangerous")])
+probabilities = run.predict(touches.readings)
+alarms = probabilities[:, run.labels.index("dangerous")] > run.threshold
 print(*(f"{label:>10}" for label in run.labels), "     alarm", "  truly dangerous")
 for row, alarm, truth in zip(probabilities, alarms, touches.labels, strict=True):
     print(

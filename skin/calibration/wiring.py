@@ -144,10 +144,10 @@ def match_channels(responses: Responses, per_newton: np.ndarray) -> tuple[np.nda
         per_newton: (P, S), true readings per N of every press.
 
     Returns:
-        residual: (channels, sensors), fraction of a channel's energy that the prediction does not explain
-            with any gain and limit, without that of the noise: 0 to 1.
-        sign: (channels, sensors), 1 or -1: whether the channel rises or falls with force.
-        expected: (sensors,), largest prediction, as a fraction of the largest of all.
+        The residual, (channels, sensors): fraction of a channel's energy, without that of the noise, that the
+        prediction does not explain with any gain and limit, 0 to 1. The sign, (channels, sensors), 1 or -1:
+        whether the channel rises or falls with force. The largest prediction for each sensor, (sensors,), as
+        a fraction of the largest of all.
     """
     prediction = responses.force[:, None] * per_newton[responses.press]  # N, (F, S)
     largest = np.abs(prediction).max(axis=0)

@@ -69,6 +69,23 @@ def test_a_mistyped_verb_is_told_the_right_one(verb, words, capsys):
     assert words in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("override", "said"),
+    [
+        ("learner.rounds=20", "no setting or group learner.rounds, but learner=boosted_trees has it"),
+        ("model=cn", "there is no model=cn: did you mean "),
+        ("seed=[", "seed=["),
+    ],
+)
+def test_what_cannot_be_composed_is_one_sentence(override, said, capsys):
+    with pytest.raises(SystemExit) as stop:
+        main(["train", override])
+    assert stop.value.code == 2
+    text = capsys.readouterr().err
+    assert said in text
+    assert text.count("\n") == 1
+
+
 @pytest.mark.skipif(shutil.which("bash") is None, reason="needs bash")
 @pytest.mark.parametrize(
     ("line", "choices"),

@@ -81,7 +81,7 @@ def spread_readings(noise: Noise, rows: np.ndarray, width: np.ndarray) -> tuple[
     """
     own = np.array([noise.relative, noise.position, noise.position, 0]) ** 2
     boxes = own + np.pad(width**2 / 12, [(0, 0), (1, 0)])
-    squares = np.square(rows).sum(2)
+    squares = np.einsum("nkls,nkls->nks", rows, rows)
     both = np.stack(np.broadcast_arrays(own, boxes), axis=1).astype(np.float32) @ squares
     return both[:, 0], both[:, 1]
 
@@ -158,7 +158,8 @@ def refit_force(
     force = np.exp(mode)[:, None]
     weight = frame.counts / (force * force * spread + np.float32(frame.noise.floor))
     weighted = readings * weight[:, None]
-    pull, gram = weighted @ frame.readings, weighted @ readings.transpose(0, 2, 1)
+    # Matrices are so small that calls of BLAS take longer than the products.
+    pull, gram = np.vecdot(weighted, frame.readings), np.vecdot(weighted[:, :, None], readings[:, None])
     # What a tangential force explains does not count for the force.
     inverse, _ = invert_on_prior(gram[:, 1:, 1:] * force[..., None] ** 2)
     cross = gram[:, 0, 1:]

@@ -356,7 +356,15 @@ class Posterior:
         odds = self._large.evidence(frame) + math.log(self.prior.large) - total if self._large else -math.inf
         large = float(expit(odds))
         fingertip = number > 0 and fit >= _FITS and large < 0.5
-        return FrameEstimate(number, probabilities, contacts, fit, large, fingertip, _unknown(sensors, frame))
+        return FrameEstimate(
+            number,
+            probabilities,
+            contacts,
+            fit,
+            large,
+            fingertip,
+            _unknown(sensors, frame, self.prior, contacts[0].force if contacts else 0.0),
+        )
 
     def _several(
         self, frame: Observation, single: Cloud, maximum: int
@@ -421,7 +429,7 @@ class Posterior:
         )
 
 
-def _unknown(sensors: int, frame: Observation) -> str | None:
+def _unknown(sensors: int, frame: Observation, prior: FingertipPrior, force: float) -> str | None:
     """Return what a frame cannot determine, in a sentence."""
     if sensors == 0:
         return "no sensor is valid: nothing is known beyond the prior"
@@ -432,4 +440,6 @@ def _unknown(sensors: int, frame: Observation) -> str | None:
         )
     if len(frame.clipped):
         return f"beyond the range of sensors {frame.clipped.tolist()}: force and position may be elsewhere"
+    if force > prior.force * math.exp(2 * prior.spread):  # the prior draws it towards what it expects
+        return f"{force:.3g} N is beyond the range of the prior: force and position may be elsewhere"
     return None

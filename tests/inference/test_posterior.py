@@ -336,9 +336,11 @@ def test_a_force_far_above_the_prior_is_held_or_said_to_be_beyond_the_range():
     touches[..., 3] = 150.0
     noise, true = Noise(0.05, 10, clip=1.0), true_readings(touches, thin=True)
     for row in np.flatnonzero((true > noise.clip).any(1)):
-        estimate = posterior(True, noise).estimate(np.minimum(measure(true[row], noise, 3), noise.clip))
-        held = any(each.region().contains(touches[row, 0, :2]) for each in estimate.contacts)
-        assert held or "beyond the range of sensors" in estimate.unknown
+        clipped = posterior(True, noise).estimate(np.minimum(measure(true[row], noise, 3), noise.clip))
+        for estimate in (clipped, posterior(True, prior=SINGLE).estimate(measure(true[row], NOISE, 3))):
+            held = any(each.region().contains(touches[row, 0, :2]) for each in estimate.contacts)
+            assert held or "beyond the range of " in estimate.unknown
+    assert "beyond the range of the prior" in posterior(True, prior=SINGLE).estimate(true[0]).unknown
     assert posterior(True, noise).estimate(np.minimum(true[0] / 300, 0.9)).unknown is None
 
 

@@ -88,7 +88,7 @@ reproduce-table: $(READY)  ## train the models of the results table and print it
 	$(BIN)/skin study study=table 'study.seeds=[$(shell seq -s , 0 $$(($(SEEDS) - 1)))]' \
 		$(if $(filter smoke,$(BUDGET)),smoke=true) $(if $(SIMULATORS),'study.trainings.0.simulator=[$(SIMULATORS)]')
 
-results: $(READY) $(if $(filter tuned,$(PART)),$(PEERS)/.ready)  ## publish all results in 6 h: PART=table 1.6 h, best_fresh 1.82 h, best_fresh_solid 1.05 h, sensors 0.15 h, any_skin 0.27 h, studies 0.46 h, design 0.48 h; not of all: tuned 0.85 h, gestures 0.3 h, networks 1.0 h, table_solid 1.1 h, devices 0.75 h, guarantee 2.0 h, graphs 1.9 h, other_skins 0.4 h, images 0.45 h (JOBS=2, FRESH=1)
+results: $(READY) $(if $(filter tuned,$(PART)),$(PEERS)/.ready)  ## publish all results in 6 h: PART=table 1.6 h, best_fresh 1.82 h, best_fresh_solid 1.05 h, sensors 0.15 h, any_skin 0.27 h, studies 0.46 h, design 0.48 h; not of all: tuned 0.85 h, gestures 0.3 h, networks 1.0 h, table_solid 1.1 h, devices 0.75 h, guarantee 2.0 h, graphs 1.9 h, other_skins 0.4 h, images 1.6 h (JOBS=2, FRESH=1)
 	$(BIN)/skin results results.part=$(PART) $(if $(FRESH),tracking.uri=sqlite:///results/fresh.db tracking.artifacts=results/fresh) $(if $(JOBS),results.jobs=$(JOBS))
 
 wheel-check: $(READY)  ## install the wheel in an empty environment; train and evaluate a small model and run the demo there

@@ -243,7 +243,8 @@ def base_readings(
     weight: that of a bar under an eccentric force.
 
     Raises:
-        InputError: an incline that leaves a direction of sensors without load, or without such sensors.
+        InputError: an incline that leaves a direction of sensors without load, without such sensors, or of a
+            body that is not flat.
     """
     positions = np.clip(sensors.positions[:: sensors.axes, :2], load.base, np.array(body.size) - load.base)
     images = torch.cat([*pressed_images(body, stair_gauge(positions, indenter="disc", radius=load.base))])
@@ -259,11 +260,12 @@ def base_readings(
         friction = slope * torch.stack([down.cos(), down.sin()])[None] if slope else None
         readings.append(model(pressure, friction).readings.double().numpy())
     expected = np.stack(readings)
-    if load.incline and (sensors.axes == 1 or not _find_own(expected)[1].all()):
+    if load.incline and not (body.flat and sensors.axes > 1 and _find_own(expected)[1].all()):
         raise InputError(
             "this incline does not load each axis along the surface, of layout.axes=three, by "
             f"{_ALONG:.0%} of the one inwards: give directions between the axes, as in {_INCLINED}, "
-            "a steeper incline or a flatter weight; leave it out where sensors have one axis"
+            "a steeper incline or a flatter weight; leave it out where sensors have one axis or "
+            "the body is no flat sheet"
         )
     return expected
 

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from skin.body.arm import Arm
 from skin.body.base import Sensors, Sheet
 from skin.body.layout import Grid
 from skin.calibration.bench import BenchSession
@@ -139,6 +140,17 @@ def test_inclines_that_give_no_gains_are_refused(incline, axes, reason):
         model = Solid(skin.body, sensors)
     with pytest.raises(InputError, match=reason):
         base_readings(model, skin.body, sensors, KnownLoad.of(2.0, 0.02, skin.size, *incline))
+
+
+def test_an_incline_of_an_arm_is_refused():
+    """Downhill is another direction of the surface at every place of it."""
+    layers = [{"material": "EcoFlex 00-30", "thickness": 0.015}]
+    arm = Arm(radius=0.05, length=0.16, angle=3.2, cells=[12, 12], layers=layers)
+    sensors = Grid(2, 2, depth=0.005, axes="three").sensors(arm)
+    with free():
+        model = Solid(arm, sensors)
+    with pytest.raises(InputError, match="the body is no flat sheet"):
+        base_readings(model, arm, sensors, INCLINED)
 
 
 def test_an_untouched_session_has_no_placement():

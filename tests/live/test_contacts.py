@@ -182,7 +182,8 @@ def test_where_a_hard_touch_is_is_shown_though_no_fingertip_fits_it(posterior, f
     (best,) = message["contacts"]
     assert np.hypot(best["x"] - TRUTH[0, 0], best["y"] - TRUTH[0, 1]) < 0.005
     assert best["force"] == pytest.approx(25, rel=0.2)
-    head, line = contact_text_lines(message)
+    head, line, note = contact_text_lines(message)
+    assert "beyond the range of the prior" in note
     assert head == "not a fingertip (fit 0.0021, a larger contact 30 %)"
     assert line.startswith("best: (")
     assert " N, " in line

@@ -100,9 +100,10 @@ def store_check(check: Check) -> Path:
             written.
     """
     if not all(abs(ratio - 1) <= AGREES for ratio in check.ratios.values()):
-        text = ", ".join(f"{ratio:.3g} (sensor {sensor})" for sensor, ratio in check.ratios.items())
         raise InputError(
-            f"the readings are those of the load times {text}, not within {AGREES:.0%} of 1: correct "
+            "the readings are those of the load times "
+            + ", ".join(f"{ratio:.3g} (sensor {sensor})" for sensor, ratio in check.ratios.items())
+            + f", not within {AGREES:.0%} of 1: correct "
             f"device.scale or calibrate again; nothing was stored (usual factors or their inverse: 9.8 kg "
             "and N, 4.45 lbf, 2.2 lb, 1000 g, 2.8 a calibration with simulator=fem, below 0 polarity)"
         )

@@ -52,10 +52,11 @@ def fit_calibration(bench: BenchData, presses: Collection[int] | None = None) ->
     """
     used = range(len(bench.gauge)) if presses is None else presses
     raw, responses = bench.session.raw, collect_responses(bench)
-    counts = (np.isfinite(raw) & bench.idle[:, None]).sum(axis=0)
-    responding = responses.responding & (counts >= QUIET)
-    broken = _find_broken(bench.session, bench.true.max(axis=0), responding)
-    usable = ~np.isin(np.arange(raw.shape[1]), np.concatenate([*broken.values()]))
+    broken = _find_broken(
+        bench.session,
+        bench.true.max(axis=0),
+        responses.responding & (np.isfinite(raw[bench.idle]).sum(axis=0) >= QUIET),
+    )
     rests = measure_rests(bench.session, bench.idle)
     polarity, (offset, drift) = find_polarity(responses, bench.each), rests[["offset", "drift"]].to_numpy().T
     changes = polarity * (raw - offset - drift * bench.session.time[:, None])
@@ -63,7 +64,8 @@ def fit_calibration(bench: BenchData, presses: Collection[int] | None = None) ->
     noise, loads = np.hypot(rests["noise"], rests["quantum"] / math.sqrt(12)), Loads(bench, used)
     channels = {
         number: channel
-        for number in np.flatnonzero(usable & (driven >= _PRESSED * driven.max())).tolist()
+        for number in np.flatnonzero(driven >= _PRESSED * driven.max()).tolist()
+        if not any(number in group for group in broken.values())
         if (channel := fit_channel(loads, bench.each[:, number], changes[:, number], noise[number]))
     }
     if not any(channel.known for channel in channels.values()):
@@ -78,11 +80,13 @@ def _find_broken(session: BenchSession, pressed: np.ndarray, responding: np.ndar
     """Return the broken channels by kind: those that never change, or are silent though ``pressed``, N."""
     largest, table = float(np.nanmax(session.raw, initial=-np.inf)), pd.DataFrame(session.raw)
     limit = min(2**session.bits - 1 if session.bits else np.inf, _LIMIT * largest)
-    silent = (pressed >= _PRESSED * pressed.max()) & ~responding
     still, level = table.nunique().to_numpy() < 2, table.bfill().iloc[0].fillna(0.0).to_numpy()
     fixed, full = still & (level != 0), (level >= limit) & (limit > 0)
-    kinds = {"dead": ~fixed & (still | silent), "stuck": fixed & ~full, "saturated": fixed & full}
-    return {kind: np.flatnonzero(kinds[kind]).tolist() for kind in BROKEN}
+    dead = ~fixed & (still | (pressed >= _PRESSED * pressed.max()) & ~responding)
+    return {
+        kind: np.flatnonzero(where).tolist()
+        for kind, where in zip(BROKEN, (dead, fixed & ~full, fixed & full), strict=True)
+    }
 
 
 def _curved_noise(bench: BenchData, curves: Curves, number: int, change: np.ndarray) -> float:
@@ -110,9 +114,10 @@ def _describe(
     at = math.exp(float(np.median([channel.middle[1] for channel in bent.values()]))) if bent else 1.0
     tables = {n: channel.table(at) for n, channel in bent.items() if channel.kind == "table"}
     values["clip"] = pd.Series({n: channel.clip for n, channel in channels.items()})
-    values["gain"] = pd.Series({n: channel.gain(at) for n, channel in known.items()})
-    for name in ("hysteresis", "time_constant"):
-        values[name] = pd.Series({n: getattr(channel, name) for n, channel in known.items()})
+    fitted = {
+        n: [channel.gain(at), channel.hysteresis, channel.time_constant] for n, channel in known.items()
+    }
+    values[["gain", "hysteresis", "time_constant"]] = pd.DataFrame.from_dict(fitted, orient="index")
     if bent:
         values["exponent"] = pd.Series(
             {n: channel.slopes[0] if channel.kind == "power" else 1.0 for n, channel in known.items()}
@@ -154,9 +159,11 @@ def convert_to_newton(
     """
     alive = ~np.isin(np.arange(len(polarity)), np.concatenate([*broken.values()]))
     # Counts have an unknown zero, common to all channels; readings in N do not.
-    scale, zero = 1.0, 0.0
-    if session.unit != "N":
-        scale, zero = 1 / float(np.nanmedian(values["gain"])), float(np.median(values["offset"][alive]))
+    scale, zero = (
+        (1.0, 0.0)
+        if session.unit == "N"
+        else (1 / float(np.nanmedian(values["gain"])), float(np.median(values["offset"][alive])))
+    )
     values = values.assign(offset=polarity * (values["offset"] - zero))
     forces = values.columns.difference(["hysteresis", "time_constant", "exponent"])
     # Six digits, and no negative 0.
@@ -220,28 +227,27 @@ def evaluate_held_out(bench: BenchData, fraction: float) -> HeldOutErrors:
     count = min(len(spare), max(1, round(fraction * len(bench.gauge))))
     held = spare[np.linspace(0, len(spare) - 1, count).round().astype(int)].tolist()
     calibration = fit_calibration(bench, set(range(len(bench.gauge))) - set(held))
-    answers, simulated = bench.each[bench.applied[1]], predict_session(bench, calibration)
-    responding = answers > _RESPONDING * answers.max(axis=1, keepdims=True)
-    alive = ~calibration.values()["dead"] & np.isfinite(bench.session.raw)
-    counted = np.isin(bench.applied[1], held)[:, None] & responding & alive
-    measured, tared = calibration.newtons(bench.session.raw), bench.true + calibration.values()["offset"]
+    # 0 outside of held-out presses, where no sensor counts.
+    answers = np.where(np.isin(bench.applied[1], held)[:, None], bench.each[bench.applied[1]], 0.0)
+    counted = np.isfinite(calibration.corrected(bench.session.raw)) & (
+        answers > _RESPONDING * answers.max(axis=1, keepdims=True)
+    )
+    measured, simulated = calibration.newtons(bench.session.raw), predict_session(bench, calibration)
+    sides = bench.true, bench.true + calibration.values()["offset"], simulated
     rmse = {
         name: float(np.sqrt(np.mean((side - measured)[counted] ** 2)))
-        for name, side in (("simulated", bench.true), ("tared", tared), ("calibrated", simulated))
+        for name, side in zip(("simulated", "tared", "calibrated"), sides, strict=True)
     }
     shown = simulated / (calibration.scale * calibration.signs) + calibration.zero
-    loaded, ratios = bench.loading & (bench.applied[0] > _LOADED * bench.gauge.force.max()), list[float]()
-    for number in held:
-        rows, each = loaded & (bench.applied[1] == number), bench.each[number]
-        force, expected = (estimate_force(raw[rows], each, calibration) for raw in (bench.session.raw, shown))
-        ratios.append(pd.Series(force / expected).median())
-    return HeldOutErrors(rmse, held, pd.Series(ratios).dropna().to_numpy())
+    loaded = bench.loading & (bench.applied[0] > _LOADED * bench.gauge.force.max())
+    force, expected = (estimate_force(raw, answers, calibration) for raw in (bench.session.raw, shown))
+    ratios = pd.Series(force / expected)[loaded].groupby(bench.applied[1][loaded]).median()
+    return HeldOutErrors(rmse, held, ratios.dropna().to_numpy())
 
 
 def predict_session(bench: BenchData, calibration: Calibration) -> np.ndarray:
     """Return the simulated readings of a calibrated device without noise, (T, S), N."""
-    imperfection = Imperfection(calibration=calibration)
-    randomness = np.random.default_rng(0)
+    imperfection, randomness = Imperfection(calibration=calibration), np.random.default_rng(0)
     constants = imperfection.constants(bench.each.shape[1], randomness)._replace(noise=torch.zeros(()))
     true, time = (torch.from_numpy(values).float() for values in (bench.true, bench.session.time))
     return imperfection.raw(true[None], constants, randomness, time)[0].double().numpy()
@@ -252,7 +258,7 @@ def estimate_force(raw: np.ndarray, each: np.ndarray, calibration: Calibration) 
 
     Args:
         raw: (..., S), in the session's unit.
-        each: (S,), true readings per N of that indenter at that position, as
+        each: (S,) or (..., S), true readings per N of that indenter at that position, as
             :func:`skin.calibration.bench.per_newton` gives them.
         calibration: of this skin.
 
@@ -261,7 +267,8 @@ def estimate_force(raw: np.ndarray, each: np.ndarray, calibration: Calibration) 
     """
     true, values = calibration.corrected(raw), calibration.values()
     below = calibration.newtons(raw) - values["offset"] < _CLIPPED * values["clip"]
-    weights = np.where(below & np.isfinite(true) & (each > _RESPONDING * each.max()), each, 0.0)
+    felt = np.isfinite(true) & (each > _RESPONDING * each.max(axis=-1, keepdims=True))
+    weights = np.where(below & felt, each, 0.0)
     square = (weights**2).sum(axis=-1)
     return (weights * np.nan_to_num(true)).sum(axis=-1) / np.where(square > 0, square, np.nan)
 
@@ -317,9 +324,12 @@ def print_calibration(calibration: Calibration, errors: HeldOutErrors | None = N
         for name in QUANTITIES
         if name in calibration.ranges
     }
-    table = pd.DataFrame.from_dict(rows, orient="index", columns=["median", "least", "largest", ""])
-    about = ", ".join(f"{name} {value}" for name, value in calibration.about.items() if name != "unit")
-    print(about, table.to_string(float_format="{:.4g}".format), sep="\n")
+    print(*(f"{name} {value}" for name, value in calibration.about.items() if name != "unit"), sep=", ")
+    print(
+        pd.DataFrame.from_dict(rows, orient="index", columns=["median", "least", "largest", ""]).to_string(
+            float_format="{:.4g}".format
+        )
+    )
     gains = pd.Series(calibration.sensors["gain"], dtype=float)
     groups: dict[str, Sequence[int] | np.ndarray] = {
         **calibration.broken,
@@ -335,8 +345,10 @@ def print_calibration(calibration: Calibration, errors: HeldOutErrors | None = N
             print(f"{words}: sensors {list_numbers(numbers)} (from 0)")
     if errors is None:
         return
-    sides = ", ".join(f"{name} {value:.4f} N" for name, value in errors.rmse.items())
-    print(f"RMSE on {len(errors.held_out)} held-out presses: {sides}")
+    print(
+        f"RMSE on {len(errors.held_out)} held-out presses:",
+        ", ".join(f"{name} {value:.4f} N" for name, value in errors.rmse.items()),
+    )
     if len(errors.force):
         off = np.abs(errors.force - 1)
         print(f"force of these presses from readings: off by {np.median(off):.1%}, at most {off.max():.1%}")

@@ -46,10 +46,11 @@ def measure_rests(session: BenchSession, idle: np.ndarray) -> pd.DataFrame:
     """
     rests = []
     for values in session.raw.T:
-        quiet = np.isfinite(values) & idle
-        quiet = quiet if quiet.sum() >= QUIET else np.ones(len(values), dtype=bool)
-        step = find_quantum(values[np.isfinite(values)])
-        rests.append(measure_rest(session.time[quiet], np.nan_to_num(values[quiet]), step))
+        valid = np.isfinite(values)
+        quiet = valid & idle | ((valid & idle).sum() < QUIET)
+        rests.append(
+            measure_rest(session.time[quiet], np.nan_to_num(values[quiet]), find_quantum(values[valid]))
+        )
     return pd.DataFrame(rests)
 
 
@@ -129,8 +130,9 @@ def collect_responses(bench: BenchData) -> Responses:
     # Slow noise, which no mean reduces, shows between rests.
     error = np.fmax(noise * _MEDIAN / math.sqrt(count), MAD * rests.diff().abs().median().to_numpy())
     floor = np.max([_SURE * error, _VISIBLE * noise, _STEP * quantum], axis=0)
-    responding = np.abs(measured).max(axis=0) > floor
-    return Responses(measured, steps["force"].to_numpy(), numbers, error, responding)
+    return Responses(
+        measured, steps["force"].to_numpy(), numbers, error, np.abs(measured).max(axis=0) > floor
+    )
 
 
 def match_channels(responses: Responses, per_newton: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -165,8 +167,8 @@ def match_channels(responses: Responses, per_newton: np.ndarray) -> tuple[np.nda
     residual[strength[:, None] > _STRONGER * strength.max() * expected] = 1.0
     sign = np.where(best < 0, -1.0, 1.0)
     # Beside a press the surface may rise: a channel that is inverse alone has to fit better.
-    usual = sign == _sign_of_most(sign[np.arange(len(sign)), residual.argmin(axis=1)], responses)
-    return np.where(usual, residual, np.minimum(_INVERSE * residual, 1.0)), sign, expected
+    usual = _sign_of_most(sign[np.arange(len(sign)), residual.argmin(axis=1)], responses)
+    return np.where(sign == usual, residual, np.minimum(_INVERSE * residual, 1.0)), sign, expected
 
 
 def _sign_of_most(signs: np.ndarray, responses: Responses) -> float:
@@ -270,8 +272,11 @@ def wired_bench(device: Simulated, session: BenchSession, settings: BenchSetting
     bench = build_bench_data(device, replace(session, gauge=turned[(allowed or turns)[0]]))
     responses, found = collect_responses(bench), list[_Explanation]()
     for turn in allowed:
-        each = bench.each if turn == allowed[0] else per_newton(device.model, device.body, turned[turn])
-        found += _explain(turn, responses, each)
+        found += _explain(
+            turn,
+            responses,
+            bench.each if turn == allowed[0] else per_newton(device.model, device.body, turned[turn]),
+        )
     straight = found[0] if allowed[0] == settings.places else None
     limit = min(entry.residual.sum() for entry in found) + _CLEARLY
     # One change before two, and few channels before many.
@@ -340,12 +345,13 @@ def _explain(turn: Turn, responses: Responses, per_newton: np.ndarray) -> list[_
 def check_usable(calibration: Calibration) -> None:
     """Raise InputError if a calibration leaves more than a quarter of its sensors unusable."""
     if (count := int(calibration.values()["dead"].sum())) > _MOST * len(calibration):
-        words = "; ".join(
-            f"{kind}: {list_numbers(group)}" for kind, group in calibration.broken.items() if group
-        )
         raise InputError(
-            f"{count} of {len(calibration)} sensors would be unusable ({words}), and at most a quarter may "
-            "be: press near every sensor, check the supply and the cables of these channels, and record again"
+            f"{count} of {len(calibration)} sensors would be unusable ("
+            + "; ".join(
+                f"{kind}: {list_numbers(group)}" for kind, group in calibration.broken.items() if group
+            )
+            + "), and at most a quarter may be: press near every sensor, check the supply and the cables of "
+            "these channels, and record again"
         )
 
 

@@ -20,6 +20,14 @@ QUIET = 1e-3
 """N, least noise: a device without any would make each reading certain."""
 
 
+def thicken(body: "AbstractBody", sensors: "Sensors", factor: float) -> "tuple[AbstractBody, Sensors]":
+    """Return a body whose layers are thicker, and its sensors, deeper, by a factor."""
+    return (
+        replace(body, layers=tuple(replace(part, thickness=factor * part.thickness) for part in body.layers)),
+        replace(sensors, positions=sensors.positions * [1, 1, factor]),
+    )
+
+
 @dataclass(frozen=True)
 class Mechanics:
     """What contacts are estimated with.
@@ -76,9 +84,7 @@ class Mechanics:
         """Return the readings of a skin whose layers are thicker, and whose sensors deeper, by a factor."""
         from skin.inference.candidates import CandidateReadings
 
-        layers = tuple(replace(layer, thickness=factor * layer.thickness) for layer in self.body.layers)
-        body = replace(self.body, layers=layers)
-        sensors = replace(self.sensors, positions=self.sensors.positions * [1, 1, factor])
+        body, sensors = thicken(self.body, self.sensors, factor)
         return CandidateReadings(self.simulator(body, sensors), body, prior)
 
     def posterior(self) -> "Posterior":

@@ -2,7 +2,8 @@
 
 import json
 import logging
-from collections.abc import Iterator, Mapping, Sequence
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -16,12 +17,13 @@ import torch
 from annotated_types import Ge, Le
 from pydantic import NegativeFloat, NonNegativeInt, PositiveFloat
 
-from skin.body.base import AbstractBody, require_memory
+from skin.body.base import AbstractBody, Sensors, require_memory
 from skin.core.files import tabular, whole
 from skin.core.safe_loading import read_parts
 from skin.core.settings import checked, configured
 from skin.device.simulated import Simulated
 from skin.errors import InputError
+from skin.inference.mechanics import thicken
 from skin.mechanics.simulator.base import AbstractSimulator
 from skin.touch.fingertips import half_extents, peak_per_newton
 from skin.touch.shapes import Shapes
@@ -94,8 +96,12 @@ class BenchSettings:
         Raises:
             InputError: a value is invalid.
         """
-        names = cls.__dataclass_fields__.keys() & group.keys()
-        return configured(cls, {name: group[name] for name in names} | {"command": command}, command)
+        return configured(
+            cls,
+            {name: group[name] for name in cls.__dataclass_fields__.keys() & group.keys()}
+            | {"command": command},
+            command,
+        )
 
     def seconds(self, time: np.ndarray, where: str) -> np.ndarray:
         """Return times (N,) in s.
@@ -202,8 +208,10 @@ class Gauge:
         Raises:
             InputError: the rows are invalid.
         """
-        spare = {"indenter": settings.indenter, "radius_m": settings.radius, "angle": 0.0, "press": 0.0}
-        table = table.assign(**{name: value for name, value in spare.items() if name not in table})
+        table = pd.DataFrame(
+            {"indenter": settings.indenter, "radius_m": settings.radius, "angle": 0.0, "press": 0.0},
+            index=table.index,
+        ).assign(**{str(name): column for name, column in table.items()})
         names = ["time", "force", "press", *_PRESS[1:]]
         values = _numbers(table, names, where)
         complete = np.isfinite(values).all(axis=1)
@@ -432,8 +440,7 @@ class BenchData:
     @cached_property
     def begun(self) -> np.ndarray:
         """Number of presses that have begun, (T,), a fifth of a second before their first row."""
-        starts = self.gauge.time[self.gauge.first] - _LEAD
-        return np.searchsorted(starts, self.session.time, side="right")
+        return np.searchsorted(self.gauge.time[self.gauge.first] - _LEAD, self.session.time, side="right")
 
     @cached_property
     def idle(self) -> np.ndarray:
@@ -473,8 +480,9 @@ def build_bench_data(device: Simulated, session: BenchSession) -> BenchData:
     if gauge is None:
         raise InputError("no force in the session: add presses=gauge.csv with time, force, x_m and y_m")
     check_channels(device, session)
-    model = device.simulator(device.body, device.sensors)
-    bench = BenchData(session, gauge, per_newton(model, device.body, gauge))
+    bench = BenchData(
+        session, gauge, per_newton(device.simulator(device.body, device.sensors), device.body, gauge)
+    )
     if not bench.loading.any():
         spans = [np.ptp(values) for values in (session.time, gauge.time)]
         raise InputError(
@@ -486,3 +494,68 @@ def build_bench_data(device: Simulated, session: BenchSession) -> BenchData:
             f"{bench.idle.sum()} idle frames, needed are {_FEWEST}: do not touch the skin for some seconds"
         )
     return bench
+
+
+# Another thickness of the layers.
+
+
+# Factors on the thickness: of the operators, between which interpolation errs by 0.5 % of the largest reading
+# (skin/inference/watch.py); that are compared.
+_FACTORS, _SEARCHED = (0.8, 1.0, 1.25), (0.6, 1.6)
+# Errors: of a reading, 0.35 of gains and model (skin/calibration/known_loads.py) without 0.3 of gains; of the
+# largest one.
+_MODEL, _BESIDE = 0.18, 0.03
+# Of the largest reading: on the default skin the second sensor has less, and gains change by 1 %.
+_FELT = 0.1
+# Part of the misfit, and standard deviations, that another thickness must explain. Of 120 emulated devices as
+# described (30 mm, 3 x 3 and 6 x 6 sensors, off by 2 mm, one of them dead, gain spread 30 %, cross-talk up to
+# 2 %), it explains at most 0.05; of 40 that are 24 mm thick, at least 0.24.
+_EXPLAINED, _SURE = 0.1, 3.0
+
+
+@torch.no_grad()
+def warn_of_thickness(
+    device: Simulated,
+    described: np.ndarray,
+    readings: np.ndarray,
+    noise: np.ndarray,
+    simulate: Callable[[AbstractBody, Sensors], np.ndarray],
+) -> dict[str, float]:
+    """Warn where readings fit another thickness of all layers than the described one; return it, m, by name.
+
+    How far a load is felt tells the thickness, whatever the gain of each sensor is. Residuals between three
+    thicknesses are interpolated quadratically in the logarithm (:class:`skin.inference.watch.Thickness`).
+    Nothing is said of an arm, of a simulator without depth, or where one sensor alone feels a load.
+
+    Args:
+        device: with the skin as designed.
+        described: its true readings under loads, (P, S), N.
+        readings: measured ones, (P, S), N, by the fitted gains; NaN: without a gain.
+        noise: of these readings, (S,), N.
+        simulate: ``simulate(body, sensors)``: those of another skin.
+    """
+    known, residuals = np.isfinite(readings).all(axis=0), list[np.ndarray]()
+    sizes = np.abs([described, readings])[..., known]
+    felt = (sizes > _FELT * sizes.max(axis=2, keepdims=True)).sum(axis=2)
+    if not (device.body.flat and device.model.feels_shear and np.median(felt, axis=1).max() > 1):
+        return {}
+    error = np.hypot(np.hypot(_MODEL * described, noise), _BESIDE * described.max())
+    for factor in _FACTORS:
+        expected = simulate(*thicken(device.body, device.sensors, factor)) / error
+        gains = (readings / error * expected).sum(axis=0) / (expected**2).sum(axis=0)
+        residuals.append((readings / error / gains - expected)[:, known].ravel())
+    fine = np.log(np.linspace(*_SEARCHED, 201))
+    misfits = ((np.vander(fine, 3) @ np.polyfit(np.log(_FACTORS), residuals, 2)) ** 2).sum(axis=1)
+    misfit = float((residuals[1] ** 2).sum())
+    if misfit - misfits.min() < max(_EXPLAINED * misfit, _SURE**2):
+        return {}
+    fitted = float(np.exp(fine[misfits.argmin()])) * device.body.thickness
+    warnings.warn(
+        f"readings fit layers of {1e3 * fitted:.2g} mm in all better than the described "
+        f"{1e3 * device.body.thickness:.3g} mm: a wrong thickness or width of the load makes gains wrong; "
+        "measure both, correct body.layers or base=, and calibrate again (live.thickness takes a range, but "
+        "leaves the gains as they are)",
+        UserWarning,
+        stacklevel=3,
+    )
+    return {"thickness that fits": float(f"{fitted:.2g}")}

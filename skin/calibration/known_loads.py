@@ -20,6 +20,7 @@ from skin.calibration.bench import (
     check_channels,
     per_newton,
     pressed_images,
+    warn_of_thickness,
     write_bench_session,
 )
 from skin.calibration.fit import convert_to_newton
@@ -194,22 +195,20 @@ def fit_known_load(device: Simulated, session: BenchSession, load: KnownLoad) ->
     check_channels(device, session)
     placements = find_placements(session)
     if not len(placements.change):
-        touched = f" ({placements.unsteady} changed while they lay, or were touched)"
         raise InputError(
-            f"no placement in the session{touched * bool(placements.unsteady)}: leave the skin untouched for "
-            "3 s, put the load down, let go of it for 2 s, lift it for 2 s, and so on"
+            f"no placement in the session ({placements.unsteady} changed while they lay, or were touched): "
+            "leave the skin untouched for 3 s, put down the load, let go for 2 s, lift it for 2 s, and so on"
         )
-    gains, signs, loaded = _fit_gains(
-        base_readings(device.model, device.body, device.sensors, load), placements
-    )
+    expected = base_readings(device.model, device.body, device.sensors, load)
+    gains, signs, loaded, site = _fit_gains(expected, placements)
     if len(missed := np.flatnonzero(np.isnan(gains) & loaded)) > _MISSED * loaded.sum():
         raise InputError(
             f"sensors {list_numbers(missed)} were never loaded, or do not respond: put the load on every "
             "sensor and record again, or check the wiring"
         )
     # Slow drift is left to the tare: placements move the rest a little, too.
-    time = session.time - session.time[placements.idle].mean()
-    rests = measure_rests(replace(session, time=time), placements.idle).drop(columns="drift")
+    centred = replace(session, time=session.time - session.time[placements.idle].mean())
+    rests = measure_rests(centred, placements.idle).drop(columns="drift")
     quiet = float(np.hypot(rests["noise"], rests["quantum"] / math.sqrt(12)).median() / np.nanmedian(gains))
     usual = float(device.constants.noise.median())
     if quiet < usual / _QUIETER:  # a load in another unit makes the noise that of no sensor
@@ -228,6 +227,17 @@ def fit_known_load(device: Simulated, session: BenchSession, load: KnownLoad) ->
             {}
             if loaded.all()
             else {"along the surface": f"gains unknown, as inwards; {_INCLINED} gives them"}
+        )
+        | (
+            {}
+            if load.incline
+            else warn_of_thickness(
+                device,
+                expected[0, site],
+                signs * placements.change / gains,
+                placements.noise / gains,
+                lambda *skin: base_readings(device.simulator(*skin), skin[0], skin[1], load)[0, site],
+            )
         ),
     )
 
@@ -277,40 +287,37 @@ def _find_own(expected: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return own, size >= _ALONG * size[:, -1:]
 
 
-def _fit_gains(expected: np.ndarray, placements: Placements) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return gains (NaN: none) and signs of the channels, and which the load determines, (S,)."""
+def _fit_gains(
+    expected: np.ndarray, placements: Placements
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return gains (NaN: none), signs and which the load determines, (S,), and the sites of the loads, (P,).
+
+    A site is that whose pattern of readings is the most likely. Gains are unknown, so a reading is its
+    expectation within a third. A dead sensor is found by the readings of its neighbours.
+    """
     own, loaded = _find_own(expected)
     directions, sites, axes = own.shape
     strongest = placements.change[np.abs(placements.change).argmax(axis=0), np.arange(sites * axes)]
     inwards = np.arange(sites * axes) % axes == axes - 1
     used, signs = inwards & placements.reached, np.where(strongest < 0, -1.0, 1.0)
     signs[~used] = -1.0 if signs[used].sum() < 0 else 1.0  # as most others
-    change = signs * placements.change
-    site = _assign(expected[0], change, placements.noise, inwards, used)
+    change, pattern = signs * placements.change, expected[0]
+    typical = float(np.median(change[:, inwards].max(axis=1)) / np.median(pattern[:, inwards].max(axis=1)))
+    variance = (_SPREAD * pattern) ** 2 + (placements.noise / typical) ** 2 + (_FLOOR * pattern.max()) ** 2
+    cost = (change[:, None] / typical - pattern) ** 2 / variance + np.log(variance)
+    site = cost[..., used].sum(axis=-1).argmin(axis=1)
     # The directions follow each other.
     placed = pd.Series(site).groupby(site)
     direction = (placed.cumcount() * directions // placed.transform("size")).to_numpy()
-    at_site = change.reshape(-1, sites, axes)[np.arange(len(site)), site]
-    ratios = pd.DataFrame(at_site / np.where(loaded, own, np.nan)[direction, site])
+    ratios = pd.DataFrame(
+        change.reshape(-1, sites, axes)[np.arange(len(site)), site]
+        / np.where(loaded, own, np.nan)[direction, site]
+    )
     # In two opposite directions, cross-talk of the force inwards and errors of the position cancel.
     medians = ratios.groupby([site, direction]).median().groupby(level=0)
     agreed = medians.mean().where(medians.min() * medians.max() > 0).reindex(range(sites)).to_numpy().ravel()
     gains = np.where(placements.reached & ((agreed > 0) | ~inwards), np.abs(agreed), np.nan)
-    return gains, np.where((agreed < 0) & ~inwards, -signs, signs), loaded.ravel()
-
-
-def _assign(
-    expected: np.ndarray, change: np.ndarray, noise: np.ndarray, inwards: np.ndarray, used: np.ndarray
-) -> np.ndarray:
-    """Return the site (P,) below each placement: that whose pattern of readings is the most likely.
-
-    Gains are unknown, so a reading is its expectation within a third. A dead sensor is found by the readings
-    of its neighbours.
-    """
-    typical = float(np.median(change[:, inwards].max(axis=1)) / np.median(expected[:, inwards].max(axis=1)))
-    variance = (_SPREAD * expected) ** 2 + (noise / typical) ** 2 + (_FLOOR * expected.max()) ** 2
-    cost = (change[:, None] / typical - expected) ** 2 / variance + np.log(variance)
-    return np.asarray(cost[..., used].sum(axis=-1).argmin(axis=1))
+    return gains, np.where((agreed < 0) & ~inwards, -signs, signs), loaded.ravel(), site
 
 
 # A second load, measured while it is put on three sensors.
@@ -413,12 +420,11 @@ def stair_gauge(
         np.interp(inside, corners, peak * np.repeat(levels, 2)[1:]), np.zeros(max(2, round(0.2 * rate)))
     ]
     starts = round(idle * rate) + np.arange(len(positions)) * (len(press) + round(rest * rate))
-    presses = pd.DataFrame({"indenter": indenter, "x_m": positions[:, 0], "y_m": positions[:, 1]})
     return Gauge(
         (starts[:, None] + np.arange(len(press))).ravel() / rate,
         np.tile(press, len(positions)),
         np.repeat(np.arange(len(positions)), len(press)),
-        presses.assign(radius_m=radius, angle=0.0),
+        pd.DataFrame(positions, columns=["x_m", "y_m"]).assign(indenter=indenter, radius_m=radius, angle=0.0),
     )
 
 

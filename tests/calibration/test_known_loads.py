@@ -49,9 +49,8 @@ def test_counts_are_converted_to_newtons_of_the_same_force():
     skin = device(noise=0.02)
     calibration = fit_known_load(device(), weighed(skin, ORDER, bits=12), WEIGHT)
     true = weight_readings(skin)[0]
-    raw = np.round(
-        2**11 + (true * skin.constants.gain.numpy() + skin.constants.offset.numpy()) / (20 / 2**11)
-    )
+    gain, offset = skin.constants.gain.numpy(), skin.constants.offset.numpy()
+    raw = np.round(2**11 + (true * gain + offset) / (20 / 2**11))
     np.testing.assert_allclose(calibration.corrected(raw)[0], true[0], rtol=0.05)
 
 
@@ -72,13 +71,26 @@ def test_half_a_session_is_refused_and_names_the_sensors():
         fit_known_load(solid(), weighed(skin, list(range(8))), WEIGHT)
 
 
+def thick(thickness: float, **hidden) -> Simulated:
+    body = Sheet([0.09, 0.09], [9, 9], [{"material": "EcoFlex 00-30", "thickness": thickness}])
+    return Simulated(body=body, layout=Grid(3, 3, depth=thickness * 2 / 3), simulator=Solid, **hidden)
+
+
+def test_a_wrong_thickness_is_named_with_the_one_that_fits_and_a_right_one_is_not():
+    hidden, thickness = {"gain_spread": 0.3, "position_error": 0.001}, "thickness that fits"
+    right, wrong = (weighed(thick(true, **hidden), [*range(9)] * 2) for true in (0.030, 0.024))
+    assert thickness not in fit_known_load(thick(0.030), right, WEIGHT).about
+    with pytest.warns(UserWarning, match="better than the described 30 mm"):
+        found = fit_known_load(thick(0.030), wrong, WEIGHT)
+    assert found.about[thickness] == pytest.approx(0.024, rel=0.06)
+
+
 INCLINED = KnownLoad.of(4.0, 0.02, (0.16, 0.16), 20, [45, 225], 0.005)
 
 
 def test_sensors_that_cover_a_plane_feel_the_weight_along_and_across_an_incline(monkeypatch):
-    monkeypatch.setattr(
-        "skin.calibration.known_loads._ALONG", 0.0
-    )  # a base near the rim is far from the sensor
+    # A base near the rim is far from the sensor.
+    monkeypatch.setattr("skin.calibration.known_loads._ALONG", 0.0)
     places = np.stack(np.meshgrid(*2 * [0.01 * np.arange(6) + 0.005]), axis=-1).reshape(-1, 2)
     positions = np.column_stack([places, np.full(36, 0.009)]).repeat(3, axis=0)
     sensors = Sensors(positions, (0.01, 0.01), directions=np.tile(np.eye(3), (36, 1)))
@@ -118,17 +130,9 @@ def test_a_weight_gives_normal_gains_and_one_on_an_incline_those_along_the_surfa
 @pytest.mark.parametrize(
     ("incline", "axes", "reason"),
     [
-        (
-            (20, None, 0.005),
-            "three",
-            "got incline=20 downhill=None height=0.005: an incline needs its angle and",
-        ),
+        ((20, None, 0.005), "three", "got incline=20 downhill=None height=0.005: an incline needs its angle"),
         ((None, [45], None), "three", "got incline=None"),
-        (
-            (20, [45], 0.02),
-            "three",
-            "lifts its upper edge: take a flatter one, or incline it by up to 14.0 deg",
-        ),
+        ((20, [45], 0.02), "three", "upper edge: take a flatter one, or incline it by up to 14.0 deg"),
         ((20, [45, 180], 0.005), "three", "does not load each axis along the surface"),
         ((20, [45], 0.005), "normal", "of layout.axes=three"),
     ],
@@ -155,10 +159,8 @@ def test_an_incline_of_an_arm_is_refused():
 
 def test_an_untouched_session_has_no_placement():
     skin = device()
-    noise = skin.imperfection.raw(torch.zeros(1, 3000, 6), skin.constants, np.random.default_rng(0))[
-        0
-    ].numpy()
-    session = BenchSession(np.arange(3000) / 100, noise, "N")
+    noise = skin.imperfection.raw(torch.zeros(1, 3000, 6), skin.constants, np.random.default_rng(0))
+    session = BenchSession(np.arange(3000) / 100, noise[0].numpy(), "N")
     with pytest.raises(InputError, match="no placement in the session"):
         fit_known_load(device(), session, WEIGHT)
 
@@ -177,9 +179,8 @@ def test_a_touch_or_a_sliding_load_is_no_placement():
 @pytest.mark.parametrize("bits", [None, 12])
 def test_a_load_in_another_unit_shows_in_the_noise(bits):
     session = weighed(device(), ORDER, bits)
-    with pytest.raises(
-        InputError, match=r"^weight=0\.002 \(kg\) would mean a noise of \S+ N, device.noise is 0.05"
-    ):
+    reason = r"^weight=0\.002 \(kg\) would mean a noise of \S+ N, device.noise is 0.05"
+    with pytest.raises(InputError, match=reason):
         fit_known_load(device(), session, KnownLoad(0.002, 0.02))
     fit_known_load(device(), session, KnownLoad(0.1, 0.02))
     fit_known_load(device(noise=0.0), session, KnownLoad(0.002, 0.02))

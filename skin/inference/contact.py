@@ -167,7 +167,7 @@ def _probable(evidence: np.ndarray, others: list[np.ndarray], dropped: float) ->
 
 
 def _expand(
-    frame: Observation, prior: FingertipPrior, leaves: _Leaves
+    frame: Observation, prior: FingertipPrior, leaves: _Leaves, kind: type = np.float32
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return slope (N, 3), 1/m, and information (N, 3, 3), 1/m^2, of the log likelihood in boxes.
 
@@ -176,9 +176,9 @@ def _expand(
     """
     rows, force = leaves.rows, np.exp(leaves.forces.mode)[:, None]
     mean, *_ = leaves.forces.tangent(force)
-    loads = np.concatenate([np.ones((len(mean), 1, 1)), mean], axis=2)[:, None].astype(rows.dtype)
     # The readings and their derivatives, then what the tangential force changes.
-    every = np.concatenate([(loads @ rows)[:, :, 0], rows[:, 0, 1:]], axis=1) * force[..., None]
+    every = blend(rows.reshape(-1, *rows.shape[2:]), mean.repeat(4, axis=0)).reshape(-1, 4, rows.shape[3])
+    every = np.concatenate([every, rows[:, 0, 1:]], axis=1).astype(kind) * force[..., None]
     predicted = every[:, 0]
     variance = np.float32(frame.noise.floor) + force * force * leaves.spread
     weight = frame.counts / variance
@@ -211,7 +211,7 @@ def _average(
     To second order, with a normal distribution in place of the uniform one over the box.
     """
     # In double precision: what the force explains is subtracted, and may be nearly all.
-    slope, information, turn = _expand(frame, prior, leaves._replace(rows=leaves.rows.astype(float)))
+    slope, information, turn = _expand(frame, prior, leaves, float)
     centre, width = leaves.boxes
     # In units of the standard deviation over a box.
     unit = width / math.sqrt(12)

@@ -7,13 +7,7 @@ import pytest
 
 from skin.body.base import Layer
 from skin.body.material import Material
-from skin.calibration.check import (
-    Check,
-    describe_setup,
-    find_check,
-    store_check,
-    verify_source,
-)
+from skin.calibration.check import Check, describe_setup, find_check, store_check, verify_source
 from skin.calibration.known_loads import measure_ratios
 from skin.device.resampling import Frame
 from skin.errors import InputError
@@ -119,11 +113,7 @@ def test_a_scale_is_verified_by_its_check_alone(data):
 
 @pytest.mark.parametrize(
     ("changed", "difference"),
-    [
-        ({"scale": 0.01}, "scale"),
-        ({"scale": -0.02}, "scale"),
-        ({"positions": POSITIONS + 0.001}, "layout"),
-    ],
+    [({"scale": 0.01}, "scale"), ({"scale": -0.02}, "scale"), ({"positions": POSITIONS + 0.001}, "layout")],
 )
 def test_what_differs_from_the_check_is_named(data, changed, difference):
     stored()

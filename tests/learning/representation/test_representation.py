@@ -10,17 +10,9 @@ from scipy.spatial import Delaunay
 from skin.body.base import GEOMETRY
 from skin.device.touches import Touches
 from skin.errors import InputError
+from skin.learning import representation
 from skin.learning.graph import Graph
-from skin.learning.representation import (
-    Features,
-    Fourier,
-    Image,
-    Interpolation,
-    Readings,
-    Sites,
-    centres,
-    weights,
-)
+from skin.learning.representation import Fourier, Image, Readings, Sites
 
 # Interpolation against planes and brute force.
 SIZE = (0.16, 0.12)
@@ -39,7 +31,7 @@ def test_x_is_the_column_and_y_the_row_also_on_an_oblong_sheet():
     assert picture.count_nonzero() == 2
 
 
-@pytest.mark.parametrize("kind", [Fourier, Graph, Image, Interpolation])
+@pytest.mark.parametrize("kind", [Fourier, Graph, Image, representation.Interpolation])
 def test_three_axes_of_a_site_are_three_features_of_one_place(kind):
     """Each is what a skin with sensors along this axis alone shows; masks come behind all readings."""
     places = torch.tensor([[0.02, 0.01, 0.0], [0.05, 0.06, 0.0], [0.11, 0.03, 0.0], [0.15, 0.07, 0.0]])
@@ -79,7 +71,7 @@ def test_readings_then_their_mask():
 def test_both_views_of_one_newton_above_idle():
     readings = torch.zeros(1, 30, 5)
     readings[0, 20, 2] = 1.0
-    represent = Features(torch.rand(5, 3), (1.0, 1.0))
+    represent = representation.Features(torch.rand(5, 3), (1.0, 1.0))
     x = represent(readings, torch.ones_like(readings, dtype=torch.bool)).x[0, 20]
     assert x[2] == pytest.approx(1 / 3)
     # asinh(1 / 0.2) = ln(5 + sqrt(26))
@@ -97,26 +89,27 @@ def test_a_plane_is_reproduced_inside_the_hull(points, method, tolerance):
     def plane(xy):
         return 3 + 40 * xy[:, 0] - 70 * xy[:, 1]
 
-    targets = centres(SIZE, 64)
+    targets = representation.centres(SIZE, 64)
     inside = Delaunay(points).find_simplex(targets) >= 0
-    values = weights(points, targets, method) @ plane(points)
+    values = representation.weights(points, targets, method) @ plane(points)
     assert inside.sum() > 1000
     assert np.abs(values - plane(targets))[inside].max() < tolerance
 
 
 @pytest.mark.parametrize("method", ["linear", "cubic"])
 def test_outside_the_hull_the_nearest_value_holds(points, method):
-    targets = centres(SIZE, 48)
+    targets = representation.centres(SIZE, 48)
     outside = Delaunay(points).find_simplex(targets) < 0
     assert outside.sum() > 100
     np.testing.assert_array_equal(
-        weights(points, targets, method)[outside], weights(points, targets, "nearest")[outside]
+        representation.weights(points, targets, method)[outside],
+        representation.weights(points, targets, "nearest")[outside],
     )
 
 
 def test_sensors_in_a_line_are_refused(points):
     with pytest.raises(InputError, match=r"got 3: set representation\.method=nearest"):
-        weights(np.array([[0.0, 0.0], [0.1, 0.1], [0.2, 0.2]]), points, "linear")
+        representation.weights(np.array([[0.0, 0.0], [0.1, 0.1], [0.2, 0.2]]), points, "linear")
 
 
 # Virtual sites do not depend on the number and the order of the sensors.

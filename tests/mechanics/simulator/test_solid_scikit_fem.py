@@ -5,19 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 import scipy.sparse as sp
+import skfem as fem
 from scipy.sparse.linalg import splu
-from skfem import (
-    BilinearForm,
-    CellBasis,
-    ElementHex0,
-    ElementHex1,
-    ElementVector,
-    FacetBasis,
-    Functional,
-    LinearForm,
-    MeshHex,
-    condense,
-)
+from skfem import MeshHex
 from skfem.helpers import ddot, div, sym_grad
 
 from skin.body.base import Sheet
@@ -66,28 +56,28 @@ def solve_frame(
     elements, and ``extent`` the side of the sensor's footprint, m, of whole cells about the node.
     """
     points = MeshHex(mesh.nodes.T.copy(), mesh.corners.T.copy())
-    basis = CellBasis(points, ElementVector(ElementHex1()), intorder=2)
-    inner = basis.with_element(ElementHex0())
+    basis = fem.CellBasis(points, fem.ElementVector(fem.ElementHex1()), intorder=2)
+    inner = basis.with_element(fem.ElementHex0())
     columns, rows, _ = mesh.counts
     lam, mu = (constant.repeat(columns * rows) for constant in mesh.lame)
     shape = basis.dx.shape
     fields = {"mu": np.broadcast_to(mu[:, None], shape), "lam": np.broadcast_to(lam[:, None], shape)}
-    stiff = BilinearForm(lambda u, v, w: 2 * w.mu * ddot(sym_grad(u), sym_grad(v)))
+    stiff = fem.BilinearForm(lambda u, v, w: 2 * w.mu * ddot(sym_grad(u), sym_grad(v)))
     elastic = stiff.assemble(basis, **fields)
-    grown = BilinearForm(lambda u, q, w: div(u) * q).assemble(basis, inner)
-    squeezed = BilinearForm(lambda p, q, w: p * q / w.lam).assemble(inner, **fields)
+    grown = fem.BilinearForm(lambda u, q, w: div(u) * q).assemble(basis, inner)
+    squeezed = fem.BilinearForm(lambda p, q, w: p * q / w.lam).assemble(inner, **fields)
     whole = sp.block_array([[elastic, grown.T], [grown, -squeezed]]).tocsr()
 
-    top = FacetBasis(points, basis.elem, facets=points.facets_satisfying(lambda x: np.abs(x[2]) < 1e-12))
+    top = fem.FacetBasis(points, basis.elem, facets=points.facets_satisfying(lambda x: np.abs(x[2]) < 1e-12))
     columns, rows = (np.diff(line[:2])[0] for line in mesh.lines[:2])
 
     def traction(v, w):
         push = pressure[(w.x[1] // rows).astype(int), (w.x[0] // columns).astype(int)]
         return push * (shear * v[0] - v[2])
 
-    load = np.concatenate([LinearForm(traction).assemble(top), np.zeros(inner.N)])
+    load = np.concatenate([fem.LinearForm(traction).assemble(top), np.zeros(inner.N)])
     table = basis.get_dofs(lambda x: np.abs(x[2] + mesh.lines[2][-1]) < 1e-12).all()
-    solution = _solve(*condense(whole, load, D=table))
+    solution = _solve(*fem.condense(whole, load, D=table))
     moved, squeeze = solution[: basis.N], solution[basis.N :]
     below = np.array([position[0], position[1], -position[2]])
     above = np.array([position[0], position[1], 0.0])
@@ -105,7 +95,7 @@ def _solve(matrix, right, whole, free) -> np.ndarray:
     return answer
 
 
-def _at(points: MeshHex, basis: CellBasis, moved: np.ndarray, spot: np.ndarray) -> np.ndarray:
+def _at(points: MeshHex, basis: fem.CellBasis, moved: np.ndarray, spot: np.ndarray) -> np.ndarray:
     node = np.linalg.norm(points.p - spot[:, None], axis=0).argmin()
     return moved[basis.nodal_dofs[:, node]]
 
@@ -122,8 +112,8 @@ def _reading(points, basis, moved, squeeze, mu, mesh: Hexahedra, position, exten
     felt = []
     for middle in (upper, lower):
         elements = np.flatnonzero(within & (np.abs(z + middle) < 1e-9))
-        plane = CellBasis(points, basis.elem, quadrature=(half_way, np.full(4, 0.25)), elements=elements)
-        push = Functional(lambda w: -(2 * w.mu * w["u"].grad[2][2] + w.q) / w.high)
+        plane = fem.CellBasis(points, basis.elem, quadrature=(half_way, np.full(4, 0.25)), elements=elements)
+        push = fem.Functional(lambda w: -(2 * w.mu * w["u"].grad[2][2] + w.q) / w.high)
         shape = plane.dx.shape
         felt.append(
             push.assemble(

@@ -1,7 +1,6 @@
 """Values that are off by a unit, and skins whose mechanics do nothing."""
 
 import pytest
-import torch
 
 from skin.body.sheet import Sheet
 from skin.errors import InputError
@@ -9,10 +8,6 @@ from skin.runs.build import build_device
 
 ONE = "body.layers=[{material: {name: rubber, young: 83e3, poisson: 0.45}, thickness: 0.012}]"
 SMALL = ("body.size=[0.08,0.08]", "body.cells=[4,4]", "layout=grid", "layout.rows=2", "layout.columns=2")
-STACK = (
-    "body.layers=[{material: {name: a, young: 560e3, poisson: 0.45}, thickness: 0.006},"
-    "{material: {name: b, young: YOUNG, poisson: 0.45}, thickness: 0.006}]"
-)
 
 
 @pytest.mark.parametrize(
@@ -33,12 +28,7 @@ STACK = (
         ("touch.press=[4,20]", r"touch.press=20 s"),
         ("touch.spare=10", r"touch.spare=10 m"),
         ("device.position_error=2", r"device.position_error=2 m"),
-        (ONE.replace("0.45", "45"), r"material.poisson=45 must be less than 1"),
-        (
-            "layout.depth=5",
-            r"depth = 5 m, on a surface of 0.16 x 0.16 m, 0.015 m thick: positions are in met",
-        ),
-        ("layout.depth=deep", r"layout.depth=deep must be a valid number"),
+        ("layout.depth=5", r"depth = 5 m, on a surface of 0.16 x 0.16 m, 0.015 m thick: positions are in m"),
     ],
 )
 def test_a_value_off_by_a_unit_is_refused_with_the_range(configured, override, message):
@@ -51,27 +41,9 @@ def test_a_class_takes_what_a_proof_needs():
     assert Sheet([1.0, 1.0], [2, 2], [{"material": "EcoFlex 00-30", "thickness": 1.0}]).thickness == 1
 
 
-def readings(configured, *overrides):
-    """Return what four sensors read of 100 kPa on one cell above the first."""
-    model = build_device(configured(*SMALL, "body.cells=[8,8]", *overrides)).model
-    pressure = torch.zeros(8, 8)
-    pressure[2, 2] = 1e5
-    return model(pressure).readings
-
-
 @pytest.mark.parametrize("simulator", ["fem", "solid"])
 def test_sensors_on_the_surface_are_warned_of(configured, simulator):
     config = configured(f"simulator={simulator}", *SMALL, ONE)
     match = r"4 of 4 sensors lie on the surface.*layout.depth=0.004 simulator=solid"
     with pytest.warns(UserWarning, match=match):
         build_device(config)
-
-
-@pytest.mark.parametrize(
-    "layers",
-    [(ONE, ONE.replace("0.012", "0.050")), (STACK.replace("YOUNG", "83e3"), STACK.replace("YOUNG", "83e6"))],
-)
-def test_at_a_depth_of_the_solid_thickness_and_stiffness_are_felt(configured, layers):
-    """Under discs of 5 to 11 mm on endless layers 12 and 50 mm differ by 4 to 5 %."""
-    one, other = (readings(configured, "simulator=solid", "layout.depth=0.004", each) for each in layers)
-    assert (one - other).abs().max() > 0.03 * one.max()

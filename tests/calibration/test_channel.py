@@ -137,9 +137,7 @@ def test_gain_and_limit(limit):
 def test_the_gain_is_between_those_of_presses_that_disagree():
     """Off the layout by a millimetre, the stronger press may be the weaker one in the simulation."""
     factors = np.array([0.98, 1.07, 1.0])
-    found = channel(
-        [0.96, 0.92], (0.1, 0.2, 1.0), lambda true, press: np.minimum(true * factors[press], 10.0)
-    )
+    found = channel([0.96, 0.92], (0.1, 0.2, 1.0), lambda true, n: np.minimum(true * factors[n], 10.0))
     assert 0.98 <= found.gain(1.0) <= 1.07
     assert found.clip == pytest.approx(10, rel=0.01)
 

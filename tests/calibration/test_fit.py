@@ -63,13 +63,6 @@ def solid(**hidden) -> Simulated:
     return Simulated(body=body, layout=Grid(4, 4), simulator=Solid, **hidden)
 
 
-def test_gains_are_found_on_a_solid_where_each_press_reaches_every_sensor():
-    skin = solid(gain_spread=0.3)
-    found = fit_calibration(session_of(skin)).values()
-    np.testing.assert_allclose(found["gain"], skin.constants.gain.numpy(), rtol=0.02)
-    np.testing.assert_allclose(found["clip"], 10, rtol=0.01)
-
-
 def test_gains_are_not_trusted_where_sensors_are_not_where_the_layout_says():
     with free():  # the operator, which others use, too
         skin = solid(position_error=0.008)

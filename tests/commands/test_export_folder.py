@@ -63,8 +63,6 @@ def test_an_altered_file_ends_a_command_with_a_sentence(model, run):
         (["name=new"], "add licence=MIT"),
         (["name=small", "licence=MIT"], "models/small exists"),
         (["name=new", "licence=MIT", "run=none"], "no finished training run none"),
-        (["name=new", "licence=MIT", "run=3e066519"], "no finished training run 3e066519"),
-        (["name=new", "licence=MIT", "run=0123"], "no finished training run 0123"),
         (["name=new", "licence=MIT", "out=x"], "not to out=x: add name=my_skin"),
     ],
 )

@@ -79,23 +79,6 @@ def test_a_run_of_old_gets_its_threshold_now_and_that_is_said(run, folder):
     assert f"alarm above {stored(folder)['threshold']:.4f}" in done.stdout
 
 
-def test_another_rate_gets_another_threshold(run, folder):
-    done = run(folder, "evaluate", FEW, "evaluation.false_alarm_rate=0.2", f"out={folder}/rate")
-    assert "stores no alarm threshold for 20 % false alarms" in done.stderr
-    level = float(re.search(r"alarm above (0\.\d+), chosen on 200 fresh", done.stdout)[1])
-    assert level < stored(folder)["threshold"]
-
-
-@pytest.fixture(scope="module")
-def found(run, folder):
-    done = run(folder, "evaluate", FEW, "evaluation.profile=rough", f"out={folder}/profile")
-    return float(re.search(r"alarm above (\d\.\d+), chosen on 200 fresh", done.stdout)[1])
-
-
-def test_a_profile_gets_a_threshold_of_its_own(folder, found):
-    assert abs(found - stored(folder)["threshold"]) > 1e-3
-
-
 def test_an_unknown_profile_is_refused_before_anything_is_trained(run, folder, tmp_path):
     for where, words in ((folder, ["evaluate"]), (tmp_path, ["train", "experiment=rules", *SKIN])):
         done = run(where, *words, "evaluation.profile=none_such", code=2)
@@ -125,20 +108,3 @@ def test_live_raises_the_alarm_where_it_is_told(run, folder, port, above, alarm)
     assert re.search(r"[1-9]\d* verdicts", done.stderr)
     assert ('"dangerous": true' in done.stdout) == alarm
     assert f"alarm above {float(above):g}" in done.stderr
-
-
-@pytest.mark.slow("draws and plays touches for three live views")
-def test_live_chooses_a_threshold_for_the_profile_and_keeps_it(run, folder, port, tmp_path, monkeypatch):
-    monkeypatch.setenv("SKIN_CACHE", str(tmp_path))
-    levels, few = [], "evaluation.safe_gestures=50"  # the time goes with their number
-    for words in ([], ["evaluation.profile=rough"], ["evaluation.profile=rough"]):
-        done = run(folder, "live.py", "device=serial", port, *LIVE, few, *words, code=None)
-        said = " ".join(done.stderr.split())
-        # A training of seconds may find too few dangerous touches.
-        hides = re.search(r"it hides dangerous touches: train with more gestures, or give a lower", said)
-        assert done.returncode == (2 if hides else 0), done.stderr
-        above = re.search(r"alarm above (\d\.\d+), chosen on 50 fresh safe touches at 10 Hz", said)
-        levels.append(float(above[1]))
-        assert ("choosing the alarm's threshold" in said) == (len(levels) < 3)
-        assert ("devices of the profile rough" in said) == (len(levels) == 2)
-    assert levels[0] != levels[1] == levels[2]

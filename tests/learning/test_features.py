@@ -134,9 +134,7 @@ def test_every_vector_points_where_the_touch_goes(angle):
         x, y = (float(found[f"{name}, cosine with {axis}"]) for axis in "xy")
         assert math.cos(math.atan2(y, x) - angle) > 0.99, name
     assert found["lean, x"] == 0
-    for name, length in (
-        ("way of the centre 1 beyond 0.1", 0.072),
-        ("slope of the centre 2 beyond 0.25", 0.008),
-    ):
+    lengths = {"way of the centre 1 beyond 0.1": 0.072, "slope of the centre 2 beyond 0.25": 0.008}
+    for name, length in lengths.items():
         x, y = (float(found[f"{name} of the peak, {axis}"]) for axis in "xy")
         assert math.hypot(x, y) == pytest.approx(length, rel=0.05)

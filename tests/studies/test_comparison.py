@@ -56,11 +56,10 @@ def test_a_verdict_needs_the_margin_as_room_and_three_seeds(minimum, maximum, me
 
 
 def test_a_statement_about_several_holds_against_each():
-    assert comparison.combine_verdicts(["agree", "agree"]) == "agree"
-    assert (
-        comparison.combine_verdicts(["agree", "undecided"]) == comparison.combine_verdicts([]) == "undecided"
-    )
-    assert comparison.combine_verdicts(["undecided", "agree", "disagree"]) == "disagree"
+    combine = comparison.combine_verdicts
+    assert combine(["agree", "agree"]) == "agree"
+    assert combine(["agree", "undecided"]) == combine([]) == "undecided"
+    assert combine(["undecided", "agree", "disagree"]) == "disagree"
 
 
 def test_the_error_is_that_of_repeated_comparisons():
@@ -72,10 +71,8 @@ def test_the_error_is_that_of_repeated_comparisons():
             scale * random.standard_normal((2, *shape))
             for scale, shape in ((0.4, (5, 1, 1)), (0.5, (1, 4, 1)), (3.0, (1, 1, 100)), (1.0, (5, 4, 100)))
         ]
-        one, other = sum(parts) + np.array([8.0, 20.0]).reshape(2, 1, 1, 1)
-        seeds, devices = (
-            [pd.Series(each.mean(axis=axes)) for each in (one, other)] for axes in ((1, 2), (0, 2))
-        )
+        one, other = both = sum(parts) + np.array([8.0, 20.0]).reshape(2, 1, 1, 1)
+        seeds, devices = ([pd.Series(one.mean(axis=axes)) for one in both] for axes in ((1, 2), (0, 2)))
         gestures = one.mean(axis=(0, 1)), other.mean(axis=(0, 1))
         found = comparison.compare_samples(*seeds, False, tuple(devices), gestures)
         means.append(found.mean)

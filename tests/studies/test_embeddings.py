@@ -25,9 +25,8 @@ def test_words_tell_apart_the_same_subtrees_as_networkx():
         graph, weights = network(seed)
         labels = np.random.default_rng(seed).integers(0, 2, (1, 9))
         nx.set_node_attributes(graph, {n: str(labels[0, n]) for n in graph}, "label")
-        known = nx.weisfeiler_lehman_subgraph_hashes(
-            graph, node_attr="label", iterations=3, include_initial_labels=True
-        )
+        depths = {"iterations": 3, "include_initial_labels": True}
+        known = nx.weisfeiler_lehman_subgraph_hashes(graph, node_attr="label", **depths)
         words = subtrees(labels, weights > 0, depth=3).reshape(4, 9)
         for depth, (ours, theirs) in collected.items():
             ours += words[depth].tolist()
@@ -152,10 +151,8 @@ def probed(configured):
 def test_an_svm_reads_what_is_there_and_no_more():
     generator = np.random.default_rng(0)
     vectors, probability = generator.standard_normal((400, 4)), generator.integers(0, 2, 400)
-    assert (
-        embeddings.svm_accuracy(vectors, (vectors[:, 0] ** 2 + vectors[:, 1] ** 2 > 1.4).astype(int), 300)
-        > 0.85
-    )
+    far = (vectors[:, 0] ** 2 + vectors[:, 1] ** 2 > 1.4).astype(int)
+    assert embeddings.svm_accuracy(vectors, far, 300) > 0.85
     assert abs(embeddings.svm_accuracy(vectors, probability, 300) - 0.5) < 0.15  # three standard errors
     assert np.isnan(embeddings.svm_accuracy(vectors, np.zeros(400, dtype=int), 300))
 

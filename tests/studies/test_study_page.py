@@ -166,9 +166,8 @@ def test_the_csv_has_the_reference_and_another_file_may_be_chosen(tmp_path):
     path = tmp_path / "report.csv"
     path.write_text("row,simulator,label,value\ngru,fem,overall,0.5\n")
     study = replace(STUDY, reference=str(path), statements=())
-    pages.publish_study(
-        study, "t", pd.DataFrame([reported("gru", 0.9), reported("rules", 0.8)]), tmp_path / "s"
-    )
+    trials = pd.DataFrame([reported("gru", 0.9), reported("rules", 0.8)])
+    pages.publish_study(study, "t", trials, tmp_path / "s")
     assert pd.read_csv(tmp_path / "s.csv", keep_default_na=False).reference.tolist() == ["0.5", ""]
     with pytest.raises(InputError, match=r"study\.reference=nowhere"):
         read_reference("nowhere")

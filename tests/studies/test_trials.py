@@ -136,8 +136,6 @@ def test_models_vote_by_seed_and_by_equal_other_settings():
     metrics = [vote[f"same/{name}"] for name in ("big/accuracy", "dynamic/accuracy", "any/disagreement")]
     assert metrics == pytest.approx([2 / 3, 1, 2 / 3])
     assert not list(trials.votes(study(), pd.DataFrame(found)))
-    both = [
-        trial(one["row"], "0", [*one["outcomes"]], simulator=name) for name in ("a", "b") for one in found[:3]
-    ]
+    both = [trial(one["row"], "0", [*one["outcomes"]], simulator=name) for name in "ab" for one in found[:3]]
     named = [one["variant"] for one in trials.votes(study(vote="all"), pd.DataFrame(both))]
     assert named == ["a vote", "b vote"]

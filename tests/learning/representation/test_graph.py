@@ -46,9 +46,8 @@ def test_weights_of_edges():
     linked = neighbours(points, "knn", 1)  # 0-1 and 1-2; the nearest are 1, 1 and 2 cm away: d0 = 1 cm
     for law, a, b in (("exp", np.exp(-1), np.exp(-2)), ("distance", 1, 2), ("none", 1, 1)):
         for unit in (1, 10):
-            np.testing.assert_allclose(
-                adjacency(unit * points, linked, law), [[0, a, 0], [a, 0, b], [0, b, 0]]
-            )
+            weights = adjacency(unit * points, linked, law)
+            np.testing.assert_allclose(weights, [[0, a, 0], [a, 0, b], [0, b, 0]])
 
 
 def test_normalised_by_hand():

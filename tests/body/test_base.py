@@ -97,22 +97,6 @@ def test_straight_lines_of_the_chart_are_the_shortest_on_the_surface():
         assert np.linalg.norm(np.diff(body.locate(detour), axis=0), axis=1).sum() > along
 
 
-@pytest.mark.parametrize(
-    ("changes", "says"),
-    [
-        ({"radius": 0}, "body.radius=0 must be greater than 0"),
-        ({"length": -1}, "body.length=-1 must be greater than 0"),
-        ({"angle": 2 * np.pi}, "body.angle=6.283.* must be less than 6.283"),
-        ({"radius": 0.015}, "layers of 0.015 m together leave no core within body.radius=0.015 m"),
-        ({"cells": [1, 8]}, "body.cells=.* must be greater than or equal to 2"),
-        ({"layers": []}, "at least one layer"),
-    ],
-)
-def test_what_is_no_arm_is_refused_by_name(changes, says):
-    with pytest.raises(InputError, match=says):
-        arm(**changes)
-
-
 def test_it_says_how_to_give_it_another_size():
     """Recordings and layouts know extents, not angles."""
     body = arm()
@@ -146,19 +130,25 @@ def test_footprint_mean_is_the_integral_of_a_fine_raster():
 
 
 @pytest.mark.parametrize(
-    ("changes", "says"),
+    ("make", "changes", "says"),
     [
-        ({"size": [0.16, 0]}, r"body.size=\[0.16, 0\] must be greater than 0"),
-        ({"cells": [1, 8]}, r"body.cells=\[1, 8\] must be greater than or equal to 2"),
-        ({"layers": []}, "at least one layer"),
-        ({"layers": [{"material": "EcoFlex 00-30"}]}, "body.layers.0 needs thickness, got material"),
-        ({"layers": [LAYERS[0], LAYERS[1] | {"thickness": -1}]}, "body.layers.1.thickness=-1 must"),
-        ({"layers": [{"material": "rubber", "thickness": 0.01}]}, "unknown material rubber"),
+        (arm, {"radius": 0}, "body.radius=0 must be greater than 0"),
+        (arm, {"length": -1}, "body.length=-1 must be greater than 0"),
+        (arm, {"angle": 2 * np.pi}, "body.angle=6.283.* must be less than 6.283"),
+        (arm, {"radius": 0.015}, "layers of 0.015 m together leave no core within body.radius=0.015 m"),
+        (arm, {"cells": [1, 8]}, "body.cells=.* must be greater than or equal to 2"),
+        (arm, {"layers": []}, "at least one layer"),
+        (sheet, {"size": [0.16, 0]}, r"body.size=\[0.16, 0\] must be greater than 0"),
+        (sheet, {"cells": [1, 8]}, r"body.cells=\[1, 8\] must be greater than or equal to 2"),
+        (sheet, {"layers": []}, "at least one layer"),
+        (sheet, {"layers": [{"material": "EcoFlex 00-30"}]}, "body.layers.0 needs thickness, got material"),
+        (sheet, {"layers": [LAYERS[0], LAYERS[1] | {"thickness": -1}]}, "body.layers.1.thickness=-1 must"),
+        (sheet, {"layers": [{"material": "rubber", "thickness": 0.01}]}, "unknown material rubber"),
     ],
 )
-def test_what_is_no_sheet_is_refused_by_name(changes, says):
+def test_what_is_no_body_is_refused_by_name(make, changes, says):
     with pytest.raises(InputError, match=says):
-        sheet(**changes)
+        make(**changes)
 
 
 def test_a_mesh_too_fine_for_memory_is_refused_with_an_estimate():

@@ -83,20 +83,6 @@ def test_three_axes_are_three_sensors_at_each_site():
     np.testing.assert_allclose(frames @ frames.transpose(0, 2, 1), np.tile(np.eye(3), (6, 1, 1)), atol=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("options", "says"),
-    [
-        ({"tilt": -0.1}, "layout.tilt=-0.1 must be greater than or equal to 0"),
-        ({"tilt": np.pi / 2}, "layout.tilt=1.57.* must be less than 1.57"),
-        ({"rows": 0}, "layout.rows=0 must be greater than 0: as in layout.rows=5"),
-        ({"footprint": [0.01, 0]}, "layout.footprint=.* must be greater than 0"),
-    ],
-)
-def test_what_is_no_grid_is_refused(options, says):
-    with pytest.raises(InputError, match=says):
-        Grid(**options).sensors(OBLONG)
-
-
 LAYERS = [{"material": "EcoFlex 00-30", "thickness": thickness} for thickness in (0.010, 0.005)]
 BODY = Sheet([0.16, 0.16], [32, 32], LAYERS)
 
@@ -115,12 +101,6 @@ def test_no_sensor_moves_farther_than_the_jitter():
     assert (moves.max(axis=(0, 1)) > 0.24 * pitch).all()
 
 
-@pytest.mark.parametrize("jitter", [-0.1, 0.5])
-def test_a_jitter_at_which_sensors_could_meet_is_refused(jitter):
-    with pytest.raises(InputError, match=r"layout\.jitter=.* must be .*: as in layout.jitter=0\.25"):
-        Scattered(jitter=jitter)
-
-
 OBLONG = Sheet([0.16, 0.08], [32, 16], [{"material": "EcoFlex 00-30", "thickness": 0.005}])
 
 
@@ -135,12 +115,6 @@ def test_footprints_neither_overlap_nor_leave_the_surface(seed):
     assert (apart.any(axis=2) | np.eye(25, dtype=bool)).all()
 
 
-@pytest.mark.parametrize(("count", "footprint"), [(200, (0.01, 0.01)), (1, (0.2, 0.01))])
-def test_more_sensors_than_fit_are_refused(count, footprint):
-    with pytest.raises(InputError, match=r"layout\.count"):
-        Random(count, 0, footprint).sensors(OBLONG)
-
-
 def test_an_inner_sensor_has_six_neighbours_at_equal_distances():
     pitch = 0.02
     body = Sheet([6 * pitch, 5 * pitch * np.sqrt(3) / 2], [12, 10], LAYERS)
@@ -151,11 +125,6 @@ def test_an_inner_sensor_has_six_neighbours_at_equal_distances():
     assert distances[6] > 1.5 * pitch
 
 
-def test_no_row_is_refused():
-    with pytest.raises(InputError, match=r"layout\.rows"):
-        Hexagonal(rows=0)
-
-
 FACING = "x_m,y_m,normal_x,normal_y,normal_z\n"
 ALONG = "x_m,y_m,direction_x,direction_y,direction_z\n"
 MINE = b"""x_m, y_m, depth_m, normal_x, normal_y, normal_z
@@ -163,6 +132,25 @@ MINE = b"""x_m, y_m, depth_m, normal_x, normal_y, normal_z
 0.08, 0.031, 0.004, 0.5, 0, 1
 0.15, 0.12, 0.005, 0, -1, 2
 """
+
+
+@pytest.mark.parametrize(
+    ("kind", "options", "says"),
+    [
+        (Grid, {"tilt": -0.1}, "layout.tilt=-0.1 must be greater than or equal to 0"),
+        (Grid, {"tilt": np.pi / 2}, "layout.tilt=1.57.* must be less than 1.57"),
+        (Grid, {"rows": 0}, "layout.rows=0 must be greater than 0: as in layout.rows=5"),
+        (Grid, {"footprint": [0.01, 0]}, "layout.footprint=.* must be greater than 0"),
+        (Hexagonal, {"rows": 0}, "layout.rows"),
+        (Scattered, {"jitter": -0.1}, "layout.jitter=-0.1 must be .*: as in layout.jitter=0.25"),
+        (Scattered, {"jitter": 0.5}, "layout.jitter=0.5 must be .*: as in layout.jitter=0.25"),
+        (Random, {"count": 200}, "layout.count"),
+        (Random, {"count": 1, "footprint": (0.2, 0.01)}, "layout.count"),
+    ],
+)
+def test_what_no_layout_can_be_is_refused(kind, options, says):
+    with pytest.raises(InputError, match=says):
+        kind(**options).sensors(OBLONG)
 
 
 @pytest.fixture

@@ -59,11 +59,7 @@ def test_finished_runs_are_found_and_judged(run, folder):
 
 @pytest.mark.parametrize(
     ("arguments", "named"),
-    [
-        ((), "which study"),
-        (["study=margin"], "margins"),
-        (["study=models", NO_METRIC], "statements[0]"),
-    ],
+    [((), "which study"), (["study=margin"], "margins"), (["study=models", NO_METRIC], "statements[0]")],
 )
 def test_bad_input_ends_with_code_2_and_imports_nothing_heavy(arguments, named, light, tmp_path):
     done = light(tmp_path, "study", *arguments)

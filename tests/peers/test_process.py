@@ -33,9 +33,11 @@ def fitted(own_python, data):
     return learner
 
 
-def test_a_stored_model_predicts_the_same(fitted, data, tmp_path):
+def test_it_learns_and_a_stored_model_predicts_the_same(fitted, data, tmp_path):
     touches = data.touches("test")
     expected = fitted.probabilities(touches)
+    assert ((expected > 0.5) == (touches.labels > 0.5)).float().mean() > 0.7
+    assert fitted.seconds_per_epoch > 0
     path = fitted.save(tmp_path)
     with np.load(path, allow_pickle=False) as arrays:
         assert {array.dtype.kind for array in arrays.values()} == {"f"}
@@ -43,13 +45,6 @@ def test_a_stored_model_predicts_the_same(fitted, data, tmp_path):
     other.load(data, path)
     assert other.parameters == fitted.parameters
     torch.testing.assert_close(other.probabilities(touches), expected)
-
-
-def test_it_learns(fitted, data):
-    touches = data.touches("test")
-    right = (fitted.probabilities(touches) > 0.5) == (touches.labels > 0.5)
-    assert right.float().mean() > 0.7
-    assert fitted.seconds_per_epoch > 0
 
 
 def test_touches_of_another_shape_are_refused(fitted, data):

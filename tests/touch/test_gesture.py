@@ -74,20 +74,14 @@ def test_durations_are_whole_frames_of_the_model():
 
 @pytest.mark.parametrize(
     ("given", "expected"),
-    [
-        (None, (30, 10.0)),
-        ({"rate": 50, "press": [9, 1]}, (150, 50.0)),
-        (GestureSettings(window=2.0), (20, 10.0)),
-    ],
+    [(None, (30, 10)), ({"rate": 50, "press": [9, 1]}, (150, 50)), (GestureSettings(window=2.0), (20, 10))],
 )
 def test_the_window_of_a_model(given, expected):
     assert model_window(given) == expected
 
 
 def test_a_window_that_no_model_has_is_refused():
-    with pytest.raises(
-        InputError, match=r"touch.window=0.01 s is no frame at .*=10 Hz: raise it to 0.1 or more"
-    ):
+    with pytest.raises(InputError, match=r"touch.window=0.01 s is no frame at .* raise it to 0.1 or more"):
         model_window({"window": 0.01})
 
 

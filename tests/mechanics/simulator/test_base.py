@@ -13,11 +13,7 @@ from skin.errors import InputError
 from skin.mechanics.simulator.base import AbstractSimulator, Response
 from skin.mechanics.simulator.naive import Naive
 
-LAYERS = [
-    {"material": "Dragon Skin 10 Medium", "thickness": 0.010},
-    {"material": "EcoFlex 00-30", "thickness": 0.005},
-]
-BODY = Sheet([0.16, 0.12], [9, 7], LAYERS)
+BODY = instantiate(OmegaConf.load(CONF / "body" / "sheet.yaml"), size=[0.16, 0.12], cells=[9, 7])
 SENSORS = Scattered(2, 3, seed=3).sensors(BODY)
 OPTIONS = [
     pytest.param((path, extra), id="-".join([path.stem, *map(str, extra.values())]))

@@ -1,7 +1,8 @@
-"""The threshold of the alarm through the commands: a training stores it, and all others use it."""
+"""A finished run in the commands: where its alarm is raised, and its folder, by whose name it is used."""
 
 import json
 import re
+import shutil
 from contextlib import contextmanager
 
 import numpy as np
@@ -108,3 +109,71 @@ def test_live_raises_the_alarm_where_it_is_told(run, folder, port, above, alarm)
     assert re.search(r"[1-9]\d* verdicts", done.stderr)
     assert ('"dangerous": true' in done.stdout) == alarm
     assert f"alarm above {float(above):g}" in done.stderr
+
+
+@pytest.fixture(scope="module")
+def published(run, folder):
+    """Return the folder of the run, which is published there as ``small``."""
+    assert run(folder, "export", "format=folder", "name=small", "licence=MIT").stdout == "models/small\n"
+    return folder
+
+
+@pytest.fixture
+def model(published, tmp_path):
+    shutil.copytree(published / "models" / "small", tmp_path / "models" / "small")
+    return tmp_path / "models" / "small"
+
+
+def test_the_folder_has_weights_configuration_hashes_and_card(published):
+    assert [path.name for path in (published / "models").iterdir()] == ["small"]
+    written = {path.name for path in (published / "models" / "small").iterdir()}
+    assert written == {"README.md", "SHA256SUMS", "config.yaml", "rules.json", "run.json"}
+    card = (published / "models" / "small" / "README.md").read_text()
+    assert "`skin.learning.learner.Rules`" in card
+    assert "Mlp" not in card
+
+
+def test_its_name_is_a_run_where_the_run_itself_is_not(published, model, run):
+    done = run(model.parents[1], "evaluate", "run=small")
+    table = lambda text: [line for line in text.splitlines() if "accuracy" in line]  # noqa: E731
+    assert len(table(done.stdout)) > 3
+    assert table(done.stdout) == table((published / "said").read_text())
+
+
+def test_an_altered_file_ends_a_command_with_a_sentence(model, run):
+    with (model / "rules.json").open("a") as file:
+        file.write(" ")
+    for verb in ("evaluate", "live"):
+        done = run(model.parents[1], verb, "run=small", code=2)
+        assert "rules.json in " in done.stderr
+        assert "differs from SHA256SUMS: restore the folder" in done.stderr
+        assert done.stderr.count("\n") == 1
+    assert not (model.parents[1] / "results").exists()
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["licence=MIT"], "name=None is no name of a model"),
+        (["name=../small", "licence=MIT"], "name=../small is no name of a model"),
+        (["name=latest", "licence=MIT"], "name=latest is no name of a model"),
+        (["name=new"], "add licence=MIT"),
+        (["name=small", "licence=MIT"], "models/small exists"),
+        (["name=new", "licence=MIT", "run=none"], "no finished training run none"),
+        (["name=new", "licence=MIT", "out=x"], "not to out=x: add name=my_skin"),
+    ],
+)
+def test_bad_input_ends_with_a_sentence(published, run, overrides, message):
+    done = run(published, "export", "format=folder", *overrides, code=2)
+    assert message in done.stderr
+    assert done.stderr.count("\n") == 1
+    assert [path.name for path in (published / "models").iterdir()] == ["small"]
+
+
+def test_weights_that_are_too_large_are_refused(published, run):
+    code = "import skin.runs.run as m; from skin.commands.export import main; m._LARGEST = 100\n"
+    code += "main(['format=folder', 'name=new', 'licence=MIT'{own}])"
+    (published / "limited.py").write_text(code.format(own=f", 'tracking.uri=sqlite:///{published}/m.db'"))
+    done = run(published, published / "limited.py", store=False, code=2)
+    assert "are not one file of at most 0.0001 MB" in done.stderr
+    assert [path.name for path in (published / "models").iterdir()] == ["small"]

@@ -63,7 +63,7 @@ def test_a_session_with_other_axes_is_refused_until_that_is_confirmed(run, tmp_p
     assert list(read_calibration(out).channels) == [1, 0, 2, 3]
 
 
-SOLID = ["simulator=solid", "simulator.divisions=1", "layout=grid", "layout.rows=2", "layout.columns=2"]
+SOLID = [*SMALL, "simulator=solid", "simulator.divisions=1"]
 PRESSES = ["calibrate.protocol.rest=1.5", "calibrate.protocol.peak=60"]
 WATCHED = ["run=any_skin", "evaluation.safe_gestures=64"]
 
@@ -85,7 +85,7 @@ def test_eight_presses_show_a_little_and_no_more(run, tmp_path):
     assert "needs presses of known force, and run= whose alarm they test" in done.stderr
 
 
-NAIVE = ["layout=grid", "layout.rows=2", "layout.columns=2", "simulator=naive"]
+NAIVE = [*SMALL, "simulator=naive"]
 LOAD, PERIOD = 2.8, 4.2  # s
 
 

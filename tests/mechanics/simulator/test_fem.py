@@ -18,11 +18,10 @@ from skin.errors import InputError
 from skin.mechanics.simulator import fem as _operator
 from skin.mechanics.simulator.fem import PlatesAndBeams, Structure, build, cached
 
-LAYERS = [
-    {"material": "Dragon Skin 10 Medium", "thickness": 0.010},
-    {"material": "EcoFlex 00-30", "thickness": 0.005},
-]
-THREE = [*LAYERS, {"material": {"name": "foam", "young": 40e3, "poisson": 0.2}, "thickness": 0.003}]
+DRAGON = {"material": "Dragon Skin 10 Medium", "thickness": 0.010}
+ECOFLEX = {"material": "EcoFlex 00-30", "thickness": 0.005}
+FOAM = {"material": {"name": "foam", "young": 40e3, "poisson": 0.2}, "thickness": 0.003}
+LAYERS = [DRAGON, ECOFLEX]
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +73,7 @@ def test_equation_10_is_what_it_says(default):
 
 def test_interface_reading_is_the_force_of_the_beams_under_the_footprint(cache):
     """Two of a layer's beams and a half: E A / h times their shortening, by hand."""
-    body = Sheet([0.06, 0.06], [6, 6], THREE)
+    body = Sheet([0.06, 0.06], [6, 6], [*LAYERS, FOAM])
     pressure = torch.rand(body.shape, generator=torch.Generator().manual_seed(0)) * 1e5
     sensor = at((0.03, 0.02, 0.003), footprint=(0.02, 0.01))
     skin = PlatesAndBeams(body, sensor, reading="interface", cache=cache)
@@ -109,7 +108,6 @@ def test_a_mesh_too_fine_for_its_factors_is_refused_before_they_are_made(cache, 
         PlatesAndBeams(body, at((0.08, 0.08, 0.005)), cache=cache)
 
 
-ECOFLEX = {"material": "EcoFlex 00-30", "thickness": 0.005}
 STRUCTURE = Structure(Sheet([0.04, 0.03], [4, 3], [ECOFLEX]))
 SENSORS = Sensors(np.array([[0.01, 0.02, 0.0], [0.03, 0.01, 0.0]]), (0.01, 0.01))
 
@@ -227,8 +225,6 @@ def test_many_may_write_at_once(tmp_path):
     assert stored(tmp_path).suffix == ".npz"
 
 
-DRAGON = {"material": "Dragon Skin 10 Medium", "thickness": 0.010}
-FOAM = {"material": {"name": "foam", "young": 40e3, "poisson": 0.2}, "thickness": 0.003}
 BODIES = {
     "3x3, one layer": Sheet([0.03, 0.03], [3, 3], [ECOFLEX]),
     "6x5, flat cells, two layers": Sheet([0.05, 0.09], [6, 5], [DRAGON, ECOFLEX]),

@@ -242,16 +242,12 @@ def test_a_cut_footprint_is_said_with_its_share():
         Solid(body, Sensors(positions, (0.01, 0.01), lean), divisions=1)
 
 
-MIXED = [
-    {"material": {"name": "muscle", "young": 560e3, "poisson": 0.49}, "thickness": 0.010},
-    {"material": {"name": "skin", "young": 170e3, "poisson": 0.499}, "thickness": 0.005},
-]
 _GAUSS = (np.array([-1, 1]) / np.sqrt(3) + 1) / 2
 
 
 @pytest.mark.parametrize(("seed", "shear"), [(0, 0.0), (1, 0.5)])
 def test_the_operator_agrees_with_scikit_fem_on_single_frames(seed, shear):
-    body = Sheet((0.12, 0.12), (8, 8), MIXED)
+    body = Sheet((0.12, 0.12), (8, 8), LAYERS)
     position = np.array([3 * body.cell[0], 4 * body.cell[1], 0.005])
     mesh, extent = build_mesh(body, 2, {}), 2 * body.cell[0]
     down, above = np.array([[0.0, 0, 1]]), position * [1, 1, 0]

@@ -11,13 +11,7 @@ import pytest
 from skin.body.base import Sheet
 from skin.body.layout import Grid
 from skin.calibration import bench
-from skin.calibration.bench import (
-    BenchSession,
-    BenchSettings,
-    Gauge,
-    read_bench_session,
-    write_bench_session,
-)
+from skin.calibration.bench import BenchSession, BenchSettings, Gauge, read_bench_session, write_bench_session
 from skin.calibration.fit import check_force, fit_calibration
 from skin.calibration.known_loads import choose_presses, emulate_session, stair_gauge
 from skin.calibration.wiring import wired_bench
@@ -162,11 +156,7 @@ def changed(written, tmp_path, **factors):
 @pytest.mark.parametrize(
     ("factors", "settings", "hint"),
     [
-        (
-            {"time": 1000},
-            {"time_scale": 0.001},
-            "0.1 rows per second, .* add calibrate.time_scale=0.001",
-        ),
+        ({"time": 1000}, {"time_scale": 0.001}, "0.1 rows per second, .* add calibrate.time_scale=0.001"),
         ({"force": -1}, {"force_scale": -1.0}, r"add calibrate\.force_scale=-1"),
     ],
 )

@@ -7,13 +7,7 @@ import pytest
 
 from skin.body.base import Layer
 from skin.body.material import Material
-from skin.calibration.check import (
-    Check,
-    describe_setup,
-    find_check,
-    store_check,
-    verify_source,
-)
+from skin.calibration.check import Check, describe_setup, find_check, store_check, verify_source
 from skin.calibration.known_loads import measure_ratios
 from skin.device.resampling import Frame
 from skin.errors import InputError
@@ -24,10 +18,8 @@ from skin.wire.skin import SerialSource, Source
 
 SENSORS, RATE, HOLD, GAP = 9, 25.0, 11.0, 2.5
 EXPECTED = 3.0 * np.eye(SENSORS) + 0.05
-POSITIONS, SIZE = (
-    np.stack(np.meshgrid([0.04, 0.12, 0.2], [0.01, 0.04, 0.07]), -1).reshape(-1, 2),
-    (0.24, 0.08),
-)
+POSITIONS = np.stack(np.meshgrid([0.04, 0.12, 0.2], [0.01, 0.04, 0.07]), -1).reshape(-1, 2)
+SIZE = (0.24, 0.08)
 
 LAYERS = [Layer(Material("silicone", 1e5, 0.4), 0.005)]
 
@@ -119,11 +111,7 @@ def test_a_scale_is_verified_by_its_check_alone(data):
 
 @pytest.mark.parametrize(
     ("changed", "difference"),
-    [
-        ({"scale": 0.01}, "scale"),
-        ({"scale": -0.02}, "scale"),
-        ({"positions": POSITIONS + 0.001}, "layout"),
-    ],
+    [({"scale": 0.01}, "scale"), ({"scale": -0.02}, "scale"), ({"positions": POSITIONS + 0.001}, "layout")],
 )
 def test_what_differs_from_the_check_is_named(data, changed, difference):
     stored()

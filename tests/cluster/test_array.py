@@ -14,10 +14,8 @@ def test_a_task_runs_its_part_with_its_cores():
     task = {"SLURM_ARRAY_TASK_ID": "3", "SLURM_ARRAY_TASK_COUNT": "8", "SLURM_CPUS_PER_TASK": "4"}
     script = [str(ROOT / "experiments" / "cluster" / "array.sh"), "study", "study=norm", "seed=0,1"]
     kept = {name: value for name, value in os.environ.items() if name != "OMP_NUM_THREADS"}
-    done = subprocess.run(
-        script, env=kept | task | {"PYTHON": "echo"}, capture_output=True, text=True, check=True
-    )
-    assert done.stdout == "-m skin study study=norm seed=0,1 shard=3/8\n"
+    out = subprocess.check_output(script, env=kept | task | {"PYTHON": "echo"}, text=True)
+    assert out == "-m skin study study=norm seed=0,1 shard=3/8\n"
 
 
 @pytest.mark.parametrize("path", SCRIPTS, ids=lambda path: path.name)

@@ -11,16 +11,14 @@ PORT = "device.port=/dev/ttyACM77"
         ("animate", "add out=touch.gif"),
         ("animate out=x.gif touch=fingertips labels=[big]", "fingertips cannot be drawn to be big"),
         ("animate out=x.mp4", "out=x.mp4 must be a .gif file or a .png file: add out=touch.gif"),
-        ("animate vieww=flat", "vieww"),
         ("calibrate", "which session?"),
         ("calibrate session=none.csv", "cannot read the session none.csv: "),
         ("check weight=0 layout=grid simulator=naive", "is no known load: give a mass in kg, up to 50"),
-        ("check seconds=1 layout=grid", "seconds=1 must be greater than or equal to 2"),
         ("compare", "which session?"),
         ("convert", "skin convert needs from= or reader=, and out=, as in from=map.yaml out=x.parquet"),
         (
             "convert from=map.yaml out=x.txt",
-            "out=x.txt must be a .parquet file or a .csv file or a .mcap file or",
+            "out=x.txt must be a .parquet file or a .csv file or a .mcap",
         ),
         ("convert from=none.yaml out=x.csv", "cannot read the mapping none.yaml"),
         ("convert from=efles out=x.csv", "from=efles is no format: give map.yaml, or one of folder, sdu"),
@@ -28,10 +26,8 @@ PORT = "device.port=/dev/ttyACM77"
         ("design out=x simulator=naive layout=grid layout.axes=three", "set simulator=solid, or layout.tilt"),
         ("design out=x layout=grid layout.axes=two", "layout.axes=two must be 'normal' or 'three'"),
         ("emulate gestures=-1", "gestures=-1 is below 0: give a number above 0"),
-        ("emulate emulate.rate=0", "emulate.rate=0 must be greater than 0"),
         ("export format=zip", "format=zip must be 'onnx', 'c', 'folder' or 'thresholds'"),
         ("export name=small", "only a folder takes name and licence: add format=folder, or leave them out"),
-        ("export export.rates=[]", "export.rates=[] has too few entries"),
         ("export out=x.txt", "out=x.txt must be a .onnx file: add out=skin.onnx"),
         ("export format=c out=x.onnx", "out=x.onnx must be a .h file: add out=skin.h"),
         ("generate n=-1", "n=-1 is below 0: give a number above 0"),
@@ -43,17 +39,10 @@ PORT = "device.port=/dev/ttyACM77"
         (f"listen {PORT}", "no port /dev/ttyACM77"),
         ("live demo=true run=none", "no finished training run none"),
         ("live demo=true device=serial", "leave out device=serial, or demo=true"),
-        ("live live.top=0", "live.top=0 must be greater than 0"),
-        ("live live.web_port=70000", "live.web_port=70000 must be less than or equal to 65535"),
         ("live +live.patience.alarms=0.1", "live.patience has no setting alarms: did you mean alarm"),
-        *(
-            (f"{verb} seconds=-1", "seconds=-1 is below 0")
-            for verb in ("live", "record", "listen", "emulate")
-        ),
+        *((f"{verb} seconds=-1", "seconds=-1 is below") for verb in ("live", "record", "listen", "emulate")),
         ("record", "out=None must be a folder: add out=session"),
-        ("record out=x device.silence=-1", "device.silence=-1 must be greater than or equal to 0"),
         ("setup", "device.port is missing: add device.port=/dev/ttyACM0"),
-        ("train trainer.max_epochs=0.5", "trainer.max_epochs=0.5 must be a whole number from 1 up"),
     ],
 )
 def test_bad_input_ends_with_a_sentence(run, tmp_path, words, message):

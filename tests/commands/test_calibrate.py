@@ -1,8 +1,16 @@
 """The command that calibrates: from an emulated bench to a device that trains."""
 
+import json
+from time import monotonic
+
+import numpy as np
 import pytest
 
+from skin.calibration.known_loads import KnownLoad, base_readings
 from skin.device.calibration import read_calibration
+from skin.runs.build import build_skin
+from skin.wire.protocol import Header, encode_header, encode_line
+from tests.wire.conftest import Plug
 
 SMALL = ["layout=grid", "layout.rows=2", "layout.columns=2"]
 
@@ -53,3 +61,69 @@ def test_a_session_with_other_axes_is_refused_until_that_is_confirmed(run, tmp_p
     assert all(f"{setting}" in done.stderr for setting in wrong)
     done = run(tmp_path, "calibrate", *SMALL, *files, *wrong, store=False)
     assert list(read_calibration(out).channels) == [1, 0, 2, 3]
+
+
+SOLID = [*SMALL, "simulator=solid", "simulator.divisions=1"]
+PRESSES = ["calibrate.protocol.rest=1.5", "calibrate.protocol.peak=60"]
+WATCHED = ["run=any_skin", "evaluation.safe_gestures=64"]
+
+
+@pytest.mark.slow("chooses a threshold")
+def test_eight_presses_show_a_little_and_no_more(run, tmp_path):
+    run(tmp_path, "calibrate", *SOLID, *PRESSES, "session=bench.csv", "calibrate.demo=true", store=False)
+    words = ["compare", "session=bench.csv", *SOLID]
+    done = run(tmp_path, *words, *WATCHED, "out=enough", "compare.miss_rate=0.5", store=False)
+    page = (tmp_path / "enough" / "compare.md").read_text()
+    assert "above 1.1 x the limit and on a valid sensor: 8 of 8, 0 missed" in page
+    assert "- alarm above 0." in page
+    assert page in done.stdout
+    done = run(tmp_path, *words, *WATCHED, "out=few", "compare.miss_rate=0.05", store=False, code=2)
+    assert "0 misses of 8 presses above 1.1 x the limit" in done.stderr
+    assert "88 presses are needed" in done.stderr
+    assert not (tmp_path / "few").exists()
+    done = run(tmp_path, *words, "compare.miss_rate=0.05", store=False, code=2)
+    assert "needs presses of known force, and run= whose alarm they test" in done.stderr
+
+
+NAIVE = [*SMALL, "simulator=naive"]
+LOAD, PERIOD = 2.8, 4.2  # s
+
+
+@pytest.fixture
+def port(configured):
+    """Serve a skin in counts of 0.02 N, on which 0.5 kg lies on three sensors, one after the other."""
+    model = build_skin(configured(*NAIVE))
+    simulator = model.simulator(model.body, model.sensors)
+    expected = base_readings(simulator, model.body, model.sensors, KnownLoad(0.5, 0.006))[0]
+    plug, noise = Plug(), np.random.default_rng(0)
+    now, sent = 0.0, monotonic()
+
+    def send(number):
+        nonlocal now, sent
+        before, sent = sent, monotonic()
+        now += min(sent - before, 0.1)  # it stands still while nobody reads
+        position, since = divmod(now - 12, PERIOD)
+        load = expected[int(position)] if 0 <= position < 3 and since < LOAD else np.zeros(4)
+        header = encode_header(Header(1, 4, 50.0, "adc", 12, "arm-L")) if number % 50 == 0 else b""
+        counts = np.round(100 + (load + noise.normal(0, 0.02, 4)) / 0.02).astype(int).tolist()
+        return header + encode_line(counts, number, round(1e6 * now))
+
+    with plug.streaming(send, 1 / 50):
+        yield f"device.port={plug.port}"
+    plug.unplug()
+
+
+@pytest.mark.parametrize("scale", [0.02, 0.002])
+def test_three_loads_at_a_port(run, tmp_path, monkeypatch, port, scale):
+    monkeypatch.setenv("SKIN_DATA", str(tmp_path / "data"))
+    done = run(tmp_path, "check", *NAIVE, port, f"device.scale={scale}", "seconds=2", store=False, code=None)
+    files = list((tmp_path / "data").rglob("*.json"))
+    if scale == 0.02:
+        (stored,) = [json.loads(file.read_text()) for file in files]
+        assert stored["setup"]["device"] == "arm-L"
+        assert list(stored["ratios"]) == ["0", "1", "2"]
+        assert stored["rest"] == pytest.approx([100] * 4, abs=3)
+        assert "3 of 3" in done.stderr
+    else:
+        assert (done.returncode, files) == (2, [])
+        assert "nothing was stored" in done.stderr.splitlines()[-1]

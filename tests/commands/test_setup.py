@@ -15,8 +15,6 @@ import pytest
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
-pytest.importorskip("termios", reason="pseudo-terminals need a POSIX system")
-
 from skin.calibration.known_loads import KnownLoad, base_readings
 from skin.device.calibration import read_calibration
 from skin.runs.build import build_skin
@@ -126,9 +124,7 @@ def test_bad_answers_are_asked_again_and_nothing_is_half_written(run, monkeypatc
     assert not list(tmp_path.iterdir())
 
 
-def test_a_step_that_fails_is_offered_again_and_the_guide_continues_where_it_was_left(
-    run, monkeypatch, tmp_path
-):
+def test_a_step_that_fails_is_offered_again_and_the_guide_goes_on_where_it_was(run, monkeypatch, tmp_path):
     steps = lambda said: re.findall(r"of 7: (\w+)", said)  # noqa: E731
     assert steps(asked(run, monkeypatch, tmp_path, "")) == ["board", "board"]
     assert steps(asked(run, monkeypatch, tmp_path, "", "", program="true")) == ["board", "values", "skin"]

@@ -43,6 +43,8 @@ def test_what_fits_is_taken():
     composed = OmegaConf.create({"span": [1, 2.5], "copies": {"a": 1}})
     check_settings(Thing, {name: composed[name] for name in composed}, "thing")
     check_settings(lambda **settings: None, {"anything": 1}, "thing")
+    # classes of libraries check themselves
+    check_groups({"learner": {"optimizer": {"_target_": "torch.optim.Adam", "no": "such setting"}}})
 
 
 @pytest.mark.parametrize(
@@ -92,10 +94,6 @@ def test_classes_of_others_are_checked_too(part, said):
         check_groups({"learner": {"model": part}})
 
 
-def test_classes_of_libraries_check_themselves():
-    check_groups({"learner": {"optimizer": {"_target_": "torch.optim.Adam", "no": "such setting"}}})
-
-
 def test_settings_that_are_all_are_missed_by_name():
     with pytest.raises(InputError, match=r"^thing needs made, got count$"):
         configured(Thing, {"count": 1}, "thing")
@@ -127,10 +125,7 @@ def test_a_checked_class_refuses_what_a_script_gives_it():
         (["learner=boosted_trees", "learner.rounds=0"], "learner.rounds=0 must be greater than or equal"),
         (["device.noise=-1"], "device.noise=-1 must be greater than or equal to 0"),
         (["device.dead=[4,2]"], r"device.dead=\[4, 2\] must be a range \[minimum, maximum\]"),
-        (
-            ["+device.noize=1"],
-            "no setting noize: did you mean noise[?] it has .*gain_spread, scale_spread, off",
-        ),
+        (["+device.noize=1"], "no setting noize: did you mean noise[?] it has .*gain_spread, scale_spread, "),
         ([*SERIAL, "device.limits=[1023,0]"], r"device.limits=\[1023, 0\] must be \[smallest, largest\]"),
     ],
 )

@@ -14,7 +14,6 @@ SMALL = (
 @pytest.mark.slow("solves for the posteriors of nine sensors")
 def test_the_expected_posterior_of_nine_sensors(run, tmp_path):
     done = run(tmp_path, *SMALL, "simulator=solid", "simulator.divisions=2", "out=x", store=False)
-    assert done.returncode == 0, done.stderr
     assert "Expected posterior of a fingertip" in done.stdout
     assert "\u2026" not in done.stdout  # no column is cut off
     assert "bound" not in done.stdout.lower()
@@ -35,8 +34,7 @@ def test_the_expected_posterior_of_nine_sensors(run, tmp_path):
 
 
 def test_a_skin_without_mechanics_has_a_posterior_too(run, tmp_path):
-    done = run(tmp_path, *SMALL, "simulator=naive", "design.touches=32", "out=x", store=False)
-    assert done.returncode == 0, done.stderr
+    run(tmp_path, *SMALL, "simulator=naive", "design.touches=32", "out=x", store=False)
     weak, _, strong = json.loads((tmp_path / "x" / "design.json").read_text())["expected"]
     # A touch beside every sensor's cell raises none, however hard it is.
     assert 0.5 < strong["blind_share"] <= weak["blind_share"] < 1
@@ -46,8 +44,7 @@ def test_a_skin_without_mechanics_has_a_posterior_too(run, tmp_path):
 def test_a_sweep_has_a_line_for_each_thickness_and_grid(run, tmp_path):
     sizes = "design.thicknesses=[0.015,0.03]", "design.grids=[[2,4],[2,6]]", "design.margin=0.02"
     given = "design=sweep", *sizes, "simulator=solid", "simulator.divisions=2"
-    done = run(tmp_path, *SMALL, *given, "out=x", store=False)
-    assert done.returncode == 0, done.stderr
+    run(tmp_path, *SMALL, *given, "out=x", store=False)
     with (tmp_path / "x" / "design_sweep.csv").open(newline="") as file:
         lines = [{name: float(value) for name, value in line.items()} for line in csv.DictReader(file)]
     skins = [(line["thickness_m"], line["columns"]) for line in lines]
@@ -67,14 +64,12 @@ def test_a_sweep_has_a_line_for_each_thickness_and_grid(run, tmp_path):
         (["device.noise=[0.05,0.2]"], "design.noise="),
         (["design=sweep", "simulator=naive"], "needs a simulator with mechanics: set simulator=solid"),
         (["design=sweep", "design.height=0.02", "simulator=solid"], "design.height=0.02 m is not inside"),
-        (["body=arm", "simulator=fem", "~body.size"], "simulator=solid"),
+        (["body=arm", "simulator=fem"], "simulator=solid"),
         (["design=placement"], "there is no design=placement: did you mean place?"),
     ],
 )
 def test_refuses(run, tmp_path, given, words):
     first = [one for one in SMALL if "body=arm" not in given or not one.startswith("body.")]
-    done = run(tmp_path, *first, *[one for one in given if not one.startswith("~")], "out=x", store=False)
-    assert done.returncode == 2, done.stderr
+    done = run(tmp_path, *first, *given, "out=x", store=False, code=2)
     assert words in done.stderr
-    assert "Traceback" not in done.stderr
     assert not (tmp_path / "x").exists()

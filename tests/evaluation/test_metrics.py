@@ -24,21 +24,16 @@ def scored():
     return (2 * labels - 1 + 1.5 * noise).sigmoid(), labels
 
 
-def test_accuracies_are_those_of_scikit_learn_and_overall_their_mean(scored):
+def test_accuracies_and_confusions_are_those_of_scikit_learn_and_overall_their_mean(scored):
     probabilities, labels = scored
-    found = compute_metrics(probabilities, labels, TOUCH)
+    found, counts = compute_metrics(probabilities, labels, TOUCH), count_confusions(probabilities, labels)
     for i, name in enumerate(TOUCH.names):
         truth, said = labels[:, i], probabilities[:, i] > 0.5
         assert found[f"{name}/accuracy"] == pytest.approx(accuracy_score(truth, said))
         assert found[f"{name}/balanced_accuracy"] == pytest.approx(balanced_accuracy_score(truth, said))
+        assert (counts[i].numpy() == confusion_matrix(truth, said)).all()
     each = [found[f"{name}/accuracy"] for name in TOUCH.names]
     assert found["overall/accuracy"] == pytest.approx(sum(each) / 4)
-
-
-def test_confusion_has_the_true_class_down(scored):
-    probabilities, labels = scored
-    for i, counts in enumerate(count_confusions(probabilities, labels).numpy()):
-        assert (counts == confusion_matrix(labels[:, i], probabilities[:, i] > 0.5)).all()
 
 
 def test_a_gate_leaves_the_other_labels_to_the_touches_it_lets_through(scored):
@@ -77,22 +72,6 @@ def test_angles_are_measured_on_touches_that_have_a_direction(scored):
     assert metrics.measure_angles(torch.zeros(1, 6), label, TOUCH_SLIDING).tolist() == [90.0]
 
 
-@pytest.mark.parametrize("dangerous", [0.0, 1.0])
-def test_no_recall_is_made_up_where_no_gesture_is_safe_or_none_is_dangerous(scored, dangerous):
-    probabilities, labels = scored
-    labels = labels.clone()
-    labels[:, 3] = dangerous
-    found = compute_metrics(probabilities, labels, TOUCH, OperatingPoint(0.5, 0.02, 64, 1, 0))
-    undefined, other = "false_alarm_rate", "alarm_recall"
-    if not dangerous:
-        undefined, other = other, undefined
-    assert math.isnan(found[f"dangerous/{undefined}"])
-    assert 0 <= found[f"dangerous/{other}"] <= 1
-    assert math.isnan(found["dangerous/balanced_accuracy"])
-    assert 0 < found["dangerous/accuracy"] < 1
-    assert 0 < found["overall/accuracy"] < 1
-
-
 def test_calibration_error_in_bins_of_equal_numbers_is_that_of_plain_python():
     generator = torch.Generator().manual_seed(4)
     probability = torch.rand(1500, generator=generator) ** 3
@@ -105,9 +84,7 @@ def test_calibration_error_in_bins_of_equal_numbers_is_that_of_plain_python():
     assert metrics.calibration_error(probability, label) == pytest.approx(sum(gaps) / 1500, abs=1e-3)
     assert metrics.calibration_error(probability, (probability > 0.5).long()) > 0.1
     # Equal probabilities share a bin.
-    assert metrics.calibration_error(torch.full((100,), 0.5), torch.tensor([1, 0] * 50)) == pytest.approx(
-        0, abs=1e-9
-    )
+    assert metrics.calibration_error(torch.full((100,), 0.5), torch.tensor([1, 0] * 50)) < 1e-9
 
 
 def test_means_over_gestures_are_the_metrics():

@@ -4,13 +4,15 @@ import io
 from dataclasses import replace
 from types import SimpleNamespace
 
+import pandas as pd
 import pytest
 import torch
 from rich.console import Console
 
 from skin.errors import InputError
+from skin.evaluation import report
 from skin.evaluation.operating_point import OperatingPoint
-from skin.evaluation.report import evaluate, evaluation_markdown, touch_sets
+from skin.evaluation.report import ALARM_NAME, evaluate
 from skin.evaluation.report import print_report as show
 from skin.evaluation.settings import Evaluation
 from skin.runs.build import build_device
@@ -78,7 +80,7 @@ def test_unseen_layouts_lean_as_the_known_one_does(configured):
     scattered = "layout=scattered", "layout.rows=3", "layout.columns=4", "device.test_gestures=16"
     known = build_device(configured(*solid, *scattered, "layout.tilt=0.5"))
     settings = replace(SETTINGS, layouts=1)
-    (unseen,) = touch_sets(known, settings)["unseen_layout"]
+    (unseen,) = report.touch_sets(known, settings)["unseen_layout"]
     for tilt, same in ((0.5, True), (0.0, False)):
         other = configured(*solid, *scattered, f"layout.tilt={tilt}", "layout.seed=101")
         touches = build_device(other).touches("test")
@@ -95,10 +97,10 @@ def test_an_unseen_layout_has_as_many_sensors_elsewhere(tried):
 
 
 def test_who_cannot_take_another_layout_says_so(device):
-    report = evaluate(Knows(device.touches("test").positions), device, SETTINGS, POINT)
-    assert report.unavailable == {"unseen_layout": "another layout"}
-    assert not [name for name in report.metrics if name.startswith("unseen_layout")]
-    assert report.metrics["device_shift/overall/accuracy"] == 1
+    found = evaluate(Knows(device.touches("test").positions), device, SETTINGS, POINT)
+    assert found.unavailable == {"unseen_layout": "another layout"}
+    assert not [name for name in found.metrics if name.startswith("unseen_layout")]
+    assert found.metrics["device_shift/overall/accuracy"] == 1
 
 
 def test_predictions_tell_of_every_test_gesture(device, tried):
@@ -136,7 +138,8 @@ def test_what_is_not_defined_has_a_reason_and_is_shown_as_a_dash(made_up_device,
     assert "100.0" not in line
     assert line.count(" - ") == 2
     assert "same/dangerous/false_alarm_rate: not defined" in seen.getvalue()
-    assert "| dangerous/false_alarm_rate | - | - |" in evaluation_markdown(found, TOUCH, "title", "about")
+    page = report.evaluation_markdown(found, TOUCH, "title", "about")
+    assert "| dangerous/false_alarm_rate | - | - |" in page
 
 
 def test_labels_that_nobody_knows_have_a_sentence_instead_of_figures(made_up_device, monkeypatch):
@@ -145,9 +148,71 @@ def test_labels_that_nobody_knows_have_a_sentence_instead_of_figures(made_up_dev
     labels[:, [0, 3]] = torch.nan
     monkeypatch.setattr(made_up_device, "touches", lambda *_: replace(touches, labels=labels))
     constant = SimpleNamespace(probabilities=lambda touches: torch.full((len(touches), 4), 0.9))
-    report = evaluate(constant, made_up_device, SETTINGS, POINT)
-    assert not [name for name in report.metrics if name.split("/")[1] in ("big", "dangerous")]
-    assert {"same/press/accuracy", "same/overall/accuracy"} <= set(report.metrics)
-    assert report.unavailable["labels"] == "the touches of the test tell nothing of big, dangerous"
-    assert "/big" not in "".join(report.unavailable)
-    assert report.reached is None
+    found = evaluate(constant, made_up_device, SETTINGS, POINT)
+    assert not [name for name in found.metrics if name.split("/")[1] in ("big", "dangerous")]
+    assert {"same/press/accuracy", "same/overall/accuracy"} <= set(found.metrics)
+    assert found.unavailable["labels"] == "the touches of the test tell nothing of big, dangerous"
+    assert "/big" not in "".join(found.unavailable)
+    assert found.reached is None
+
+
+class Sure:
+    """Says what the labels say, but for some."""
+
+    def __init__(self, but):
+        self.but = but
+
+    def probabilities(self, touches):
+        return ((touches.labels > 0.5) != self.but).float() * 0.8 + 0.1
+
+
+def test_spans_hold_what_is_said_and_what_is_wrong():
+    fractions = torch.tensor([0.0, 0.97, 1.0, 1.01, 1.02, 3.0])
+    said = torch.tensor([True, False, True, True, False, True])
+    found = pd.DataFrame(report.span_rows("big", said, fractions))
+    assert found[["low", "high", "touches", "said", "wrong"]].to_numpy().tolist() == [
+        ["0", "0.5", 1, "1", 1],
+        ["0.95", "1", 2, "1", 1],  # a measure that only reaches its threshold does not pass it
+        ["1", "1.05", 2, "1", 1],
+        ["2", "inf", 1, "1", 0],
+    ]
+    assert found["mean"][1] == pytest.approx(0.985)
+
+
+@pytest.fixture(scope="module")
+def grid_device(configured):
+    return build_device(configured("simulator=naive", "layout=grid", "device.test_gestures=64"))
+
+
+def measured(grid_device, but, point=POINT):
+    frame, reached = report.measure_margins(Sure(but), grid_device, 200, point)
+    frame = frame.assign(low=frame.low.astype(float), high=frame.high.astype(float))
+    assert (frame.groupby(["label", "by"]).touches.sum() == 200).all()
+    spans = frame[frame.by == "threshold"]
+    return spans.assign(said=spans.said.astype(int)), frame[frame.by == "reading"], reached
+
+
+def test_the_labels_are_what_the_measures_say(grid_device):
+    """A learner that says the labels is wrong in no span; every label changes where its measure passes 1."""
+    spans, faint, _ = measured(grid_device, torch.zeros(200, 4, dtype=torch.bool))
+    assert set(spans.label) == {*TOUCH.names, ALARM_NAME}
+    assert (spans.said == spans.touches.where(spans.high > 1, 0)).all()
+    assert (((spans.low < spans["mean"]) | (spans.low == 0)) & (spans["mean"] <= spans.high)).all()
+    assert spans.wrong.sum() == faint.wrong.sum() == 0
+
+
+def test_errors_are_found_where_they_are(grid_device):
+    but = torch.zeros(200, 4, dtype=torch.bool)
+    but[:7, 1] = True
+    spans, faint, _ = measured(grid_device, but)
+    assert [part.groupby("label").wrong.sum()["dynamic"] for part in (spans, faint)] == [7, 7]
+    assert spans.groupby("label").wrong.sum()["big"] == 0
+
+
+def test_the_alarm_is_raised_at_the_operating_point_and_the_label_at_one_half(grid_device):
+    """Whoever says 0.9 at most raises no alarm above 0.95."""
+    shy = OperatingPoint(0.95, 0.02, 64, 1, 0)
+    spans, _, reached = measured(grid_device, torch.zeros(200, 4, dtype=torch.bool), shy)
+    said = spans.groupby("label").said.sum()
+    assert (said[ALARM_NAME], said["dangerous"]) == (0, 100)
+    assert (reached.recall, reached.false_alarm_rate, reached.safe) == (0, 0, 100)

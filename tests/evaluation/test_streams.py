@@ -1,15 +1,18 @@
-"""A learner that knows the answer, and one that never does, on windows of streams."""
+"""Streams: a learner that knows the answer, one that never does, and touched or not against brute force."""
 
 from dataclasses import replace
 
 import pytest
 import torch
 from scipy.stats import poisson
+from sklearn.metrics import balanced_accuracy_score
 
+from skin.device.touches import Touches
 from skin.errors import InputError
+from skin.evaluation import streams
 from skin.evaluation.operating_point import OperatingPoint
 from skin.evaluation.settings import StreamSettings
-from skin.evaluation.streams import Alarms, bin_by_fraction, count_alarms, evaluate_windows
+from skin.evaluation.streams import Alarms, ContactThreshold, rise
 from skin.runs.build import build_device
 from skin.touch.labels import TOUCH, TOUCH_OR_NOT
 
@@ -50,13 +53,13 @@ def streamed(device):
 
 @pytest.fixture(scope="module")
 def knew(streamed):
-    return evaluate_windows(Knows(TOUCH_OR_NOT), streamed, ONLY_ALARMS, POINT)
+    return streams.evaluate_windows(Knows(TOUCH_OR_NOT), streamed, ONLY_ALARMS, POINT)
 
 
 @pytest.fixture(scope="module")
 def whole(device):
     learner = Knows(TOUCH, refuses=60)
-    return learner, evaluate_windows(learner, device, COURSE, POINT)
+    return learner, streams.evaluate_windows(learner, device, COURSE, POINT)
 
 
 def test_who_knows_the_labels_is_right_about_everything(knew):
@@ -84,7 +87,7 @@ def test_every_test_window_with_touch_is_in_one_bin(streamed, knew):
 
 
 def test_gates_keep_false_alarms_from_one_who_always_cries(streamed):
-    found = evaluate_windows(AlwaysDangerous(TOUCH_OR_NOT), streamed, ONLY_ALARMS, POINT)
+    found = streams.evaluate_windows(AlwaysDangerous(TOUCH_OR_NOT), streamed, ONLY_ALARMS, POINT)
     none, threshold = found.alarms["none"], found.alarms["threshold"]
     assert none.false > 10
     assert threshold.false < none.false / 5
@@ -118,7 +121,7 @@ def test_bins_by_hand():
     fraction = torch.tensor([0.0, 0.2, 0.25, 1.0, 1.0])
     labels = torch.tensor([[0, 0, 0, 0, 0], *[[1, 0, 1, 0, 1]] * 3, [0, 0, 1, 1, 1]]).float()
     probabilities = torch.tensor([[0.9, 0.9, 0.1, 0.1]] * 5)
-    found = bin_by_fraction(probabilities, labels, fraction, TOUCH)
+    found = streams.bin_by_fraction(probabilities, labels, fraction, TOUCH)
     assert [(one.name, one.count) for one in found] == [("0-0.2", 1), ("0.2-0.4", 1), ("whole", 2)]
     assert found[2].accuracy == {"big": 0.5, "dynamic": 0.0, "press": 0.0, "dangerous": 0.5}
     assert found[2].majority == {"big": 0.5, "dynamic": 1.0, "press": 1.0, "dangerous": 0.5}
@@ -133,7 +136,7 @@ def test_courses_that_lead_nowhere(wrong):
 def count(alarm, gesture, dangerous=(True, False, True, True)):
     said = torch.tensor([one == "!" for one in alarm])
     shown = torch.tensor([int(one) if one.isdigit() else -1 for one in gesture])
-    return count_alarms(said, shown, torch.tensor(dangerous), 0.5)
+    return streams.count_alarms(said, shown, torch.tensor(dangerous), 0.5)
 
 
 def test_an_alarm_that_lasts_is_one_and_one_that_outlasts_its_touch_is_false():
@@ -159,3 +162,54 @@ def test_the_range_holds_the_rates_under_which_the_count_is_no_surprise(false):
     assert found.per_hour == false / 2
     assert poisson.cdf(false, high * 2) == pytest.approx(0.025)
     assert low == 0 if not false else poisson.sf(false - 1, low * 2) == pytest.approx(0.025)
+
+
+def touches(readings, valid=None):
+    valid = torch.ones_like(readings, dtype=torch.bool) if valid is None else valid
+    return Touches(readings, valid, torch.zeros(readings.shape[2], 3), None, 10.0)
+
+
+@pytest.fixture
+def noisy():
+    return 0.05 * torch.randn(40, 30, 5, generator=torch.Generator().manual_seed(0))
+
+
+def test_the_rise_is_the_largest_reading_above_what_the_untouched_skin_reads(noisy):
+    idle = torch.tensor([3.0, -2.0, 0.5, 10.0, 0.0])
+    found = rise(touches(noisy + idle), idle)
+    for window, value in zip(noisy, found, strict=True):
+        assert value.item() == pytest.approx(max(max(row) for row in window.tolist()), abs=1e-5)
+
+
+def test_a_sensor_that_means_nothing_does_not_rise(noisy):
+    broken = noisy.clone()
+    broken[:, 10, 4] = 50
+    valid = torch.ones_like(broken, dtype=torch.bool)
+    valid[:, :, 4] = False
+    torch.testing.assert_close(rise(touches(broken, valid)), rise(touches(noisy[..., :4])))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_no_threshold_tells_better_than_the_tuned_one(seed):
+    generator = torch.Generator().manual_seed(seed)
+    touched = torch.rand(80, generator=generator) < 0.8
+    rises = (torch.rand(80, generator=generator) + 0.6 * touched).round(decimals=2)  # with ties
+    tuned = ContactThreshold.tuned(rises, touched)
+    best = max(balanced_accuracy_score(touched, rises >= cut) for cut in rises.tolist())
+    assert balanced_accuracy_score(touched, rises >= tuned.minimum) == pytest.approx(best)
+
+
+def test_windows_that_are_all_alike_tune_nothing():
+    with pytest.raises(InputError, match=r"data.gestures"):
+        ContactThreshold.tuned(torch.rand(5), torch.ones(5, dtype=torch.bool))
+
+
+def test_only_a_task_with_a_gate_has_a_learned_one(noisy):
+    assert list(streams.gates(ContactThreshold(0.3), TOUCH)) == ["none", "threshold"]
+    noisy[3, 5, 1] += 2
+    found = streams.gates(ContactThreshold(0.5), TOUCH_OR_NOT)
+    probabilities = torch.zeros(40, 5)
+    probabilities[7, 4] = 0.6
+    open_at = lambda gate: gate(touches(noisy), probabilities).nonzero().flatten().tolist()  # noqa: E731
+    said = {name: open_at(gate) for name, gate in found.items()}
+    assert said == {"none": list(range(40)), "threshold": [3], "learned": [7]}

@@ -7,6 +7,7 @@ from collections.abc import Callable
 import pytest
 
 from skin.core.files import ROOT
+from tests.commands.conftest import run  # noqa: F401
 
 HEAVY = {"torch", "mlflow", "pytorch_lightning", "numpy", "scipy"}
 LIGHT = f"""
@@ -22,8 +23,8 @@ main(sys.argv[1:])
 def light() -> Callable[..., subprocess.CompletedProcess]:
     """Return a function that runs ``skin`` in a folder; its last line has the heavy libraries it imported."""
 
-    def run(folder, *words: str) -> subprocess.CompletedProcess:
+    def start(folder, *words: str) -> subprocess.CompletedProcess:
         command = [sys.executable, "-c", LIGHT, *words]
         return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=120)
 
-    return run
+    return start

@@ -16,14 +16,11 @@ FEW = "data.gestures=16", "device.test_gestures=16"
 @pytest.mark.slow("generates and trains on an arm")
 def test_generated_touches_train_and_are_evaluated(run, tmp_path):
     arm = "body=arm", "body.angle=2.5", "layout=grid"
-    made = run(tmp_path, "generate.py", *arm, "simulator=naive", "n=48", "out=arm.parquet", store=False)
-    assert made.returncode == 0, made.stderr
+    run(tmp_path, "generate.py", *arm, "simulator=naive", "n=48", "out=arm.parquet", store=False)
     assert read_recording(tmp_path / "arm.parquet").size == pytest.approx((0.125, 0.16))
     recording = *arm, "device=recording", "device.path=arm.parquet"
-    done = run(tmp_path, "train.py", *recording, "experiment=temporal_graph", "trainer.max_epochs=1")
-    assert done.returncode == 0, done.stderr
-    tried = run(tmp_path, "evaluate.py", "run=latest", f"out={tmp_path}")
-    assert tried.returncode == 0, tried.stderr
+    run(tmp_path, "train.py", *recording, "experiment=temporal_graph", "trainer.max_epochs=1")
+    run(tmp_path, "evaluate.py", "run=latest", f"out={tmp_path}")
     assert list(tmp_path.glob("evaluation_recording_*.md"))
 
 

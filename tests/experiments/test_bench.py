@@ -26,11 +26,7 @@ def test_a_verdict_is_timed_by_the_wall_and_by_the_core(name):
 
 @pytest.mark.parametrize(
     ("words", "reason"),
-    [
-        ("--repeats 1", "choose from 3"),
-        ("--repeat x", "invalid int"),
-        ("--only page", "from 'generation.fem'"),
-    ],
+    [("--repeats 1", "choose from 3"), ("--repeat x", "invalid int"), ("--only page", "'generation.fem'")],
 )
 def test_a_bad_setting_is_refused(words, reason, capsys):
     with pytest.raises(SystemExit, match="2"):

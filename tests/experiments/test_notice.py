@@ -7,9 +7,7 @@ from skin.core.files import ROOT
 from skin.errors import InputError
 
 CONSTRAINTS = ROOT / "constraints.txt"
-LISTED = dict(
-    line.split(": ", 1) for line in (ROOT / "NOTICE").read_text().rpartition("\n\n")[2].splitlines()
-)
+LISTED = dict(row.split(": ", 1) for row in (ROOT / "NOTICE").read_text().rpartition("\n\n")[2].splitlines())
 
 
 def test_every_dependency_is_listed():

@@ -82,9 +82,8 @@ def put(store, configured, tmp_path):
 def refused(done, marker, *words):
     """Check that a command ended with one sentence, and that no payload ran."""
     assert not marker.exists(), "the payload ran"
-    assert (done.returncode, done.stderr.count("\n")) == (2, 1), done.stderr
-    for word in words:
-        assert word in done.stderr, done.stderr
+    assert done.stderr.count("\n") == 1, done.stderr
+    assert all(word in done.stderr for word in words), done.stderr
 
 
 CASES = {
@@ -112,7 +111,7 @@ CASES = {
 def test_a_run_builds_only_parts_of_the_package(case, run, folder, put, bait, marker):
     command, change = CASES[case]
     identity = put(change(bait, marker))
-    refused(run(folder, *command.format(identity).split()), marker, "trust=true", identity)
+    refused(run(folder, *command.format(identity).split(), code=2), marker, "trust=true", identity)
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -131,8 +130,8 @@ def test_what_is_refused_would_have_run(case, store, put, bait, marker):
 
 def test_a_stored_configuration_cannot_say_that_it_is_trusted(run, folder, put, bait, marker):
     identity = put(CASES["a function of a library"][1](bait, marker) | {"trust": True})
-    refused(run(folder, "evaluate.py", f"run={identity}"), marker, "trust=true")
-    assert run(folder, "evaluate.py", f"run={identity}", "trust=true").returncode
+    refused(run(folder, "evaluate.py", f"run={identity}", code=2), marker, "trust=true")
+    assert run(folder, "evaluate.py", f"run={identity}", "trust=true", code=None).returncode
     assert marker.exists()
 
 
@@ -155,13 +154,13 @@ def test_what_a_run_learned_holds_numbers_alone(learner, run, folder, put, tmp_p
         path = tmp_path / "weights.pt"
         torch.save({"layer": Payload(marker)}, path)
     identity = put({}, f"learner={learner}", learned=path)
-    refused(run(folder, "evaluate.py", f"run={identity}"), marker, path.name)
+    refused(run(folder, "evaluate.py", f"run={identity}", code=2), marker, path.name)
 
 
 def test_a_calibration_makes_no_objects(run, tmp_path, marker):
     path = tmp_path / "gains.yaml"
     path.write_text(f"format: 1\ncount: 4\nsensors: !!python/object/apply:os.mkdir [{marker}]\n")
-    done = run(tmp_path, "generate.py", *SKIN, "out=x.csv", f"device.calibration={path}", store=False)
+    done = run(tmp_path, "generate.py", *SKIN, "out=x.csv", f"device.calibration={path}", store=False, code=2)
     refused(done, marker, "gains.yaml")
 
 
@@ -169,7 +168,7 @@ def test_a_calibration_makes_no_objects(run, tmp_path, marker):
 def recording(run, tmp_path_factory):
     folder = tmp_path_factory.mktemp("recording")
     for name in ("x.parquet", "x.csv"):
-        assert run(folder, "generate.py", *SKIN, "n=20", f"out={name}", store=False).returncode == 0
+        run(folder, "generate.py", *SKIN, "n=20", f"out={name}", store=False)
     return folder
 
 
@@ -181,19 +180,18 @@ def test_a_recording_makes_no_objects(run, recording, tmp_path, marker):
     field = pa.field("reading_00", pa.float32(), metadata=kind)
     position = table.schema.get_field_index("reading_00")
     pq.write_table(table.cast(table.schema.set(position, field)), tmp_path / "x.parquet")
-    done = run(tmp_path, *PLAYED, "device.path=x.parquet", store=False)
+    run(tmp_path, *PLAYED, "device.path=x.parquet", store=False)
     assert not marker.exists()
-    assert done.returncode == 0, done.stderr
 
 
 def test_a_cache_is_built_anew_where_it_holds_objects(run, tmp_path, marker, monkeypatch):
     monkeypatch.setenv("SKIN_CACHE", str(tmp_path / "cache"))
     command = ["generate.py", "simulator=fem", *SKIN[1:], "n=5", "body.cells=[12,12]", "out=x.csv"]
-    assert run(tmp_path, *command, store=False).returncode == 0
+    run(tmp_path, *command, store=False)
     (known,) = (tmp_path / "cache").iterdir()
     with np.load(known) as file:
         names, before = list(file), (tmp_path / "x.csv").read_bytes()
     np.savez(known, **dict.fromkeys(names, np.array([Payload(marker)], dtype=object)))
-    done = run(tmp_path, *command, store=False)
+    run(tmp_path, *command, store=False)
     assert not marker.exists()
-    assert (done.returncode, (tmp_path / "x.csv").read_bytes()) == (0, before), done.stderr
+    assert (tmp_path / "x.csv").read_bytes() == before

@@ -15,7 +15,7 @@ SMALL = ["data.gestures=160", "device.test_gestures=64", "evaluation.devices=0",
          "evaluation.safe_gestures=64"]  # fmt: skip
 NAIVE = ["simulator=naive", *SMALL]
 ACCURACY = "same/overall/accuracy"
-WITHOUT_METRIC = "study.statements=[{id: a, says: b}]"
+NO_METRIC = "study.statements=[{id: a, says: b}]"
 
 
 def runs(folder):
@@ -25,16 +25,6 @@ def runs(folder):
 def lines(path):
     with path.open(newline="") as file:
         return list(csv.DictReader(file))
-
-
-@pytest.fixture(scope="module")
-def command(run):
-    def command(folder, verb, *words, **how):
-        done = run(folder, verb, *words, **how)
-        assert done.returncode == 0, done.stderr
-        return done
-
-    return command
 
 
 @pytest.fixture(scope="module")
@@ -56,9 +46,9 @@ def folder(tmp_path_factory, configured):
 
 
 @pytest.mark.slow("composes nine runs twice and draws their page")
-def test_finished_runs_are_found_and_judged(command, folder):
+def test_finished_runs_are_found_and_judged(run, folder):
     words = ["study=models", "study.part=activation", "study.seeds=[0,1,2]", f"out={folder}/r"]
-    done = command(folder, "study", *words)
+    done = run(folder, "study", *words)
     assert "…" not in done.stdout, "nothing was to be trained"
     page = (folder / "r" / "study_activation.md").read_text()
     assert "| activation=silu | 81.0 ± 2.5 |" in page
@@ -69,11 +59,7 @@ def test_finished_runs_are_found_and_judged(command, folder):
 
 @pytest.mark.parametrize(
     ("arguments", "named"),
-    [
-        ((), "which study"),
-        (["study=margin"], "margins"),
-        (["study=models", WITHOUT_METRIC], "study.statements[0]"),
-    ],
+    [((), "which study"), (["study=margin"], "margins"), (["study=models", NO_METRIC], "statements[0]")],
 )
 def test_bad_input_ends_with_code_2_and_imports_nothing_heavy(arguments, named, light, tmp_path):
     done = light(tmp_path, "study", *arguments)
@@ -86,8 +72,7 @@ def test_bad_input_ends_with_code_2_and_imports_nothing_heavy(arguments, named, 
 def test_what_is_missing_is_trained_and_what_failed_is_told(run, tmp_path):
     # graph convolutions know this pooling, the transformer does not
     few = ["smoke=true", "study.seeds=[0]", "simulator=naive", "+model.pooling=attention", "out=r"]
-    done = run(tmp_path, "study", "study=models", "study.part=transformer", *few)
-    assert done.returncode == 1, done.stderr
+    done = run(tmp_path, "study", "study=models", "study.part=transformer", *few, code=1)
     assert done.stdout.count(": done") == 1
     said = done.stdout.replace("\n", "")
     assert all(setting in said for setting in ("data.gestures=80", "device.test_gestures=48"))
@@ -100,18 +85,18 @@ def test_what_is_missing_is_trained_and_what_failed_is_told(run, tmp_path):
 
 
 @pytest.fixture(scope="module")
-def trained(command, tmp_path_factory):
+def trained(run, tmp_path_factory):
     folder = tmp_path_factory.mktemp("finished")
     for words in (["experiment=rules"], ["experiment=temporal_graph", "trainer.max_epochs=1"]):
-        command(folder, "train", *words, *NAIVE)
+        run(folder, "train", *words, *NAIVE)
     return folder
 
 
 @pytest.mark.slow("evaluates trained rows")
-def test_finished_runs_are_tried_under_conditions_once(command, run, trained):
+def test_finished_runs_are_tried_under_conditions_once(run, trained):
     words = ["study=robustness", "study.part=dead", "simulator=naive", "study.devices=2"]
     words += ["device.test_gestures=48", "out=dead"]
-    done = command(trained, "study", *words)
+    done = run(trained, "study", *words)
     found = lines(trained / "dead" / "study_dead.csv")
     assert [line["condition"] for line in found[::2]] == ["0 dead", "1 dead", "3 dead", "5 dead"] * 2
     assert {line["variant"].split()[0] for line in found} == {"rules", "temporal_graph"}
@@ -119,23 +104,22 @@ def test_finished_runs_are_tried_under_conditions_once(command, run, trained):
     assert "undecided" in done.stdout
     before, files = runs(trained), {path: path.stat().st_mtime_ns for path in trained.rglob("*-*.parquet")}
     assert len(files) == 2 * 4 * 2
-    assert command(trained, "study", *words).stdout == done.stdout
+    assert run(trained, "study", *words).stdout == done.stdout
     assert runs(trained) == before
     assert {path: path.stat().st_mtime_ns for path in trained.rglob("*-*.parquet")} == files
     assert lines(trained / "dead" / "study_dead.csv") == found
-    refused = run(trained, "study", *words[:3], "study.rows=[gru]")
-    assert refused.returncode == 2
+    refused = run(trained, "study", *words[:3], "study.rows=[gru]", code=2)
     assert "no finished run of gru" in refused.stderr
 
 
 @pytest.mark.slow("evaluates trained rows")
-def test_a_condition_changes_the_device_as_an_evaluation_does(command, trained):
+def test_a_condition_changes_the_device_as_an_evaluation_does(run, trained):
     """Independent answer: skin evaluate with the same settings."""
     few = ["simulator=naive", "study.rows=[rules]", "study.devices=1", "device.test_gestures=48"]
-    command(trained, "study", "study=robustness", "study.part=misplaced", *few, "out=misplaced")
+    run(trained, "study", "study=robustness", "study.part=misplaced", *few, "out=misplaced")
     found = {line["condition"]: line for line in lines(trained / "misplaced" / "study_misplaced.csv")}
     device = ["device.seed=1", "device.position_error=0.005", "device.test_gestures=48"]
-    command(trained, "evaluate", f"run={found['5 mm']['run']}", *device, *SMALL[2:4], "out=e")
+    run(trained, "evaluate", f"run={found['5 mm']['run']}", *device, *SMALL[2:4], "out=e")
     question = "select value from latest_metrics join runs using (run_uuid) where name like 'evaluation of%'"
     ((evaluated,),) = query(trained, f"{question} and key = '{ACCURACY}'")[:1]
     assert float(found["5 mm"][ACCURACY]) == pytest.approx(evaluated)
@@ -143,9 +127,9 @@ def test_a_condition_changes_the_device_as_an_evaluation_does(command, trained):
 
 
 @pytest.mark.slow("evaluates trained rows")
-def test_verdicts_are_sorted_by_margins(command, trained):
+def test_verdicts_are_sorted_by_margins(run, trained):
     few = ["study.rows=[rules,temporal_graph]", "simulator=naive", "out=margins"]
-    said = command(trained, "study", "study=margins", "study.measure.gestures=400", *few).stdout.splitlines()
+    said = run(trained, "study", "study=margins", "study.measure.gestures=400", *few).stdout.splitlines()
     assert "chosen on 64 fresh safe gestures for 2 % false alarms, finds " in said[0]
     (path,) = (trained / "margins").glob("margins_rules_*.csv")
     table = pd.read_csv(path)
@@ -162,10 +146,10 @@ def test_verdicts_are_sorted_by_margins(command, trained):
 
 
 @pytest.mark.slow("evaluates trained rows")
-def test_a_run_is_probed_beside_graph_embeddings(command, trained):
+def test_a_run_is_probed_beside_graph_embeddings(run, trained):
     few = ["train=80", "test=40", "seeds=[0]", "epochs=2", "layouts=2", "attributes=[reading]"]
     words = ["study.rows=[temporal_graph]", "simulator=naive", *(f"study.measure.{one}" for one in few)]
-    command(trained, "study", "study=embeddings", *words, "out=embeddings")
+    run(trained, "study", "study=embeddings", *words, "out=embeddings")
     (path,) = (trained / "embeddings").glob("embeddings_temporal_graph_*.md")
     assert path.with_suffix(".png").is_file()
     rows = [line.split("|")[1].strip() for line in path.read_text().splitlines() if line.startswith("| ")]
@@ -175,26 +159,26 @@ def test_a_run_is_probed_beside_graph_embeddings(command, trained):
 
 
 @pytest.mark.slow("trains several rows")
-def test_a_study_of_ones_own_needs_a_file_only(command, tmp_path):
+def test_a_study_of_ones_own_needs_a_file_only(run, tmp_path):
     mine = "# @package _global_\ndefaults:\n  - override /learner: rules\nrow: mine\n"
     noise = "about: noise\ntrainings: [{experiment: mine, device.noise: [0.05, 0.5]}]\ndifferences: greater\n"
     for name, text in (("experiment/mine", mine), ("study/noise", noise)):
         write(text, tmp_path / "own" / f"{name}.yaml")
     few = ["--config-dir", tmp_path / "own", "study.seeds=[0]"]
-    command(tmp_path, "study", *few, "study=noise", *NAIVE)
+    run(tmp_path, "study", *few, "study=noise", *NAIVE)
     found = lines(tmp_path / "results" / "study_noise.csv")
     assert [line["variant"] for line in found] == ["noise=0.05", "noise=0.5"]
     assert "| noise=0.5 |  | " in (tmp_path / "results" / "study_noise.md").read_text()
 
 
 @pytest.mark.slow("evaluates trained rows")
-def test_a_row_that_cannot_take_a_skin_is_named_so_also_where_thresholds_are_chosen(command, trained):
+def test_a_row_that_cannot_take_a_skin_is_named_so_also_where_thresholds_are_chosen(run, trained):
     text = "about: four sensors\nrows: [gru]\ntest: {evaluation.profile: mild}\n"
     text += "conditions: {own: {}, four: {layout: grid, layout.rows: 2, layout.columns: 2}}\n"
     write(text, trained / "own" / "study" / "four.yaml")
-    command(trained, "train", "experiment=gru", *NAIVE)
+    run(trained, "train", "experiment=gru", *NAIVE)
     words = ["study.seeds=[0]", "evaluation.safe_gestures=64", "out=four"]
-    command(trained, "study", "--config-dir", trained / "own", "study=four", *words, *NAIVE)
+    run(trained, "study", "--config-dir", trained / "own", "study=four", *words, *NAIVE)
     found = {line["condition"]: line for line in lines(trained / "four" / "study_four.csv")}
     assert float(found["own"][ACCURACY]) > 0
     assert not found.get("four", {}).get(ACCURACY)
@@ -202,12 +186,12 @@ def test_a_row_that_cannot_take_a_skin_is_named_so_also_where_thresholds_are_cho
 
 
 @pytest.mark.slow("trains several rows")
-def test_the_table_is_a_study_with_the_reports_numbers_and_its_figures(command, trained):
+def test_the_table_is_a_study_with_the_reports_numbers_and_its_figures(run, trained):
     """Rows that it does not train stand in it once they have finished; two trainings run at a time."""
-    command(trained, "train", "experiment=best_fresh", "trainer.max_epochs=1", *NAIVE)
+    run(trained, "train", "experiment=best_fresh", "trainer.max_epochs=1", *NAIVE)
     words = ["study=table", "study.trainings.0.simulator=[naive]", "study.jobs=2", "trainer.max_epochs=1"]
     words += ["study.trainings.0.experiment=[rules,temporal_graph,gru]", *SMALL, "out=table"]
-    done = command(trained, "study", *words, apart=True)
+    done = run(trained, "study", *words, apart=True)
     found = {line["variant"]: line for line in lines(trained / "table" / "study_table.csv")}
     assert list(found) == ["rules", "temporal_graph", "gru", "best_fresh"]
     assert found["temporal_graph"]["reference"] == "0.85"
@@ -215,4 +199,4 @@ def test_the_table_is_a_study_with_the_reports_numbers_and_its_figures(command, 
     names = {path.name for path in (trained / "table").iterdir()}
     assert names >= {"figure07_speed_naive.csv", "figure08_confusion_naive.png", "figure10_naive_naive.png"}
     assert ": done" in done.stdout
-    assert ": done" not in command(trained, "study", *words).stdout
+    assert ": done" not in run(trained, "study", *words).stdout

@@ -79,9 +79,8 @@ def test_processes_share_each_batch(make):
         data.trainer.world_size, data.trainer.global_rank = 2, rank
         parts.append(numbers(data.train_dataloader()))
         assert flat(data.val_dataloader()) == list(range(23))
-    assert [sorted(one + other) for one, other in zip(*parts, strict=True)][:-1] == [
-        sorted(batch) for batch in alone[:-1]
-    ]
+    both = [sorted(one + other) for one, other in zip(*parts, strict=True)]
+    assert both[:-1] == [sorted(batch) for batch in alone[:-1]]
     assert parts[0][-1] == parts[1][-1] == alone[-1]  # three gestures are too few for two processes
 
 

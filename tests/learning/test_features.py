@@ -90,10 +90,7 @@ def test_runs_and_counts_are_those_that_plain_python_finds():
         levels = {
             "longest run above 1.0 N": (peak, 1.0 + more),
             "longest run above 0.3 of the peak": (peak, torch.maximum(0.3 * peak.max(), 3 * noise)),
-            "longest run of the sum above 0.7 of its peak": (
-                total,
-                torch.maximum(0.7 * total.max(), 6 * noise),
-            ),
+            "longest run of the sum above 0.7 of its peak": (total, max(0.7 * total.max(), 6 * noise)),
         }
         for name, (series, level) in levels.items():
             runs = [len(list(run)) for on, run in groupby((series > level).tolist()) if on]
@@ -134,9 +131,7 @@ def test_every_vector_points_where_the_touch_goes(angle):
         x, y = (float(found[f"{name}, cosine with {axis}"]) for axis in "xy")
         assert math.cos(math.atan2(y, x) - angle) > 0.99, name
     assert found["lean, x"] == 0
-    for name, length in (
-        ("way of the centre 1 beyond 0.1", 0.072),
-        ("slope of the centre 2 beyond 0.25", 0.008),
-    ):
+    lengths = {"way of the centre 1 beyond 0.1": 0.072, "slope of the centre 2 beyond 0.25": 0.008}
+    for name, length in lengths.items():
         x, y = (float(found[f"{name} of the peak, {axis}"]) for axis in "xy")
         assert math.hypot(x, y) == pytest.approx(length, rel=0.05)

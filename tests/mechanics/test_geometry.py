@@ -1,4 +1,4 @@
-"""What a network is told of each sensor, against closed forms."""
+"""What a network is told of each sensor, and the pressure of fingertips, against closed forms."""
 
 import math
 from dataclasses import replace
@@ -9,7 +9,7 @@ import torch
 from skin.body.base import GEOMETRY, Layer, Sheet
 from skin.body.layout import Grid
 from skin.body.material import Material
-from skin.mechanics.geometry import sensor_geometry
+from skin.mechanics.geometry import Fingertip, sensor_geometry
 from skin.mechanics.simulator.naive import Naive
 from skin.mechanics.simulator.solid import Solid
 
@@ -55,3 +55,19 @@ def test_in_a_solid_the_response_falls_with_distance_and_mirrors(body):
     torch.testing.assert_close(near, near.mean().expand(4), rtol=1e-3, atol=0)
     # an even load is carried evenly
     torch.testing.assert_close(column(geometry, "share"), torch.ones(4), rtol=0.05, atol=0)
+
+
+SHEET = Sheet([0.12, 0.08], [24, 16], [{"material": "EcoFlex 00-30", "thickness": 0.01}])
+TOUCHES = torch.tensor([[0.05, 0.03, 0.010, 5.0], [0.1, 0.06, 0.004, 1.0]], dtype=torch.float64)
+
+
+def test_pressure_has_the_force_and_the_centre_of_the_touch():
+    pressure = Fingertip(SHEET, 0.0015)(TOUCHES)
+    assert pressure.shape == (2, 16, 24)
+    force = pressure * (0.12 / 24 * 0.08 / 16)
+    assert force.sum((1, 2)).numpy() == pytest.approx([5, 1], rel=1e-12)
+    x, y = (torch.arange(count) * 0.005 + 0.0025 for count in (24, 16))
+    assert ((force.sum(1) @ x.double()) / force.sum((1, 2))).numpy() == pytest.approx([0.05, 0.1], abs=2e-4)
+    assert ((force.sum(2) @ y.double()) / force.sum((1, 2))).numpy() == pytest.approx([0.03, 0.06], abs=2e-4)
+    pressure = Fingertip(SHEET, 2e-4)(torch.tensor([[0.06, 0.04, 0.02, 3.0]], dtype=torch.float64))
+    assert pressure.max().item() == pytest.approx(3 / (torch.pi * 0.02**2), rel=0.01)

@@ -1,15 +1,20 @@
-"""Peers fit and apply a model in another process."""
+"""Peers fit and apply a model in another process; the fits of that against scikit-learn."""
 
 import gc
+import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 from hydra.utils import instantiate
+from sklearn.base import BaseEstimator, ClassifierMixin
+from sklearn.calibration import CalibratedClassifierCV
+from sklearn.frozen import FrozenEstimator
 
 from experiments.peers import PYTHON
 from experiments.peers.rocket import Rocket
+from experiments.peers.worker import platt
 from skin.device.touches import Touches
 from skin.errors import InputError
 from skin.learning.data import TouchData
@@ -28,9 +33,11 @@ def fitted(own_python, data):
     return learner
 
 
-def test_a_stored_model_predicts_the_same(fitted, data, tmp_path):
+def test_it_learns_and_a_stored_model_predicts_the_same(fitted, data, tmp_path):
     touches = data.touches("test")
     expected = fitted.probabilities(touches)
+    assert ((expected > 0.5) == (touches.labels > 0.5)).float().mean() > 0.7
+    assert fitted.seconds_per_epoch > 0
     path = fitted.save(tmp_path)
     with np.load(path, allow_pickle=False) as arrays:
         assert {array.dtype.kind for array in arrays.values()} == {"f"}
@@ -38,13 +45,6 @@ def test_a_stored_model_predicts_the_same(fitted, data, tmp_path):
     other.load(data, path)
     assert other.parameters == fitted.parameters
     torch.testing.assert_close(other.probabilities(touches), expected)
-
-
-def test_it_learns(fitted, data):
-    touches = data.touches("test")
-    right = (fitted.probabilities(touches) > 0.5) == (touches.labels > 0.5)
-    assert right.float().mean() > 0.7
-    assert fitted.seconds_per_epoch > 0
 
 
 def test_touches_of_another_shape_are_refused(fitted, data):
@@ -114,3 +114,45 @@ def test_a_channel_is_a_sensor_and_what_is_not_valid_is_0():
     found = Rocket().inputs(Touches(readings, valid, torch.zeros(4, 3), None, 10.0))
     assert torch.equal(found[:, 1:], readings[..., 1:].mT)
     assert not found[:, 0].any()
+
+
+@pytest.fixture
+def own_python(monkeypatch):
+    """Run the worker in this environment, which has all that a ridge without kernels needs."""
+    monkeypatch.setenv(PYTHON, sys.executable)
+
+
+class Scores(ClassifierMixin, BaseEstimator):
+    """A classifier whose score is its only feature."""
+
+    def fit(self, x, y):
+        self.classes_ = np.array([0, 1])
+        return self
+
+    def decision_function(self, x):
+        return x[:, 0]
+
+    def predict(self, x):
+        return (x[:, 0] > 0).astype(int)
+
+
+def probability(curve, score):
+    return 1 / (1 + np.exp(-(curve[0] * score + curve[1])))
+
+
+def test_scores_become_probabilities_by_platt_scaling():
+    random = np.random.default_rng(0)
+    truth = random.integers(0, 2, 300)
+    score = truth + 0.4 * random.standard_normal(300)
+    theirs = CalibratedClassifierCV(FrozenEstimator(Scores().fit(None, None)), method="sigmoid")
+    theirs.fit(score[:, None], truth)
+    # Both search for the minimum of the same smooth loss.
+    expected = theirs.predict_proba(score[:, None])[:, 1]
+    assert probability(platt(score, truth), score) == pytest.approx(expected, abs=2e-3)
+
+
+def test_scores_that_separate_the_classes_stay_finite_and_in_order():
+    score = np.linspace(-1, 1, 40)
+    found = probability(platt(score, (score > 0).astype(int)), score)
+    assert (np.diff(found) > 0).all()
+    assert 0 < found[0] < 0.1 < 0.9 < found[-1] < 1

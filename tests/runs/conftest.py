@@ -4,6 +4,7 @@ import pytest
 
 from skin.runs.configuration import Tracking
 from skin.runs.store import Store
+from tests.commands.conftest import run  # noqa: F401
 
 
 def tracking(folder):

@@ -15,15 +15,8 @@ from skin.device.files import write_recording
 from skin.errors import InputError
 from skin.learning.data import TouchData
 from skin.learning.small_data import split_folds
-from skin.runs.adaptation import (
-    Candidate,
-    FineTuning,
-    choose_candidate,
-    choose_gestures,
-    find_target,
-    fine_tune,
-    learn_from_scratch,
-)
+from skin.runs import adaptation
+from skin.runs.adaptation import Candidate, FineTuning
 from skin.runs.build import build_device, build_learner, default_option
 from skin.runs.configuration import validate_config
 from skin.runs.run import FinishedRun
@@ -35,13 +28,13 @@ SMALL = FineTuning(layers=["all"], lr=[3e-3], epochs=15, patience=5)
 
 def test_a_part_of_a_recording_is_chosen_and_the_rest_is_reported(made_up_device):
     whole = made_up_device.all_touches()
-    touches, others = choose_gestures(made_up_device, FineTuning(gestures=16, seed=1))
+    touches, others = adaptation.choose_gestures(made_up_device, FineTuning(gestures=16, seed=1))
     both = torch.cat([touches.readings, others.touches("test").readings])
     assert (len(touches), len(both)) == (16, len(whole))
     assert torch.equal(both.sum(dim=(1, 2)).sort().values, whole.readings.sum(dim=(1, 2)).sort().values)
-    other, _ = choose_gestures(made_up_device, FineTuning(gestures=16, seed=2))
+    other, _ = adaptation.choose_gestures(made_up_device, FineTuning(gestures=16, seed=2))
     assert not torch.equal(touches.readings, other.readings)
-    touches, others = choose_gestures(made_up_device, FineTuning())
+    touches, others = adaptation.choose_gestures(made_up_device, FineTuning())
     assert (len(touches), others) == (len(whole), None)
 
 
@@ -57,7 +50,7 @@ def test_too_few_or_unlabelled_gestures_are_refused(made_up_device, monkeypatch,
     touches = change(made_up_device.all_touches())
     monkeypatch.setattr(made_up_device, "all_touches", lambda: touches)
     with pytest.raises(InputError, match=reason):
-        choose_gestures(made_up_device, FineTuning(gestures=wanted))
+        adaptation.choose_gestures(made_up_device, FineTuning(gestures=wanted))
 
 
 def test_the_threshold_of_the_alarm_may_be_for_a_profile(configured, tmp_path):
@@ -68,7 +61,7 @@ def test_the_threshold_of_the_alarm_may_be_for_a_profile(configured, tmp_path):
     with initialize_config_dir(str(CONF), version_base="1.3"):
         parent.__dict__["stored"] = validate_config(compose("train", [*NAIVE, "device.noise=0.2"]))
         (_, twin, config), (_, plain, _) = (
-            find_target(parent, validate_config(compose("adapt", words)), FineTuning(), words)
+            adaptation.find_target(parent, validate_config(compose("adapt", words)), FineTuning(), words)
             for words in ([*recorded, "evaluation.profile=rough"], recorded)
         )
     assert (twin.noise, twin.gain_spread, twin.randomise) == (0.1, 0.2, True)
@@ -109,8 +102,8 @@ def equal(one, other):
 
 
 def adapted(learner, data, touches, settings):
-    candidates = fine_tune(learner, data, touches, settings)
-    best, judged = choose_candidate(candidates, touches, data.task, settings)
+    candidates = adaptation.fine_tune(learner, data, touches, settings)
+    best, judged = adaptation.choose_candidate(candidates, touches, data.task, settings)
     best.train()
     return candidates, best, judged
 
@@ -142,7 +135,7 @@ def test_a_fold_is_judged_by_the_choice_of_the_others(trained):
     first = np.where(held, 1 - right, right)
     lucky = np.where(held, right, 0.9 * right + 0.05)
     candidates = [Candidate("", first, None), Candidate("lucky", lucky, None)]
-    assert choose_candidate(candidates, touches, data.task, SMALL)[0].name == ""
+    assert adaptation.choose_candidate(candidates, touches, data.task, SMALL)[0].name == ""
 
 
 def test_gestures_are_held_out_of_what_predicts_them(trained):
@@ -151,11 +144,11 @@ def test_gestures_are_held_out_of_what_predicts_them(trained):
     labels = torch.rand(48, 4, generator=torch.Generator().manual_seed(2)).round()
     touches = replace(data.touches("train")[:48], labels=labels)
     long = replace(SMALL, epochs=20, patience=20, lr=[1e-2])
-    candidates = fine_tune(learner, data, touches, long)
+    candidates = adaptation.fine_tune(learner, data, touches, long)
     assert len(candidates) == 21
     assert ((candidates[-1].probabilities > 0.5) == (labels.numpy() > 0.5)).mean() < 0.65
     options = {"kernel_ridge": default_option("learner", "kernel_ridge")}
-    (scratch,) = learn_from_scratch(touches, data.task, long, options)
+    (scratch,) = adaptation.learn_from_scratch(touches, data.task, long, options)
     assert ((scratch.probabilities > 0.5) == (labels.numpy() > 0.5)).mean() < 0.65
 
 
@@ -164,7 +157,7 @@ def test_learners_from_scratch_need_each_label_outside_of_each_fold(trained, cap
     touches = data.touches("train")[:16]
     touches = replace(touches, labels=torch.zeros_like(touches.labels))
     options = {"kernel_ridge": default_option("learner", "kernel_ridge")}
-    assert not [*learn_from_scratch(touches, data.task, SMALL, options)]
+    assert not [*adaptation.learn_from_scratch(touches, data.task, SMALL, options)]
     assert "kernel_ridge is not compared: all training touches have the same label" in capsys.readouterr().err
 
 

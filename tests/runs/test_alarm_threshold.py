@@ -91,20 +91,11 @@ def alarm_point(stored, config, *live, **how):
     return choose_alarm_threshold(alarm_source(run_of(stored, STORED), Quiet(), config), *live, **how)
 
 
-def test_the_stored_threshold_holds_without_another_profile(hydra):
-    assert alarm_point(hydra(), hydra()) == STORED
-    rough = hydra("evaluation.profile=rough")
-    assert alarm_point(rough, rough) == STORED
-
-
-def test_another_profile_and_one_of_many_skins_have_a_threshold_of_their_own(hydra):
-    skins = hydra(*SKINS)
-    assert alarm_point(skins, skins) == STORED
-    for run, config, one_skin in (
-        (hydra(), hydra("evaluation.profile=rough"), False),
-        (skins, hydra(), False),
-        (skins, skins, True),
-    ):
+def test_the_stored_threshold_holds_but_for_another_profile_and_for_one_of_many_skins(hydra):
+    one, skins, rough = hydra(), hydra(*SKINS), hydra("evaluation.profile=rough")
+    for config in (one, skins, rough):
+        assert alarm_point(config, config) == STORED
+    for run, config, one_skin in ((one, rough, False), (skins, one, False), (skins, skins, True)):
         point = alarm_point(run, config, one_skin=one_skin)
         assert 0.25 < point.threshold < 0.2501
 

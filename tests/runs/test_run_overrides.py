@@ -1,12 +1,17 @@
 """A run's configuration changes only in what the command line names."""
 
+import numpy as np
 import pytest
 from hydra import initialize_config_dir
+from hydra.utils import instantiate
 
+from skin.body.base import Arm, Layer, Sheet
+from skin.body.layout import File, Grid, Random
+from skin.body.material import Material, Relaxation
 from skin.core.files import CONF
 from skin.errors import InputError
-from skin.runs.build import build_device, build_skin, with_axes_of
-from skin.runs.configuration import recompose, settings_of
+from skin.runs.build import build_device, build_skin, with_axes_of, with_skin
+from skin.runs.configuration import Config, recompose, settings_of
 
 SEQUENCE = ("experiment=sequence_graph", "simulator=naive", "device.offset=0.3", "seed=4")
 OWN = """\
@@ -92,6 +97,9 @@ def test_all_that_a_chosen_option_sets_is_taken(with_option, layout):
     targets = [part["simulator"]["_target_"] for part in (back, back["device"])]
     assert targets == ["skin.mechanics.simulator.solid.Solid"] * 2
     assert back["touch"]["spare"] == back["device"]["touch"]["spare"] == 0.005
+    # The command line takes precedence.
+    other = with_option((), "layout.path=other.csv", "simulator=naive")
+    assert (other["layout"]["path"], other["simulator"]["_target_"][-5:]) == ("other.csv", "Naive")
     # What the option does not set stays that of the run.
     assert (back["device"]["offset"], back["data"]["name"]) == (0.3, "fem")
 
@@ -99,12 +107,6 @@ def test_all_that_a_chosen_option_sets_is_taken(with_option, layout):
 def test_a_setting_equal_to_the_default_is_taken_too(with_option):
     text = OWN.replace("0.008, 0.008", "0.010, 0.010")
     assert with_option(("layout.footprint=[0.02,0.02]",), text=text)["layout"]["footprint"] == [0.01, 0.01]
-
-
-def test_the_command_line_takes_precedence_over_an_option(with_option):
-    back = with_option((), "layout.path=other.csv", "simulator=naive")
-    assert back["layout"]["path"] == "other.csv"
-    assert back["simulator"]["_target_"].endswith("Naive")
 
 
 def test_an_included_file_is_taken_too(with_option, tmp_path):
@@ -137,3 +139,36 @@ def test_a_run_of_normal_sensors_takes_those_inwards_of_three_axes(configured, t
     used = with_axes_of(trained, configured(*words))
     assert (build_skin(used).sensors.positions[:, 1].tolist(), used.device["inwards"]) == ([0.03, 0.06], True)
     assert build_device(used).wire.three is not None
+
+
+LAYERS = [
+    {"material": "Dragon Skin 10 Medium", "thickness": 0.01},
+    Layer(Material("gel", 4e4, 0.49, Relaxation(0.5, 0.3)), 0.004),
+]
+BODIES = Sheet((0.2, 0.1), (20, 10), LAYERS), Arm((20, 10), LAYERS, radius=0.05, length=0.1, angle=2.0)
+
+
+@pytest.mark.parametrize("body", BODIES, ids=["sheet", "arm"])
+@pytest.mark.parametrize(
+    "layout", [Grid(2, 3, (0.008, 0.006), tilt=0.3), Random(5, 1), File("data/layouts/tilted_5x5.csv")]
+)
+def test_the_settings_build_the_same_skin(body, layout):
+    if isinstance(layout, File):
+        body = Sheet((0.16, 0.16), (16, 16), LAYERS)
+    config = with_skin(Config(seed=1), body, layout)
+    assert config.seed == 1
+    assert instantiate(config.body) == body
+    sensors, expected = instantiate(config.layout).sensors(body), layout.sensors(body)
+    np.testing.assert_allclose(sensors.positions, expected.positions)
+    np.testing.assert_allclose(sensors.normals, expected.normals)
+    assert sensors.footprint == expected.footprint
+
+
+def test_names_and_files_are_options():
+    config = with_skin(Config(), "arm", "sensors.csv")
+    assert config.body["_target_"] == "skin.body.arm.Arm"
+    assert config.layout == {
+        "_target_": "skin.body.layout.File", "_convert_": "all", "path": "sensors.csv",
+        "footprint": [0.01, 0.01], "depth": None,
+    }  # fmt: skip
+    assert with_skin(Config(seed=1), None, None) == Config(seed=1)

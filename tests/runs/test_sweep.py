@@ -1,7 +1,6 @@
 """A sweep counts its jobs as Hydra does, goes on after a failure, resumes, and tells what it found."""
 
 import socket
-import sqlite3
 import subprocess
 import sys
 
@@ -77,25 +76,9 @@ def parents(store):
 
 
 @pytest.mark.slow("trains several runs")
-def test_a_sweep_that_was_killed_goes_on_where_it_was(run, begin, tmp_path, opened):
-    with begin(tmp_path, *sweep(tmp_path, "seed=0,1,2")) as first:
-        next(line for line in first.lines() if line.startswith("[1/3]"))
-    with sqlite3.connect(tmp_path / "m.db") as database:
-        began = database.execute("select name, status from runs order by start_time").fetchall()
-    assert began[:2] == [("seed=0,1,2", "RUNNING"), (named(0), "FINISHED")]
-    again = run(tmp_path, *sweep(tmp_path, "seed=0,1,2"), store=False)
-    assert again.returncode == 0, again.stderr
-    assert again.stderr.count("did this before") == 1
-    assert "[3/3] seed=2: done" in again.stdout
-    finished = [name for name, status, parent in runs(opened(tmp_path)) if status == "FINISHED" and parent]
-    assert finished == [named(0), named(1), named(2)]
-
-
-@pytest.mark.slow("trains several runs")
 def test_a_run_is_named_by_its_changes_and_a_skipped_one_prints_its_scores(run, tmp_path, opened):
     words = ["train", *SMALL, "device.offset=0.2", "layout=grid", "model=mlp"]
     first = run(tmp_path, *words)
-    assert first.returncode == 0, first.stderr
     (made,) = opened(tmp_path).find()
     assert made.info.run_name == named(0, " offset=0.2 layout=grid")
     assert len(made.info.run_name) == 80
@@ -103,7 +86,6 @@ def test_a_run_is_named_by_its_changes_and_a_skipped_one_prints_its_scores(run, 
     assert expected.items() <= made.data.params.items()
     assert not {"representation", "model", "fusion"} & set(made.data.params)  # rules use none of them
     again = run(tmp_path, *words)
-    assert again.returncode == 0, again.stderr
     assert "did this before" in again.stderr
     rows = [line for line in first.stdout.splitlines() if line.startswith("│")]
     assert rows == [line for line in again.stdout.splitlines() if line.startswith("│")]
@@ -112,8 +94,7 @@ def test_a_run_is_named_by_its_changes_and_a_skipped_one_prints_its_scores(run, 
 
 @pytest.mark.slow("trains several runs")
 def test_a_bad_job_fails_and_the_others_run(run, tmp_path, opened):
-    done = run(tmp_path, *sweep(tmp_path, "device.offset=-1,0.1"), store=False)
-    assert done.returncode == 1
+    done = run(tmp_path, *sweep(tmp_path, "device.offset=-1,0.1"), store=False, code=1)
     assert "[1/2] device.offset=-1: device.offset=-1 must be" in done.stderr
     store = opened(tmp_path)
     assert [each[:2] for each in runs(store) if each[2]] == [(named(0, " offset=0.1"), "FINISHED")]
@@ -125,7 +106,6 @@ def test_a_bad_job_fails_and_the_others_run(run, tmp_path, opened):
 def test_a_run_is_nested_under_the_sweep_that_trained_it(run, tmp_path, opened):
     for seeds in ("0,1,0", "1,0", "shuffle(0,1,2)"):
         done = run(tmp_path, *sweep(tmp_path, f"seed={seeds}"), store=False)
-        assert done.returncode == 0, done.stderr
     assert done.stderr.count("did this before") == 2
     store = opened(tmp_path)
     second, first = (parent.info for parent in parents(store))  # the one in between trained nothing
@@ -138,8 +118,7 @@ def test_a_run_is_nested_under_the_sweep_that_trained_it(run, tmp_path, opened):
 def test_parallel_jobs_end_in_a_finished_parent(run, tmp_path, opened):
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
     parallel = ["hydra/launcher=joblib", "hydra.launcher.n_jobs=2"]
-    done = run(tmp_path, *sweep(tmp_path, "device.gain_spread=0.05,0.1", *parallel), store=False)
-    assert done.returncode == 0, done.stderr
+    run(tmp_path, *sweep(tmp_path, "device.gain_spread=0.05,0.1", *parallel), store=False)
     (parent,) = parents(opened(tmp_path))
     assert parent.info.status == "FINISHED"
 
@@ -147,7 +126,7 @@ def test_parallel_jobs_end_in_a_finished_parent(run, tmp_path, opened):
 @pytest.mark.slow("composes several sweeps with trained runs")
 @pytest.mark.parametrize("given", [["device.offset=-1,-2"], ["seed=x,y"], ["model=cn", "seed=0,1"]])
 def test_a_sweep_that_trains_nothing_leaves_no_parent(run, tmp_path, given, opened):
-    done = run(tmp_path, *sweep(tmp_path, *given), store=False)
+    done = run(tmp_path, *sweep(tmp_path, *given), store=False, code=None)
     assert done.returncode in (1, 2)
     assert given[0].split("=")[1].split(",")[0] in done.stderr
     assert not (tmp_path / "m.db").exists() or not runs(opened(tmp_path))
@@ -158,7 +137,6 @@ def test_shards_train_every_job_once(run, tmp_path, opened):
     said = []
     for shard in ("1/2", "2/2", "3/3"):
         done = run(tmp_path, *sweep(tmp_path, "seed=0,1,0", f"shard={shard}"), store=False)
-        assert done.returncode == 0, done.stderr
         said.append(done.stdout)
     assert "shard 3/3 has no job: the sweep has only 2" in said[2]
     store = opened(tmp_path)
@@ -176,10 +154,8 @@ def test_shards_train_every_job_once(run, tmp_path, opened):
     ],
 )
 def test_what_no_job_could_accept_is_refused_once(run, tmp_path, words, said):
-    done = run(tmp_path, "train", *words, *SMALL)
-    assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr.count(said) == 1
-    assert "Traceback" not in done.stderr
+    done = run(tmp_path, "train", *words, *SMALL, code=2)
+    assert (done.stdout, done.stderr.count(said)) == ("", 1)
     assert not (tmp_path / "m.db").exists()
 
 

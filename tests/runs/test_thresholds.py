@@ -31,15 +31,14 @@ def found(run, tmp_path_factory):
     out, values = f"out={folder}/out", {}
 
     def stored(*words):
-        done = run(folder, *words)
-        assert done.returncode == 0, done.stderr
+        run(folder, *words)
         points = "select value from tags join runs using (run_uuid) where key='operating_point'"
         return json.loads(query(folder, f"{points} order by start_time")[-1][0])["threshold"]
 
     def per_touch(*words):
         cache = folder / f"cache{len(values)}"
         patch.setenv("SKIN_CACHE", str(cache))
-        assert run(folder, *words).returncode in (0, 2)
+        run(folder, *words, code=None)
         files = sorted(cache.glob("threshold_*.npz"), key=lambda path: path.stat().st_mtime_ns)
         return [float(np.load(path)["point"][0]) for path in files]
 
@@ -71,9 +70,7 @@ def found(run, tmp_path_factory):
         export = ("export", "export.touches=10", "export.touch=0.3", f"out={folder}/x.onnx")
         values["export"] = per_touch(*export, own, FEW, "export.rates=[10,47,500]")
         values["export drawn"] = per_touch(*export, "run=any_skin", *SKIN, FEW, "export.rates=[100]")
-    values["written"] = [
-        each for model in described for each in (model.threshold, *model.thresholds.values())
-    ]
+    values["written"] = [each for one in described for each in (one.threshold, *one.thresholds.values())]
     return values
 
 

@@ -127,7 +127,6 @@ def test_two_processes_make_one_run(run, tmp_path, opened):
     given = [*SMALL, "data.gestures=80", "trainer.max_epochs=2"]  # 64 to train on: two equal parts
     two = ["trainer.devices=2", "trainer.strategy=ddp", "trainer.accelerator=cpu"]
     done = run(tmp_path, "train", *given, *two, apart=True)
-    assert done.returncode == 0, done.stderr
     ((name, status, losses),) = logged(opened(tmp_path))
     assert status == "FINISHED"
     assert "strategy" not in name  # names tell what results depend on
@@ -136,7 +135,6 @@ def test_two_processes_make_one_run(run, tmp_path, opened):
     alone = run(tmp_path, "train", *given)
     assert "did this before" in alone.stderr
     alone = run(tmp_path, "train", *given, "tracking.resume=false")
-    assert alone.returncode == 0, alone.stderr
     assert losses == pytest.approx(logged(opened(tmp_path))[1][2], rel=1e-5)
     assert len(losses) == 2
 
@@ -151,7 +149,7 @@ def test_two_processes_make_one_run(run, tmp_path, opened):
 )
 def test_processes_that_cannot_train_together_are_refused(run, tmp_path, opened, given, said):
     words = [*given, *SMALL, "trainer.devices=2", f"hydra.sweep.dir={tmp_path}/out"]
-    done = run(tmp_path, "train", *words, apart=True)
+    done = run(tmp_path, "train", *words, apart=True, code=None)
     assert done.returncode in (1, 2)
     assert said in done.stderr
     assert "Traceback" not in done.stderr

@@ -130,12 +130,7 @@ def test_settings_of_a_variant_hold_instead_of_the_common_ones(composed):
         (("study=models", "study.seeds=[]"), "study.seeds"),
         (("study=robustness", "study.part=layouts", "study.seeds=[-1]"), "study.seeds"),
         (("study=robustness", "study.part=dead", "study.devices=-1"), "study.devices=-1"),
-        (("study=margins", "study.measure.gestures=0"), "study.measure.gestures=0"),
-        (("study=holds", "study.measure.rate=0"), "study.measure.rate=0"),
-        (("study=streams", "study.measure.hours=0"), "hours=0"),
-        (("study=embeddings", "study.measure.train=1"), "study.measure.train=1"),
         (("study=embeddings", "study.measure.attributes=[colour]"), "study.measure.attributes"),
-        (("study=embeddings", "study.measure.seeds=[]"), "study.measure.seeds"),
         (("study=holds", "+study.measure.rates=0"), "did you mean rate"),
     ],
 )

@@ -1,25 +1,25 @@
 """A study's tables say what was found, in files and on a narrow terminal."""
 
+import math
 from dataclasses import replace
 from itertools import product
 
 import numpy as np
 import pandas as pd
 import pytest
+import torch
 from PIL import Image
 
+from experiments.studies import pages
 from experiments.studies.comparison import Conclusion, Estimate
-from experiments.studies.pages import (
-    Page,
-    comparison_text,
-    publish_measured,
-    publish_study,
-    read_reference,
-    study_figure,
-    variants_table,
-)
+from experiments.studies.measures import Streams, streams_frame
+from experiments.studies.pages import Page, publish_measured, read_reference
 from experiments.studies.study import Statement, Study
 from skin.errors import InputError
+from skin.evaluation.metrics import encode
+from skin.evaluation.operating_point import OperatingPoint
+from skin.evaluation.streams import Alarms, Bin, WindowReport
+from skin.touch.labels import TOUCH
 
 LABELS = ("overall", "big", "dynamic", "press", "dangerous")
 METRICS = [f"same/{label}/accuracy" for label in LABELS]
@@ -55,7 +55,7 @@ STUDY = Study("edges", "edges", [0, 1], rows="all", metrics=METRICS, statements=
 
 
 def table(trials, *settings):
-    shown = variants_table(pd.DataFrame(trials), *settings)
+    shown = pages.variants_table(pd.DataFrame(trials), *settings)
     return [list(shown.columns), *shown.to_numpy().tolist()]
 
 
@@ -88,11 +88,11 @@ def test_conditions_are_columns_or_lines_of_a_single_variant(variants, head, nam
 def test_what_was_measured_has_its_unit(fields, compared, text):
     said = Statement(**vars(SAID) | fields)
     named = dict(zip("ab", compared, strict=False))
-    assert comparison_text(Conclusion(said, named, "undecided")) == text
+    assert pages.comparison_text(Conclusion(said, named, "undecided")) == text
 
 
 def test_files_and_terminal_say_the_same(tmp_path, capsys):
-    publish_study(STUDY, "edges, little [data]", FOUND, tmp_path / "study_edges")
+    pages.publish_study(STUDY, "edges, little [data]", FOUND, tmp_path / "study_edges")
     page = (tmp_path / "study_edges.md").read_text()
     assert page.splitlines()[0] == "# edges, little [data]"
     assert "| 3.2.2 | one [sic] beats the other | +20.0 points | undecided |" in page
@@ -115,7 +115,7 @@ def test_an_axis_draws_lines_over_the_numbers_in_the_names(single):
     ]
     for name in ("other", "equation 10"):  # no number, and a single one
         found += [trial("any" if single else name, "0", 0.5, condition=name if single else "")]
-    (axis,) = study_figure(replace(STUDY, axis="number of sensors"), pd.DataFrame(found)).axes
+    (axis,) = pages.study_figure(replace(STUDY, axis="number of sensors"), pd.DataFrame(found)).axes
     (line,) = axis.containers
     assert line[0].get_xdata().tolist() == [4, 9, 25]
     assert line[0].get_ydata().tolist() == pytest.approx([90, 95, 97])
@@ -166,7 +166,66 @@ def test_the_csv_has_the_reference_and_another_file_may_be_chosen(tmp_path):
     path = tmp_path / "report.csv"
     path.write_text("row,simulator,label,value\ngru,fem,overall,0.5\n")
     study = replace(STUDY, reference=str(path), statements=())
-    publish_study(study, "t", pd.DataFrame([reported("gru", 0.9), reported("rules", 0.8)]), tmp_path / "s")
+    trials = pd.DataFrame([reported("gru", 0.9), reported("rules", 0.8)])
+    pages.publish_study(study, "t", trials, tmp_path / "s")
     assert pd.read_csv(tmp_path / "s.csv", keep_default_na=False).reference.tolist() == ["0.5", ""]
     with pytest.raises(InputError, match=r"study\.reference=nowhere"):
         read_reference("nowhere")
+
+
+NAMES = ("big", "dynamic", "press", "dangerous")
+HALF, MORE, MOST = (dict.fromkeys(NAMES, fraction) for fraction in (0.5, 0.625, 0.9))
+STREAMED = WindowReport(
+    bins=[Bin("0-0.2", 40, HALF, MORE), Bin("whole", 160, MOST, HALF)],
+    gates={"threshold": torch.tensor([[90, 10], [20, 180]])},
+    threshold=0.31,
+    alarms={"none": Alarms(0.5, 3, 8, 7, 9, 1), "threshold": Alarms(0.5, 0, 8, 6, 9, 0)},
+    hours=0.6,
+    lengths={2.0: 0.8125, 6.0: "made for 30"},
+    point=OperatingPoint(0.5, 0.02, 64, 1, 0),
+)
+
+
+def test_the_files_have_what_was_found(tmp_path):
+    frame = streams_frame(STREAMED)
+    about = frame.attrs["about"]
+    assert about.startswith("gate none: 6.0 (1.2")
+    assert "7 of 8 dangerous touches and 1 of 9 safe ones raised the alarm" in about
+    page, table = pages.publish_page(Streams().page(frame, "rules"), "rules fem 0", tmp_path / "stream_rules")
+    text = page.read_text()
+    rows = ["press | 0.5000 | 0.9000", " | 40 | 160", "threshold | 180", "overall | 0.8125 | made for 30"]
+    assert all(f"| {row} |" in text for row in rows)
+    assert text.startswith("# rules fem 0\n\ngate none")
+    values = pd.read_csv(table, dtype=str, keep_default_na=False).set_index(["measure", "name", "at"]).value
+    assert values["accuracy", "press", "whole"] == "0.9000"
+    assert values["idle said touched", "threshold", ""] == "10"
+    assert values["alarms false", "none", ""] == "3"
+    assert values["window, s", "overall", "6"] == "made for 30"
+    assert {*tmp_path.iterdir()} == {page, table}
+
+
+def outcomes(called, dangerous):
+    """Return the outcomes of a run that calls each gesture dangerous or not, and is right about the rest."""
+    labels = torch.zeros(len(dangerous), len(TOUCH))
+    position = TOUCH.names.index("dangerous")
+    labels[:, position] = torch.tensor(dangerous)
+    said = labels.clone()
+    said[:, position] = torch.tensor(called)
+    return encode(said, labels, TOUCH)
+
+
+def test_the_two_kinds_of_errors_are_shares_of_safe_and_of_dangerous_gestures():
+    dangerous = [0.0] * 8 + [1.0] * 4
+    first = outcomes([1.0] * 4 + [0.0] * 4 + [1.0] * 4, dangerous)  # half of the safe ones
+    second = outcomes([1.0] * 4 + [0.0] * 5 + [1.0] * 3, dangerous)  # and one of four dangerous ones
+    (found,) = pages.confusion_rows({"gru": np.array([first, second])}).to_dict("records")
+    assert float(found["safe_called_dangerous"]) == 0.5
+    assert float(found["dangerous_called_safe"]) == 0.125
+    assert float(found["difference"]) == 0.375
+    # By hand: over runs 0.5 and 0.25; over 8 safe gestures, of which 4 are wrong, and over 4 dangerous ones,
+    # of which one is wrong in half of the runs.
+    runs, safe, missed = 0.25**2 / 2 / 2, 0.25 * 8 / 7 / 8, 3 / 64 * 4 / 3 / 4
+    assert float(found["error"]) == pytest.approx(math.sqrt(runs + safe + missed), abs=1e-4)
+    # Student's quantiles of two runs, of eight and of four gestures.
+    margin = math.sqrt(12.706**2 * runs + 2.3646**2 * safe + 3.1824**2 * missed)
+    assert float(found["margin"]) == pytest.approx(margin, abs=1e-4)

@@ -8,16 +8,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from experiments.studies import trials
 from experiments.studies.measures import Subject
 from experiments.studies.study import Study, Variant
-from experiments.studies.trials import (
-    StudyRun,
-    measure_once,
-    numbered_settings,
-    read_frame,
-    votes,
-    write_frame,
-)
+from experiments.studies.trials import StudyRun, read_frame
 from skin.errors import InputError
 from skin.runs.configuration import fingerprint
 from skin.runs.run import FinishedRun
@@ -47,13 +41,13 @@ def study(**settings):
 )  # fmt: skip
 def test_lists_of_a_condition_number_its_devices(condition, more, found):
     expected = [("c", number, settings) for number, settings in found]
-    assert list(numbered_settings(study(conditions={"c": condition}, **more))) == expected
+    assert list(trials.numbered_settings(study(conditions={"c": condition}, **more))) == expected
 
 
 def test_lists_of_different_lengths_are_refused():
     conditions = {"c": {"layout.seed": [1, 2]}}
     with pytest.raises(InputError, match="one length"):
-        list(numbered_settings(study(devices=3, numbered=["device.seed"], conditions=conditions)))
+        list(trials.numbered_settings(study(devices=3, numbered=["device.seed"], conditions=conditions)))
 
 
 @dataclass(frozen=True)
@@ -84,7 +78,7 @@ def measured(configured, tmp_path, monkeypatch):
 
         def trial(condition="a, b", *changes):
             subject = Subject(configured("experiment=rules", *changes), condition=condition)
-            frame, _ = measure_once("x", Counted(gestures), run, subject)
+            frame, _ = trials.measure_once("x", Counted(gestures), run, subject)
             assert frame["same/overall/accuracy"].tolist() == [0.5]
             return len(Counted.calls)
 
@@ -113,7 +107,7 @@ def test_a_trial_of_an_earlier_training_is_not_reused(measured):
 def test_a_frame_is_read_as_it_was_written_and_a_damaged_one_is_refused(tmp_path):
     path, frame = tmp_path / "new" / "a.parquet", measured_frame()
     assert read_frame(path) is None
-    write_frame(frame, path)
+    trials.write_frame(frame, path)
     pd.testing.assert_frame_equal(read_frame(path), frame)
     assert read_frame(path).attrs["about"] == "a line"
     assert [file.name for file in path.parent.iterdir()] == ["a.parquet"]
@@ -137,13 +131,11 @@ def test_models_vote_by_seed_and_by_equal_other_settings():
     """Of three gestures, the second is wrong in two of three models, the third in one."""
     found = [trial("a", "0", [0, 1, 0]), trial("b", "0", [0, 1, 1]), trial("c", "0", [0, 0, 0])]
     found += [trial("d", "0", [1, 1, 1]), trial("a", "1", [0, 0, 0]), trial("b", "1", None)]
-    (vote,) = votes(study(vote=["a", "b", "c"]), pd.DataFrame(found))
+    (vote,) = trials.votes(study(vote=["a", "b", "c"]), pd.DataFrame(found))
     assert (vote["variant"], vote["seed"], vote["run"]) == ("vote", "0", "run_a run_b run_c")
     metrics = [vote[f"same/{name}"] for name in ("big/accuracy", "dynamic/accuracy", "any/disagreement")]
     assert metrics == pytest.approx([2 / 3, 1, 2 / 3])
-    assert not list(votes(study(), pd.DataFrame(found)))
-    both = [
-        trial(one["row"], "0", [*one["outcomes"]], simulator=name) for name in ("a", "b") for one in found[:3]
-    ]
-    named = [one["variant"] for one in votes(study(vote="all"), pd.DataFrame(both))]
+    assert not list(trials.votes(study(), pd.DataFrame(found)))
+    both = [trial(one["row"], "0", [*one["outcomes"]], simulator=name) for name in "ab" for one in found[:3]]
+    named = [one["variant"] for one in trials.votes(study(vote="all"), pd.DataFrame(both))]
     assert named == ["a vote", "b vote"]

@@ -32,22 +32,24 @@ def sampled(request):
     return source, movie, movie.pressure().double().numpy()
 
 
+def centres(frames: torch.Tensor, body: Sheet) -> torch.Tensor:
+    """Return the centres of pressure, m, of frames (N, H, W), (N, 2)."""
+    frames, cells = frames.double(), zip(body.cells, body.cell, strict=True)
+    x, y = ((torch.arange(count) + 0.5) * cell for count, cell in cells)
+    moments = [(frames.sum(1) * x).sum(1), (frames.sum(2) * y).sum(1)]
+    return torch.stack(moments, 1) / frames.sum((1, 2))[:, None]
+
+
 def test_labels_are_what_the_movie_gives(sampled):
     """Recomputed from the dense movie alone, gesture by gesture, straight from the report's sentences."""
     source, movie, pressure = sampled
-    body = source.body
     weights = source.footprints.double().numpy()
-    x = (np.arange(body.cells[0]) + 0.5) * body.cell[0]
-    y = (np.arange(body.cells[1]) + 0.5) * body.cell[1]
     for gesture, labels in zip(pressure, movie.labels.bool().tolist(), strict=True):
         contact = gesture > 0.02 * gesture.max()
         big = contact.mean((1, 2)).max() > 0.30
         touched = contact.any((1, 2))
-        centres = [
-            (np.sum(frame.sum(0) * x) / frame.sum(), np.sum(frame.sum(1) * y) / frame.sum())
-            for frame in gesture[touched]
-        ]
-        dynamic = max(np.hypot(*np.subtract(centre, centres[0])) for centre in centres) > 1e-3
+        centre = centres(torch.from_numpy(gesture[touched]), source.body)
+        dynamic = (centre - centre[0]).norm(dim=1).max() > 1e-3
         dangerous = (gesture.reshape(len(gesture), -1) @ weights.T).max() > 90.5e3
         longest = max(len(list(run)) for on, run in groupby(touched) if on)
         assert [big, dynamic, longest > 3, dangerous] == labels
@@ -79,9 +81,7 @@ def test_sliding_is_straight_and_as_fast_as_drawn():
     source = TouchSampler(body, np.full((1, 40000), 1 / 40000), Prescribed(), settings)
     wanted = np.tile([False, True, False, False], (40, 1))
     movie = source.sample(40, np.random.default_rng(0), wanted)
-    weight = movie.frames / movie.frames.sum((1, 2), keepdim=True)
-    middle = (torch.arange(200) + 0.5) * 0.005
-    centre = torch.stack([(weight.sum(1) * middle).sum(1), (weight.sum(2) * middle).sum(1)], 1)[movie.index]
+    centre = centres(movie.frames, body)[movie.index]
     speed, direction = movie.parameters["speed"], movie.parameters["direction"]
     step = speed[:, None] * torch.stack([direction.cos(), direction.sin()], 1)
     moved = [one[fraction > 0].diff(dim=0) for one, fraction in zip(centre, movie.scale, strict=True)]
@@ -142,16 +142,12 @@ def test_drag_follows_the_centre_of_pressure():
     movie = source.sample(96, np.random.default_rng(3))
     size = torch.linalg.vector_norm(movie.shear, dim=1)
     dynamic = movie.labels[:, 1] == 1
-    x, y = (torch.arange(32) + 0.5) * 0.005, (torch.arange(32) + 0.5) * 0.005
     for index, scale, slides in zip(movie.index, movie.scale, dynamic.tolist(), strict=True):
         shown = index[scale > 0]
         if not slides:
             assert (size[shown] == 0).all()
             continue
-        frames = movie.frames[shown].double()
-        total = frames.sum((1, 2))
-        centre = torch.stack([(frames.sum(1) * x).sum(1), (frames.sum(2) * y).sum(1)], 1) / total[:, None]
-        steps = centre.diff(dim=0)
+        steps = centres(movie.frames[shown], source.body).diff(dim=0)
         far = torch.linalg.vector_norm(steps, dim=1) > 2e-3
         # Rendering on cells of 5 mm moves a centre by parts of a millimetre.
         cosine = torch.cosine_similarity(steps, movie.shear[shown][1:].double())
@@ -162,13 +158,9 @@ def test_drag_follows_the_centre_of_pressure():
 def test_net_is_from_the_first_place_to_the_last(sampled):
     """The centre of pressure of a rigid shape moves as its place does; cells of 5 to 8 mm blur it."""
     source, movie, _ = sampled
-    cells = zip(source.body.cells, source.body.cell, strict=True)
-    x, y = ((torch.arange(count) + 0.5) * cell for count, cell in cells)
     moved = []
     for index, scale in zip(movie.index, movie.scale, strict=True):
-        ends = movie.frames[index[scale > 0][[0, -1]]].double()
-        total = ends.sum((1, 2))
-        centre = torch.stack([(ends.sum(1) * x).sum(1), (ends.sum(2) * y).sum(1)], 1) / total[:, None]
-        moved.append(centre[1] - centre[0])
+        first, last = centres(movie.frames[index[scale > 0][[0, -1]]], source.body)
+        moved.append(last - first)
     net = torch.stack([movie.parameters["net_x"], movie.parameters["net_y"]], dim=1)
     torch.testing.assert_close(net, torch.stack(moved).float(), atol=2e-3, rtol=0)

@@ -1,7 +1,6 @@
 """Each fusion by itself."""
 
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,6 +8,7 @@ import torch
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
+from skin.core.files import CONF
 from skin.errors import InputError
 from skin.learning.cnn import Cnn
 from skin.learning.fusion import HEADS, Linked, link
@@ -18,7 +18,7 @@ from skin.learning.representation import Frames
 
 PAIR = np.array([[0.0, 0.5], [0.5, 0.0]])
 # What every fusion must do, whatever model it holds.
-OPTIONS = sorted((Path(__file__).parents[3] / "conf" / "fusion").glob("*.yaml"))
+OPTIONS = sorted((CONF / "fusion").glob("*.yaml"))
 MODELS = {
     "readings": partial(Mlp, widths=[8]),
     "graph": partial(Gcn, widths=[4, 8]),

@@ -1,15 +1,20 @@
-"""Graph networks against the laws of graphs and against PyTorch Geometric, and the perceptron."""
+"""What every model must do; graph networks against PyTorch Geometric, and the transformer by hand."""
 
 import math
+import re
 import warnings
 from contextlib import contextmanager
 
 import numpy as np
 import pytest
 import torch
+from hydra.utils import instantiate
+from omegaconf import OmegaConf
 from torch.nn import functional as F
 
-from skin.learning.graph import adjacency, neighbours, normalised
+from skin.core.files import CONF
+from skin.errors import InputError
+from skin.learning.graph import Graph, adjacency, neighbours, normalised
 from skin.learning.model import POOLINGS, Gcn, Pyg, Transformer, _InstanceNorm
 
 PLACES = 0.1 * np.random.default_rng(0).random((8, 3))
@@ -93,9 +98,6 @@ def test_a_graph_of_one_sensor_can_be_normed():
     assert torch.isfinite(model(torch.randn(4, 1, 2), torch.ones(1, 1))).all()
 
 
-# The transformer over sensors: an encoder layer typed out, and what does not matter to it.
-
-
 NO_EDGES = torch.eye(8)
 
 
@@ -130,3 +132,91 @@ def test_it_is_the_encoder_that_the_formulas_describe(pooling, context):
     wanted = tokens.amax(dim=1) if pooling == "max" else tokens.mean(dim=1)
     with context():
         torch.testing.assert_close(model(x, NO_EDGES), wanted, atol=1e-5, rtol=1e-5)
+
+
+OPTIONS = sorted((CONF / "model").glob("*.yaml"))
+PYG = "torch_geometric.nn.models"
+NETWORKS = {
+    "GCN": {},
+    "GIN": {},
+    "GAT": {"heads": 4, "v2": True},
+    "PNA": {"aggregators": ["mean", "max", "std"], "scalers": ["identity", "amplification"]},
+}
+CHANGES = {
+    "gcn": [
+        {"pooling": "max", "norm": "batch", "activation": "relu"},
+        {"pooling": "mean", "norm": "layer", "activation": "elu"},
+        {"pooling": "set2set", "norm": "instance"},
+        {"widths": [40, 8]},
+    ],
+    "cnn": [{"channels": [4], "embedding": None}, {"repeat": 3}],
+    "transformer": [{"pooling": "max", "layers": 1, "heads": 1}],
+    "pyg": [{"network": {"_target_": f"{PYG}.{name}"} | extra} for name, extra in NETWORKS.items()],
+    "mlp": [{"widths": [5], "activation": "silu"}],
+}
+# Biases, kept because the original has them: a softmax takes the first away, a norm behind them the others.
+WITHOUT_EFFECT = (r"gate\.bias$", r"(convolutions|block)\.\d[.\d]*\.bias$")
+# trained weights are a file that a test cannot count on
+NEEDED = {"efficientnet": {"weights": "random"}}
+VARIANTS = [
+    (path, NEEDED.get(path.stem, {}) | extra)
+    for path in OPTIONS
+    for extra in ({}, *CHANGES.get(path.stem, []))
+]
+
+
+def frames(kind, count=6, seed=0):
+    """Return the shape of one frame, frames of that kind and their adjacency."""
+    generator = torch.Generator().manual_seed(seed)
+    shape = {"image": (3, 24, 24), "graph": (9, 3), "readings": (11,)}[kind]
+    x = torch.randn(count, *shape, generator=generator)
+    positions = 0.1 * torch.rand(9, 3, generator=generator)
+    return shape, x, Graph(positions, (0.16, 0.16)).adjacency if kind == "graph" else None
+
+
+@pytest.fixture(params=VARIANTS, ids=lambda v: "-".join([v[0].stem, *map(str, v[1].values())]))
+def make(request):
+    path, extra = request.param
+    torch.manual_seed(0)
+    return instantiate(OmegaConf.load(path), **extra)
+
+
+@pytest.fixture
+def given(make):
+    kind = make.func.takes
+    shape, x, adjacency = frames(kind)
+    return make(kind, shape), x, adjacency
+
+
+def test_it_encodes_frames_to_its_width(given):
+    model, x, adjacency = given
+    assert model(x, adjacency).shape == (6, model.width)
+
+
+def test_a_gradient_reaches_every_parameter(given, request):
+    """In double precision: what changes nothing has a gradient of rounding size, which only may be 0."""
+    model, x, adjacency = given
+    model.double().train()
+    model(x.double(), None if adjacency is None else adjacency.double()).square().sum().backward()
+    maximum = {name: one.grad.abs().max().item() for name, one in model.named_parameters()}
+    idle = {name for name, size in maximum.items() if size < 1e-12 * max(maximum.values())}
+    normed = re.search("^efficientnet|batch|instance", request.node.callspec.id)
+    known = WITHOUT_EFFECT if normed else WITHOUT_EFFECT[:1]
+    assert all(any(re.search(one, name) for one in known) for name in idle), idle
+
+
+def test_frames_do_not_see_each_other(given):
+    model, x, adjacency = given
+    together = model.eval()(x, adjacency)
+    assert torch.equal(model(x, adjacency), together)
+    torch.testing.assert_close(model(x[2:3], adjacency), together[2:3])
+
+
+def test_other_kinds_are_refused_with_the_override_that_mends_it(make, request):
+    name = request.node.callspec.params["make"][0].stem
+    takes = make.func.takes
+    for kind in {"image", "graph", "readings"} - {takes}:
+        with pytest.raises(InputError) as error:
+            make(kind, frames(kind)[0])
+        wanted = f"representation={takes}"
+        assert str(error.value) == f"model={name} needs {wanted}, got {kind}: add {wanted}"

@@ -1,4 +1,4 @@
-"""Gestures of rigid objects: their shape, their force, their labels."""
+"""Contact from the command line on; gestures of rigid objects: their shape, their force, their labels."""
 
 from dataclasses import replace
 
@@ -8,18 +8,19 @@ import torch
 
 from skin.body.base import Arm, Sheet
 from skin.body.layout import Grid
+from skin.core.files import CONF
 from skin.device.base import in_threads
 from skin.errors import InputError
 from skin.mechanics.contact.prescribed import Prescribed
 from skin.mechanics.contact.rigid import Rigid, solids
 from skin.mechanics.simulator.base import AbstractSimulator, Response
+from skin.runs.build import build_device
 from skin.touch.gestures import GestureSettings, TouchSampler
 from skin.touch.movie import ContactProblem
 from skin.touch.paths import Trajectories
 from skin.touch.shapes import Pose, Shapes
+from tests.mechanics.contact.test_unilateral import love
 from tests.touch.movie_labels import movie_labels
-
-from .halfspace import love
 
 BODY = Sheet([0.16, 0.16], [20, 20], [{"material": "EcoFlex 00-30", "thickness": 0.015}])
 SENSORS = Grid(5, 5).sensors(BODY)
@@ -212,3 +213,28 @@ def test_the_skin_of_an_arm_falls_away_below_a_stamp():
     assert inside.sum() >= 10
     assert row[inside].numpy() == pytest.approx(expected - expected.min(), abs=1e-7)
     assert flat.gap(stamp, given).isinf().sum() == gap.isinf().sum()
+
+
+OPTIONS = sorted(path.stem for path in (CONF / "contact").glob("*.yaml"))
+SMALL = ("body.cells=[12,12]", "layout=grid", "data.gestures=16", "device.test_gestures=16")
+SOLID = ("simulator=solid", "simulator.divisions=1")
+
+
+@pytest.fixture(scope="module", params=OPTIONS)
+def device(request, configured):
+    return build_device(configured(f"contact={request.param}", *SOLID, *SMALL))
+
+
+def test_touches_are_made_of_pressures_that_carry_their_force(device):
+    movie = device.sampler.sample(16, np.random.default_rng(0))
+    width, height = device.body.cell
+    force = movie.pressure().sum((2, 3)) * width * height
+    torch.testing.assert_close(force, movie.force, rtol=1e-3, atol=1e-3)
+    assert (movie.frames >= 0).all()
+
+
+@pytest.mark.parametrize("simulator", ["naive", "fem"])
+def test_rigid_objects_need_a_surface_that_gives_way(configured, simulator):
+    match = f"simulator={simulator}: set simulator=solid, or contact=prescribed"
+    with pytest.raises(InputError, match=match):
+        build_device(configured("contact=rigid", f"simulator={simulator}"))

@@ -1,6 +1,4 @@
-"""The contract of every simulator."""
-
-from pathlib import Path
+"""The contract of every simulator, and the naive one: the pressure of a cell times the footprint's area."""
 
 import numpy as np
 import pytest
@@ -8,21 +6,18 @@ import torch
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
-from skin.body.base import Sheet
+from skin.body.base import Sensors, Sheet
 from skin.body.layout import Scattered
+from skin.core.files import CONF
 from skin.errors import InputError
 from skin.mechanics.simulator.base import AbstractSimulator, Response
+from skin.mechanics.simulator.naive import Naive
 
-CONF = Path(__file__).parents[3] / "conf" / "simulator"
-LAYERS = [
-    {"material": "Dragon Skin 10 Medium", "thickness": 0.010},
-    {"material": "EcoFlex 00-30", "thickness": 0.005},
-]
-BODY = Sheet([0.16, 0.12], [9, 7], LAYERS)
+BODY = instantiate(OmegaConf.load(CONF / "body" / "sheet.yaml"), size=[0.16, 0.12], cells=[9, 7])
 SENSORS = Scattered(2, 3, seed=3).sensors(BODY)
 OPTIONS = [
     pytest.param((path, extra), id="-".join([path.stem, *map(str, extra.values())]))
-    for path in sorted(CONF.glob("*.yaml"))
+    for path in sorted((CONF / "simulator").glob("*.yaml"))
     for extra in ([{}, {"reading": "interface"}, {"constraint": "free"}] if path.stem == "fem" else [{}])
 ]
 
@@ -107,3 +102,25 @@ def test_drag_is_felt_or_refused_by_name(simulator):
     assert not torch.allclose(plain.readings[:2], sheared.readings[:2], rtol=1e-3)
     torch.testing.assert_close(plain.readings[2], sheared.readings[2], rtol=1e-4, atol=1e-5)
     torch.testing.assert_close(twice.readings, 2 * sheared.readings, rtol=1e-4, atol=1e-5)
+
+
+TINY = Sheet([0.04, 0.03], [4, 3], [{"material": "EcoFlex 00-30", "thickness": 0.005}])
+
+
+@pytest.mark.parametrize(
+    ("x", "y", "row", "column"),
+    [(0.005, 0.005, 0, 0), (0.021, 0.019, 1, 2), (0.0, 0.029, 2, 0), (0.04, 0.03, 2, 3)],
+)
+def test_a_sensor_reads_the_cell_that_holds_it(x, y, row, column):
+    naive = Naive(TINY, Sensors(np.array([[x, y, 0.0]]), (0.002, 0.002)))
+    one_hot = torch.zeros(TINY.shape, requires_grad=True)
+    naive(one_hot).readings.sum().backward()
+    assert one_hot.grad.nonzero().tolist() == [[row, column]]
+
+
+def test_reading_is_pressure_times_area():
+    """10 kPa on 10 mm x 10 mm is 1 N; half of it at the edge."""
+    naive = Naive(TINY, Sensors(np.array([[0.015, 0.015, 0.0], [0.0, 0.015, 0.0]]), (0.01, 0.01)))
+    response = naive(torch.full(TINY.shape, 1e4))
+    torch.testing.assert_close(response.readings, torch.tensor([1.0, 0.5]))
+    assert response.displacement is None

@@ -1,7 +1,8 @@
-"""The threshold of the alarm through the commands: a training stores it, and all others use it."""
+"""A finished run in the commands: where its alarm is raised, and its folder, by whose name it is used."""
 
 import json
 import re
+import shutil
 from contextlib import contextmanager
 
 import numpy as np
@@ -79,23 +80,6 @@ def test_a_run_of_old_gets_its_threshold_now_and_that_is_said(run, folder):
     assert f"alarm above {stored(folder)['threshold']:.4f}" in done.stdout
 
 
-def test_another_rate_gets_another_threshold(run, folder):
-    done = run(folder, "evaluate", FEW, "evaluation.false_alarm_rate=0.2", f"out={folder}/rate")
-    assert "stores no alarm threshold for 20 % false alarms" in done.stderr
-    level = float(re.search(r"alarm above (0\.\d+), chosen on 200 fresh", done.stdout)[1])
-    assert level < stored(folder)["threshold"]
-
-
-@pytest.fixture(scope="module")
-def found(run, folder):
-    done = run(folder, "evaluate", FEW, "evaluation.profile=rough", f"out={folder}/profile")
-    return float(re.search(r"alarm above (\d\.\d+), chosen on 200 fresh", done.stdout)[1])
-
-
-def test_a_profile_gets_a_threshold_of_its_own(folder, found):
-    assert abs(found - stored(folder)["threshold"]) > 1e-3
-
-
 def test_an_unknown_profile_is_refused_before_anything_is_trained(run, folder, tmp_path):
     for where, words in ((folder, ["evaluate"]), (tmp_path, ["train", "experiment=rules", *SKIN])):
         done = run(where, *words, "evaluation.profile=none_such", code=2)
@@ -127,18 +111,69 @@ def test_live_raises_the_alarm_where_it_is_told(run, folder, port, above, alarm)
     assert f"alarm above {float(above):g}" in done.stderr
 
 
-@pytest.mark.slow("draws and plays touches for three live views")
-def test_live_chooses_a_threshold_for_the_profile_and_keeps_it(run, folder, port, tmp_path, monkeypatch):
-    monkeypatch.setenv("SKIN_CACHE", str(tmp_path))
-    levels, few = [], "evaluation.safe_gestures=50"  # the time goes with their number
-    for words in ([], ["evaluation.profile=rough"], ["evaluation.profile=rough"]):
-        done = run(folder, "live.py", "device=serial", port, *LIVE, few, *words, code=None)
-        said = " ".join(done.stderr.split())
-        # A training of seconds may find too few dangerous touches.
-        hides = re.search(r"it hides dangerous touches: train with more gestures, or give a lower", said)
-        assert done.returncode == (2 if hides else 0), done.stderr
-        above = re.search(r"alarm above (\d\.\d+), chosen on 50 fresh safe touches at 10 Hz", said)
-        levels.append(float(above[1]))
-        assert ("choosing the alarm's threshold" in said) == (len(levels) < 3)
-        assert ("devices of the profile rough" in said) == (len(levels) == 2)
-    assert levels[0] != levels[1] == levels[2]
+@pytest.fixture(scope="module")
+def published(run, folder):
+    """Return the folder of the run, which is published there as ``small``."""
+    assert run(folder, "export", "format=folder", "name=small", "licence=MIT").stdout == "models/small\n"
+    return folder
+
+
+@pytest.fixture
+def model(published, tmp_path):
+    shutil.copytree(published / "models" / "small", tmp_path / "models" / "small")
+    return tmp_path / "models" / "small"
+
+
+def test_the_folder_has_weights_configuration_hashes_and_card(published):
+    assert [path.name for path in (published / "models").iterdir()] == ["small"]
+    written = {path.name for path in (published / "models" / "small").iterdir()}
+    assert written == {"README.md", "SHA256SUMS", "config.yaml", "rules.json", "run.json"}
+    card = (published / "models" / "small" / "README.md").read_text()
+    assert "`skin.learning.learner.Rules`" in card
+    assert "Mlp" not in card
+
+
+def test_its_name_is_a_run_where_the_run_itself_is_not(published, model, run):
+    done = run(model.parents[1], "evaluate", "run=small")
+    table = lambda text: [line for line in text.splitlines() if "accuracy" in line]  # noqa: E731
+    assert len(table(done.stdout)) > 3
+    assert table(done.stdout) == table((published / "said").read_text())
+
+
+def test_an_altered_file_ends_a_command_with_a_sentence(model, run):
+    with (model / "rules.json").open("a") as file:
+        file.write(" ")
+    for verb in ("evaluate", "live"):
+        done = run(model.parents[1], verb, "run=small", code=2)
+        assert "rules.json in " in done.stderr
+        assert "differs from SHA256SUMS: restore the folder" in done.stderr
+        assert done.stderr.count("\n") == 1
+    assert not (model.parents[1] / "results").exists()
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["licence=MIT"], "name=None is no name of a model"),
+        (["name=../small", "licence=MIT"], "name=../small is no name of a model"),
+        (["name=latest", "licence=MIT"], "name=latest is no name of a model"),
+        (["name=new"], "add licence=MIT"),
+        (["name=small", "licence=MIT"], "models/small exists"),
+        (["name=new", "licence=MIT", "run=none"], "no finished training run none"),
+        (["name=new", "licence=MIT", "out=x"], "not to out=x: add name=my_skin"),
+    ],
+)
+def test_bad_input_ends_with_a_sentence(published, run, overrides, message):
+    done = run(published, "export", "format=folder", *overrides, code=2)
+    assert message in done.stderr
+    assert done.stderr.count("\n") == 1
+    assert [path.name for path in (published / "models").iterdir()] == ["small"]
+
+
+def test_weights_that_are_too_large_are_refused(published, run):
+    code = "import skin.runs.run as m; from skin.commands.export import main; m._LARGEST = 100\n"
+    code += "main(['format=folder', 'name=new', 'licence=MIT'{own}])"
+    (published / "limited.py").write_text(code.format(own=f", 'tracking.uri=sqlite:///{published}/m.db'"))
+    done = run(published, published / "limited.py", store=False, code=2)
+    assert "are not one file of at most 0.0001 MB" in done.stderr
+    assert [path.name for path in (published / "models").iterdir()] == ["small"]

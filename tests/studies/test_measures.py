@@ -1,10 +1,12 @@
-"""Frozen test touches, and the score of a predictor on them."""
+"""Frozen test touches, the score of a predictor on them, and distances of sensors that move with a touch."""
 
 import sys
 
+import numpy as np
 import pytest
+import torch
 
-from experiments.studies.measures import Frozen, Subject, frozen_hash
+from experiments.studies.measures import Frozen, Motion, Subject, distance_changes, frozen_hash
 from skin.errors import InputError
 from skin.runs.build import build_device
 
@@ -18,8 +20,6 @@ def safe(readings, positions):
 def wrong(readings, positions):
     return np.zeros((3, 4))
 """
-
-
 WORDS = "simulator=naive", "data.gestures=10", "device.test_gestures=64", "device.dead=2"
 
 
@@ -49,3 +49,24 @@ def test_what_cannot_be_scored_and_other_touches_are_refused(subject, predictor,
     known = "0" * 16 if predictor == "guesses:safe" else subject[1]
     with pytest.raises(InputError, match=message):
         Frozen(predictor, known)(subject[0])
+
+
+FREE = "simulator=fem", "simulator.constraint=free", "body.cells=[10,10]", "layout=grid", "layout.rows=2"
+
+
+def measure(configured, *settings: str):
+    return Motion(gestures=20)(Subject(configured(*settings)))
+
+
+def test_changes_are_those_of_sensors_moved_by_hand():
+    positions = torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.02, 0.0], [0.03, 0.0, 0.0]])
+    motion = torch.tensor([[[0.0, 0.0, 0.0], [0.0, 0.001, 0.0], [-0.003, 0.0, 0.0]]])
+    changes = distance_changes(positions, motion, np.array([0, 0]), np.array([1, 2]))
+    torch.testing.assert_close(changes, torch.tensor([[0.05, 0.1]]))
+
+
+def test_what_cannot_move_is_refused(configured):
+    with pytest.raises(InputError, match=r"simulator\.constraint=free"):
+        measure(configured, "simulator=fem", *FREE[2:], "layout.columns=1")
+    with pytest.raises(InputError, match="add sensors"):
+        measure(configured, *FREE[:4], "layout.rows=1", "layout.columns=1")

@@ -1,6 +1,8 @@
 """A device made of a real pseudo-terminal: what is written to one end comes out of a serial port."""
 
 import os
+import termios
+import tty
 from collections.abc import Callable, Sequence
 from contextlib import contextmanager, suppress
 from itertools import count
@@ -8,10 +10,6 @@ from threading import Event, Thread
 from time import monotonic
 
 import pytest
-
-pytest.importorskip("termios", reason="pseudo-terminals need a POSIX system")
-import termios
-import tty
 
 from skin.wire.protocol import encode_line
 

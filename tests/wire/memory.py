@@ -1,19 +1,10 @@
 """Streams of bytes from memory in place of ports."""
 
-from time import monotonic, sleep
+from time import sleep
 
-from skin.device.resampling import FrameError
-from skin.wire.adapter import Adapter
 from skin.wire.skin import open_skin
 
 PATIENT = 60.0  # s: machines are busy at times
-
-
-def wait_for(condition):
-    deadline = monotonic() + PATIENT
-    while not condition():
-        assert monotonic() < deadline
-        sleep(0.005)
 
 
 class Sent:
@@ -50,12 +41,3 @@ class Sent:
 
 def opened(*pieces, layout=4, end=False, **settings):
     return open_skin("memory", range(layout), opener=lambda: Sent(*pieces, end=end), **settings)
-
-
-def parse_line(line):
-    """Return the numbers of a line of our protocol; FrameError if it holds anything else."""
-    *_, layout = Adapter().layouts(3 * (line + b"\n"))
-    read = layout.reader(line)
-    if read.strange:
-        raise FrameError("number")
-    return read

@@ -4,7 +4,7 @@ from contextlib import suppress
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from skin.core.files import CONF
@@ -13,11 +13,10 @@ from skin.wire.adapter import Adapter, read_adapter
 from skin.wire.decoder import Decoder
 from skin.wire.proposal import propose
 from skin.wire.reader import Port, WireFeed
+from tests.damage import DAMAGED_FILES
 
 SHIPPED = sorted(path.stem for path in (CONF / "adapters").glob("*.yaml"))
-quickly = settings(
-    max_examples=60, deadline=None, derandomize=True, database=None, suppress_health_check=list(HealthCheck)
-)
+quickly = settings(DAMAGED_FILES, max_examples=60)
 OTHERS = {
     "pattern": Adapter(kind="text", pattern=r"<(?P<counter>\d+)\|(?P<values>[^>]*)>"),
     "decimal": Adapter(kind="text", decimal=",", separator=";"),
@@ -25,12 +24,11 @@ OTHERS = {
     "index": Adapter(kind="text", rows=0, index=0),
 }
 ALL = {name: read_adapter(name) for name in SHIPPED} | OTHERS | {"protocol": Adapter()}
+ROWS = st.lists(st.lists(st.integers(-9, 2000), min_size=1, max_size=5), max_size=30)
 TEXTS = st.one_of(
     st.binary(max_size=200),
     st.text(alphabet='0123456789,.;:-+eE \t\r\n"{}[]<>|nafov', max_size=300).map(str.encode),
-    st.lists(st.lists(st.integers(-9, 2000), min_size=1, max_size=5), max_size=30).map(
-        lambda rows: b"".join(b",".join(b"%d" % value for value in row) + b"\n" for row in rows)
-    ),
+    ROWS.map(lambda rows: "".join(",".join(map(str, row)) + "\n" for row in rows).encode()),
 )
 
 
@@ -106,12 +104,11 @@ def test_a_proposal_of_anything_is_one_or_a_sentence(pieces):
 
 
 def encoded(name, n, row):
-    values = [str(value) for value in row]
     if name == "struct":
         return b"\xaa\x55" + bytes([n % 256]) + np.array(row, "<i2").tobytes()
     if name == "index":
-        return "".join(f"{k},{value}\n" for k, value in enumerate(values)).encode()
-    return ",".join(values).encode() + b"\n"
+        return b"".join(b"%d,%d\n" % pair for pair in enumerate(row))
+    return b"%d,%d,%d\n" % tuple(row)
 
 
 @pytest.mark.parametrize("name", ["csv", "struct", "index"])

@@ -1,5 +1,7 @@
 """Numbers and clocks followed by hand; whether the device's clock is trusted, and what changes where not."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -10,14 +12,9 @@ from skin.wire.protocol import Header, encode_header, encode_line, frames_ahead
 
 RATE = 100  # Hz
 DISTRUST = "cannot be trusted"
-CHANGES = [
-    (Header(n=4, unit="N", bits=10, id="left"), "unit=adc -> N"),
-    (Header(n=4, unit="adc", bits=8, id="left"), "bits=10 -> 8"),
-    (Header(n=4, unit="adc", bits=10, id="right"), "id=left -> right"),
-    (Header(n=5, unit="adc", bits=10, id="left"), "n=4 -> 5"),
-    (Header(n=4, unit="adc", bits=10, id="left", rate=50), "rate=None -> 50.0"),
-]
 FIRST = Header(n=4, unit="adc", bits=10, id="left")
+OTHER = Header(n=5, unit="N", bits=8, id="right", rate=50)
+CHANGES = "n=4 -> 5, rate=None -> 50.0, unit=adc -> N, bits=10 -> 8, id=left -> right"
 
 
 @pytest.mark.parametrize(
@@ -208,22 +205,21 @@ def test_a_counter_that_stands_still_restarts_nothing():
     assert (len(frames), decoder.stats.resets, decoder.stats.lost) == (500, 0, 0)
 
 
-@pytest.mark.parametrize(("header", "change"), CHANGES)
-def test_a_header_that_changes_ends_the_reading(header, change):
+def test_a_header_that_changes_ends_the_reading():
     """On an open connection the device was flashed or exchanged: its frames do not count any more."""
     decoder = Decoder(4)
     assert play(decoder, lambda t: t, 3, header=encode_header(FIRST))
-    assert play(decoder, lambda t: t, 3, begin=3, header=encode_header(header)) == []
-    assert change in decoder.stats.trouble
+    assert play(decoder, lambda t: t, 3, begin=3, header=encode_header(OTHER)) == []
+    assert CHANGES in decoder.stats.trouble
     assert decoder.error() is None
-    play(decoder, lambda t: t, 4, begin=6, header=encode_header(header))
-    assert change in str(decoder.error())
+    play(decoder, lambda t: t, 4, begin=6, header=encode_header(OTHER))
+    assert CHANGES in str(decoder.error())
 
 
 def test_a_header_that_was_damaged_once_costs_frames_until_the_next():
     decoder = Decoder(4)
     play(decoder, lambda t: t, 3, header=encode_header(FIRST))
-    assert play(decoder, lambda t: t, 3, begin=3, header=encode_header(CHANGES[1][0])) == []
+    assert play(decoder, lambda t: t, 3, begin=3, header=encode_header(replace(FIRST, bits=8))) == []
     assert len(play(decoder, lambda t: t, 9, begin=6, header=encode_header(FIRST))) == 900
     assert decoder.error() is None
     assert decoder.header == FIRST

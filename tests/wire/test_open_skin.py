@@ -1,4 +1,4 @@
-"""A skin on a real pseudo-terminal or socket, and everything that goes wrong with one."""
+"""A skin on a real pseudo-terminal or socket, what goes wrong with one, and a recording in place of one."""
 
 import errno
 import os
@@ -14,24 +14,27 @@ import numpy as np
 import pytest
 import serial
 
+from skin.device.resampling import Frame
 from skin.errors import InputError
 from skin.live.engine import Detection, Engine
 from skin.live.loop import LiveLoop
+from skin.runs.build import build_device
 from skin.touch.labels import TOUCH
 from skin.wire.channels import Reason
 from skin.wire.decoder import Decoder
 from skin.wire.emulator import PtyPort
 from skin.wire.protocol import Header, encode_header, encode_line
-from skin.wire.reader import SkinDisconnected, SkinTimeout, WireFeed
-from skin.wire.skin import open_skin
+from skin.wire.reader import PlaybackFeed, SkinDisconnected, SkinTimeout, WireFeed
+from skin.wire.skin import Source, open_skin, play
 from skin.wire.tare import Tare
-from tests.wire.memory import PATIENT, Sent, opened, wait_for
+from tests.live.waiting import until
+from tests.wire.memory import PATIENT, Sent, opened
 
 LAYOUT = range(4)
 
 
-def line(number, values=(500, 501, 502, 503), check="crc16", period=10_000):
-    return encode_line(values, number, number * period, check)
+def line(number, values=(500, 501, 502, 503), period=10_000):
+    return encode_line(values, number, number * period)
 
 
 def lines(*numbers, **how):
@@ -42,12 +45,16 @@ def numbers(frames):
     return [frame.seq for frame in frames]
 
 
-def test_frames_of_a_serial_port(plug):
+def test_frames_of_a_serial_port_until_it_is_unplugged(plug):
     with open_skin(plug.port, LAYOUT) as skin:
         before = monotonic()
         plug.send(*(encode_line([1, 0, 3, number], number, 10_000 * number) for number in range(300)))
         frames = skin.read(300, timeout=PATIENT)
         stats = skin.stats
+        plug.unplug()
+        for read in (lambda: skin.read(1, timeout=PATIENT), lambda: next(iter(skin))):
+            with pytest.raises(SkinDisconnected, match="unplugged"):
+                read()
     assert numbers(frames) == list(range(300))
     assert frames[9].values.tolist() == [1, 0, 3, 9]
     assert frames[9].t == pytest.approx(0.09)
@@ -106,26 +113,18 @@ def test_silence_is_told_apart_from_nonsense_and_carries_what_came(pieces, reaso
             next(iter(skin))
 
 
-def test_unplugging_is_an_error(plug):
-    with open_skin(plug.port, LAYOUT) as skin:
-        plug.unplug()
-        for read in (lambda: skin.read(1, timeout=PATIENT), lambda: next(iter(skin))):
-            with pytest.raises(SkinDisconnected, match="unplugged"):
-                read()
-
-
 def test_a_pseudo_terminal_is_unplugged_and_plugged_in_again(tmp_path):
     port = PtyPort(str(tmp_path / "skin"))
     try:
         with open_skin(port.address, LAYOUT, reconnect=True, backoff=(0.01, 0.02)) as skin:
             for connection in range(3):
-                wait_for(port.connected)
+                until(port.connected)
                 port.write(lines(*range(50)))
                 frames = skin.read(50, timeout=PATIENT)
                 assert frames[0].after == ("reconnect" if connection else "")
                 assert numbers(frames) == list(range(50))
                 port.unplug()
-                wait_for(lambda: skin.away)
+                until(lambda: skin.away)
                 port.plug()
     finally:
         port.unplug()
@@ -142,7 +141,7 @@ def test_while_it_is_away_it_is_tried_again_and_said():
 
     with open_skin("x", LAYOUT, opener=opener, reconnect=True, backoff=(0.01, 0.02)) as skin:
         skin.read(3, timeout=PATIENT)
-        wait_for(lambda: skin.away)
+        until(lambda: skin.away)
         with pytest.raises(SkinTimeout, match="unplugged; trying again"):
             skin.read(1, timeout=0.1)
         back.set()
@@ -153,7 +152,7 @@ def test_while_it_is_away_it_is_tried_again_and_said():
 def test_who_is_late_loses_the_oldest_frames_and_is_informed():
     with opened(lines(*range(100)), queue=10) as skin:
         # A frame counts when it is decoded, before it waits to be read.
-        wait_for(lambda: skin.stats.dropped == 90)
+        until(lambda: skin.stats.dropped == 90)
         frames = skin.read(10)
         assert (numbers(frames), skin.stats.dropped) == (list(range(90, 100)), 90)
     assert [(frame.lost, frame.after) for frame in frames[:2]] == [(90, "gap"), (0, "")]
@@ -315,3 +314,38 @@ def test_a_silent_port_is_left_open(address, settings):
         with pytest.raises(SkinTimeout):
             skin.read(1)
         assert skin.stats.reconnects == 0
+
+
+@pytest.fixture(scope="module")
+def touches(configured):
+    device = build_device(configured("simulator=naive", "device.dead=1"))
+    return device.replace(gestures=12).recording().touches
+
+
+def test_touches_are_played_in_their_time_to_their_end(touches):
+    feed, times = PlaybackFeed([touches[:4]]), count(100.0, 0.5)
+    frames = [frame for _ in range(120) for frame in feed.poll(lambda: next(times))]
+    with pytest.raises(EOFError):
+        feed.poll(lambda: next(times))
+    assert frames[5].t_host - frames[0].t_host == pytest.approx(0.5)
+    played = np.stack([frame.values for frame in frames]).reshape(4, 30, 25)
+    assert played == pytest.approx(touches[:4].readings.numpy())
+    assert np.stack([frame.valid for frame in frames]).sum() == 120 * 24
+    assert [frame.after for frame in frames[28:32]] == ["", "", "cut", ""]
+    assert frames[-1].segment == 3
+
+
+def test_a_skin_that_is_played_ends(touches):
+    with play([touches[:1]]) as skin:
+        assert len(list(skin)) == skin.stats.frames == 30
+        with pytest.raises(SkinDisconnected, match="recording has ended"):
+            skin.read(1)
+
+
+def test_values_in_newtons_stay_what_they_are():
+    values, valid = np.array([0.5, -1.0, 7.0]), np.array([True, True, False])
+    source = Source.in_newtons("recording", None, 3)
+    source.tare.add(Frame(0, 0.0, 0.0, values, valid))
+    said, known = source.tare.conversion(values, valid)
+    assert said.tolist() == [0.5, -1.0, 0.0]
+    assert known.tolist() == valid.tolist()

@@ -3,21 +3,17 @@
 import pytest
 import torch
 
-from skin.body.layout import Grid
-from skin.body.sheet import Sheet
-from skin.device.files import describe_recording, read_description, read_recording, write_recording
-from skin.device.simulated import Simulated
+from skin import read_recording
+from skin.device.files import describe_recording, read_description, write_recording
 from skin.device.touches import concatenate, join_contacts
 from skin.learning.data import Augmentation
-from skin.mechanics.simulator.naive import Naive
+from tests.made_up import PERFECT, naive_skin
 
-BODY = Sheet([0.16, 0.16], [32, 32], [{"material": "EcoFlex 00-30", "thickness": 0.005}])
 TIPS = {"radius": [0.004, 0.012]}
 
 
-def device(**changes) -> Simulated:
-    settings = {"simulator": Naive, "layout": Grid(3, 3), "touch": TIPS, "gestures": 40, "test_gestures": 16}
-    return Simulated(body=BODY, **(settings | changes))
+def device(**changes):
+    return naive_skin(**({"touch": TIPS, "gestures": 40, "test_gestures": 16} | changes))
 
 
 def same(one, other) -> bool:
@@ -47,8 +43,7 @@ def test_a_file_of_gestures_has_no_trace_of_them(tmp_path):
 
 def test_contacts_press_sensors_that_are_near():
     """The naive skin reads pressure under a sensor, so a sensor that reads has a contact over it."""
-    perfect = {"gain_spread": 0.0, "offset": 0.0, "noise": 0.0, "clip": 1e9}
-    touches = device(**perfect).touches("test")
+    touches = device(**PERFECT).touches("test")
     positions = touches.contacts[:, :, None, :, :2] - touches.positions[None, None, :, None, :2]
     gap = (positions.norm(dim=-1) - touches.contacts[:, :, None, :, 2]).nan_to_num(1.0).amin(3)
     cell = 0.16 / 32
@@ -62,7 +57,7 @@ def test_windows_of_streams_have_those_that_they_show():
     shown = ~touches.contacts[..., 0].isnan().all(2)
     assert not shown[touches.labels[:, -1] == 0].any()
     assert shown[touches.labels[:, -1] == 1].any(1).all()
-    source = device(stream=True, gain_spread=0.0, offset=0.0, noise=0.0, clip=1e9)
+    source = device(stream=True, **PERFECT)
     whole = source.simulate_stream(600).whole
     assert torch.equal(~whole.touches.contacts[..., 0].isnan().all(2), whole.force > 0)
 
@@ -77,8 +72,7 @@ def test_joined_recordings_have_them_where_all_do(recording):
 
 
 def test_a_shifted_touch_has_shifted_contacts():
-    perfect = {"gain_spread": 0.0, "offset": 0.0, "noise": 0.0, "clip": 1e9}
-    touches = device(**perfect, touch=TIPS | {"over_sensors": False}).touches("train")
+    touches = device(**PERFECT, touch=TIPS | {"over_sensors": False}).touches("train")
     moved = Augmentation(shift=True, reverse=True)(touches, torch.Generator().manual_seed(0))
     assert not same(moved.contacts, touches.contacts)
     pressed = moved.readings.sum(2) > 1e-3

@@ -13,17 +13,15 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from skin import InputError, read_recording
 from skin.body.layout import Scattered
-from skin.body.sheet import Sheet
 from skin.core.safe_loading import limited_memory
-from skin.device.files import DataSet, read_description, read_recording, write_recording
-from skin.device.simulated import Simulated
+from skin.device.files import DataSet, read_description, write_recording
 from skin.device.touches import Recording, Touches, concatenate
-from skin.errors import InputError
-from skin.mechanics.simulator.naive import Naive
 from skin.touch.labels import TOUCH, Task
 from tests.damage import DAMAGED_FILES, damaged, opened
 from tests.device.conftest import write_data_set
+from tests.made_up import naive_skin
 
 BATCH, TIME, SENSORS = 7, 5, 3
 
@@ -177,8 +175,7 @@ def test_damage_never_passes_for_readings(written, data):
 
 @pytest.fixture(scope="module")
 def whole():
-    body = Sheet([0.16, 0.16], [16, 16], [{"material": "EcoFlex 00-30", "thickness": 0.005}])
-    return Simulated(body=body, layout=Scattered(seed=0), simulator=Naive, gestures=50).recording()
+    return naive_skin(layout=Scattered(seed=0), gestures=50).recording()
 
 
 @pytest.fixture

@@ -6,17 +6,16 @@ import numpy as np
 import pytest
 import torch
 
+from skin import Grid, InputError, PlatesAndBeams, Sheet
 from skin.body.base import GEOMETRY
-from skin.body.layout import Grid, Scattered
-from skin.body.sheet import Sheet
+from skin.body.layout import Scattered
 from skin.core.rng import Stream, generator
 from skin.device.imperfection import ImperfectionSettings
 from skin.device.simulated import Simulated
 from skin.device.touches import concatenate
-from skin.errors import InputError
-from skin.mechanics.simulator.fem import PlatesAndBeams
 from skin.mechanics.simulator.naive import Naive
 from skin.touch.movie import balanced
+from tests.made_up import PERFECT, naive_skin
 from tests.touch.movie_labels import movie_labels
 
 LAYERS = [
@@ -24,12 +23,11 @@ LAYERS = [
     {"material": "EcoFlex 00-30", "thickness": 0.005},
 ]
 BODY = Sheet([0.16, 0.16], [32, 32], LAYERS)
-PERFECT = {"gain_spread": 0.0, "offset": 0.0, "noise": 0.0, "clip": 1e9}
 
 
 def device(**changes) -> Simulated:
-    settings = {"simulator": Naive, "gestures": 60, "test_gestures": 32, "layout": Scattered(seed=0)}
-    return Simulated(body=BODY, **(settings | changes))
+    settings = {"body": BODY, "layout": Scattered(seed=0), "gestures": 60, "test_gestures": 32}
+    return naive_skin(**(settings | changes))
 
 
 @pytest.fixture(scope="module")

@@ -8,17 +8,13 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
-from skin.body.arm import Arm
+from skin import Arm, Grid, InputError, Sheet, Solid
 from skin.body.base import GEOMETRY, Layer
-from skin.body.layout import Grid
 from skin.body.material import Material
-from skin.body.sheet import Sheet
 from skin.core.files import CONF
 from skin.core.rng import Stream, generator
 from skin.device import skins
 from skin.device.skins import SkinDistribution
-from skin.errors import InputError
-from skin.mechanics.simulator.solid import Solid
 from skin.runs.build import build_device
 
 SMALL = (

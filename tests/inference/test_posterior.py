@@ -10,14 +10,10 @@ from scipy.special import log_ndtr
 from scipy.stats import kstest
 
 import skin
-from skin.body.base import Arm, Sheet
-from skin.body.layout import Grid
-from skin.inference.candidates import CandidateReadings, FingertipPrior, disc_readings
-from skin.inference.noise import Noise
-from skin.inference.posterior import ContactEstimate, FrameEstimate, Posterior
-from skin.mechanics.simulator.fem import PlatesAndBeams
+from skin import Arm, FingertipPrior, Grid, Noise, PlatesAndBeams, Posterior, Sheet, Solid
+from skin.inference.candidates import CandidateReadings, disc_readings
+from skin.inference.posterior import ContactEstimate, FrameEstimate
 from skin.mechanics.simulator.naive import Naive
-from skin.mechanics.simulator.solid import Solid
 
 SOFT = {"material": "EcoFlex 00-30"}
 DEEP = Sheet((0.16, 0.16), (16, 16), [SOFT | {"thickness": 0.03}])

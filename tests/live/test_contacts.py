@@ -16,13 +16,10 @@ import numpy as np
 import psutil
 import pytest
 
-from skin.body.base import Sheet
-from skin.body.layout import Grid
+from skin import Grid, InputError, Noise, Sheet, Solid
 from skin.device.resampling import Frame
-from skin.errors import InputError
 from skin.inference.candidates import disc_readings
 from skin.inference.mechanics import Mechanics
-from skin.inference.noise import Noise
 from skin.live.contacts import (
     LiveContacts,
     MeanReadings,
@@ -33,7 +30,6 @@ from skin.live.contacts import (
     unknown_contacts,
 )
 from skin.live.engine import Verdict
-from skin.mechanics.simulator.solid import Solid
 from skin.runs.build import build_device
 from skin.wire.channels import UnitConversion
 

@@ -13,9 +13,9 @@ from time import monotonic, sleep
 import numpy as np
 import pytest
 
+from skin import InputError, open_skin
 from skin.core.files import ROOT
 from skin.device.resampling import Frame
-from skin.errors import InputError
 from skin.evaluation.operating_point import OperatingPoint
 from skin.learning.network import Network
 from skin.live.engine import DebounceSettings
@@ -23,7 +23,6 @@ from skin.live.engine_builder import LiveSettings, measured_rate, watch_exported
 from skin.runs.onnx_writer import write_model
 from skin.wire.channels import unit_conversion
 from skin.wire.protocol import Header, encode_header, encode_line
-from skin.wire.skin import open_skin
 from tests.wire.memory import Sent
 
 pytest.importorskip("onnxruntime")

@@ -7,14 +7,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from skin.body.base import Sheet
-from skin.body.layout import Grid
-from skin.device.simulated import Simulated
-from skin.errors import InputError
+from skin import InputError
 from skin.live.engine import DebounceSettings, Detection, Engine
 from skin.live.engine_builder import SelfTest
 from skin.live.loop import STALE, Display, LiveLoop
-from skin.mechanics.simulator.naive import Naive
 from skin.touch.labels import TOUCH
 from skin.wire.channels import RawRange, UnitConversion
 from skin.wire.decoder import Decoder
@@ -24,6 +20,7 @@ from skin.wire.reader import Port, SkinDisconnected, SkinTimeout
 from skin.wire.skin import SerialSource
 from skin.wire.tare import Tare
 from tests.live.memory_view import MemoryView
+from tests.made_up import naive_skin
 
 RATE, SENSORS = 100, 9
 HEADER = encode_header(Header(n=SENSORS, rate=RATE, unit="N"))
@@ -232,9 +229,9 @@ def test_a_channel_of_an_emulated_skin_that_fails_at_rest_or_later_is_unknown_an
     """From 8 s on; touches begin at 14 s."""
     written = []
     port = SimpleNamespace(write=lambda data: written.append(data) or len(data), connected=lambda: True)
-    body = Sheet((0.16, 0.16), (16, 16), [{"material": "EcoFlex 00-30", "thickness": 0.005}])
-    device = Simulated(body=body, layout=Grid(3, 3), simulator=Naive, gestures=10)
-    emulator = Emulator(device, port, EmulatorSettings(speed=200.0, idle=14.0, since=8.0, **{fault: [4]}))
+    emulator = Emulator(
+        naive_skin(), port, EmulatorSettings(speed=200.0, idle=14.0, since=8.0, **{fault: [4]})
+    )
     emulator.run(19.0)
     frames = re.findall(rb"(?m)^\d.*\n", b"".join(written))
     seen = watch(frames, scale=emulator.converter.scale)

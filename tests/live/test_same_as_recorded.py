@@ -6,9 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from skin.body.base import Sheet
-from skin.body.layout import Grid
-from skin.device.files import read_recording
+from skin import Grid, read_recording
 from skin.device.touches import Touches
 from skin.live.engine import Detection, Engine
 from skin.live.loop import Display, LiveLoop
@@ -20,9 +18,9 @@ from skin.wire.decoder import Decoder
 from skin.wire.protocol import Announcement, Header, encode_announcement, encode_header, encode_line
 from skin.wire.reader import WireFeed
 from skin.wire.tare import Tare
+from tests.made_up import SHEET
 from tests.wire.memory import Sent
 
-SHEET = Sheet((0.16, 0.16), (32, 32), [{"material": "EcoFlex 00-30", "thickness": 0.005}])
 LAYOUT = Grid(2, 3)
 # A window ends with a frame at a tick, so that it is decided on.
 RATE, LENGTH, IDLE, GESTURES = 50, 150, 151, 3

@@ -15,9 +15,8 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from skin import FingertipPrior, InputError
 from skin.device.resampling import Frame
-from skin.errors import InputError
-from skin.inference.candidates import FingertipPrior
 from skin.live import loop, web
 from skin.live.contacts import unknown_contacts
 from skin.live.loop import Display

@@ -7,19 +7,15 @@ from itertools import islice
 import numpy as np
 import pytest
 
-from skin.body.base import Sheet
-from skin.body.layout import Grid
+from skin import Grid, InputError
 from skin.calibration.bench import build_bench_data, write_bench_session
 from skin.calibration.known_loads import choose_presses, emulate_session, stair_gauge
 from skin.core.files import CONF
 from skin.core.safe_loading import load_yaml
 from skin.device.resampling import Frame, Window
-from skin.device.simulated import Simulated
-from skin.errors import InputError
 from skin.evaluation.guarantee import describe_presses
 from skin.live.engine import Detection, Engine
 from skin.live.engine_builder import raises_alarm
-from skin.mechanics.simulator.naive import Naive
 from skin.record.comparison import (
     compare_gestures,
     compare_session,
@@ -32,15 +28,14 @@ from skin.touch.labels import TOUCH
 from skin.wire.channels import UnitConversion
 from skin.wire.emulator import emulated_gestures, upsample
 from skin.wire.segmentation import ContinuousSegmenter
+from tests.made_up import PERFECT, naive_skin
 
-SHEET = Sheet((0.16, 0.16), (32, 32), [{"material": "EcoFlex 00-30", "thickness": 0.005}])
 RATE, COUNT, GAIN = 50.0, 6, 0.8
 
 
 @pytest.fixture(scope="module")
 def device():
-    perfect = {"gain_spread": 0.0, "offset": 0.3, "noise": 0.0, "clip": 100.0}
-    return Simulated(body=SHEET, layout=Grid(3, 3), simulator=Naive, gestures=10, **perfect)
+    return naive_skin(**(PERFECT | {"offset": 0.3, "clip": 100.0}))
 
 
 def session(device, path, labels, known=True):

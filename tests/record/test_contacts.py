@@ -7,27 +7,23 @@ import pandas as pd
 import pytest
 import torch
 
-from skin.body.base import Sheet
-from skin.body.layout import Grid
+from skin import Grid, read_recording
 from skin.calibration import bench, known_loads
 from skin.core.files import CONF
 from skin.core.safe_loading import load_yaml
-from skin.device.files import read_recording
-from skin.device.simulated import Simulated
-from skin.mechanics.simulator.naive import Naive
 from skin.record.comparison import compare_session
 from skin.record.serial import Serial, convert_session, record_session
 from skin.record.session import read_session
 from skin.wire.emulator import emulated_gestures
+from tests.made_up import SHEET, naive_skin
 
-SHEET = Sheet((0.16, 0.16), (32, 32), [{"material": "EcoFlex 00-30", "thickness": 0.005}])
 COUNT = 3
 
 
 @pytest.fixture(scope="module")
 def device():
     tips = {"radius": [0.006, 0.012], "window": 1.0, "press": [0.4, 0.8]}
-    return Simulated(body=SHEET, layout=Grid(3, 3), simulator=Naive, gestures=10, touch=tips)
+    return naive_skin(touch=tips)
 
 
 @pytest.fixture(scope="module")

@@ -6,21 +6,15 @@ from time import sleep
 import numpy as np
 import pytest
 
-pytest.importorskip("termios", reason="pseudo-terminals need a POSIX system")
-
-from skin.body.base import Sheet
-from skin.body.layout import Grid
-from skin.device.files import read_recording
+from skin import Grid, read_recording
 from skin.device.resampling import Frame
-from skin.device.simulated import Simulated
-from skin.mechanics.simulator.naive import Naive
 from skin.record.serial import Serial, convert_session, record_session
 from skin.record.session import read_session
 from skin.touch.labels import TOUCH, TOUCH_OR_NOT
 from skin.wire.channels import UnitConversion
 from skin.wire.segmentation import label_plan
+from tests.made_up import SHEET, naive_skin
 
-BODY, LAYOUT = Sheet((0.16, 0.16), (32, 32), [{"material": "EcoFlex 00-30", "thickness": 0.005}]), Grid(3, 3)
 IDLE = 12.0  # s, of which the first is the tare
 NOISE = 0.03  # N, with rounding a little more
 LEAST = 0.09  # N: five times that, less what the largest value of an interval has anyway
@@ -35,12 +29,11 @@ def recorded(emulate, tmp_path, monkeypatch, capfd):
 
     def record(count, stream=False, dead=()):
         tips = {"window": 1.0, "press": [0.8, 0.95], "radius": [0.006, 0.012]}
-        skin = {"body": BODY, "layout": LAYOUT, "simulator": Naive, "touch": tips}
-        device = Simulated(**skin, gestures=10, noise=NOISE)
+        device = naive_skin(touch=tips, noise=NOISE)
         emulator = emulate(device, count=40, rate=100.0, speed=5.0, idle=IDLE, gap=0.1, dead=dead)
         there = {"port": emulator.port.address, "scale": emulator.converter.scale, "timeout": 20.0}
         asked = {"labels": "prompted", "gestures": count, "stream": stream, "tare": 1.0}
-        reader = Serial(body=BODY, layout=LAYOUT, touch={"window": 1.0}, **there, **asked)
+        reader = Serial(body=SHEET, layout=device.layout, touch={"window": 1.0}, **there, **asked)
         typed, keyboard = os.pipe()
         os.write(keyboard, b"\n" * 60)
         with os.fdopen(typed) as lines:
@@ -100,7 +93,7 @@ def test_dead_sensors_feel_nothing_and_the_others_do(recorded):
 def test_a_count_more_is_no_touch_for_a_skin_without_noise(change, felt, monkeypatch, tmp_path):
     """Its channels are still during the tare, and one changes by a count afterwards."""
     (tmp_path / "typed").write_text("\n")
-    reader = Serial(body=BODY, layout=LAYOUT, port="/dev/null", labels="prompted", scale=0.04)
+    reader = Serial(body=SHEET, layout=Grid(3, 3), port="/dev/null", labels="prompted", scale=0.04)
     still = np.zeros(9)
     conversion = UnitConversion(np.full(9, 0.04), np.full(9, 512.0), still > 0, noise=still, rest=still)
     rows = [np.full(9, 512.0) for _ in range(450)]

@@ -6,25 +6,16 @@ import numpy as np
 import pytest
 import torch
 
-pytest.importorskip("termios", reason="pseudo-terminals need a POSIX system")
-
-from skin.body.base import Sheet
-from skin.body.layout import Grid
-from skin.device.simulated import Simulated
-from skin.errors import InputError
-from skin.mechanics.simulator.naive import Naive
+from skin import Grid, InputError
 from skin.record.serial import Serial
 from skin.wire.emulator import Emulator, emulated_gestures
+from tests.made_up import PERFECT, SHEET, naive_skin
 
-SHEET = Sheet((0.16, 0.16), (32, 32), [{"material": "EcoFlex 00-30", "thickness": 0.005}])
-LAYOUT = Grid(2, 3)
-COUNT = 6
-# Nothing but the converter's own rounding is between what is drawn and what is read.
-PERFECT = {"gain_spread": 0.0, "offset": 0.0, "noise": 0.0, "clip": 100.0}
+LAYOUT, COUNT = Grid(2, 3), 6
 
 
 def skin(**settings):
-    return Simulated(body=SHEET, layout=LAYOUT, simulator=Naive, gestures=10, **settings)
+    return naive_skin(layout=LAYOUT, **settings)
 
 
 def serial(emulator, layout=LAYOUT, **settings):
@@ -33,7 +24,8 @@ def serial(emulator, layout=LAYOUT, **settings):
 
 
 def test_it_reads_what_was_played(emulate):
-    device = skin(**PERFECT)
+    # Nothing but the converter's own rounding is between what is drawn and what is read.
+    device = skin(**(PERFECT | {"clip": 100.0}))
     touches = serial(emulate(device, bits=None)).touches("test")
     played = list(islice(emulated_gestures(device), COUNT))
     assert touches.labels.int().tolist() == [list(one.labels.values()) for one in played]

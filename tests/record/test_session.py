@@ -15,8 +15,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-pytest.importorskip("fcntl", reason="file limits need a POSIX system")
-
 from skin.calibration.bench import BenchSettings, load_table, read_bench_session
 from skin.device.calibration import Curves
 from skin.device.resampling import Frame, Window

@@ -5,8 +5,7 @@ from typing import Any
 
 import pytest
 
-from skin.body.layout import Grid
-from skin.body.sheet import Sheet
+from skin import Grid, Sheet
 
 BODY = Sheet((0.16, 0.16), (16, 16), [{"material": "EcoFlex 00-30", "thickness": 0.015}])
 LAYOUT = Grid(5, 5, depth=0.01)

@@ -7,11 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from skin.body.arm import Arm
-from skin.body.layout import Grid
-from skin.body.sheet import Sheet
-from skin.errors import InputError
-from skin.mechanics.simulator.solid import Solid
+from skin import Arm, Grid, InputError, Sheet, Solid
 from skin.robot import MujocoSkin
 from skin.robot.mujoco_skin import MujocoSurface, Pressing
 from skin.robot.recordings import write_mcap

@@ -6,11 +6,7 @@
 import numpy as np
 import pytest
 
-from skin.body.layout import Grid
-from skin.body.sheet import Sheet
-from skin.inference.noise import Noise
-from skin.inference.posterior import Posterior
-from skin.mechanics.simulator.solid import Solid
+from skin import Grid, Noise, Posterior, Sheet, Solid
 from skin.robot.mujoco_skin import MujocoSurface, Pressing
 
 mujoco = pytest.importorskip("mujoco", reason="pip install 'tactile-skin[mujoco]'")

@@ -9,18 +9,14 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from skin.body.base import Sheet
-from skin.body.layout import Grid
+from skin import Grid, InputError
 from skin.device.resampling import resample
-from skin.device.simulated import Simulated
-from skin.errors import InputError
-from skin.mechanics.simulator.naive import Naive
 from skin.wire.decoder import Decoder
 from skin.wire.emulator import Converter, Emulator, EmulatorSettings, PtyPort, TcpPort, upsample
 from skin.wire.reader import PortStream, check_port
 from tests.live.waiting import until
+from tests.made_up import naive_skin
 
-SHEET = Sheet((0.16, 0.16), (16, 16), [{"material": "EcoFlex 00-30", "thickness": 0.005}])
 RATE = 10.0
 
 
@@ -60,7 +56,7 @@ def test_counts_are_those_of_a_converter():
 
 @pytest.mark.parametrize("waits_for", ["a reader", "the next frame", "its power"])
 def test_it_stops_wherever_it_waits(waits_for):
-    device = Simulated(body=SHEET, layout=Grid(2, 2), simulator=Naive, gestures=10)
+    device = naive_skin(layout=Grid(2, 2))
     port = TcpPort(0)
     rate = 0.005 if waits_for == "the next frame" else 100.0
     unplug = [0.01] if waits_for == "its power" else []
@@ -84,7 +80,7 @@ def test_it_says_that_it_is_emulated_and_fails_when_it_should():
     """Nobody must check its scale. Channel 1 sticks and 2 dies from 0.5 s on; nothing is sent for 0.3 s."""
     written = []
     port = SimpleNamespace(write=lambda data: written.append(data) or len(data), connected=lambda: True)
-    device = Simulated(body=SHEET, layout=Grid(2, 2), simulator=Naive, gestures=10, noise=0.3)
+    device = naive_skin(layout=Grid(2, 2), noise=0.3)
     faults = {"stuck": [1], "dead": [2], "since": 0.5, "silence": [1.2], "away": 0.3}
     Emulator(device, port, EmulatorSettings(speed=50.0, idle=2.0, **faults)).run(2.0)
     decoder = Decoder(4)

@@ -1,6 +1,6 @@
-"""A simulated device: seeds, splits, and what each setting changes."""
+"""A simulated device: seeds, splits, what each setting changes, and whether a shape tells a label."""
 
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -11,9 +11,10 @@ from skin.body.base import GEOMETRY
 from skin.body.layout import Scattered
 from skin.core.rng import Stream, generator
 from skin.device.imperfection import ImperfectionSettings
-from skin.device.simulated import Simulated
+from skin.device.simulated import Simulated, accuracy_from_shape, check_label_leakage
 from skin.device.touches import concatenate
 from skin.mechanics.simulator.naive import Naive
+from skin.runs.build import build_device
 from skin.touch.movie import balanced
 from tests.made_up import PERFECT, naive_skin
 from tests.touch.movie_labels import movie_labels
@@ -244,3 +245,23 @@ def test_the_true_footprints_differ_and_the_reported_ones_do_not():
     assert 0.05 < np.log(factors).std() < 0.15
     fractions = [skin.geometry[:, GEOMETRY.index("share")] for skin in (exact, wrong)]
     torch.testing.assert_close(*fractions)
+
+
+def test_the_accuracy_is_the_overlap_of_two_distributions():
+    """Shares 0.7 / 0.3 against 0.4 / 0.6: the best guess is right in (0.7 + 0.6) / 2."""
+    shape = np.repeat([0, 1, 0, 1], [700, 300, 400, 600])
+    assert accuracy_from_shape(shape, np.arange(2000) < 1000)[0] == pytest.approx(0.65)
+    shape = np.arange(400) % 4
+    assert accuracy_from_shape(shape, shape < 2) == (1.0, 0.0)
+    accuracy, error = accuracy_from_shape(shape, np.random.default_rng(0).random(400) < 0.5)
+    assert accuracy < 0.5 + 2 * error
+    assert 0.02 < error < 0.03
+
+
+def test_a_shape_that_tells_a_label_is_warned_of(configured):
+    device = build_device(configured("simulator=naive", "data.gestures=160", "layout=grid"))
+    check_label_leakage(device)
+    recording = device.recording(None, complete=False)
+    bars = recording.parameters | {"shape": recording.touches.labels[:, 0] * 3}
+    with pytest.warns(RuntimeWarning, match=r"the shape alone predicts big \(100%\).*touch.leak=0.6"):
+        check_label_leakage(device, replace(recording, parameters=bars))

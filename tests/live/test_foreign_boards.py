@@ -88,10 +88,12 @@ def test_frozen_values_and_silence_are_unknown(board):
 @pytest.mark.parametrize("sent", [NUMBER, -1, 0])
 def test_a_token_for_a_missing_value_or_a_cut_wire_is_unknown_and_keeps_the_alarm(board, sent):
     """Without a header nobody knows what the converter can give: the channel falls far below rest."""
-    values = counts(force(18, (6, 12, 7, 6.0)))
+    values = counts(force(24, (6, 12, 7, 6.0), (20, 21, 7, 6.0)))
     values[800:1400, 7] = sent
     seen = watch(board, frames(board, values))
     assert seen.first(3) <= 6.5 + LATE
     assert seen.kept(6.5 + LATE, 12)
     assert "no touch" not in seen.states(6.2 + LATE, 14)
+    assert not seen.kept(19, 20)
+    assert 20 <= seen.first(19.5) <= 20.5 + LATE
     assert sent != NUMBER or seen.states(17, 18) == {"no touch"}

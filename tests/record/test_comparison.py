@@ -63,15 +63,14 @@ def test_a_gain_between_session_and_simulation_is_found(device, tmp_path):
     assert [pair.same for pair in comparison.pairs] == [True] * COUNT
     for pair, played in zip(comparison.pairs, emulated_gestures(device), strict=False):
         assert pair.measures["ratio"] == pytest.approx(GAIN, rel=1e-3)
-        assert pair.measures["rmse"] == pytest.approx(
-            (1 - GAIN) * np.sqrt((played.force**2).mean()), rel=2e-3
-        )
+        error = (1 - GAIN) * np.sqrt((played.force**2).mean())
+        assert pair.measures["rmse"] == pytest.approx(error, rel=2e-3)
         # The applied force is the sum of the pressure, told by the movie and not by any sensor.
         assert pair.applied.max() > pair.measures["simulated"]
-    page = publish_comparison(comparison, [], "Here.", 2, tmp_path)[0].read_text()
-    assert "gain ratio of readings (recorded over simulated), median: 0.800" in page
     path, picture = publish_comparison(comparison, [], "Here.", 2, tmp_path)
-    assert path.read_text() == page
+    page = path.read_text()
+    assert "gain ratio of readings (recorded over simulated), median: 0.800" in page
+    assert publish_comparison(comparison, [], "Here.", 2, tmp_path)[0].read_text() == page
     assert picture.stat().st_size > 10_000
     simulated, recorded = comparison.touches
     assert recorded.readings.numpy() == pytest.approx(GAIN * simulated.readings.numpy(), abs=2e-3)
@@ -125,9 +124,7 @@ def test_presses_are_compared_as_gestures_are(device, tmp_path):
     settings = load_yaml(CONF / "compare.yaml")["compare"]
     comparison = compare_session(device, str(path), None, settings)
     assert comparison.things == "presses"
-    assert [pair.number for pair in comparison.pairs] == [
-        number for number in range(len(rows)) if number % 9 != 8
-    ]
+    assert [pair.number for pair in comparison.pairs] == [n for n in range(len(rows)) if n % 9 != 8]
     first = comparison.pairs[0]
     assert first.measures["ratio"] == pytest.approx(GAIN, rel=1e-3)
     assert first.measures["recorded"] == pytest.approx(GAIN * first.measures["simulated"], rel=1e-3)

@@ -40,8 +40,7 @@ def test_forces_follow_the_controller_and_readings_the_forces(configured):
     recording = build_device(configured(*SMALL, *quiet, "device.clip=1000")).recording("test")
     force, touches = recording.force, recording.touches
     frames = recording.parameters["duration"].long()
-    onset = recording.parameters["onset"].long()
-    for touch, first, count in zip(force, onset, frames, strict=True):
+    for touch, first, count in zip(force, recording.parameters["onset"].long(), frames, strict=True):
         assert touch[first : first + count].max() == touch.max() > 0
         assert touch[:first].sum() == touch[first + count :].sum() == 0
     assert touches.readings[force == 0].abs().max() == 0

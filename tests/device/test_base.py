@@ -48,8 +48,7 @@ def test_splits_have_one_form_and_are_80_10_10_by_gesture(device):
         assert touches.readings.dtype == touches.labels.dtype == torch.float32
         assert torch.isfinite(touches.readings).all()
         assert touches.labels.shape == (len(touches), len(device.task))
-        assert touches.positions.shape == (25, 3)
-        assert touches.rate == 10.0
+        assert (touches.positions.shape, touches.rate) == ((25, 3), 10.0)
     parts = [splits.pop(split).readings for split in ("train", "validation", "holdout")]
     assert [len(part) for part in parts] == [40, 5, 5]
     assert len(torch.cat(parts).flatten(1).unique(dim=0)) == 50

@@ -28,8 +28,7 @@ def test_a_person_may_write_little(tmp_path):
     path = tmp_path / "mine.yaml"
     path.write_text("format: 1\ncount: 4\nsensors: {noise: 1e-2}\nranges: {dead: [0, 3]}\n")
     values = read_calibration(path).values()
-    assert values["noise"].tolist() == [0.01] * 4
-    assert values["gain"].tolist() == [1.0] * 4
+    assert (values["noise"].tolist(), values["gain"].tolist()) == ([0.01] * 4, [1.0] * 4)
     assert np.isinf(values["clip"]).all()
 
 
@@ -50,8 +49,7 @@ def test_true_readings_behind_raw_ones():
     values = WHOLE.values()
     np.testing.assert_allclose(values["gain"], [1.1, 1.0, 0.9])
     np.testing.assert_array_equal(values["clip"], [7.5, 7.5, 7.5])
-    assert values["dead"].tolist() == [False, True, False]
-    assert values["level"][1] == 2.5
+    assert (values["dead"].tolist(), values["level"][1]) == ([False, True, False], 2.5)
     sent = np.array([2.0, 1.0, 4.0]) * [1.1, 1, 0.9] + [0.1, 0, -0.3]
     np.testing.assert_allclose(WHOLE.corrected(sent / WHOLE.scale + 511.5), [2.0, np.nan, 4.0])
 

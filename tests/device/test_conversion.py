@@ -61,8 +61,7 @@ def test_a_folder_has_contacts_and_persons(tmp_path):
         files[f"{person}/{number}.csv"] = "\n".join(["time,s0,s1,label", *rows])
     convert(tmp_path, yaml.safe_load((CONF / "mapping" / "folder.yaml").read_text()), **files)
     recording = convert_files(read_format("folder"), tmp_path)
-    assert recording.touches.readings.shape == (6, 30, 2)
-    assert recording.touches.rate == 10
+    assert (recording.touches.readings.shape, recording.touches.rate) == ((6, 30, 2), 10)
     peak = recording.touches.readings[0, :, 0]
     assert peak.nonzero().flatten().tolist() == list(range(5, 15))  # 20 rows at 20 Hz, 10 at 10 Hz
     assert peak.max() == pytest.approx(2.0)

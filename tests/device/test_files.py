@@ -89,8 +89,7 @@ def test_rows_are_the_reports(tmp_path, suffix):
         about = json.loads(pq.read_schema(path).metadata[b"skin"])
         assert about["units"]["reading"] == "N"
         assert about["positions"] == kept.touches.positions.tolist()
-        assert about["metadata"]["seed"] == 3
-        assert read_description(path)["first"] == 5000
+        assert (about["metadata"]["seed"], read_description(path)["first"]) == (3, 5000)
         assert same(read_recording(path), kept)
 
 

@@ -117,8 +117,7 @@ def test_stuck_and_saturated_sensors_are_invalid_and_say_one_thing():
     raw = imperfection.raw(readings, constants, generator(1))
     levels = raw[0, 0, ~valid[0, 0]]
     assert (raw[..., ~valid[0, 0]] == levels).all()
-    assert (levels == 0).sum() == 1
-    assert (levels == 10).sum() == 3
+    assert ((levels == 0).sum(), (levels == 10).sum()) == (1, 3)
     assert ((levels > 0) & (levels < 10)).sum() == 2
 
 

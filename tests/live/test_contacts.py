@@ -75,8 +75,7 @@ def test_contacts_take_all_channels_of_three_axes(felt):
     every = three.convert(Frame(None, 1.0, 0.0, values, values < np.inf))
     stream = [each._replace(three=every) for each in frames(felt)]
     contacts.look(stream, CONVERSION, [replace(TOUCHED, masked=(0,))], np.full(SENSORS, 0.5))
-    assert contacts.changed == (1,)
-    assert np.flatnonzero(~sent[0].valid).tolist() == [2]
+    assert (contacts.changed, np.flatnonzero(~sent[0].valid).tolist()) == ((1,), [2])
     above = sent[0].values.reshape(-1, 3) - felt[:, None]
     np.testing.assert_allclose(above, [[1, -2, -0.5]] * SENSORS, atol=1e-6)
     np.testing.assert_allclose(contacts.tangential, np.stack([felt + 1, felt - 2], axis=1), atol=1e-6)

@@ -203,8 +203,7 @@ def test_a_scale_may_be_negative_but_not_beside_a_calibration_and_not_0():
 def test_frames_come_in_the_order_of_the_layout():
     decoder = Decoder(3, channels=(2, 0, 1), polarity=[1, -1, 1])
     frames = decoder.feed(b"".join(encode_line([1, 2, 3], n, 1000 * n) for n in range(4)))
-    assert frames[-1].values.tolist() == [3, 1, 2]
-    assert frames[-1].polarity.tolist() == [1, -1, 1]
+    assert (frames[-1].values.tolist(), frames[-1].polarity.tolist()) == ([3, 1, 2], [1, -1, 1])
     plain = Decoder(3, polarity=[1, 1, 1])
     assert plain.feed(b"".join(encode_line([1, 2, 3], n, 1000 * n) for n in range(4)))[0].polarity is None
 

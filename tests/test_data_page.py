@@ -13,9 +13,8 @@ from skin.runs.configuration import settings_of, validate_config
 from skin.runs.generation import generate_data_set
 
 PAGE = (ROOT / "docs" / "data.md").read_text()
-LINES = {
-    re.search(r"import (\w+)", block)[1]: block for block in re.findall(r"```python\n(.*?)```", PAGE, re.S)
-}
+BLOCKS = re.findall(r"```python\n(.*?)```", PAGE, re.S)
+LINES = {re.search(r"import (\w+)", block)[1]: block for block in BLOCKS}
 
 
 @pytest.fixture(scope="module")
@@ -62,13 +61,10 @@ def first_column(table: str) -> list[str]:
     return re.findall(r"`(\w+)`", " ".join(row.split("|")[1] for row in table.splitlines() if "|" in row))
 
 
-def test_the_page_names_the_keys_of_the_manifest(position):
+def test_the_page_names_the_keys_of_the_manifest_and_the_columns(position):
     table = PAGE[PAGE.index("| key |") : PAGE.index("`touches/shards/00000.parquet` and so on")]
     named = first_column(table)
     assert sorted(named) == sorted(DataSet(position / "touches").manifest)
-
-
-def test_the_page_names_the_columns(position):
     table = PAGE[PAGE.index("| column |") : PAGE.index("## Training")]
     named = first_column(table)
     known = DataSet(position / "touches").manifest["columns"]

@@ -156,17 +156,13 @@ def example(tmp_path_factory):
         return made | {"probabilities": made["run"].predict(made["readings"])}
 
 
-def test_the_example_predicts_from_an_array(example):
-    run, probabilities = example["run"], example["probabilities"]
+def test_the_example_predicts_from_an_array_one_window_and_a_list(example):
+    run, readings, probabilities = (example[name] for name in ("run", "readings", "probabilities"))
     assert run.positions.shape == (9, 3)
     assert isinstance(probabilities, np.ndarray)
     assert (probabilities.shape, probabilities.dtype) == ((1, 4), np.float32)
     expected = dict(zip(run.labels, probabilities[0], strict=True))
     assert expected["press"] > 0.5 > expected["big"]
-
-
-def test_one_window_and_a_list_give_the_same(example):
-    run, readings, probabilities = (example[name] for name in ("run", "readings", "probabilities"))
     np.testing.assert_allclose(run.predict(readings[0]), probabilities[0], atol=1e-5)
     np.testing.assert_allclose(run.predict(readings.tolist()), probabilities, atol=1e-5)
     assert run.predict(readings[:0]).shape == (0, 4)

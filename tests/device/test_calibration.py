@@ -2,6 +2,7 @@
 
 import os
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -20,8 +21,12 @@ WHOLE = Calibration(KNOWN, {"dead": [], "stuck": [1]}, RANGES, 0.012345678901234
 
 
 def test_a_file_keeps_everything(tmp_path):
-    assert read_calibration(write_calibration(WHOLE, tmp_path / "folder" / "mine.yaml")) == WHOLE
-    assert [path.name for path in (tmp_path / "folder").iterdir()] == ["mine.yaml"]
+    wired = replace(WHOLE, polarity=(1, -1, -1), channels=(2, 0, 1))
+    for kept in (WHOLE, wired):
+        path = write_calibration(kept, tmp_path / "folder" / "mine.yaml")
+        assert read_calibration(path) == kept
+        assert ("polarity" in path.read_text()) == (kept is wired)
+    assert list(path.parent.iterdir()) == [path]
 
 
 def test_a_person_may_write_little(tmp_path):
@@ -39,9 +44,8 @@ def test_channels_inwards_have_what_is_known_of_them(tmp_path):
     wiring = {"polarity": [1, 1, -1] * 2, "channels": [*range(6)], "tables": tables}
     three = Calibration(gains, {"dead": [0, 5]}, {"dead": [0, 6]}, **wiring)
     read = read_calibration(write_calibration(three, tmp_path / "three.yaml"), inwards=True)
-    assert read == Calibration(
-        {"gain": [0.8, 1.2]}, {"dead": [1]}, polarity=(-1, -1), tables={1: [[0, 1], [0, 3]]}
-    )
+    wiring = {"polarity": (-1, -1), "tables": {1: [[0, 1], [0, 3]]}}
+    assert read == Calibration({"gain": [0.8, 1.2]}, {"dead": [1]}, **wiring)
 
 
 def test_true_readings_behind_raw_ones():

@@ -130,14 +130,6 @@ def test_a_touch_counts_once_when_it_has_ended():
     assert (seen.noise.frames, seen.noise.offset) == (10, 0.005)
 
 
-@pytest.mark.slow("estimates a hundred touches")
-def test_an_offset_is_reported_within_a_minute():
-    found, alone = detect("offset", False, 0)
-    assert found is not None
-    assert found <= 60
-    assert alone
-
-
 @pytest.mark.slow("hours of touches: 15 ms for each")
 def test_few_streams_give_a_false_report():
     """Of 20 minutes, 400 touches each, with drift and hands."""

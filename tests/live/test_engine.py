@@ -121,13 +121,10 @@ def test_an_alarm_is_not_taken_back_by_one_frame():
     assert 1.4 < times[changes[1] + 1] < 1.5
 
 
-def test_without_touch_nothing_is_said():
+def test_words_carry_the_probability_of_what_is_said_and_without_touch_nothing_is_said():
     verdict = play(engine(), np.full((100, 4), 0.2))[-1]
     assert (verdict.touched, verdict.labels, verdict.dangerous) == (False, {}, False)
     assert verdict.words() == []
-
-
-def test_words_carry_the_probability_of_what_is_said():
     subject = rested()
     verdict = play(subject, np.full((40, 4), 1.0), start=0.6)[-1]
     probability = verdict.probabilities["big"]

@@ -1,5 +1,7 @@
-"""Streams that hide a dangerous touch: it is shown as no touch, or as safe, for half a second at most."""
+"""Streams of our protocol or of other boards: a dangerous touch is hidden for half a second at most."""
 
+import json
+import struct
 from dataclasses import replace
 
 import numpy as np
@@ -9,9 +11,20 @@ from skin.errors import InputError
 from skin.live.engine import DebounceSettings
 from skin.wire.protocol import Header, encode_header, encode_line
 from tests.live.memory_view import LOOK
-from tests.live.test_safety import HEADER, RATE, SCALE, SENSORS, counted, force, lines, settings, watch
+from tests.live.test_safety import (
+    HEADER,
+    LATE,
+    RATE,
+    SCALE,
+    SENSORS,
+    counted,
+    force,
+    lines,
+    settings,
+    watch,
+)
 
-LATE = 0.5 + 2 * LOOK  # s: a decision may be so old, and the display is looked at so often
+HIDDEN = 0.5 + 2 * LOOK  # s: a decision may be so old, and the display is looked at so often
 COUNTS = encode_header(Header(n=SENSORS, rate=RATE, unit="adc", bits=10, id="left"))
 
 
@@ -39,7 +52,7 @@ def creeping(t):
 )
 def test_a_clock_that_is_wrong(clock, each):
     seen = watch(clocked(force(28, (10, 18, 4, 6.0), (24, 26, 2, 6.0)), clock), each)
-    late = LATE + (each > 1)  # a second between two deliveries
+    late = HIDDEN + (each > 1)  # a second between two deliveries
     assert seen.hidden(10, 18) <= late
     assert seen.hidden(24, 26) <= late
     assert seen.first(9) <= 10 + 4.5 + each / RATE
@@ -65,7 +78,7 @@ def test_a_header_that_changes(changes):
         watch(stream, scale=SCALE)
     assert next(iter(changes)) in str(refused.value)
     seen = watch(stream[:1100], scale=SCALE)
-    assert seen.hidden(8, 11) <= LATE
+    assert seen.hidden(8, 11) <= HIDDEN
     assert seen.states(6.7, 11) == {"unknown"}
 
 
@@ -80,7 +93,7 @@ def test_a_device_that_tares_itself(restart):
     seen = watch(lines(values, restart=restart))
     if restart is not None:
         assert seen.kept(8.6, 16)
-        assert seen.hidden(8, 16) <= LATE
+        assert seen.hidden(8, 16) <= HIDDEN
         assert not seen.kept(20, 21)
     # Falling below rest tells; from then on there is no baseline.
     assert seen.states(17, 21.9) == {"unknown"}
@@ -137,7 +150,7 @@ def test_values_that_are_lost_under_a_press(write, length):
     stream = [f"{write(row)}\n".encode() for row in values]
     seen = watch(stream, scale=SCALE if write is hexadecimal else 1.0)
     for begin, end, *_ in presses:
-        assert seen.hidden(begin, end + 0.3) <= LATE
+        assert seen.hidden(begin, end + 0.3) <= HIDDEN
         touch = [look for look in seen.looks if begin + 0.2 < look.t < end]
         assert all(look.danger is not False for look in touch)
     assert seen.states(5, 7.9) == {"no touch"}
@@ -167,7 +180,7 @@ def test_a_wire_that_breaks_to_its_rest_value(fraction):
     seen = watch(lines(values), engine=overlapping(fraction))
     assert seen.kept(8.6, 18)
     assert "lost_wire" in seen.notes(12.5, 18)
-    assert seen.hidden(8, 18) <= LATE
+    assert seen.hidden(8, 18) <= HIDDEN
     assert not seen.kept(20.5, 22)
     assert "no touch" not in seen.states(20.5, 22) or fraction == 0.2  # where the neighbours feel a press
 
@@ -219,3 +232,89 @@ def test_probably_dangerous_is_not_safe(above, danger):
     words = {word for look in during for word in look.words}
     assert words & {"safe", "dangerous?", "dangerous"} == {"dangerous" if True in danger else "dangerous?"}
     assert ("near_threshold" in seen.notes(6.6, 8)) is (None in danger)
+
+
+WORD, NUMBER = "off", -999
+JSON = {"kind": "json", "invalid": [NUMBER]}
+STRUCT = {"time": "<u4", "force": f"({SENSORS},)<i2"}
+BINARY = {"kind": "binary", "struct": STRUCT, "head": "aa 55", "tail": "0d 0a", "invalid": [NUMBER]}
+ROWS = {"kind": "text", "rows": 0, "invalid": [WORD]}
+
+
+def to_json(n, row):
+    """Return a line with a clock in ms and no counter."""
+    return json.dumps({"ms": 10 * n + 400, "f": row}).encode() + b"\n"
+
+
+def to_binary(n, row):
+    """Return a frame with a clock in us and no checksum."""
+    return b"\xaa\x55" + struct.pack(f"<I{SENSORS}h", 10_000 * n + 400, *row) + b"\r\n"
+
+
+def to_rows(n, row):
+    """Return three lines and an empty one, without clock and counter."""
+    words = [WORD if value == NUMBER else str(value) for value in row]
+    return "".join(" ".join(words[position : position + 3]) + "\n" for position in (0, 3, 6)).encode() + b"\n"
+
+
+BOARDS = {"json": (JSON, to_json), "binary": (BINARY, to_binary), "rows": (ROWS, to_rows)}
+"""Adapter, and encoder of a frame."""
+
+
+def frames(name, values, restart=None):
+    """Yield the bytes of counts (F, S); the device restarts every ``restart`` s, with a banner."""
+    encode = BOARDS[name][1]
+    every = len(values) if restart is None else round(restart * RATE)
+    for number, row in enumerate(values.tolist()):
+        banner = b"" if number % every or restart is None else b"\r\nBooting...\r\nok\r\n"
+        yield banner + encode(number % every, row)
+
+
+def view_of(name, stream):
+    return watch(stream, adapter=BOARDS[name][0], scale=SCALE)
+
+
+@pytest.fixture(params=["json", "binary", "rows"])
+def board(request):
+    return request.param
+
+
+def damaged(stream):
+    """Yield frames of which a tenth loses a byte."""
+    draw = np.random.default_rng(5)
+    for piece in stream:
+        position = int(draw.integers(len(piece)))
+        yield piece[:position] + piece[position + 1 :] if draw.random() < 0.1 else piece
+
+
+@pytest.mark.parametrize("trouble", ["none", "restarts", "damage"])
+def test_a_press_is_found_and_rest_is_no_touch(board, trouble):
+    restart = 2.5 if trouble == "restarts" else None
+    stream = frames(board, counted(force(14, (7, 11, 4, 6.0))), restart)
+    seen = view_of(board, damaged(stream) if trouble == "damage" else stream)
+    assert "no touch" in seen.states(4, 7)
+    assert 7 <= seen.first(3 if trouble == "none" else 7) <= 7.5 + LATE
+    assert seen.kept(7.5 + LATE, 11)
+
+
+def test_frozen_values_and_silence_are_unknown(board):
+    values = counted(force(20))
+    values[600:1500] = values[600]
+    seen = view_of(board, [*frames(board, values), 3.0, *frames(board, counted(force(1)))])
+    assert seen.states(11 + LATE, 15) == {"unknown"}
+    assert seen.states(16.5, 20) == {"no touch"}
+    assert seen.states(20.7, 23) == {"unknown"}
+
+
+@pytest.mark.parametrize("sent", [NUMBER, -1, 0])
+def test_a_token_for_a_missing_value_or_a_cut_wire_is_unknown_and_keeps_the_alarm(board, sent):
+    """Without a header nobody knows what the converter can give: the channel falls far below rest."""
+    values = counted(force(24, (6, 12, 7, 6.0), (20, 21, 7, 6.0)))
+    values[800:1400, 7] = sent
+    seen = view_of(board, frames(board, values))
+    assert seen.first(3) <= 6.5 + LATE
+    assert seen.kept(6.5 + LATE, 12)
+    assert "no touch" not in seen.states(6.2 + LATE, 14)
+    assert not seen.kept(19, 20)
+    assert 20 <= seen.first(19.5) <= 20.5 + LATE
+    assert sent != NUMBER or seen.states(17, 18) == {"no touch"}

@@ -10,7 +10,7 @@ from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from time import monotonic, sleep
-from types import ModuleType
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -205,39 +205,33 @@ def test_a_command_whose_reader_leaves_ends_with_code_0():
     assert live.returncode == 0
 
 
-def stand_in(published):
+def stand_in(published, parameters):
     """Return modules with the part of rclpy and std_msgs that the node uses."""
-    rclpy, node, std_msgs, msg = map(ModuleType, ("rclpy", "rclpy.node", "std_msgs", "std_msgs.msg"))
-
-    class Message:
-        def __init__(self, data):
-            self.data = data
 
     class Node:
         def __init__(self, name):
             self.name = name
 
         def declare_parameter(self, name, default):
-            return type("Parameter", (), {"value": rclpy.parameters.get(name, default)})
+            return SimpleNamespace(value=parameters.get(name, default))
 
         def create_publisher(self, kind, topic, depth):
-            send = lambda message: published.append((topic, message.data))  # noqa: E731
-            return type("Publisher", (), {"publish": staticmethod(send)})
+            return SimpleNamespace(publish=lambda message: published.append((topic, message.data)))
 
         def get_logger(self):
-            return type("Logger", (), {"warning": staticmethod(lambda text: None)})
+            return SimpleNamespace(warning=lambda text: None)
 
         def destroy_node(self):
             published.append(("destroyed", self.name))
 
-    node.Node, msg.Bool, msg.String, rclpy.parameters = Node, Message, Message, {}
-    return {"rclpy": rclpy, "rclpy.node": node, "std_msgs": std_msgs, "std_msgs.msg": msg}
+    node, msg = SimpleNamespace(Node=Node), SimpleNamespace(Bool=SimpleNamespace, String=SimpleNamespace)
+    packages = {"rclpy": SimpleNamespace(node=node), "std_msgs": SimpleNamespace(msg=msg)}
+    return packages | {"rclpy.node": node, "std_msgs.msg": msg}
 
 
 def test_the_ros_node_publishes_verdicts_and_marks_their_loss(monkeypatch):
     published = []
-    modules = stand_in(published)
-    for name, module in modules.items():
+    for name, module in stand_in(published, {"command": [sys.executable, "-c", LIVE]}).items():
         monkeypatch.setitem(sys.modules, name, module)
     path = ROOT / "docs" / "examples" / "ros2_node.py"
     assert len(path.read_text().splitlines()) <= 90
@@ -246,7 +240,6 @@ def test_the_ros_node_publishes_verdicts_and_marks_their_loss(monkeypatch):
     spec.loader.exec_module(example)
     monkeypatch.setattr(example, "SILENCE", 2 * HEARTBEAT)
 
-    modules["rclpy"].parameters = {"command": [sys.executable, "-c", LIVE]}
     node = example.SkinNode()
     for entry in (("~/stale", True), ("~/danger", False), ("~/danger", True), ("~/stale", False)):
         until(lambda entry=entry: entry in published)

@@ -66,20 +66,15 @@ def noise(rng, sensors):
 
 def damage(piece, rng):
     """Return a frame with up to five random errors of up to eight bytes."""
-    data = bytearray(piece)
     for _ in range(rng.choice((1, 1, 2, 5))):
-        first, run = rng.randrange(len(data)), rng.randint(1, 8)
-        kind, last = rng.randrange(7), min(first + run, len(data))
-        if kind <= 1:
-            data[first] ^= 1 << rng.randrange(8)
-        elif kind == 6:
-            del data[first:]
-        else:
-            begin = last if kind == 3 else first
-            changed = (b"", data[first:last], rng.randbytes(last - first), rng.choice(_INSERTED))[kind - 2]
-            data[begin : last if kind != 5 else first] = changed
-        data = data or bytearray(b"*")
-    return bytes(data)
+        first = rng.randrange(len(piece))
+        last = min(first + rng.randint(1, 8), len(piece))
+        before, part, after = piece[:first], piece[first:last], piece[last:]
+        flipped = bytes([part[0] ^ 1 << rng.randrange(8)]) + part[1:]
+        changes = (flipped, flipped, b"", part + part, rng.randbytes(len(part)), rng.choice(_INSERTED) + part)
+        change = rng.randrange(7)
+        piece = (before if change == 6 else before + changes[change] + after) or b"*"
+    return piece
 
 
 def fuzz(count, spoken, sensors, seed):

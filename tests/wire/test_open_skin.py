@@ -174,12 +174,10 @@ def test_a_port_that_is_none_is_refused(port, reason):
         open_skin(port, LAYOUT)
 
 
-def test_a_port_in_use_is_refused(plug):
+def test_a_port_in_use_and_a_forbidden_one_are_refused(plug, monkeypatch):
     with open_skin(plug.port), pytest.raises(InputError, match="in use: close the serial monitor"):
         open_skin(plug.port)
 
-
-def test_a_forbidden_port_is_refused(monkeypatch):
     def refuse(*_, **__):
         raise serial.SerialException(errno.EACCES, "Permission denied")
 

@@ -5,16 +5,17 @@ from itertools import product
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 import yaml
 
+from skin import InputError, read_recording
 from skin.body.base import Sensors
 from skin.core.files import CONF, ROOT
 from skin.device.conversion import convert_files, eflesh, epi, read_by_function
-from skin.device.files import read_recording, write_recording
+from skin.device.files import write_recording
 from skin.device.formats import read_format
-from skin.errors import InputError
 
 PLAIN = {
     "files": "*.csv",
@@ -22,11 +23,11 @@ PLAIN = {
     "channels": {"columns": "s*", "unit": "g"},
     "segments": {"by": "file", "frames": 4},
 }
-TABLE = "t,s0,s1,label,person\n" + "".join(
-    f"{100 * n},{n},{10 * n},{'press' if n else 'none'},anna\n" for n in range(4)
-)
-PRESS = {"press": {"column": "label", "values": {"press": 1, "none": 0}}}
 ROWS = [(100 * n, n, 10 * n) for n in range(4)]
+LABELS = ("none", "press", "press", "press")
+LINES = (f"{t},{a},{b},{label},anna\n" for (t, a, b), label in zip(ROWS, LABELS, strict=True))
+TABLE = "".join(["t,s0,s1,label,person\n", *LINES])
+PRESS = {"press": {"column": "label", "values": {"press": 1, "none": 0}}}
 HEADLESS = {"table": {"header": None}, "time": {"column": 0, "unit": "ms"}}
 HEADLESS |= {"channels": {"columns": [1, 2], "unit": "g"}}
 DATES = {"time": {"column": "t"}, "table": {"parse_dates": ["t"]}}
@@ -44,8 +45,6 @@ def convert(folder: Path, settings: dict, **files: str | bytes):
 
 def test_sdu_is_a_spreadsheet_whose_places_are_groups(tmp_path):
     pytest.importorskip("openpyxl")
-    import pandas as pd
-
     rows = [(2 * (n % 3), 0, 0.7, 4.0, 1 + n, 2 + n, 0.9 * n, None) for n in range(9)]
     table = pd.DataFrame(rows, columns=["X", "Y", "Tl", "Tr", "Pl", "Pr", "F", "Depth"])
     path = tmp_path / "2D_6060_learning_data.xlsx"
@@ -239,9 +238,8 @@ def test_the_reader_of_the_page_has_the_captures_of_cost(tmp_path):
     names = {}
     exec(re.search(r"```py\n(.*?)```", (ROOT / "docs" / "data.md").read_text(), re.S)[1], names)
     recording = names["read"](tmp_path / "CoST.csv", frames=17)
-    assert recording.task.names == tuple(
-        f"{a}_{b}" for a in ("grab", "hit") for b in ("gentle", "normal", "rough")
-    )
+    classes = product(("grab", "hit"), ("gentle", "normal", "rough"))
+    assert recording.task.names == tuple(map("_".join, classes))
     assert len(recording) == 12
     subjects = recording.parameters["group_subject"].int().tolist()
     given = recording.touches.readings.numpy(), recording.touches.labels, subjects

@@ -16,11 +16,10 @@ from hypothesis import strategies as st
 from skin import InputError, read_recording
 from skin.body.layout import Scattered
 from skin.core.safe_loading import limited_memory
-from skin.device.files import DataSet, read_description, write_recording
+from skin.device.files import DataSet, describe_recording, read_description, write_manifest, write_recording
 from skin.device.touches import Recording, Touches, concatenate
 from skin.touch.labels import TOUCH, Task
 from tests.damage import DAMAGED_FILES, damaged, opened
-from tests.device.conftest import write_data_set
 from tests.made_up import naive_skin
 
 BATCH, TIME, SENSORS = 7, 5, 3
@@ -175,6 +174,16 @@ def test_damage_never_passes_for_readings(written, data):
 @pytest.fixture(scope="module")
 def whole():
     return naive_skin(layout=Scattered(seed=0), gestures=50).recording()
+
+
+def write_data_set(recording: Recording, folder: Path, counts: tuple[int, ...] = (20, 20, 10)) -> Path:
+    source = {"seed": 0, "source_commit": "a", "source_dirty": "false", "config_hash": "1", "config": {}}
+    write_manifest(folder, describe_recording(recording), counts, **source)
+    data_set = DataSet(folder, complete=False)
+    for number, (first, count) in enumerate(zip(data_set.firsts, counts, strict=True)):
+        shard = replace(recording[first : first + count], metadata={"config_hash": "1", "summary": {}})
+        write_recording(shard, data_set.path(number), first)
+    return folder
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ from skin.body.layout import Scattered
 from skin.device.files import write_recording
 from skin.device.recording import Recorded
 from skin.touch.labels import Task
-from tests.device.conftest import write_data_set
+from tests.device.test_files import write_data_set
 from tests.made_up import SHEET, naive_skin
 
 LAYOUT = Scattered(5, 5, seed=0)

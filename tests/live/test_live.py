@@ -13,7 +13,7 @@ from mcap.reader import make_reader
 
 from skin.core.files import ROOT
 from skin.runs.build import build_device, equation10_warning
-from tests.live.waiting import until
+from tests.wire.memory import until
 
 SMALL = [
     "experiment=rules",

@@ -20,7 +20,7 @@ from skin.errors import InputError
 from skin.live.loop import Display, watch_age
 from skin.live.verdict import Verdict
 from skin.live.view import HEARTBEAT, VERDICTS, write_events, write_file
-from tests.live.waiting import PATIENCE, until
+from tests.wire.memory import PATIENCE, until
 
 
 def display(calm=2.0):

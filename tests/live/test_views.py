@@ -23,7 +23,7 @@ from skin.live.loop import Display
 from skin.live.verdict import Note, Verdict, verdict_message
 from skin.live.view import screen, show_in_terminal
 from skin.wire.channels import UnitConversion
-from tests.live.waiting import until
+from tests.wire.memory import until
 
 PLACES = np.array([[0.02, 0.02, 0], [0.14, 0.03, 0], [0.03, 0.1, 0], [0.13, 0.11, 0], [0.08, 0.06, 0]])
 SIZE = 0.16, 0.12

@@ -2,6 +2,7 @@
 
 import os
 from itertools import count, islice
+from threading import Thread
 from time import sleep
 
 import numpy as np
@@ -19,7 +20,7 @@ from skin.record.serial import Serial, convert_session, record_session
 from skin.record.session import read_session
 from skin.touch.labels import TOUCH, TOUCH_OR_NOT
 from skin.wire.channels import UnitConversion
-from skin.wire.emulator import Emulator, emulated_gestures
+from skin.wire.emulator import Emulator, EmulatorSettings, PtyPort, emulated_gestures
 from skin.wire.segmentation import label_plan
 from tests.made_up import PERFECT, SHEET, naive_skin
 
@@ -33,6 +34,27 @@ def skin(**settings):
 def serial(emulator, layout=LAYOUT, **settings):
     port = emulator and emulator.port.address
     return Serial(body=SHEET, layout=layout, port=port, gestures=COUNT, timeout=30.0, **settings)
+
+
+@pytest.fixture
+def emulate():
+    """Return a function that plays a device at a port and returns the emulator; nothing is left behind."""
+    playing = []
+
+    def begin(device, count=7, **settings):
+        chosen = EmulatorSettings(**{"speed": 40.0, "idle": 4.0, "rate": 40.0} | settings)
+        emulator = Emulator(device, PtyPort(None), chosen)
+        thread = Thread(target=emulator.run, kwargs={"count": count})
+        thread.start()
+        playing.append((emulator, thread))
+        return emulator
+
+    yield begin
+    for emulator, thread in playing:
+        emulator.stop()
+        thread.join(20)
+        assert not thread.is_alive()
+        emulator.port.unplug()
 
 
 def test_it_reads_what_was_played(emulate):
@@ -79,7 +101,7 @@ def test_only_a_test_split_of_a_port(split):
         serial(None).touches(split)
 
 
-TIPS = 3
+FEW = 3
 
 
 @pytest.fixture(scope="module")
@@ -90,7 +112,7 @@ def device():
 
 @pytest.fixture(scope="module")
 def played(device):
-    return list(islice(emulated_gestures(device), TIPS))
+    return list(islice(emulated_gestures(device), FEW))
 
 
 def same(one, other):
@@ -101,13 +123,13 @@ def test_a_recorded_session_has_them(emulate, device, played, tmp_path):
     emulator = emulate(device, rate=100.0, speed=5.0, gap=0.1)
     settings = {"touch": {"window": 1.0}, "tare": 1.0, "scale": emulator.converter.scale, "timeout": 20.0}
     port, path = emulator.port.address, tmp_path / "s"
-    reader = Serial(body=SHEET, layout=Grid(3, 3), port=port, gestures=TIPS, **settings)
+    reader = Serial(body=SHEET, layout=Grid(3, 3), port=port, gestures=FEW, **settings)
     record_session(reader, path, None, False, lambda text: None)
     stored = read_session(path)
     for number, gesture in enumerate(played):
         assert same(stored.gestures[number][0].contacts, gesture.contacts)
     parquet, count = convert_session(reader, path)
-    assert count == TIPS
+    assert count == FEW
     touches = read_recording(parquet).touches
     assert same(touches.contacts, np.stack([gesture.contacts for gesture in played]))
     # They are in time with the readings: nothing is felt without a contact.

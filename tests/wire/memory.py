@@ -1,10 +1,20 @@
-"""Streams of bytes from memory in place of ports."""
+"""Streams of bytes from memory in place of ports; waiting for other threads and processes."""
 
-from time import sleep
+from time import monotonic, sleep
 
 from skin.wire.skin import open_skin
 
-PATIENT = 60.0  # s: machines are busy at times
+PATIENCE = 300  # s, on a machine that is busy with other things
+
+
+def until(found, process=None, wanted=None):
+    """Wait until a function gives ``wanted``, or anything true, and return it; ``process`` must not end."""
+    deadline = monotonic() + PATIENCE
+    while not (result := found()) if wanted is None else (result := found()) != wanted:
+        assert monotonic() < deadline, f"waited in vain: {result}"
+        assert process is None or process.poll() is None, "ended while waited for"
+        sleep(0.05)
+    return result
 
 
 class Sent:

@@ -14,8 +14,8 @@ from skin.device.resampling import resample
 from skin.wire.decoder import Decoder
 from skin.wire.emulator import Converter, Emulator, EmulatorSettings, PtyPort, TcpPort, upsample
 from skin.wire.reader import PortStream, check_port
-from tests.live.waiting import until
 from tests.made_up import naive_skin
+from tests.wire.memory import until
 
 RATE = 10.0
 

@@ -27,8 +27,7 @@ from skin.wire.protocol import Header, encode_header, encode_line
 from skin.wire.reader import PlaybackFeed, SkinDisconnected, SkinTimeout, WireFeed
 from skin.wire.skin import Source, open_skin, play
 from skin.wire.tare import Tare
-from tests.live.waiting import until
-from tests.wire.memory import PATIENT, Sent, opened
+from tests.wire.memory import PATIENCE, Sent, opened, until
 
 LAYOUT = range(4)
 
@@ -49,10 +48,10 @@ def test_frames_of_a_serial_port_until_it_is_unplugged(plug):
     with open_skin(plug.port, LAYOUT) as skin:
         before = monotonic()
         plug.send(*(encode_line([1, 0, 3, number], number, 10_000 * number) for number in range(300)))
-        frames = skin.read(300, timeout=PATIENT)
+        frames = skin.read(300, timeout=PATIENCE)
         stats = skin.stats
         plug.unplug()
-        for read in (lambda: skin.read(1, timeout=PATIENT), lambda: next(iter(skin))):
+        for read in (lambda: skin.read(1, timeout=PATIENCE), lambda: next(iter(skin))):
             with pytest.raises(SkinDisconnected, match="unplugged"):
                 read()
     assert numbers(frames) == list(range(300))
@@ -66,7 +65,7 @@ def test_frames_of_a_serial_port_until_it_is_unplugged(plug):
 def test_a_peer_at_a_socket_that_stops_sending_is_left_and_found_again_and_its_end(caplog):
     """A connection stays open after a power cut in the middle of a frame."""
     with socket.create_server(("127.0.0.1", 0)) as server:
-        server.settimeout(PATIENT)
+        server.settimeout(PATIENCE)
         address = f"socket://127.0.0.1:{server.getsockname()[1]}"
         with (
             open_skin(address, LAYOUT, reconnect=True, silence=0.3, backoff=(0.01, 0.04)) as skin,
@@ -75,7 +74,7 @@ def test_a_peer_at_a_socket_that_stops_sending_is_left_and_found_again_and_its_e
             first.sendall(lines(*range(5)) + b"5,50000,500,5")
             with server.accept()[0] as second:
                 second.sendall(lines(*range(3)))
-                frames = skin.read(8, timeout=PATIENT)
+                frames = skin.read(8, timeout=PATIENCE)
                 assert (skin.stats.reconnects, skin.stats.bad_frames) == (1, 0)
             assert first.recv(1) == b""
     assert numbers(frames) == [0, 1, 2, 3, 4, 0, 1, 2]
@@ -92,7 +91,7 @@ def test_the_end_of_a_socket_is_an_error_after_what_came_before():
         device.sendall(lines(50, 51, 52))
         device.close()
         with pytest.raises(SkinDisconnected, match="disconnected") as caught:
-            skin.read(4, timeout=PATIENT)
+            skin.read(4, timeout=PATIENCE)
         assert numbers(caught.value.frames) == [50, 51, 52]
 
 
@@ -120,7 +119,7 @@ def test_a_pseudo_terminal_is_unplugged_and_plugged_in_again(tmp_path):
             for connection in range(3):
                 until(port.connected)
                 port.write(lines(*range(50)))
-                frames = skin.read(50, timeout=PATIENT)
+                frames = skin.read(50, timeout=PATIENCE)
                 assert frames[0].after == ("reconnect" if connection else "")
                 assert numbers(frames) == list(range(50))
                 port.unplug()
@@ -140,13 +139,13 @@ def test_while_it_is_away_it_is_tried_again_and_said():
         return streams.pop() if streams else Sent(other, end=False)
 
     with open_skin("x", LAYOUT, opener=opener, reconnect=True, backoff=(0.01, 0.02)) as skin:
-        skin.read(3, timeout=PATIENT)
+        skin.read(3, timeout=PATIENCE)
         until(lambda: skin.away)
         with pytest.raises(SkinTimeout, match="unplugged; trying again"):
             skin.read(1, timeout=0.1)
         back.set()
         with pytest.raises(InputError, match="sends 3 values per frame, the layout has 4"):
-            skin.read(1, timeout=PATIENT)
+            skin.read(1, timeout=PATIENCE)
 
 
 def test_who_is_late_loses_the_oldest_frames_and_is_informed():
@@ -194,7 +193,7 @@ def status(skin):
 @pytest.mark.parametrize(("rate", "said"), [(10, " (short taps read low below 100 Hz)"), (100, "")])
 def test_a_rate_that_misses_the_peaks_of_taps_stands_in_the_status_line(rate, said):
     with opened(lines(*range(60), period=1_000_000 // rate)) as skin:
-        skin.read(60, timeout=PATIENT)
+        skin.read(60, timeout=PATIENCE)
         assert status(skin).startswith(f"{rate}.0 Hz{said}")
 
 
@@ -206,7 +205,7 @@ def test_channels_that_mean_nothing_are_masked_and_named():
     values[-1, 3] = 1023
     data = b"".join(line(number, row.tolist()) for number, row in enumerate(values))
     with opened(encode_header(Header(n=6, bits=10)), data, layout=6) as skin:
-        frames = skin.read(800, timeout=PATIENT)
+        frames = skin.read(800, timeout=PATIENCE)
         assert skin.channels == ("ok", "dead", "stuck", "saturated", "ok", "ok")
         assert "sensor 1 dead, sensor 2 stuck, sensor 3 saturated" in status(skin)
     assert frames[100].valid.all()
@@ -221,7 +220,7 @@ def test_tare_and_a_touch(plug):
     def values(number):
         return rng.integers(499, 502, 4) + np.array([0, 0, 300 * bool(pressed), 0])
 
-    with open_skin(plug.port, LAYOUT, timeout=PATIENT) as skin, plug.sending(values):
+    with open_skin(plug.port, LAYOUT, timeout=PATIENCE) as skin, plug.sending(values):
         baseline = skin.tare(0.5)
         assert baseline == pytest.approx([500] * 4, abs=1.01)
         pressed.append(True)
@@ -233,7 +232,7 @@ def test_tare_and_a_touch(plug):
 
 
 def test_tare_while_the_device_restarts_is_refused():
-    with opened(*[lines(*range(20))] * 5000, timeout=PATIENT) as skin:
+    with opened(*[lines(*range(20))] * 5000, timeout=PATIENCE) as skin:
         with pytest.raises(InputError, match="restarted"):
             skin.tare(0.1)
         assert skin.baseline is None
@@ -251,7 +250,7 @@ def test_ctrl_c_ends_a_read_that_waits(plug):
         assert process.stdout.readline() == b"open\n"
         sleep(0.2)
         process.send_signal(signal.SIGINT)
-        assert b"KeyboardInterrupt" in process.communicate(timeout=PATIENT)[1]
+        assert b"KeyboardInterrupt" in process.communicate(timeout=PATIENCE)[1]
 
 
 def polled(pieces, silence, step=0.1):

@@ -85,14 +85,8 @@ def test_a_device_of_ones_own_needs_touches_alone(made_up_device, capsys):
         (lambda device: device.simulated("this is simulated"), "^this is simulated: leave out device="),
         (lambda device: device.recording(), "only simulated or recorded touches"),
         (open_source, "can be watched: give device=serial"),
-        (
-            lambda device: measure_margins(None, device, 20, POINT),
-            "has none: .* add device=simulated",
-        ),
-        (
-            lambda device: evaluate_windows(None, device, None, POINT),
-            "has none: .* add device=simulated",
-        ),
+        (lambda device: measure_margins(None, device, 20, POINT), "has none: .* add device=simulated"),
+        (lambda device: evaluate_windows(None, device, None, POINT), "has none: .* add device=simulated"),
     ],
 )
 def test_what_it_does_not_know_is_refused_in_a_sentence(made_up_device, ask, said):

@@ -48,14 +48,7 @@ def source():
     with initialize_config_dir(str(CONF), version_base="1.3"):
         config = validate_config(compose("train", ["simulator=naive", "evaluation.safe_gestures=100"]))
     build = device_on_skin(config, vars(config))
-    return AlarmSource(
-        "run x",
-        config.evaluation,
-        Largest(),
-        config.device,
-        config.device,
-        build=build,
-    )
+    return AlarmSource("run x", config.evaluation, Largest(), config.device, config.device, build=build)
 
 
 def watched(source):

@@ -11,18 +11,7 @@ from skin.errors import InputError
 from skin.live.engine import DebounceSettings
 from skin.wire.protocol import Header, encode_header, encode_line
 from tests.live.memory_view import LOOK
-from tests.live.test_safety import (
-    HEADER,
-    LATE,
-    RATE,
-    SCALE,
-    SENSORS,
-    counted,
-    force,
-    lines,
-    settings,
-    watch,
-)
+from tests.live.test_safety import HEADER, LATE, RATE, SCALE, SENSORS, counted, force, lines, settings, watch
 
 HIDDEN = 0.5 + 2 * LOOK  # s: a decision may be so old, and the display is looked at so often
 COUNTS = encode_header(Header(n=SENSORS, rate=RATE, unit="adc", bits=10, id="left"))

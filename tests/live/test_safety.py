@@ -265,10 +265,7 @@ ONE = np.where(np.arange(SENSORS) == 3, 1e-9, SCALE)
         ({"presses": FEW}, "even with nominal settings: train another run"),
         *(({"converted": conversion(scale), "slowly": 1}, DEVICE) for scale in (1e-9, 1e-300, 1e9, 2e-8)),
         ({"converted": conversion(ONE)}, "sensor 3 cannot raise it"),
-        (
-            {"converted": conversion(broken=3)},
-            r"9 of 14 .* 3 of 9 sensors have no valid reading .*: they",
-        ),
+        ({"converted": conversion(broken=3)}, r"9 of 14 .* 3 of 9 sensors have no valid reading .*: they"),
         ({"nominal": detecting(threshold=1e308)}, "the contact threshold of the model"),
     ],
 )

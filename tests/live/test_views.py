@@ -84,10 +84,7 @@ def test_no_peak_between_two_looks_is_missed():
 
 def test_where_output_is_no_terminal_a_line_tells_each_change(tmp_path):
     subject = display()
-    with (
-        (tmp_path / "said").open("w") as file,
-        show_in_terminal(subject, Console(file=file, width=60)),
-    ):
+    with (tmp_path / "said").open("w") as file, show_in_terminal(subject, Console(file=file, width=60)):
         for verdict in (None, None, PRESSED, PRESSED):
             subject.set_verdict(verdict, monotonic(), "" if verdict else "taking the baseline: do not touch")
             sleep(0.2)

@@ -67,7 +67,6 @@ def test_what_only_the_repository_has_is_refused_elsewhere(tmp_path):
         (["trian"], "did you mean train?"),
         (["x"], "animate, calibrate"),
         (["train", "learner.rounds=20"], "no setting or group learner.rounds, but learner=boosted_trees has"),
-        (["train", "model=cn"], "there is no model=cn: did you mean "),
         (["train", "seed=["], "seed=["),
     ],
 )

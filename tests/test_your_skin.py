@@ -56,12 +56,9 @@ def started(command: str, home: Path) -> str:
     return result.stdout
 
 
-def test_the_page_has_the_files_and_commands_of_the_walk():
+def test_the_check_of_the_page_draws_the_skin_and_refuses_a_wrong_layout(follow, home):
     assert sorted(FILES) == ["my-skin/body/mine.yaml", "my-skin/sensors.csv"]
     assert ["--cfg job" in command for command in COMMANDS] == [False, False, False, False, True, False]
-
-
-def test_the_check_of_the_page_draws_the_skin_and_refuses_a_wrong_layout(follow, home):
     done = follow(COMMANDS[0], *COARSE)
     assert "touch.png: " in done.stdout, done.stderr
     path = home / "my-skin" / "sensors.csv"

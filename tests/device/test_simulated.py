@@ -36,13 +36,6 @@ def plain() -> Simulated:
     return device()
 
 
-def test_everything_comes_from_the_seeds(plain):
-    for split in ("train", "validation", "holdout", "test"):
-        one, other = plain.touches(split), device().touches(split)
-        assert torch.equal(one.readings, other.readings)
-        assert torch.equal(one.labels, other.labels)
-
-
 def test_the_number_of_threads_does_not_matter(plain, monkeypatch):
     monkeypatch.setattr("skin.device.simulated._BATCH", 16)
     threads = torch.get_num_threads()
@@ -74,7 +67,11 @@ def test_parts_are_the_budget(monkeypatch, stream):
     assert one.parts("train") is None
 
 
-def test_training_seeds_change_the_budget_and_never_the_test(plain):
+def test_everything_comes_from_the_seeds_and_those_of_training_never_change_the_test(plain):
+    for split in ("train", "validation", "holdout", "test"):
+        one, again = plain.touches(split), device().touches(split)
+        assert torch.equal(one.readings, again.readings)
+        assert torch.equal(one.labels, again.labels)
     other = device(data_seed=1)
     assert torch.equal(plain.touches("test").readings, other.touches("test").readings)
     assert not torch.equal(plain.touches("train").readings, other.touches("train").readings)

@@ -60,6 +60,8 @@ def test_training_skins_may_have_other_touches(configured):
         assert (skin.sampler.settings.second, skin.sampler.settings.frames.press) == (0.0, (4, 20))
     with pytest.raises(InputError, match=r"touch\.window"):
         build_device(configured(*SMALL, "+device.training_touch.window=4.0"))
+    with pytest.raises(InputError, match=r"device\.skins\.interface must be at most 1, got 1\.1"):
+        build_device(configured(*SMALL, "device.skins={plates: 0.6, naive: 0.5}"))
 
 
 def test_no_stream_defines_a_skin_and_orders_an_epoch(configured, monkeypatch):
@@ -82,11 +84,6 @@ def test_no_stream_defines_a_skin_and_orders_an_epoch(configured, monkeypatch):
     assert len(defining) == fresh.count + fresh.test_skins
     assert used
     assert not defining & set(used)
-
-
-def test_fractions_of_mechanics_above_1_are_refused(configured):
-    with pytest.raises(InputError, match=r"device\.skins\.interface must be at most 1, got 1\.1"):
-        build_device(configured(*SMALL, "device.skins={plates: 0.6, naive: 0.5}"))
 
 
 def test_a_blank_device_prepares_no_skin(configured):

@@ -283,7 +283,7 @@ def test_labels_that_exclude_each_other_have_one_winner():
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [("alarm", 0.11), ("label", -1.0), ("above", 1.0), ("label", np.inf), ("calm", np.inf)]
+    [("alarm", 0.101), ("label", -1.0), ("above", 1.0), ("label", np.inf), ("calm", np.inf)]
     + [(name, np.nan) for name in ("label", "alarm", "calm", "above")],
 )
 def test_patience_that_would_be_too_late_is_refused(name, value):

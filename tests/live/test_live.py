@@ -89,20 +89,6 @@ def test_the_simulator_is_watched_without_hardware(run, store, tmp_path):
     assert topics == {"/skin/readings", "/skin/verdict", "/skin/contacts"}
 
 
-@pytest.mark.parametrize(
-    ("override", "needed"),
-    [
-        ("live.patience.alarm=0.2", "must be less than or equal to 0.1"),
-        ("run=none", "no finished training run none"),
-    ],
-)
-def test_bad_input_is_one_sentence(run, tmp_path, override, needed):
-    done = run(tmp_path, "live.py", override)
-    assert done.returncode == 2
-    assert needed in done.stderr
-    assert done.stderr.count("\n") == 1
-
-
 COLLECTING = """
 import gc, runpy, sys, time
 from skin.live.loop import LiveLoop

@@ -67,10 +67,8 @@ def test_a_peer_at_a_socket_that_stops_sending_is_left_and_found_again_and_its_e
     with socket.create_server(("127.0.0.1", 0)) as server:
         server.settimeout(PATIENCE)
         address = f"socket://127.0.0.1:{server.getsockname()[1]}"
-        with (
-            open_skin(address, LAYOUT, reconnect=True, silence=0.3, backoff=(0.01, 0.04)) as skin,
-            server.accept()[0] as first,
-        ):
+        settings = {"reconnect": True, "silence": 0.3, "backoff": (0.01, 0.04)}
+        with open_skin(address, LAYOUT, **settings) as skin, server.accept()[0] as first:
             first.sendall(lines(*range(5)) + b"5,50000,500,5")
             with server.accept()[0] as second:
                 second.sendall(lines(*range(3)))

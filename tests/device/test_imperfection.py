@@ -204,9 +204,14 @@ def test_what_lies_outside_of_other_devices_is_named():
     ranges = {"rate": [20.0, 500.0], "time_constant": [0.0, 0.1], "noise": 0.05, "drift": [0.0, 0.05]}
     assert outside({"rate": 100.0, "time_constant": 0.1, "noise": 0.02, "gain_spread": 0.3}, ranges) == []
     device = {"rate": 10.0, "time_constant": [0.0, 0.2], "noise": 0.06}
-    assert outside(device, ranges) == [
-        "rate 10 Hz (20 to 500 Hz)", "lag 0 to 0.2 s (0 to 0.1 s)", "noise 0.06 N (0.05 to 0.05 N)"
-    ]  # fmt: skip
+    lag, noise = "lag 0 to 0.2 s (0 to 0.1 s)", "noise 0.06 N (0.05 to 0.05 N)"
+    assert outside(device, ranges) == ["rate 10 Hz (20 to 500 Hz)", lag, noise]
+
+
+def read(device, force, *gestures, **more):
+    """Return what a device says of forces (B, T, S) at 10 Hz: readings, valid and saturated."""
+    constants = device.constants(force.shape[-1], generator(), *gestures)
+    return measure(device, constants, force, 10.0, generator(1), **more)
 
 
 ROUGH = {"noise": 0.1, "drift": 0.05, "time_constant": 0.1, "hysteresis": 0.05, "quantum": 0.02, "clip": 4.0}
@@ -232,9 +237,7 @@ def test_a_device_reads_a_short_tap_at_any_phase(rate):
     """A reading is up to half its interval from the peak, towards which the force rises in half a frame."""
     tap = torch.zeros(4000, 3, 1)
     tap[:, 1] = 1.0
-    ideal = Imperfection(rate=rate, gain_spread=0.0, offset=0.0, noise=0.0)
-    constants = ideal.constants(1, np.random.default_rng(0))
-    highest = measure(ideal, constants, tap, 10.0, np.random.default_rng(1))[0].amax(dim=(1, 2)).numpy()
+    highest = read(Imperfection(rate=rate, **NONE), tap)[0].amax(dim=(1, 2)).numpy()
     loss = 10 / rate  # the largest
     assert 1 - loss <= highest.min() < 1 - 0.99 * loss
     assert 1 - 0.01 * loss < highest.max() <= 1.0
@@ -257,9 +260,8 @@ def test_a_touch_begins_and_ends_at_the_edges_of_its_frames(rate):
 def test_a_simulated_device_reads_like_a_real_one(rate):
     """The frames of a device at a rate, added one by one to the window of a live skin."""
     device = Imperfection(rate=rate, dead=1, **ROUGH)
-    constants = device.constants(3, np.random.default_rng(0))
-    found = measure(device, constants, touches(), 10.0, np.random.default_rng(1))
-    noise = np.random.default_rng(1)
+    constants, found = device.constants(3, generator()), read(device, touches())
+    noise = generator(1)
     fine = touches() if rate <= 10.0 else between_frames(touches(), 10.0, rate, noise.random(2))
     values, works, limited = (one.numpy() for one in device.apply(fine, constants, noise))
     for gesture in range(2):
@@ -275,9 +277,8 @@ def test_each_gesture_is_read_as_a_single_one_is():
     """At one rate, touches that are read each at a rate of their own are those that are read together."""
     settings = {"drift": 0.05, "quantum": 0.02, "clip": 4.0, "noise": 0.0}
     together, each = (Imperfection(rate=rate, dead=1, **settings) for rate in (70.0, (70.0, 70.0)))
-    constants = together.constants(3, np.random.default_rng(0))
-    expected = measure(together, constants, touches(), 10.0, np.random.default_rng(1))
-    drawn = measure(each, constants, touches(), 10.0, np.random.default_rng(1))
+    constants = together.constants(3, generator())
+    expected, drawn = (measure(one, constants, touches(), 10.0, generator(1)) for one in (together, each))
     # A drift is taken in the middle of the interval, so a few readings round to the next step.
     error = (drawn[0] - expected[0]).abs()
     assert (error <= 0.021).all()
@@ -290,11 +291,8 @@ def test_lag_and_hysteresis_before_the_converter_are_those_at_the_rate_of_the_de
     """They are computed at 50 Hz whatever the rate; the device's own steps differ by part of a step."""
     slow = {"time_constant": 0.05, "hysteresis": 0.05, "noise": 0.0, "offset": 0.0}
     together, each = (Imperfection(rate=bounds, **slow) for bounds in (rate, (rate, rate)))
-    constants = together.constants(3, np.random.default_rng(0))
-    expected, drawn = (
-        measure(device, constants, touches(), 10.0, np.random.default_rng(1))[0]
-        for device in (together, each)
-    )
+    constants = together.constants(3, generator())
+    expected, drawn = (measure(one, constants, touches(), 10.0, generator(1))[0] for one in (together, each))
     step = max(1 / rate, 0.02)
     # The force rises by at most 2 N in 0.05 s, of which the lag passes on 1 - exp(-step / 0.05).
     assert (drawn - expected).abs().max() < 5.0 * (1 - np.exp(-step / 0.05))
@@ -306,11 +304,11 @@ def test_unaligned_readings_are_those_of_the_common_resampler():
     rates, tap = np.array([10.0, 12.3, 47.0, 100.0, 999.0]), torch.zeros(5, 12, 2)
     tap[:, 6] = torch.tensor([1.0, -3.0])
     tap[4, 6:] = torch.tensor([1.0, -3.0])  # until the end of the window: it is moved to the front
-    device = Imperfection(rate=(10.0, 1000.0), aligned=False, noise=0.0, offset=0.0, gain_spread=0.0)
-    constants = device.constants(2, np.random.default_rng(0), 5)
+    device = Imperfection(rate=(10.0, 1000.0), aligned=False, **NONE)
+    constants = device.constants(2, generator(0), 5)
     constants = constants._replace(rate=torch.from_numpy(rates).reshape(5, 1, 1))
-    readings, valid, saturated = measure(device, constants, tap, 10.0, np.random.default_rng(1))
-    later = np.random.default_rng(1).random(5) - (tap[:, -1, 0] != 0).numpy()
+    readings, valid, saturated = measure(device, constants, tap, 10.0, generator(1))
+    later = generator(1).random(5) - (tap[:, -1, 0] != 0).numpy()
     for number, (rate, shift) in enumerate(zip(rates, later, strict=True)):
         time = 1.2 - (np.arange(round(1.2 * rate + 0.5), 0, -1) - 0.5) / rate
         time = time[time > 0]
@@ -326,9 +324,8 @@ def test_unaligned_readings_are_those_of_the_common_resampler():
 
 def test_a_touch_that_goes_on_is_shown_to_the_middle_of_its_last_frame():
     rising = torch.arange(-2.0, 4.0).clamp(min=0)[None, :, None].expand(2000, -1, 1)
-    device = Imperfection(rate=1000.0, aligned=False, noise=0.0, offset=0.0, gain_spread=0.0)
-    constants = device.constants(1, np.random.default_rng(0))
-    readings = measure(device, constants, rising, 10.0, np.random.default_rng(1), ongoing=True)[0][:, :, 0]
+    device = Imperfection(rate=1000.0, aligned=False, **NONE)
+    readings = read(device, rising, ongoing=True)[0][:, :, 0]
     # A reading is up to 1 ms from the middle, in which it falls by 0.06.
     torch.testing.assert_close(readings[:, -1], torch.full((2000,), 3.0), atol=0.06, rtol=0)
     # With a uniform phase: the first interval of the touch holds from nothing to its first frame.
@@ -344,7 +341,7 @@ def test_rare_draws_of_noise_are_finite(drawn):
             return np.full(size, drawn, dtype)
 
     device = Imperfection(rate=(10.0, 1000.0), aligned=False, gain_spread=0.0, offset=0.0, noise=1.0)
-    constants = device.constants(3, np.random.default_rng(0), 50)
+    constants = device.constants(3, generator(0), 50)
     readings = measure(device, constants, torch.zeros(50, 12, 3), 10.0, Rare(np.random.PCG64(1)))[0]
     assert readings.isfinite().all()
     assert readings.abs().max() < 8
@@ -352,22 +349,19 @@ def test_rare_draws_of_noise_are_finite(drawn):
 
 def test_a_share_of_devices_reads_the_frames_of_the_model():
     force = touches()[:1].expand(2000, -1, -1)
-    quiet = {"noise": 0.0, "offset": 0.0, "gain_spread": 0.0}
-    device = Imperfection(rate=(10.0, 1000.0), aligned=False, framed=0.3, **quiet)
-    constants = device.constants(3, np.random.default_rng(0), 2000)
-    readings = measure(device, constants, force, 10.0, np.random.default_rng(1))[0]
-    framed = (readings - force).abs().amax(dim=(1, 2)) < 1e-6
+    device = Imperfection(rate=(10.0, 1000.0), aligned=False, framed=0.3, **NONE)
+    framed = (read(device, force, 2000)[0] - force).abs().amax(dim=(1, 2)) < 1e-6
     assert framed.float().mean().item() == pytest.approx(0.3, abs=0.05)
 
 
 def test_a_share_of_devices_has_no_lag_and_each_has_one_scale():
     ranges = {"time_constant": (0.02, 0.1), "hysteresis": (0.01, 0.1), "independent": True}
     device = Imperfection(without_lag=0.4, **ranges)
-    constants = device.constants(3, np.random.default_rng(0), 2000)
+    constants = device.constants(3, generator(0), 2000)
     assert (constants.time_constant == 0).float().mean().item() == pytest.approx(0.4, abs=0.04)
     assert (constants.hysteresis > 0).all()
     former = Imperfection(**ranges, gain_spread=0.0, scale_spread=0.2)
-    gain = former.constants(3, np.random.default_rng(0), 2000).gain
+    gain = former.constants(3, generator(0), 2000).gain
     assert torch.equal(gain, gain[:, :, :1].expand_as(gain))
     assert gain[:, 0, 0].log().std().item() == pytest.approx(0.2, abs=0.02)
 
@@ -377,7 +371,7 @@ def test_independent_ranges_are_not_correlated():
     ranges = dict.fromkeys(names[:3], (0.0, 0.1)) | {"rate": (10.0, 1000.0)}
     for independent in (False, True):
         device = Imperfection(independent=independent, **ranges)
-        constants = device.constants(4, np.random.default_rng(0), 2000)
+        constants = device.constants(4, generator(0), 2000)
         values = np.stack([getattr(constants, name).double().numpy().ravel() for name in names])
         correlation = np.corrcoef(values[:3])[np.triu_indices(3, 1)]
         assert (np.abs(correlation) < 0.1).all() if independent else (correlation > 0.99).all()
@@ -390,11 +384,10 @@ def test_independent_ranges_are_not_correlated():
 def test_the_noise_of_an_interval_is_the_largest_of_its_frames(rate):
     """It is drawn at once where nothing touches, and frame by frame elsewhere; both are the same noise."""
     device = Imperfection(rate=(rate, rate), noise=0.1, offset=0.0, aligned=False)
-    constants = device.constants(20, np.random.default_rng(0))
     force = torch.zeros(1000, 8, 20)
     force[:, 2:5] = 0.002  # N, felt by the device, and nothing beside the noise
-    readings = measure(device, constants, force, 10.0, np.random.default_rng(1))[0]
-    direct = 0.1 * np.random.default_rng(2).standard_normal((20000, round(rate / 10))).max(axis=1)
+    readings = read(device, force)[0]
+    direct = 0.1 * generator(2).standard_normal((20000, round(rate / 10))).max(axis=1)
     fractions = np.linspace(0.02, 0.98, 25)
     for values in (readings[:, 3], readings[:, 6:]):
         drawn, expected = (np.quantile(noise, fractions) for noise in (values.numpy(), direct))

@@ -11,6 +11,7 @@ from time import monotonic
 
 import pytest
 
+from skin.wire.decoder import Decoder
 from skin.wire.protocol import encode_line
 
 
@@ -68,3 +69,8 @@ def plug():
     cable = Plug()
     yield cable
     cable.unplug()
+
+
+@pytest.fixture
+def decoder():
+    return Decoder(4)

@@ -146,8 +146,7 @@ def play(decoder, clock, seconds, arrival=lambda t: t, each=1, begin=0.0, header
     ],
 )
 @pytest.mark.parametrize("each", [1, 25, 100])
-def test_the_host_rules_where_the_clock_disagrees(clock, each):
-    decoder = Decoder(4)
+def test_the_host_rules_where_the_clock_disagrees(decoder, clock, each):
     frames = play(decoder, clock, 16, each=each)
     assert DISTRUST in decoder.stats.clock
     assert decoder.stats.resets == 1
@@ -167,16 +166,14 @@ def test_the_host_rules_where_the_clock_disagrees(clock, each):
         lambda t: max(t, 9.0) if t > 3 else t,  # the bridge was silent for six seconds
     ],
 )
-def test_the_clock_is_trusted_where_it_agrees(arrival, each):
-    decoder = Decoder(4)
+def test_the_clock_is_trusted_where_it_agrees(decoder, arrival, each):
     frames = play(decoder, lambda t: t, 16, arrival, each)
     assert DISTRUST not in decoder.stats.clock
     assert (frames[-1][0].segment, frames[-1][0].t) == (0, pytest.approx(16, abs=0.02))
 
 
-def test_a_suspended_host_is_no_fault_of_the_clock():
+def test_a_suspended_host_is_no_fault_of_the_clock(decoder):
     """It was away for a minute: first the old frames of the buffer come, then those of now."""
-    decoder = Decoder(4)
     play(decoder, lambda t: t, 5)
     play(decoder, lambda t: t, 0.8, lambda t: 65.0, 80, begin=5)
     frames = play(decoder, lambda t: t, 5, begin=65)
@@ -192,22 +189,19 @@ def test_a_replay_states_its_speed():
         assert (DISTRUST not in decoder.stats.clock) is trusted
 
 
-def test_a_device_that_restarts_is_compared_anew():
-    decoder = Decoder(4)
+def test_a_device_that_restarts_is_compared_anew(decoder):
     play(decoder, lambda t: t % 1.5, 20, counter=lambda number: number % 150)
     assert DISTRUST not in decoder.stats.clock
     assert decoder.stats.resets == 13
 
 
-def test_a_counter_that_stands_still_restarts_nothing():
-    decoder = Decoder(4)
+def test_a_counter_that_stands_still_restarts_nothing(decoder):
     frames = play(decoder, lambda t: t, 5, counter=lambda number: min(number, 200))
     assert (len(frames), decoder.stats.resets, decoder.stats.lost) == (500, 0, 0)
 
 
-def test_a_header_that_changes_ends_the_reading():
+def test_a_header_that_changes_ends_the_reading(decoder):
     """On an open connection the device was flashed or exchanged: its frames do not count any more."""
-    decoder = Decoder(4)
     assert play(decoder, lambda t: t, 3, header=encode_header(FIRST))
     assert play(decoder, lambda t: t, 3, begin=3, header=encode_header(OTHER)) == []
     assert CHANGES in decoder.stats.trouble
@@ -216,8 +210,7 @@ def test_a_header_that_changes_ends_the_reading():
     assert CHANGES in str(decoder.error())
 
 
-def test_a_header_that_was_damaged_once_costs_frames_until_the_next():
-    decoder = Decoder(4)
+def test_a_header_that_was_damaged_once_costs_frames_until_the_next(decoder):
     play(decoder, lambda t: t, 3, header=encode_header(FIRST))
     assert play(decoder, lambda t: t, 3, begin=3, header=encode_header(replace(FIRST, bits=8))) == []
     assert len(play(decoder, lambda t: t, 9, begin=6, header=encode_header(FIRST))) == 900

@@ -105,8 +105,7 @@ def test_a_wrong_baud_rate_is_refused_with_64_bytes_in_hex():
     assert "device.baudrate" in str(decoder.error())
 
 
-def test_two_seconds_of_receiving_are_enough_but_a_slow_start_is_none():
-    decoder = Decoder(4)
+def test_two_seconds_of_receiving_are_enough_but_a_slow_start_is_none(decoder):
     decoder.feed(b"ets Jun  8 2016 00:22:57\nrst:0x1\n", now=0.0)
     decoder.feed(b"wifi\n", now=6.0)  # seconds of silence while the board starts
     assert decoder.error() is None
@@ -129,8 +128,7 @@ def test_two_seconds_of_receiving_are_enough_but_a_slow_start_is_none():
         (b"3" * 70000 + b"\n", "long"),
     ],
 )
-def test_a_bad_line_is_dropped_and_the_next_one_taken(spoilt, reason):
-    decoder = Decoder(4)
+def test_a_bad_line_is_dropped_and_the_next_one_taken(decoder, spoilt, reason):
     data = [*lines(3, check="none"), spoilt, *lines(3, first=4, check="none")]
     frames = [frame for piece in data for frame in decoder.feed(piece)]
     assert numbers(frames) == [1, 2, 4, 5, 6]
@@ -139,15 +137,13 @@ def test_a_bad_line_is_dropped_and_the_next_one_taken(spoilt, reason):
     assert (counters.bad, counters.lost) == ({reason: 1}, 1)
 
 
-def test_a_weaker_checksum_than_the_first_lines_had_is_refused():
-    decoder = Decoder(4)
+def test_a_weaker_checksum_than_the_first_lines_had_is_refused(decoder):
     weaker = lines(1, first=3, check="none") + lines(1, first=4, check="xor")
     frames = decoder.feed(b"".join(lines(3) + weaker))
     assert (numbers(frames), decoder.stats.bad) == ([0, 1, 2], {"checksum": 2})
 
 
-def test_memory_stays_small_without_any_delimiter():
-    decoder = Decoder(4)
+def test_memory_stays_small_without_any_delimiter(decoder):
     decoder.feed(b"".join(lines(3)))
     for _ in range(100):
         decoder.feed(b"5" * 10_000)
@@ -167,8 +163,7 @@ def test_more_than_half_bad_over_two_seconds_is_trouble_until_it_is_not():
     assert decoder.stats.trouble == ""
 
 
-def test_a_device_that_sends_another_number_of_values_later_is_told_with_it():
-    decoder = Decoder(4)
+def test_a_device_that_sends_another_number_of_values_later_is_told_with_it(decoder):
     decoder.feed(b"".join(lines(3)), now=0.0)
     for step in range(25):
         assert decoder.feed(lines(1, sensors=3, first=3 + step)[0], now=0.1 * step) == []
@@ -208,8 +203,7 @@ def test_frames_after_a_reconnection_count_only_once_the_same_header_came():
     assert (decoder.stats.trouble, decoder.stats.frames, decoder.stats.bad_frames) == ("", 40, 0)
 
 
-def test_a_damaged_header_without_a_checksum_does_not_lock_the_device_out():
-    decoder = Decoder(4)
+def test_a_damaged_header_without_a_checksum_does_not_lock_the_device_out(decoder):
     for header in (HEADER, replace(HEADER, id="arm-M")):
         decoder.feed(encode_header(header, "none") + b"".join(lines(10)))
     decoder.restart()

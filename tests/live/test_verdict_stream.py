@@ -27,6 +27,11 @@ def display(calm=2.0):
     return Display("run", "port", np.zeros((4, 3)), (0.1, 0.1), 4.0, calm=calm)
 
 
+@pytest.fixture
+def shown():
+    return display()
+
+
 def logged(dangerous):
     certain = {"probabilities": {"dangerous": 0.9}, "labels": {"dangerous": dangerous}}
     return replace(verdict(dangerous), masked=(), **certain)
@@ -56,8 +61,7 @@ def wait_for(lines, accepted):
     return next(filter(accepted, map(json.loads, lines)))
 
 
-def test_a_verdict_is_a_line():
-    shown = display()
+def test_a_verdict_is_a_line(shown):
     with piped(shown) as lines:
         shown.set_verdict(verdict(dangerous=True, probability=float("nan")), monotonic())
         found = wait_for(lines, lambda message: message["event"] == "verdict")
@@ -69,9 +73,8 @@ def test_a_verdict_is_a_line():
     assert found["time"].endswith("Z")
 
 
-def test_a_verdict_that_is_too_old_is_stale_and_keeps_its_alarm():
+def test_a_verdict_that_is_too_old_is_stale_and_keeps_its_alarm(shown):
     """Also where the engine hangs, which would tell nothing itself."""
-    shown = display()
     with piped(shown) as lines:
         shown.set_verdict(verdict(dangerous=True), monotonic())
         began = monotonic()
@@ -85,8 +88,7 @@ def test_a_verdict_that_is_too_old_is_stale_and_keeps_its_alarm():
         assert "labels" not in old
 
 
-def test_a_reason_is_sent_once_and_then_with_each_heartbeat():
-    shown = display()
+def test_a_reason_is_sent_once_and_then_with_each_heartbeat(shown):
     with piped(shown) as lines:
         for _ in range(3):
             shown.set_verdict(None, monotonic(), "unplugged", True)
@@ -96,8 +98,7 @@ def test_a_reason_is_sent_once_and_then_with_each_heartbeat():
     assert all(one["alarm"] for one in events)
 
 
-def test_a_reader_that_is_slow_delays_nothing_and_misses_the_oldest():
-    shown = display()
+def test_a_reader_that_is_slow_delays_nothing_and_misses_the_oldest(shown):
     with piped(shown) as lines:
         began = monotonic()
         for _ in range(5_000):
@@ -110,16 +111,14 @@ def test_a_reader_that_is_slow_delays_nothing_and_misses_the_oldest():
     assert len(numbers) < 4_000
 
 
-def test_the_view_closes_with_the_reader_of_its_lines():
-    shown = display()
+def test_the_view_closes_with_the_reader_of_its_lines(shown):
     with suppress(BrokenPipeError), piped(shown) as lines:
         lines.readline()
         lines.close()
         assert shown.closed.wait(PATIENCE)
 
 
-def test_what_waits_is_written_before_the_end():
-    shown = display()
+def test_what_waits_is_written_before_the_end(shown):
     reading, writing = os.pipe()
     with os.fdopen(reading, "rb") as lines:
         with os.fdopen(writing, "w", buffering=1) as file, write_events(shown, file, shown.close, VERDICTS):

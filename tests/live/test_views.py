@@ -48,6 +48,11 @@ def display(*values, **more):
     return subject
 
 
+@pytest.fixture
+def subject():
+    return display()
+
+
 def frame(values, valid=None, **more):
     """Return a frame in newtons."""
     valid = np.ones(5, bool) if valid is None else valid
@@ -82,8 +87,7 @@ def test_no_peak_between_two_looks_is_missed():
     assert subject.state(monotonic(), state.number).values[3] == 2
 
 
-def test_where_output_is_no_terminal_a_line_tells_each_change(tmp_path):
-    subject = display()
+def test_where_output_is_no_terminal_a_line_tells_each_change(subject, tmp_path):
     with (tmp_path / "said").open("w") as file, show_in_terminal(subject, Console(file=file, width=60)):
         for verdict in (None, None, PRESSED, PRESSED):
             subject.set_verdict(verdict, monotonic(), "" if verdict else "taking the baseline: do not touch")
@@ -95,8 +99,7 @@ def test_where_output_is_no_terminal_a_line_tells_each_change(tmp_path):
     assert (said[3]["alarm"], said[3]["labels"]) == (True, {"big": False, "dangerous": True})
 
 
-def test_the_terminal_shows_the_alarm_and_the_probability():
-    subject = display()
+def test_the_terminal_shows_the_alarm_and_the_probability(subject):
     subject.set_verdict(replace(SAFE, contact=0.1), monotonic())
     subject.add(frame([0, 0, 6.25, 0, 0]))
     subject.set_verdict(replace(PRESSED, contact=75.0), monotonic())
@@ -110,8 +113,7 @@ def test_the_terminal_shows_the_alarm_and_the_probability():
     assert re.search(r"contact since \d\d:\d\d:\d\d \(75 s\).*take a new tare", text, re.DOTALL)
 
 
-def test_a_valid_guarantee_is_no_reason_and_hides_none():
-    subject = display()
+def test_a_valid_guarantee_is_no_reason_and_hides_none(subject):
     subject.add_note(Note("guarantee_valid", detail="at most 0.1 % missed"))
     for verdict in (replace(PRESSED, touched=False), PRESSED):
         subject.set_verdict(verdict, now := monotonic())
@@ -160,8 +162,7 @@ def test_a_saturated_sensor_shows_its_limit_and_an_unknown_one_nothing():
     assert (sent["saturated"][2], sent["valid"][4], sent["values"][2]) == (True, False, 4.0)
 
 
-def test_an_alarm_outlives_silence_in_every_view():
-    subject = display()
+def test_an_alarm_outlives_silence_in_every_view(subject):
     subject.set_verdict(PRESSED, monotonic())
     subject.set_verdict(None, monotonic(), "the device has stopped sending", alarm=True)
     state = subject.state(monotonic())
@@ -172,8 +173,7 @@ def test_an_alarm_outlives_silence_in_every_view():
     assert "stopped sending" in text
 
 
-def test_the_page_asks_for_a_tare_and_other_sites_and_ports_in_use_are_refused():
-    subject = display()
+def test_the_page_asks_for_a_tare_and_other_sites_and_ports_in_use_are_refused(subject):
     with web.serve_page(subject, 0) as address:
         assert fetch(f"{address}/skin.json", Host="evil.example")[0] == 400
         with pytest.raises(InputError, match=r"live\.web_port="):
@@ -248,8 +248,7 @@ def test_a_refused_tare_is_said_while_it_may_be_forced():
     assert subject.state(161.0).line == "there is nothing to force, 99.9 Hz"
 
 
-def test_the_map_of_an_alarm_is_held_and_goes_with_the_touch():
-    subject = display()
+def test_the_map_of_an_alarm_is_held_and_goes_with_the_touch(subject):
     subject.set_verdict(IDLE, monotonic())
     subject.add(frame([0, 0, 6.0, 0, 0]))
     subject.set_verdict(replace(SAFE, contact=0.1), monotonic())
@@ -270,8 +269,7 @@ def test_the_map_of_an_alarm_is_held_and_goes_with_the_touch():
     assert subject.state(monotonic()).peak.max() == 0
 
 
-def test_an_unknown_place_is_not_shown_as_no_touch():
-    subject = display()
+def test_an_unknown_place_is_not_shown_as_no_touch(subject):
     masked = {"unknown": (2,), "masked": (2,), "notes": (Note("masked", (2,)), Note("pause", seconds=0.7))}
     subject.set_verdict(replace(IDLE, labels={}, **masked), monotonic())
     sent = web.message(subject.state(monotonic()), monotonic())
@@ -285,8 +283,7 @@ def test_an_unknown_place_is_not_shown_as_no_touch():
     assert "unknown: readings are frozen" in shown(subject)
 
 
-def test_the_page_goes_when_the_watching_ends():
-    subject = display()
+def test_the_page_goes_when_the_watching_ends(subject):
     with web.serve_page(subject, 0) as address:
         answer = urllib.request.urlopen(f"{address}/pictures", timeout=30)
         answer.readline()

@@ -70,9 +70,8 @@ def test_a_blank_has_labelled_touches_of_the_same_shape(device):
 def test_a_device_of_ones_own_needs_touches_alone(made_up_device, capsys):
     settings = Evaluation(devices=2, layouts=2, false_alarm_rate=0.02)
     assert list(touch_sets(made_up_device, settings)) == ["holdout"]
-    assert torch.equal(
-        threshold_gestures(made_up_device, settings).readings, made_up_device.touches("validation").readings
-    )
+    gestures = threshold_gestures(made_up_device, settings)
+    assert torch.equal(gestures.readings, made_up_device.touches("validation").readings)
     check_label_leakage(made_up_device)
     assert not capsys.readouterr().err
     assert made_up_device.blank() is made_up_device

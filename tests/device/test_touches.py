@@ -21,9 +21,8 @@ def touches(count: int = 4, moving: bool = False) -> Touches:
 
 def recording(count: int = 4) -> Recording:
     extra = {"force": torch.rand(count, 6), "displacement": torch.rand(count, 6, 3, 2)}
-    return Recording(
-        touches(count), TOUCH, (0.1, 0.1), (0.01, 0.01), **extra, parameters={"speed": torch.rand(count)}
-    )
+    extra |= {"parameters": {"speed": torch.rand(count)}}
+    return Recording(touches(count), TOUCH, (0.1, 0.1), (0.01, 0.01), **extra)
 
 
 @pytest.mark.parametrize("moving", [False, True])

@@ -295,7 +295,7 @@ def test_frozen_values_and_silence_are_unknown(board):
     assert seen.states(20.7, 23) == {"unknown"}
 
 
-@pytest.mark.parametrize("sent", [NUMBER, -1, 0])
+@pytest.mark.parametrize("sent", [NUMBER, -1, 0, 125])
 def test_a_token_for_a_missing_value_or_a_cut_wire_is_unknown_and_keeps_the_alarm(board, sent):
     """Without a header nobody knows what the converter can give: the channel falls far below rest."""
     values = counted(force(24, (6, 12, 7, 6.0), (20, 21, 7, 6.0)))

@@ -51,9 +51,8 @@ def pieces(late=0):
             data += encode_header(Header(n=6, rate=RATE, unit="adc"))
         gesture, position = divmod(number - IDLE, LENGTH + 30)
         if number >= IDLE and position == 0 and gesture < GESTURES:
-            data += encode_announcement(
-                Announcement(gesture, number, LENGTH, dict.fromkeys(TOUCH.names, gesture % 2))
-            )
+            labels = dict.fromkeys(TOUCH.names, gesture % 2)
+            data += encode_announcement(Announcement(gesture, number, LENGTH, labels))
         if number not in lost:
             data += encode_line(row.tolist(), number, number * 1_000_000 // RATE)
         if data:

@@ -1,10 +1,25 @@
-"""A device whose touches are drawn from no simulation."""
+"""A skin with the simplest simulator, and a device whose touches are drawn from no simulation."""
+
+from typing import Any
 
 import torch
 
+from skin import Grid, Sheet
 from skin.device.base import AbstractDevice
+from skin.device.simulated import Simulated
 from skin.device.touches import Touches
+from skin.mechanics.simulator.naive import Naive
 from skin.touch.labels import TOUCH
+
+SHEET = Sheet((0.16, 0.16), (32, 32), [{"material": "EcoFlex 00-30", "thickness": 0.005}])
+PERFECT = {"gain_spread": 0.0, "offset": 0.0, "noise": 0.0, "clip": 1e9}
+"""Settings of a device that reads what its simulator answers."""
+
+
+def naive_skin(**settings: Any) -> Simulated:
+    """Return a simulated skin, by default of 3 x 3 sensors with ten gestures."""
+    defaults = {"body": SHEET, "layout": Grid(3, 3), "simulator": Naive, "gestures": 10}
+    return Simulated(**(defaults | settings))
 
 
 class MadeUpDevice(AbstractDevice):

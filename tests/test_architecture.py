@@ -63,9 +63,8 @@ def test_a_room_imports_only_rooms_below_it(room):
     wrong = set()
     for name, path in library().items():
         if name.split(".")[1:2] == [room]:
-            targets = {
-                target.split(".")[1] for target in imports(path) if target in library() and "." in target
-            }
+            modules = [target.split(".") for target in imports(path) & library().keys()]
+            targets = {module[1] for module in modules if len(module) > 1}
             wrong |= {(name, target) for target in targets - {room} if LEVEL[target] >= LEVEL[room]}
     assert not wrong
 

@@ -56,12 +56,9 @@ def started(command: str, home: Path) -> str:
     return result.stdout
 
 
-def test_the_page_has_the_files_and_commands_of_the_walk():
+def test_the_check_of_the_page_draws_the_skin_and_refuses_a_wrong_layout(follow, home):
     assert sorted(FILES) == ["my-skin/body/mine.yaml", "my-skin/sensors.csv"]
     assert ["--cfg job" in command for command in COMMANDS] == [False, False, False, False, True, False]
-
-
-def test_the_check_of_the_page_draws_the_skin_and_refuses_a_wrong_layout(follow, home):
     done = follow(COMMANDS[0], *COARSE)
     assert "touch.png: " in done.stdout, done.stderr
     path = home / "my-skin" / "sensors.csv"
@@ -83,8 +80,7 @@ def test_the_configuration_of_the_page_is_the_users(home):
     depths = instantiate(OmegaConf.merge(shown.layout, {"path": str(home / "my-skin/sensors.csv")}))
     # Inside a layer, where only the solid has sensors.
     assert set(depths.sensors(body).positions[:, 2]) == {0.006}
-    assert shown.layout.path == "~/my-skin/sensors.csv"
-    assert shown.layout.footprint == [0.008, 0.008]
+    assert (shown.layout.path, shown.layout.footprint) == ("~/my-skin/sensors.csv", [0.008, 0.008])
 
 
 def test_the_overrides_of_the_page_describe_the_same_sheet(home):
@@ -92,8 +88,7 @@ def test_the_overrides_of_the_page_describe_the_same_sheet(home):
     body = instantiate(shown.body)
     sensors = instantiate(shown.layout).sensors(body)
     assert (body.size, body.thickness) == ((0.15, 0.10), pytest.approx(0.016))
-    assert body.layers[1].material.young == 69e3
-    assert len(sensors) == 8
+    assert (body.layers[1].material.young, len(sensors)) == (69e3, 8)
 
 
 @pytest.mark.parametrize("line", COMMANDS[5].splitlines())

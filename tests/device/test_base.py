@@ -48,8 +48,7 @@ def test_splits_have_one_form_and_are_80_10_10_by_gesture(device):
         assert touches.readings.dtype == touches.labels.dtype == torch.float32
         assert torch.isfinite(touches.readings).all()
         assert touches.labels.shape == (len(touches), len(device.task))
-        assert touches.positions.shape == (25, 3)
-        assert touches.rate == 10.0
+        assert (touches.positions.shape, touches.rate) == ((25, 3), 10.0)
     parts = [splits.pop(split).readings for split in ("train", "validation", "holdout")]
     assert [len(part) for part in parts] == [40, 5, 5]
     assert len(torch.cat(parts).flatten(1).unique(dim=0)) == 50
@@ -71,9 +70,8 @@ def test_a_blank_has_labelled_touches_of_the_same_shape(device):
 def test_a_device_of_ones_own_needs_touches_alone(made_up_device, capsys):
     settings = Evaluation(devices=2, layouts=2, false_alarm_rate=0.02)
     assert list(touch_sets(made_up_device, settings)) == ["holdout"]
-    assert torch.equal(
-        threshold_gestures(made_up_device, settings).readings, made_up_device.touches("validation").readings
-    )
+    gestures = threshold_gestures(made_up_device, settings)
+    assert torch.equal(gestures.readings, made_up_device.touches("validation").readings)
     check_label_leakage(made_up_device)
     assert not capsys.readouterr().err
     assert made_up_device.blank() is made_up_device
@@ -86,14 +84,8 @@ def test_a_device_of_ones_own_needs_touches_alone(made_up_device, capsys):
         (lambda device: device.simulated("this is simulated"), "^this is simulated: leave out device="),
         (lambda device: device.recording(), "only simulated or recorded touches"),
         (open_source, "can be watched: give device=serial"),
-        (
-            lambda device: measure_margins(None, device, 20, POINT),
-            "has none: .* add device=simulated",
-        ),
-        (
-            lambda device: evaluate_windows(None, device, None, POINT),
-            "has none: .* add device=simulated",
-        ),
+        (lambda device: measure_margins(None, device, 20, POINT), "has none: .* add device=simulated"),
+        (lambda device: evaluate_windows(None, device, None, POINT), "has none: .* add device=simulated"),
     ],
 )
 def test_what_it_does_not_know_is_refused_in_a_sentence(made_up_device, ask, said):

@@ -2,6 +2,7 @@
 
 import os
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -20,16 +21,19 @@ WHOLE = Calibration(KNOWN, {"dead": [], "stuck": [1]}, RANGES, 0.012345678901234
 
 
 def test_a_file_keeps_everything(tmp_path):
-    assert read_calibration(write_calibration(WHOLE, tmp_path / "folder" / "mine.yaml")) == WHOLE
-    assert [path.name for path in (tmp_path / "folder").iterdir()] == ["mine.yaml"]
+    wired = replace(WHOLE, polarity=(1, -1, -1), channels=(2, 0, 1))
+    for kept in (WHOLE, wired):
+        path = write_calibration(kept, tmp_path / "folder" / "mine.yaml")
+        assert read_calibration(path) == kept
+        assert ("polarity" in path.read_text()) == (kept is wired)
+    assert list(path.parent.iterdir()) == [path]
 
 
 def test_a_person_may_write_little(tmp_path):
     path = tmp_path / "mine.yaml"
     path.write_text("format: 1\ncount: 4\nsensors: {noise: 1e-2}\nranges: {dead: [0, 3]}\n")
     values = read_calibration(path).values()
-    assert values["noise"].tolist() == [0.01] * 4
-    assert values["gain"].tolist() == [1.0] * 4
+    assert (values["noise"].tolist(), values["gain"].tolist()) == ([0.01] * 4, [1.0] * 4)
     assert np.isinf(values["clip"]).all()
 
 
@@ -40,9 +44,8 @@ def test_channels_inwards_have_what_is_known_of_them(tmp_path):
     wiring = {"polarity": [1, 1, -1] * 2, "channels": [*range(6)], "tables": tables}
     three = Calibration(gains, {"dead": [0, 5]}, {"dead": [0, 6]}, **wiring)
     read = read_calibration(write_calibration(three, tmp_path / "three.yaml"), inwards=True)
-    assert read == Calibration(
-        {"gain": [0.8, 1.2]}, {"dead": [1]}, polarity=(-1, -1), tables={1: [[0, 1], [0, 3]]}
-    )
+    wiring = {"polarity": (-1, -1), "tables": {1: [[0, 1], [0, 3]]}}
+    assert read == Calibration({"gain": [0.8, 1.2]}, {"dead": [1]}, **wiring)
 
 
 def test_true_readings_behind_raw_ones():
@@ -50,8 +53,7 @@ def test_true_readings_behind_raw_ones():
     values = WHOLE.values()
     np.testing.assert_allclose(values["gain"], [1.1, 1.0, 0.9])
     np.testing.assert_array_equal(values["clip"], [7.5, 7.5, 7.5])
-    assert values["dead"].tolist() == [False, True, False]
-    assert values["level"][1] == 2.5
+    assert (values["dead"].tolist(), values["level"][1]) == ([False, True, False], 2.5)
     sent = np.array([2.0, 1.0, 4.0]) * [1.1, 1, 0.9] + [0.1, 0, -0.3]
     np.testing.assert_allclose(WHOLE.corrected(sent / WHOLE.scale + 511.5), [2.0, np.nan, 4.0])
 

@@ -1,6 +1,7 @@
 """Recordings and data sets in files: equal to the last bit, or refused by name."""
 
 import json
+import os
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -13,17 +14,14 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from skin import InputError, read_recording
 from skin.body.layout import Scattered
-from skin.body.sheet import Sheet
 from skin.core.safe_loading import limited_memory
-from skin.device.files import DataSet, read_description, read_recording, write_recording
-from skin.device.simulated import Simulated
+from skin.device.files import DataSet, describe_recording, read_description, write_manifest, write_recording
 from skin.device.touches import Recording, Touches, concatenate
-from skin.errors import InputError
-from skin.mechanics.simulator.naive import Naive
 from skin.touch.labels import TOUCH, Task
 from tests.damage import DAMAGED_FILES, damaged, opened
-from tests.device.conftest import write_data_set
+from tests.made_up import naive_skin
 
 BATCH, TIME, SENSORS = 7, 5, 3
 
@@ -91,8 +89,7 @@ def test_rows_are_the_reports(tmp_path, suffix):
         about = json.loads(pq.read_schema(path).metadata[b"skin"])
         assert about["units"]["reading"] == "N"
         assert about["positions"] == kept.touches.positions.tolist()
-        assert about["metadata"]["seed"] == 3
-        assert read_description(path)["first"] == 5000
+        assert (about["metadata"]["seed"], read_description(path)["first"]) == (3, 5000)
         assert same(read_recording(path), kept)
 
 
@@ -122,7 +119,7 @@ def test_files_that_are_no_recordings_are_refused(tmp_path):
     with pytest.raises(InputError, match=r"z.parquet is damaged or no recording .* its schema has no units"):
         read_recording(tmp_path / "z.parquet")
     path = write_recording(recording(), tmp_path / "cut.parquet")
-    path.write_bytes(path.read_bytes()[:-100])
+    os.truncate(path, 1000)
     with pytest.raises(InputError, match=r"cut.parquet is damaged"):
         read_recording(path)
 
@@ -177,8 +174,17 @@ def test_damage_never_passes_for_readings(written, data):
 
 @pytest.fixture(scope="module")
 def whole():
-    body = Sheet([0.16, 0.16], [16, 16], [{"material": "EcoFlex 00-30", "thickness": 0.005}])
-    return Simulated(body=body, layout=Scattered(seed=0), simulator=Naive, gestures=50).recording()
+    return naive_skin(layout=Scattered(seed=0), gestures=50).recording()
+
+
+def write_data_set(recording: Recording, folder: Path, counts: tuple[int, ...] = (20, 20, 10)) -> Path:
+    source = {"seed": 0, "source_commit": "a", "source_dirty": "false", "config_hash": "1", "config": {}}
+    write_manifest(folder, describe_recording(recording), counts, **source)
+    data_set = DataSet(folder, complete=False)
+    for number, (first, count) in enumerate(zip(data_set.firsts, counts, strict=True)):
+        shard = replace(recording[first : first + count], metadata={"config_hash": "1", "summary": {}})
+        write_recording(shard, data_set.path(number), first)
+    return folder
 
 
 @pytest.fixture
@@ -223,10 +229,6 @@ def test_another_manifest_is_refused(folder, changes, message):
     assert "\n" not in str(refused.value)
 
 
-def cut_off(path: Path) -> None:
-    path.write_bytes(path.read_bytes()[:-100])
-
-
 def exchange(path: Path) -> None:
     other = path.with_name("00001.parquet")
     path.rename(path.with_name("x"))
@@ -243,7 +245,11 @@ def exchange(path: Path) -> None:
             for text in ("", "{", "[]", "3", "null")
         ),
         ("shards/00001.parquet", Path.unlink, r"1 of 3 shards are missing, as 00001.parquet is: repeat"),
-        ("shards/00002.parquet", cut_off, r"00002.parquet is damaged .*: delete it, and repeat"),
+        (
+            "shards/00002.parquet",
+            lambda path: os.truncate(path, 1000),
+            r"2.parquet is damaged .*: delete it",
+        ),
         ("shards/00000.parquet", exchange, r"00000.parquet is not the shard"),
     ],
 )

@@ -1,4 +1,4 @@
-"""Imperfections, one by one."""
+"""Imperfections, one by one, and simulated readings between the frames of a model, against a stream."""
 
 from dataclasses import replace
 
@@ -8,7 +8,8 @@ import torch
 
 from skin.device.calibration import Calibration
 from skin.device.imperfection import Imperfection, outside
-from skin.device.sampling import measure
+from skin.device.resampling import Frame, Window, resample
+from skin.device.sampling import between_frames, measure
 from skin.errors import InputError
 
 NONE = {"gain_spread": 0.0, "offset": 0.0, "noise": 0.0}
@@ -117,8 +118,7 @@ def test_stuck_and_saturated_sensors_are_invalid_and_say_one_thing():
     raw = imperfection.raw(readings, constants, generator(1))
     levels = raw[0, 0, ~valid[0, 0]]
     assert (raw[..., ~valid[0, 0]] == levels).all()
-    assert (levels == 0).sum() == 1
-    assert (levels == 10).sum() == 3
+    assert ((levels == 0).sum(), (levels == 10).sum()) == (1, 3)
     assert ((levels > 0) & (levels < 10)).sum() == 2
 
 
@@ -204,6 +204,191 @@ def test_what_lies_outside_of_other_devices_is_named():
     ranges = {"rate": [20.0, 500.0], "time_constant": [0.0, 0.1], "noise": 0.05, "drift": [0.0, 0.05]}
     assert outside({"rate": 100.0, "time_constant": 0.1, "noise": 0.02, "gain_spread": 0.3}, ranges) == []
     device = {"rate": 10.0, "time_constant": [0.0, 0.2], "noise": 0.06}
-    assert outside(device, ranges) == [
-        "rate 10 Hz (20 to 500 Hz)", "lag 0 to 0.2 s (0 to 0.1 s)", "noise 0.06 N (0.05 to 0.05 N)"
-    ]  # fmt: skip
+    lag, noise = "lag 0 to 0.2 s (0 to 0.1 s)", "noise 0.06 N (0.05 to 0.05 N)"
+    assert outside(device, ranges) == ["rate 10 Hz (20 to 500 Hz)", lag, noise]
+
+
+def read(device, force, *gestures, **more):
+    """Return what a device says of forces (B, T, S) at 10 Hz: readings, valid and saturated."""
+    constants = device.constants(force.shape[-1], generator(), *gestures)
+    return measure(device, constants, force, 10.0, generator(1), **more)
+
+
+ROUGH = {"noise": 0.1, "drift": 0.05, "time_constant": 0.1, "hysteresis": 0.05, "quantum": 0.02, "clip": 4.0}
+
+
+def touches():
+    """Return true readings (2, 12, 3) at 10 Hz of a press that slides, and of a tap of one frame."""
+    force = torch.zeros(2, 12, 3)
+    force[0, 3:9] = torch.tensor([[1.0, 0, 0], [2, 1, 0], [1, 3, 1], [0, 2, 3], [0, 1, 5], [0, 0, 2]])
+    force[1, 6] = torch.tensor([1.0, 2.0, 0.5])
+    return force
+
+
+@pytest.mark.parametrize("rate", [10.0, 30.0, 50.0, 70.0])
+def test_the_middle_of_an_interval_is_the_frame(rate):
+    number = round(rate / 10)
+    fine = between_frames(touches(), 10.0, rate)
+    assert torch.equal(fine[:, number // 2 :: number], touches())
+
+
+@pytest.mark.parametrize("rate", [20.0, 40.0, 50.0, 500.0])
+def test_a_device_reads_a_short_tap_at_any_phase(rate):
+    """A reading is up to half its interval from the peak, towards which the force rises in half a frame."""
+    tap = torch.zeros(4000, 3, 1)
+    tap[:, 1] = 1.0
+    highest = read(Imperfection(rate=rate, **NONE), tap)[0].amax(dim=(1, 2)).numpy()
+    loss = 10 / rate  # the largest
+    assert 1 - loss <= highest.min() < 1 - 0.99 * loss
+    assert 1 - 0.01 * loss < highest.max() <= 1.0
+    error = 5 * loss / np.sqrt(12 * len(highest))
+    assert highest.mean() == pytest.approx(1 - loss / 2, abs=error)
+
+
+@pytest.mark.parametrize("rate", [20.0, 50.0, 100.0, 1000.0])
+def test_a_touch_begins_and_ends_at_the_edges_of_its_frames(rate):
+    fine = between_frames(touches(), 10.0, rate)
+    number = round(rate / 10)
+    touched = (touches() != 0).any(2).repeat_interleave(number, dim=1)
+    assert torch.equal((fine != 0).any(2), touched)
+    rising = fine[1, 6 * number : 6 * number + number // 2]
+    assert (rising[:, 1] <= 2.0).all()
+    assert rising[0, 1].item() == pytest.approx(2.0 / number)
+
+
+@pytest.mark.parametrize("rate", [9.6, 10.0, 20.0, 50.0, 100.0])
+def test_a_simulated_device_reads_like_a_real_one(rate):
+    """The frames of a device at a rate, added one by one to the window of a live skin."""
+    device = Imperfection(rate=rate, dead=1, **ROUGH)
+    constants, found = device.constants(3, generator()), read(device, touches())
+    noise = generator(1)
+    fine = touches() if rate <= 10.0 else between_frames(touches(), 10.0, rate, noise.random(2))
+    values, works, limited = (one.numpy() for one in device.apply(fine, constants, noise))
+    for gesture in range(2):
+        window = Window(12, 10.0, 3)
+        for number, row in enumerate(values[gesture]):
+            frame = Frame(number, number / rate, 0.0, row, works[gesture, number])
+            window.add(frame._replace(saturated=limited[gesture, number]))
+        for measured, seen in zip(found, window.read(), strict=False):
+            np.testing.assert_array_equal(measured[gesture].numpy(), seen)
+
+
+def test_each_gesture_is_read_as_a_single_one_is():
+    """At one rate, touches that are read each at a rate of their own are those that are read together."""
+    settings = {"drift": 0.05, "quantum": 0.02, "clip": 4.0, "noise": 0.0}
+    together, each = (Imperfection(rate=rate, dead=1, **settings) for rate in (70.0, (70.0, 70.0)))
+    constants = together.constants(3, generator())
+    expected, drawn = (measure(one, constants, touches(), 10.0, generator(1)) for one in (together, each))
+    # A drift is taken in the middle of the interval, so a few readings round to the next step.
+    error = (drawn[0] - expected[0]).abs()
+    assert (error <= 0.021).all()
+    assert (error > 1e-5).float().mean() < 0.25
+    assert all(torch.equal(one, other) for one, other in zip(drawn[1:], expected[1:], strict=True))
+
+
+@pytest.mark.parametrize("rate", [40.0, 100.0, 370.0])
+def test_lag_and_hysteresis_before_the_converter_are_those_at_the_rate_of_the_device(rate):
+    """They are computed at 50 Hz whatever the rate; the device's own steps differ by part of a step."""
+    slow = {"time_constant": 0.05, "hysteresis": 0.05, "noise": 0.0, "offset": 0.0}
+    together, each = (Imperfection(rate=bounds, **slow) for bounds in (rate, (rate, rate)))
+    constants = together.constants(3, generator())
+    expected, drawn = (measure(one, constants, touches(), 10.0, generator(1))[0] for one in (together, each))
+    step = max(1 / rate, 0.02)
+    # The force rises by at most 2 N in 0.05 s, of which the lag passes on 1 - exp(-step / 0.05).
+    assert (drawn - expected).abs().max() < 5.0 * (1 - np.exp(-step / 0.05))
+    assert (drawn - expected).abs().mean() < 0.1
+
+
+def test_unaligned_readings_are_those_of_the_common_resampler():
+    """Each device reads at its own rate; the window is cut as that of a live skin is."""
+    rates, tap = np.array([10.0, 12.3, 47.0, 100.0, 999.0]), torch.zeros(5, 12, 2)
+    tap[:, 6] = torch.tensor([1.0, -3.0])
+    tap[4, 6:] = torch.tensor([1.0, -3.0])  # until the end of the window: it is moved to the front
+    device = Imperfection(rate=(10.0, 1000.0), aligned=False, **NONE)
+    constants = device.constants(2, generator(0), 5)
+    constants = constants._replace(rate=torch.from_numpy(rates).reshape(5, 1, 1))
+    readings, valid, saturated = measure(device, constants, tap, 10.0, generator(1))
+    later = generator(1).random(5) - (tap[:, -1, 0] != 0).numpy()
+    for number, (rate, shift) in enumerate(zip(rates, later, strict=True)):
+        time = 1.2 - (np.arange(round(1.2 * rate + 0.5), 0, -1) - 0.5) / rate
+        time = time[time > 0]
+        knots, force = ([6, 6.5, 11.5, 12], [0, 1, 1, 0]) if number == 4 else ([6, 6.5, 7], [0, 1, 0])
+        fraction = np.interp(10 * time - shift, knots, force)
+        values = fraction[:, None] * [1.0, -3.0]
+        works = np.ones(values.shape, dtype=bool)
+        seen = resample(time, values, works, ~works, 1.2, 0.1, 12)
+        np.testing.assert_allclose(readings[number].numpy(), seen.values, atol=1e-5)
+    assert valid.all()
+    assert not saturated.any()
+
+
+def test_a_touch_that_goes_on_is_shown_to_the_middle_of_its_last_frame():
+    rising = torch.arange(-2.0, 4.0).clamp(min=0)[None, :, None].expand(2000, -1, 1)
+    device = Imperfection(rate=1000.0, aligned=False, **NONE)
+    readings = read(device, rising, ongoing=True)[0][:, :, 0]
+    # A reading is up to 1 ms from the middle, in which it falls by 0.06.
+    torch.testing.assert_close(readings[:, -1], torch.full((2000,), 3.0), atol=0.06, rtol=0)
+    # With a uniform phase: the first interval of the touch holds from nothing to its first frame.
+    assert 0.2 < (readings[:, 2] > 0.01).float().mean() < 0.8
+    assert readings[:, 4].min() < 2.1
+    assert readings[:, 4].max() > 2.4
+
+
+@pytest.mark.parametrize("drawn", [0.0, 1e-12, 30.0])
+def test_rare_draws_of_noise_are_finite(drawn):
+    class Rare(np.random.Generator):
+        def standard_exponential(self, size=None, dtype=np.float64, **options):
+            return np.full(size, drawn, dtype)
+
+    device = Imperfection(rate=(10.0, 1000.0), aligned=False, gain_spread=0.0, offset=0.0, noise=1.0)
+    constants = device.constants(3, generator(0), 50)
+    readings = measure(device, constants, torch.zeros(50, 12, 3), 10.0, Rare(np.random.PCG64(1)))[0]
+    assert readings.isfinite().all()
+    assert readings.abs().max() < 8
+
+
+def test_a_share_of_devices_reads_the_frames_of_the_model():
+    force = touches()[:1].expand(2000, -1, -1)
+    device = Imperfection(rate=(10.0, 1000.0), aligned=False, framed=0.3, **NONE)
+    framed = (read(device, force, 2000)[0] - force).abs().amax(dim=(1, 2)) < 1e-6
+    assert framed.float().mean().item() == pytest.approx(0.3, abs=0.05)
+
+
+def test_a_share_of_devices_has_no_lag_and_each_has_one_scale():
+    ranges = {"time_constant": (0.02, 0.1), "hysteresis": (0.01, 0.1), "independent": True}
+    device = Imperfection(without_lag=0.4, **ranges)
+    constants = device.constants(3, generator(0), 2000)
+    assert (constants.time_constant == 0).float().mean().item() == pytest.approx(0.4, abs=0.04)
+    assert (constants.hysteresis > 0).all()
+    former = Imperfection(**ranges, gain_spread=0.0, scale_spread=0.2)
+    gain = former.constants(3, generator(0), 2000).gain
+    assert torch.equal(gain, gain[:, :, :1].expand_as(gain))
+    assert gain[:, 0, 0].log().std().item() == pytest.approx(0.2, abs=0.02)
+
+
+def test_independent_ranges_are_not_correlated():
+    names = ("noise", "time_constant", "hysteresis", "rate")
+    ranges = dict.fromkeys(names[:3], (0.0, 0.1)) | {"rate": (10.0, 1000.0)}
+    for independent in (False, True):
+        device = Imperfection(independent=independent, **ranges)
+        constants = device.constants(4, generator(0), 2000)
+        values = np.stack([getattr(constants, name).double().numpy().ravel() for name in names])
+        correlation = np.corrcoef(values[:3])[np.triu_indices(3, 1)]
+        assert (np.abs(correlation) < 0.1).all() if independent else (correlation > 0.99).all()
+        rate = np.log(values[3])
+        assert abs(np.corrcoef(values[0], rate)[0, 1]) < 0.1
+        assert rate.mean() == pytest.approx(np.log(100), abs=0.15)
+
+
+@pytest.mark.parametrize("rate", [10.0, 30.0, 1000.0])
+def test_the_noise_of_an_interval_is_the_largest_of_its_frames(rate):
+    """It is drawn at once where nothing touches, and frame by frame elsewhere; both are the same noise."""
+    device = Imperfection(rate=(rate, rate), noise=0.1, offset=0.0, aligned=False)
+    force = torch.zeros(1000, 8, 20)
+    force[:, 2:5] = 0.002  # N, felt by the device, and nothing beside the noise
+    readings = read(device, force)[0]
+    direct = 0.1 * generator(2).standard_normal((20000, round(rate / 10))).max(axis=1)
+    fractions = np.linspace(0.02, 0.98, 25)
+    for values in (readings[:, 3], readings[:, 6:]):
+        drawn, expected = (np.quantile(noise, fractions) for noise in (values.numpy(), direct))
+        np.testing.assert_allclose(drawn, expected, atol=0.008)

@@ -1,22 +1,22 @@
-"""A simulated device: seeds, splits, and what each setting changes."""
+"""A simulated device: seeds, splits, what each setting changes, and whether a shape tells a label."""
 
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
 import torch
 
+from skin import Grid, InputError, PlatesAndBeams, Sheet
 from skin.body.base import GEOMETRY
-from skin.body.layout import Grid, Scattered
-from skin.body.sheet import Sheet
+from skin.body.layout import Scattered
 from skin.core.rng import Stream, generator
 from skin.device.imperfection import ImperfectionSettings
-from skin.device.simulated import Simulated
+from skin.device.simulated import Simulated, accuracy_from_shape, check_label_leakage
 from skin.device.touches import concatenate
-from skin.errors import InputError
-from skin.mechanics.simulator.fem import PlatesAndBeams
 from skin.mechanics.simulator.naive import Naive
+from skin.runs.build import build_device
 from skin.touch.movie import balanced
+from tests.made_up import PERFECT, naive_skin
 from tests.touch.movie_labels import movie_labels
 
 LAYERS = [
@@ -24,24 +24,16 @@ LAYERS = [
     {"material": "EcoFlex 00-30", "thickness": 0.005},
 ]
 BODY = Sheet([0.16, 0.16], [32, 32], LAYERS)
-PERFECT = {"gain_spread": 0.0, "offset": 0.0, "noise": 0.0, "clip": 1e9}
 
 
 def device(**changes) -> Simulated:
-    settings = {"simulator": Naive, "gestures": 60, "test_gestures": 32, "layout": Scattered(seed=0)}
-    return Simulated(body=BODY, **(settings | changes))
+    settings = {"body": BODY, "layout": Scattered(seed=0), "gestures": 60, "test_gestures": 32}
+    return naive_skin(**(settings | changes))
 
 
 @pytest.fixture(scope="module")
 def plain() -> Simulated:
     return device()
-
-
-def test_everything_comes_from_the_seeds(plain):
-    for split in ("train", "validation", "holdout", "test"):
-        one, other = plain.touches(split), device().touches(split)
-        assert torch.equal(one.readings, other.readings)
-        assert torch.equal(one.labels, other.labels)
 
 
 def test_the_number_of_threads_does_not_matter(plain, monkeypatch):
@@ -75,7 +67,11 @@ def test_parts_are_the_budget(monkeypatch, stream):
     assert one.parts("train") is None
 
 
-def test_training_seeds_change_the_budget_and_never_the_test(plain):
+def test_everything_comes_from_the_seeds_and_those_of_training_never_change_the_test(plain):
+    for split in ("train", "validation", "holdout", "test"):
+        one, again = plain.touches(split), device().touches(split)
+        assert torch.equal(one.readings, again.readings)
+        assert torch.equal(one.labels, again.labels)
     other = device(data_seed=1)
     assert torch.equal(plain.touches("test").readings, other.touches("test").readings)
     assert not torch.equal(plain.touches("train").readings, other.touches("train").readings)
@@ -246,3 +242,23 @@ def test_the_true_footprints_differ_and_the_reported_ones_do_not():
     assert 0.05 < np.log(factors).std() < 0.15
     fractions = [skin.geometry[:, GEOMETRY.index("share")] for skin in (exact, wrong)]
     torch.testing.assert_close(*fractions)
+
+
+def test_the_accuracy_is_the_overlap_of_two_distributions():
+    """Shares 0.7 / 0.3 against 0.4 / 0.6: the best guess is right in (0.7 + 0.6) / 2."""
+    shape = np.repeat([0, 1, 0, 1], [700, 300, 400, 600])
+    assert accuracy_from_shape(shape, np.arange(2000) < 1000)[0] == pytest.approx(0.65)
+    shape = np.arange(400) % 4
+    assert accuracy_from_shape(shape, shape < 2) == (1.0, 0.0)
+    accuracy, error = accuracy_from_shape(shape, np.random.default_rng(0).random(400) < 0.5)
+    assert accuracy < 0.5 + 2 * error
+    assert 0.02 < error < 0.03
+
+
+def test_a_shape_that_tells_a_label_is_warned_of(configured):
+    device = build_device(configured("simulator=naive", "data.gestures=160", "layout=grid"))
+    check_label_leakage(device)
+    recording = device.recording(None, complete=False)
+    bars = recording.parameters | {"shape": recording.touches.labels[:, 0] * 3}
+    with pytest.warns(RuntimeWarning, match=r"the shape alone predicts big \(100%\).*touch.leak=0.6"):
+        check_label_leakage(device, replace(recording, parameters=bars))

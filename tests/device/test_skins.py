@@ -8,17 +8,13 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
-from skin.body.arm import Arm
+from skin import Arm, Grid, InputError, Sheet, Solid
 from skin.body.base import GEOMETRY, Layer
-from skin.body.layout import Grid
 from skin.body.material import Material
-from skin.body.sheet import Sheet
 from skin.core.files import CONF
 from skin.core.rng import Stream, generator
 from skin.device import skins
 from skin.device.skins import SkinDistribution
-from skin.errors import InputError
-from skin.mechanics.simulator.solid import Solid
 from skin.runs.build import build_device
 
 SMALL = (
@@ -64,6 +60,8 @@ def test_training_skins_may_have_other_touches(configured):
         assert (skin.sampler.settings.second, skin.sampler.settings.frames.press) == (0.0, (4, 20))
     with pytest.raises(InputError, match=r"touch\.window"):
         build_device(configured(*SMALL, "+device.training_touch.window=4.0"))
+    with pytest.raises(InputError, match=r"device\.skins\.interface must be at most 1, got 1\.1"):
+        build_device(configured(*SMALL, "device.skins={plates: 0.6, naive: 0.5}"))
 
 
 def test_no_stream_defines_a_skin_and_orders_an_epoch(configured, monkeypatch):
@@ -86,11 +84,6 @@ def test_no_stream_defines_a_skin_and_orders_an_epoch(configured, monkeypatch):
     assert len(defining) == fresh.count + fresh.test_skins
     assert used
     assert not defining & set(used)
-
-
-def test_fractions_of_mechanics_above_1_are_refused(configured):
-    with pytest.raises(InputError, match=r"device\.skins\.interface must be at most 1, got 1\.1"):
-        build_device(configured(*SMALL, "device.skins={plates: 0.6, naive: 0.5}"))
 
 
 def test_a_blank_device_prepares_no_skin(configured):

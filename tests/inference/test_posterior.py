@@ -10,22 +10,15 @@ from scipy.special import log_ndtr
 from scipy.stats import kstest
 
 import skin
-from skin.body.base import Arm, Sheet
-from skin.body.layout import Grid
-from skin.inference.candidates import CandidateReadings, FingertipPrior, disc_readings
-from skin.inference.noise import Noise
-from skin.inference.posterior import ContactEstimate, FrameEstimate, Posterior
-from skin.mechanics.simulator.fem import PlatesAndBeams
+from skin import Arm, FingertipPrior, Grid, Noise, PlatesAndBeams, Posterior, Sheet, Solid
+from skin.inference.candidates import CandidateReadings, disc_readings
+from skin.inference.posterior import ContactEstimate, FrameEstimate
 from skin.mechanics.simulator.naive import Naive
-from skin.mechanics.simulator.solid import Solid
 
 SOFT = {"material": "EcoFlex 00-30"}
 DEEP = Sheet((0.16, 0.16), (16, 16), [SOFT | {"thickness": 0.03}])
-THIN = Sheet(
-    (0.16, 0.16),
-    (24, 24),
-    [{"material": "Dragon Skin 10 Medium", "thickness": 0.01}, SOFT | {"thickness": 0.005}],
-)
+FIRM = {"material": "Dragon Skin 10 Medium", "thickness": 0.01}
+THIN = Sheet((0.16, 0.16), (24, 24), [FIRM, SOFT | {"thickness": 0.005}])
 SMALL = Sheet((0.08, 0.08), (8, 8), DEEP.layers)
 NOISE = Noise(0.05, frames=10)
 SINGLE = FingertipPrior(numbers=(0.0, 1.0, 0.0, 0.0), large=0.0)
@@ -144,10 +137,7 @@ def test_a_region_holds_what_it_says():
         estimate = posterior(contacts=1).estimate(readings)
         (contact,) = estimate.contacts
         spread = 6 * contact.position_deviation
-        x, y = (
-            np.linspace(mean - away, mean + away, 41)
-            for mean, away in zip(contact.position, spread, strict=True)
-        )
+        x, y = np.linspace(contact.position - spread, contact.position + spread, 41).T
         radii = np.linspace(*prior.radii, 5)
         grid = np.stack(np.meshgrid(x, y, radii, indexing="ij"), -1).reshape(-1, 3)
         grid[:, :2] = grid[:, :2].clip(0, 0.16)
@@ -189,14 +179,9 @@ def test_a_contact_agrees_with_brute_force(thin, noise):
 def test_truth_drawn_from_the_prior_has_uniform_ranks(thin, noise):
     touches = draw(150, seed=8)
     readings = measure(true_readings(touches, thin), noise, seed=9)
-    contacts = [
-        estimate.contacts[0] if estimate.contacts else None
-        for estimate in posterior(thin, noise, SINGLE).estimate(readings)
-    ]
-    position = np.array(
-        [position_ranks(contact, touch[0]) for contact, touch in zip(contacts, touches, strict=True)]
-    )
-    for column in position.T:
+    contacts = [estimate.contacts[0] for estimate in posterior(thin, noise, SINGLE).estimate(readings)]
+    ranks = [position_ranks(contact, touch[0]) for contact, touch in zip(contacts, touches, strict=True)]
+    for column in np.array(ranks).T:
         assert kstest(column, "uniform").pvalue > 0.01
     held = np.mean([c.region().contains(t[0, :2]) for c, t in zip(contacts, touches, strict=True)])
     assert 0.83 <= held <= 0.96  # 90 % of 150, within 3 standard deviations
@@ -210,14 +195,9 @@ def position_ranks(contact: ContactEstimate, touch):
 
 
 def same(first: FrameEstimate, second: FrameEstimate) -> bool:
-    return (
-        first.number == second.number
-        and np.array_equal(first.probabilities, second.probabilities)
-        and all(
-            np.array_equal(np.concatenate(moments(a)), np.concatenate(moments(b)))
-            for a, b in zip(first.contacts, second.contacts, strict=True)
-        )
-    )
+    pairs = zip(first.contacts, second.contacts, strict=True)
+    alike = (first.number, *first.probabilities) == (second.number, *second.probabilities)
+    return alike and all(np.array_equal(moments(a), moments(b)) for a, b in pairs)
 
 
 def test_a_contact_is_told_as_one_and_where_it_is():
@@ -255,10 +235,8 @@ def test_contacts_that_no_sensor_feels_are_as_likely_as_brute_force_says():
     rng, count = np.random.default_rng(0), 20_000
     discs = np.column_stack([*rng.uniform(0, 0.15, (2, 3 * count)), rng.uniform(*prior.radii, 3 * count)])
     force = prior.force * np.exp(prior.spread * rng.standard_normal(3 * count))
-    readings = np.concatenate(
-        [disc_readings(simulator, body, some, prior.rim) for some in np.array_split(discs, 30)]
-    )
-    alone = (readings * force[:, None]).reshape(3, count, 12)
+    readings = [disc_readings(simulator, body, some, prior.rim) for some in np.array_split(discs, 30)]
+    alone = (np.concatenate(readings) * force[:, None]).reshape(3, count, 12)
     subject = Posterior(simulator, noise, body, prior)
     for _ in range(4):
         seen = rng.normal(scale=np.sqrt(noise.floor), size=12)
@@ -284,9 +262,7 @@ def test_frames_alone_and_together_give_the_same_bits():
     touches = np.concatenate([draw(3, 11, 2, 0.03, 0.05), np.repeat(draw(3, 12, margin=0.03), 2, 1)])
     readings = measure(true_readings(touches), NOISE, 13)
     together = posterior().estimate(readings)
-    assert all(
-        same(posterior().estimate(row), estimate) for row, estimate in zip(readings, together, strict=True)
-    )
+    assert all(map(same, map(posterior().estimate, readings), together))
 
 
 def test_the_order_of_sensors_does_not_matter():
@@ -312,10 +288,8 @@ def test_an_invalid_sensor_counts_for_nothing():
     clean, spoilt = posterior().estimate(readings, valid), posterior().estimate(worse, valid)
     assert same(clean, spoilt)
     assert same(clean, posterior().estimate(np.where(valid, readings, np.nan)))
-    assert (
-        clean.contacts[0].position_deviation.max()
-        > posterior().estimate(readings).contacts[0].position_deviation.max()
-    )
+    whole = posterior().estimate(readings)
+    assert clean.contacts[0].position_deviation.max() > whole.contacts[0].position_deviation.max()
 
 
 def test_a_sensor_that_clips_says_at_least_so_much():
@@ -378,11 +352,9 @@ def test_a_limit_of_pressure_has_a_probability():
 def test_every_simulator_that_adds_up_and_an_arm_work():
     sheet, touch = Sheet((0.08, 0.08), (16, 16), THIN.layers), np.array([[0.035, 0.043, 0.008]])
     sensors = sensors_of(sheet, None, 3)
-    arm = Arm(
-        radius=0.05, length=0.08, angle=1.6, cells=(8, 8),
-        layers=[{"material": {"name": "Dragon Skin 10 Medium", "poisson": 0.49}, "thickness": 0.01},
-                SOFT | {"thickness": 0.005}],
-    )  # fmt: skip
+    firm = FIRM | {"material": {"name": "Dragon Skin 10 Medium", "poisson": 0.49}}
+    layers = [firm, SOFT | {"thickness": 0.005}]
+    arm = Arm(radius=0.05, length=0.08, angle=1.6, cells=(8, 8), layers=layers)
     skins = [
         (PlatesAndBeams(sheet, sensors, reading="interface"), sheet, 3),
         (PlatesAndBeams(sheet, sensors), sheet, 1),

@@ -2,20 +2,19 @@
 
 import json
 import re
-import socket
 import subprocess
 import sys
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
-from threading import Event, Thread
+from itertools import count
 from time import monotonic, sleep
 
 import numpy as np
 import pytest
 
+from skin import InputError, open_skin
 from skin.core.files import ROOT
 from skin.device.resampling import Frame
-from skin.errors import InputError
 from skin.evaluation.operating_point import OperatingPoint
 from skin.learning.network import Network
 from skin.live.engine import DebounceSettings
@@ -23,7 +22,6 @@ from skin.live.engine_builder import LiveSettings, measured_rate, watch_exported
 from skin.runs.onnx_writer import write_model
 from skin.wire.channels import unit_conversion
 from skin.wire.protocol import Header, encode_header, encode_line
-from skin.wire.skin import open_skin
 from tests.wire.memory import Sent
 
 pytest.importorskip("onnxruntime")
@@ -66,30 +64,24 @@ def model(trained, tmp_path_factory):
     return path
 
 
-@contextmanager
-def served(line, pause):
-    """Yield the address of a board that sends ``line(number)`` every ``pause`` s, without end."""
-    stop = Event()
+@pytest.fixture
+def sending(played):
+    """Return a function that gives the address of a board that sends ``line(number)`` every ``pause`` s."""
 
-    def serve():
-        with server.accept()[0] as peer, suppress(OSError):  # the reader has ended
-            for number in range(10**6):
-                peer.sendall(line(number))
+    def begin(line, pause):
+        def say(reader, stop):
+            for number in count():
+                reader.sendall(line(number))
                 if stop.wait(pause):
                     return
 
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        server.settimeout(PATIENCE)
-        thread = Thread(target=serve)
-        thread.start()
-        yield f"socket://127.0.0.1:{server.getsockname()[1]}"
-        stop.set()
-        with suppress(OSError), socket.create_connection(server.getsockname(), timeout=5):  # wakes accept()
-            thread.join(PATIENCE)
+        return played(say)
+
+    return begin
 
 
 @pytest.fixture
-def skin(request):
+def skin(request, sending):
     """Return the address of a skin of six sensors that is touched for one of five seconds, without end."""
     rng, touched_from = np.random.default_rng(0), getattr(request, "param", 4.0)
 
@@ -98,22 +90,15 @@ def skin(request):
         values = rng.normal(3.0 * (number / RATE % 5.0 > touched_from), 0.02, size=6).round(4)
         return header + encode_line(values, number, round(1e6 * number / RATE))
 
-    with served(line, 1 / RATE) as address:
-        yield address
+    return sending(line, 1 / RATE)
 
 
 @pytest.mark.slow("starts a process that imports anew")
 def test_it_runs_without_torch_and_writes_json_lines(model, skin, tmp_path):
     words = [f"run={model}", "device=serial", f"device.port={skin}", "device.tare=1", "live.verdicts=stdout"]
     words += ["seconds=15", "live.log=alarms.jsonl", "live.selftest=false"]  # untrained
-    done = subprocess.run(
-        [sys.executable, "-c", WATCH, *words],
-        cwd=tmp_path,
-        env={"PYTHONPATH": str(ROOT), "PATH": ""},
-        capture_output=True,
-        text=True,
-        timeout=PATIENCE,
-    )
+    line, settings = [sys.executable, "-c", WATCH, *words], {"PYTHONPATH": str(ROOT), "PATH": ""}
+    done = subprocess.run(line, cwd=tmp_path, env=settings, capture_output=True, text=True, timeout=PATIENCE)
     assert done.returncode == 0, done.stderr
     assert done.stderr.splitlines()[-1] == "False False"
     lines = [json.loads(line) for line in done.stdout.splitlines()]
@@ -122,9 +107,7 @@ def test_it_runs_without_torch_and_writes_json_lines(model, skin, tmp_path):
     assert {line["touched"] for line in said} == {False, True}
     assert set(said[-1]["probabilities"]) == {"big", "dynamic", "press", "dangerous"}
     logged = [json.loads(line)["event"] for line in (tmp_path / "alarms.jsonl").read_text().splitlines()]
-    assert logged[0] == "started"
-    assert "alarm" in logged
-    assert logged[-1] == "ended"
+    assert (logged[0], "alarm" in logged, logged[-1]) == ("started", True, "ended")
 
 
 def test_only_a_skin_at_a_port_is_watched(model):
@@ -132,27 +115,26 @@ def test_only_a_skin_at_a_port_is_watched(model):
         watch_exported(str(model), {"seed": 0}, print, opened)
 
 
-@pytest.fixture(scope="module", params=[None, {"20": 0.3, "100": 0.35, "500": 0.4}], ids=["one", "rates"])
-def with_thresholds(request, trained, tmp_path_factory):
-    """Return the file of a network with thresholds for rates or without, and the one at 100 Hz."""
-    of, touches = trained
-    path = tmp_path_factory.mktemp("thresholds") / "skin.onnx"
-    write_model(of.learner.pipeline(of.sites), of.describe(request.param), touches, path)
-    return path, (request.param or {"100": 0.25})["100"]
-
-
-def test_the_settings_of_the_file_and_of_the_command(with_thresholds, skin):
+@pytest.mark.parametrize(
+    ("rates", "threshold"), [(None, 0.25), ({"20": 0.3, "100": 0.35, "500": 0.4}, 0.35)], ids=["one", "rates"]
+)
+def test_the_settings_of_the_file_and_of_the_command(trained, skin, tmp_path, rates, threshold):
     """The threshold is the one for the rate of the device, which sends 100 frames a second."""
-    path, threshold = with_thresholds
-    said = []
+    of, touches = trained
+    write_model(of.learner.pipeline(of.sites), of.describe(rates), touches, path := tmp_path / "skin.onnx")
+    said, other = [], replace(LIVE, touch=0.5, patience=DebounceSettings(above=0.75))
     with ExitStack() as opened:
         device = {"port": skin, "labels": "announced"}
         setup = watch_exported(str(path), device, said.append, opened)
         assert not any("alarm above" in text for text in said)  # the views open before
         source, _, nominal, _ = setup.watch(LIVE, said.append)
+        of_file = said[:]
+        engine, usual = setup.watch(other, said.append)[1:3]
     assert (setup.model.title, len(setup.model.positions), setup.name) == ("untrained", 6, source.name)
-    assert said[-1] == f"alarm above {threshold:.4f}"
-    assert ("single windows" in said[-2]) == (threshold == 0.25)
+    assert of_file[-1] == f"alarm above {threshold:.4f}"
+    assert ("single windows" in of_file[-2]) == (threshold == 0.25)
+    assert said[-1] == "alarm above 0.75"
+    assert (engine.detection.threshold, usual.detection.threshold) == (0.5, 0.3)
     assert nominal.presses.shape == (6, 6)
     assert (nominal.presses.argmax(axis=1) == np.arange(6)).all()
 
@@ -187,15 +169,6 @@ def test_frames_that_waited_while_the_threshold_was_chosen_give_the_baseline_alo
             source.tare.add(frame)
         assert frame.t_host > begun - 0.5
         assert monotonic() - begun < 0.5
-
-
-def test_the_command_replaces_settings_of_the_file(model, skin):
-    said, other = [], replace(LIVE, touch=0.5, patience=DebounceSettings(above=0.75))
-    with ExitStack() as opened:
-        setup = watch_exported(str(model), {"port": skin}, said.append, opened)
-        _, engine, nominal, _ = setup.watch(other, said.append)
-    assert said[-1] == "alarm above 0.75"
-    assert (engine.detection.threshold, nominal.detection.threshold) == (0.5, 0.3)
 
 
 PROMISE = {"rate": 0.001, "touches": 3000, "misses": 0, "conditions": "mild", "patience": 0.1}
@@ -235,25 +208,6 @@ def test_a_guarantee_of_a_file_holds_or_has_lapsed(trained, skin, tmp_path, devi
     assert "guarantee_lapsed" in [note.code for note in engine.push(stream[50:])[-1].notes]
 
 
-@pytest.mark.slow("starts a process that imports anew")
-def test_the_example_without_this_package(model, begin, tmp_path):
-    sizes = ["layout=grid", "layout.rows=2", "layout.columns=3"]
-    with begin(tmp_path, "emulate", "simulator=naive", *sizes, "link=skin", "emulate.idle=4") as emulator:
-        lines = emulator.lines()
-        port, scale = next(lines), next(lines).partition("device.scale=")[2]
-        with subprocess.Popen(
-            [sys.executable, "-I", EXAMPLE, model, port, scale],
-            stdout=subprocess.PIPE,
-            text=True,
-            cwd=tmp_path,
-        ) as reader:
-            lines = [json.loads(reader.stdout.readline()) for _ in range(100)]
-            reader.terminate()
-    assert {line["touched"] for line in lines} == {False, True}
-    assert all(0 <= line[name] <= 1 for line in lines for name in ("big", "dynamic", "press", "dangerous"))
-    assert all(line["alarm"] == (line["touched"] and line["dangerous"] > 0.25) for line in lines)
-
-
 @contextmanager
 def example(model, port, *files):
     """Yield the example as a process that reads the port."""
@@ -261,6 +215,19 @@ def example(model, port, *files):
     with subprocess.Popen(line, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as reader:
         yield reader
         reader.kill()
+
+
+@pytest.mark.slow("starts a process that imports anew")
+def test_the_example_without_this_package(model, begin, tmp_path):
+    sizes = ["layout=grid", "layout.rows=2", "layout.columns=3"]
+    with begin(tmp_path, "emulate", "simulator=naive", *sizes, "link=skin", "emulate.idle=4") as emulator:
+        lines = emulator.lines()
+        port, scale = tmp_path / next(lines), next(lines).partition("device.scale=")[2]
+        with example(model, port, scale) as reader:
+            lines = [json.loads(reader.stdout.readline()) for _ in range(100)]
+    assert {line["touched"] for line in lines} == {False, True}
+    assert all(0 <= line[name] <= 1 for line in lines for name in ("big", "dynamic", "press", "dangerous"))
+    assert all(line["alarm"] == (line["touched"] and line["dangerous"] > 0.25) for line in lines)
 
 
 ADAPTER = """
@@ -284,7 +251,7 @@ broken: {dead: [2]}
 """
 
 
-def test_the_example_reads_an_adapter_and_a_calibration(model, tmp_path):
+def test_the_example_reads_an_adapter_and_a_calibration(model, sending, tmp_path):
     """A touch of 10 counts is 2 N, and 0.1 N without the gains; one of the broken sensor is none."""
     (tmp_path / "board.yaml").write_text(ADAPTER)
     (tmp_path / "gains.yaml").write_text(GAINS)
@@ -298,10 +265,7 @@ def test_the_example_reads_an_adapter_and_a_calibration(model, tmp_path):
         words[5] = "off" if number % 3 else words[5]
         return ";".join(map(str, words)).encode() + b"\r\n"
 
-    with (
-        served(line, 0.002) as port,
-        example(model, port, tmp_path / "gains.yaml", tmp_path / "board.yaml") as reader,
-    ):
+    with example(model, sending(line, 0.002), tmp_path / "gains.yaml", tmp_path / "board.yaml") as reader:
         said = [json.loads(reader.stdout.readline()) for _ in range(600)]
         # 1.2 cycles from any phase on: half a cycle and the window behind it, and a fifth; the broken sensor
         # would add a quarter.
@@ -317,11 +281,9 @@ def test_the_example_reads_an_adapter_and_a_calibration(model, tmp_path):
         ("kind: text\ndecimal: ','", r"\d+ of 50 lines cannot be read: .*; give an adapter"),
     ],
 )
-def test_what_the_example_cannot_read_it_refuses_in_a_sentence(model, tmp_path, setting, said):
+def test_what_the_example_cannot_read_it_refuses_in_a_sentence(model, sending, tmp_path, setting, said):
     (tmp_path / "board.yaml").write_text(setting)
-    with (
-        served(lambda number: b"%d,1,2,3,4,5,6\n" % number, 0.002) as port,
-        example(model, port, "0.01", tmp_path / "board.yaml") as reader,
-    ):
+    port = sending(lambda number: b"%d,1,2,3,4,5,6\n" % number, 0.002)
+    with example(model, port, "0.01", tmp_path / "board.yaml") as reader:
         assert re.match(said, reader.stderr.read())
         assert reader.wait() == 2

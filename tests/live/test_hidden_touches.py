@@ -1,5 +1,7 @@
-"""Streams that hide a dangerous touch: it is shown as no touch, or as safe, for half a second at most."""
+"""Streams of our protocol or of other boards: a dangerous touch is hidden for half a second at most."""
 
+import json
+import struct
 from dataclasses import replace
 
 import numpy as np
@@ -8,21 +10,18 @@ import pytest
 from skin.errors import InputError
 from skin.live.engine import DebounceSettings
 from skin.wire.protocol import Header, encode_header, encode_line
-from tests.live.memory_view import LOOK, MemoryView
-from tests.live.test_safety import HEADER, RATE, SCALE, SENSORS, arriving, force, lines, settings
+from tests.live.memory_view import LOOK
+from tests.live.test_safety import HEADER, LATE, RATE, SCALE, SENSORS, counted, force, lines, settings, watch
 
-LATE = 0.5 + 2 * LOOK  # s: a decision may be so old, and the display is looked at so often
+HIDDEN = 0.5 + 2 * LOOK  # s: a decision may be so old, and the display is looked at so often
 COUNTS = encode_header(Header(n=SENSORS, rate=RATE, unit="adc", bits=10, id="left"))
 
 
-def clocked(values, clock, counter=int, each=1):
-    """Yield (s, bytes) of readings (F, S) with the device's ``clock(t)``, s, and its counter."""
-    stream = (
-        (b"" if number else HEADER)
-        + encode_line(row.round(4), counter(number), round(1e6 * clock(number / RATE)) % 2**32)
-        for number, row in enumerate(values)
-    )
-    return arriving(stream, each)
+def clocked(values, clock, counter=int):
+    """Yield the bytes of readings (F, S) with the device's ``clock(t)``, s, and its counter."""
+    for number, row in enumerate(values):
+        line = encode_line(row.round(4), counter(number), round(1e6 * clock(number / RATE)) % 2**32)
+        yield line if number else HEADER + line
 
 
 def creeping(t):
@@ -41,8 +40,8 @@ def creeping(t):
     ],
 )
 def test_a_clock_that_is_wrong(clock, each):
-    seen = MemoryView(clocked(force(28, (10, 18, 4, 6.0), (24, 26, 2, 6.0)), clock, each=each), settings())
-    late = LATE + (each > 1)  # a second between two deliveries
+    seen = watch(clocked(force(28, (10, 18, 4, 6.0), (24, 26, 2, 6.0)), clock), each)
+    late = HIDDEN + (each > 1)  # a second between two deliveries
     assert seen.hidden(10, 18) <= late
     assert seen.hidden(24, 26) <= late
     assert seen.first(9) <= 10 + 4.5 + each / RATE
@@ -52,13 +51,9 @@ def test_a_clock_that_is_wrong(clock, each):
 
 
 def test_a_counter_that_stands_still_keeps_no_alarm():
-    seen = MemoryView(clocked(force(16, (8, 10, 4, 6.0)), lambda t: t, lambda n: min(n, 900)), settings())
+    seen = watch(clocked(force(16, (8, 10, 4, 6.0)), lambda t: t, lambda n: min(n, 900)))
     assert 8 <= seen.first(7) <= 8.5
     assert seen.states(13.5, 16) == {"no touch"}
-
-
-def counted(row):
-    return np.clip(np.round(200 + row / SCALE), 0, 1023).astype(int)
 
 
 @pytest.mark.parametrize("changes", [{"unit": "N"}, {"bits": 8}, {"id": "right"}, {"rate": 50.0}])
@@ -69,10 +64,10 @@ def test_a_header_that_changes(changes):
     for number, data in enumerate(lines(force(20, (8, 13, 4, 6.0)), header=b"", encode=counted)):
         stream.append((COUNTS if number < 600 else other) * (number % 100 == 0) + data)
     with pytest.raises(InputError, match="header of the device has changed") as refused:
-        MemoryView(arriving(stream), settings(), scale=SCALE)
+        watch(stream, scale=SCALE)
     assert next(iter(changes)) in str(refused.value)
-    seen = MemoryView(arriving(stream[:1100]), settings(), scale=SCALE)
-    assert seen.hidden(8, 11) <= LATE
+    seen = watch(stream[:1100], scale=SCALE)
+    assert seen.hidden(8, 11) <= HIDDEN
     assert seen.states(6.7, 11) == {"unknown"}
 
 
@@ -84,10 +79,10 @@ def test_a_device_that_tares_itself(restart):
         values[:, 4] -= np.interp(np.arange(3000) / RATE, [9, 14, 16, 18], [0, 6, 6, 0])
     else:
         values[1000:, 4] -= 6.0
-    seen = MemoryView(arriving(lines(values, restart=restart)), settings())
+    seen = watch(lines(values, restart=restart))
     if restart is not None:
         assert seen.kept(8.6, 16)
-        assert seen.hidden(8, 16) <= LATE
+        assert seen.hidden(8, 16) <= HIDDEN
         assert not seen.kept(20, 21)
     # Falling below rest tells; from then on there is no baseline.
     assert seen.states(17, 21.9) == {"unknown"}
@@ -95,17 +90,9 @@ def test_a_device_that_tares_itself(restart):
     assert "void" in seen.notes(17, 30)
 
 
-def test_a_restart_under_a_press_that_tares_nothing():
-    values = force(30, (8, 16, 4, 6.0), (22, 24, 4, 6.0))
-    seen = MemoryView(arriving(lines(values, restart=10.0)), settings())
-    assert seen.kept(8.6, 16)
-    assert seen.states(20, 21.9) == {"no touch"}
-    assert 22 <= seen.first(21.9) <= 22.5
-
-
 def test_a_tare_under_a_load():
     values = force(24, (0, 8, 4, 13.0), (14, 22, 4, 13.0))
-    seen = MemoryView(arriving(lines(values)), settings())
+    seen = watch(lines(values))
     assert seen.states(3, 7.9) == {"no touch"}  # nothing shows yet
     assert seen.states(8.5, 13.9) == {"unknown"}
     assert seen.hidden(8.5, 24) == 0
@@ -115,7 +102,7 @@ def test_a_baseline_above_the_stored_rest_is_void_at_once():
     """As `verify` finds it: nothing is shown as no touch, and the next tare counts."""
     raised = np.where(np.arange(SENSORS) == 4, 6.0, 0.01)
     values = force(12, (0, 12, 4, 6.0), (8, 9, 2, 6.0))
-    seen = MemoryView(arriving(lines(values)), settings(), verify=lambda conversion: raised)
+    seen = watch(lines(values), verify=lambda conversion: raised)
     assert seen.hidden(3, 12) == 0
     assert seen.notes(3, 7) >= {"void"}
     assert 8 <= seen.first(7) <= 8.5
@@ -125,7 +112,7 @@ def test_slow_drift_voids_nothing():
     """Five thresholds in 20 s; presses alarm afterwards."""
     presses = [(26 + 5 * n, 27 + 5 * n, n, 13.0) for n in range(2)]
     values = force(34, *presses) - np.interp(np.arange(3400) / RATE, [4, 24], [0, 1.5])[:, None]
-    seen = MemoryView(arriving(lines(values)), settings())
+    seen = watch(lines(values))
     for begin, *_ in presses:
         assert begin <= seen.first(begin - 1) <= begin + 0.5
     assert "void" not in seen.notes(3, 34)
@@ -150,9 +137,9 @@ def test_values_that_are_lost_under_a_press(write, length):
     ramp = np.r_[np.linspace(0, 1, 6), np.ones(1), np.linspace(1, 0, 6)]
     values = np.apply_along_axis(lambda column: np.convolve(column, ramp / ramp.sum(), "same"), 0, values)
     stream = [f"{write(row)}\n".encode() for row in values]
-    seen = MemoryView(arriving(stream), settings(), scale=SCALE if write is hexadecimal else 1.0)
+    seen = watch(stream, scale=SCALE if write is hexadecimal else 1.0)
     for begin, end, *_ in presses:
-        assert seen.hidden(begin, end + 0.3) <= LATE
+        assert seen.hidden(begin, end + 0.3) <= HIDDEN
         touch = [look for look in seen.looks if begin + 0.2 < look.t < end]
         assert all(look.danger is not False for look in touch)
     assert seen.states(5, 7.9) == {"no touch"}
@@ -161,7 +148,7 @@ def test_values_that_are_lost_under_a_press(write, length):
 def test_frames_that_are_lost_at_random_make_no_touch_doubtful():
     probability = np.random.default_rng(0)
     kept = [data for data in lines(force(30, (8, 28, 4, 2.0))) if probability.random() > 0.1]
-    seen = MemoryView(arriving(kept), settings())
+    seen = watch(kept)
     assert "unreadable" not in seen.notes(0, 30)
     assert {look.danger for look in seen.looks if 12 < look.t < 26} == {False}
 
@@ -178,12 +165,11 @@ def overlapping(fraction):
 def test_a_wire_that_breaks_to_its_rest_value(fraction):
     touches = [(8, 18, 4, 6.0), (8, 18, 3, 6.0 * fraction), (8, 18, 5, 6.0 * fraction)]
     values = force(24, *touches)
-    values[1200:, 4] -= values[1200:, 4]
-    values[1200:, 4] += np.random.default_rng(1).normal(scale=0.02, size=1200)
-    seen = MemoryView(arriving(lines(values)), overlapping(fraction))
+    values[1200:, 4] = np.random.default_rng(1).normal(scale=0.02, size=1200)
+    seen = watch(lines(values), engine=overlapping(fraction))
     assert seen.kept(8.6, 18)
     assert "lost_wire" in seen.notes(12.5, 18)
-    assert seen.hidden(8, 18) <= LATE
+    assert seen.hidden(8, 18) <= HIDDEN
     assert not seen.kept(20.5, 22)
     assert "no touch" not in seen.states(20.5, 22) or fraction == 0.2  # where the neighbours feel a press
 
@@ -196,7 +182,7 @@ def test_a_finger_that_slides_or_lifts_breaks_no_wire():
         near = np.clip(1 - np.abs(position - sensor), 0, 1)
         felt = near + fraction * np.clip(1 - np.abs(np.abs(position - sensor) - 1), 0, 1)
         values[:, sensor] += 6.0 * felt * ((times > 7) & (times < 14))
-    seen = MemoryView(arriving(lines(values)), overlapping(fraction))
+    seen = watch(lines(values), engine=overlapping(fraction))
     assert "lost_wire" not in seen.notes(0, 24)
     assert seen.states(18, 24) == {"no touch"}
 
@@ -205,7 +191,7 @@ def test_a_block_that_is_sent_again_and_again():
     """The device, or a bridge, is stuck: what was read in half a second comes ever again."""
     values = force(20, (12, 15, 4, 6.0))
     values[600:1900] = np.tile(values[550:600], (26, 1))
-    seen = MemoryView(arriving(lines(values)), settings())
+    seen = watch(lines(values))
     assert seen.states(3, 6) == {"no touch"}
     assert seen.states(6.6, 18.9) == {"unknown"}
     assert seen.states(19.7, 20) == {"no touch"}
@@ -215,7 +201,7 @@ def test_few_values_that_alternate_are_no_block():
     """Noise of one count, in step with the frames on some channels."""
     values = np.round(force(20, (12, 15, 4, 6.0)) / SCALE + 200)
     values[:, :6] += np.arange(2000)[:, None] % 2
-    seen = MemoryView(arriving(lines(values, encode=lambda row: row.astype(int))), settings(), scale=SCALE)
+    seen = watch(lines(values, encode=lambda row: row.astype(int)), scale=SCALE)
     assert seen.states(3, 11.9) == {"no touch"}
     assert 12 <= seen.first(11) <= 12.5
 
@@ -229,10 +215,95 @@ def sure(readings, valid):
 @pytest.mark.parametrize(("above", "danger"), [(0.99, {None}), (0.9, {True})])
 def test_probably_dangerous_is_not_safe(above, danger):
     strict = replace(settings(), classify=sure, patience=DebounceSettings(above=above))
-    seen = MemoryView(arriving(lines(force(12, (6, 8, 4, 6.0)))), strict)
+    seen = watch(lines(force(12, (6, 8, 4, 6.0))), engine=strict)
     during = [look for look in seen.looks if 6.6 < look.t < 8]
     assert {look.danger for look in during} == danger
-    assert {word for look in during for word in look.words} & {"safe", "dangerous?", "dangerous"} == {
-        "dangerous" if True in danger else "dangerous?"
-    }
+    words = {word for look in during for word in look.words}
+    assert words & {"safe", "dangerous?", "dangerous"} == {"dangerous" if True in danger else "dangerous?"}
     assert ("near_threshold" in seen.notes(6.6, 8)) is (None in danger)
+
+
+WORD, NUMBER = "off", -999
+JSON = {"kind": "json", "invalid": [NUMBER]}
+STRUCT = {"time": "<u4", "force": f"({SENSORS},)<i2"}
+BINARY = {"kind": "binary", "struct": STRUCT, "head": "aa 55", "tail": "0d 0a", "invalid": [NUMBER]}
+ROWS = {"kind": "text", "rows": 0, "invalid": [WORD]}
+
+
+def to_json(n, row):
+    """Return a line with a clock in ms and no counter."""
+    return json.dumps({"ms": 10 * n + 400, "f": row}).encode() + b"\n"
+
+
+def to_binary(n, row):
+    """Return a frame with a clock in us and no checksum."""
+    return b"\xaa\x55" + struct.pack(f"<I{SENSORS}h", 10_000 * n + 400, *row) + b"\r\n"
+
+
+def to_rows(n, row):
+    """Return three lines and an empty one, without clock and counter."""
+    words = [WORD if value == NUMBER else str(value) for value in row]
+    return "".join(" ".join(words[position : position + 3]) + "\n" for position in (0, 3, 6)).encode() + b"\n"
+
+
+BOARDS = {"json": (JSON, to_json), "binary": (BINARY, to_binary), "rows": (ROWS, to_rows)}
+"""Adapter, and encoder of a frame."""
+
+
+def frames(name, values, restart=None):
+    """Yield the bytes of counts (F, S); the device restarts every ``restart`` s, with a banner."""
+    encode = BOARDS[name][1]
+    every = len(values) if restart is None else round(restart * RATE)
+    for number, row in enumerate(values.tolist()):
+        banner = b"" if number % every or restart is None else b"\r\nBooting...\r\nok\r\n"
+        yield banner + encode(number % every, row)
+
+
+def view_of(name, stream):
+    return watch(stream, adapter=BOARDS[name][0], scale=SCALE)
+
+
+@pytest.fixture(params=["json", "binary", "rows"])
+def board(request):
+    return request.param
+
+
+def damaged(stream):
+    """Yield frames of which a tenth loses a byte."""
+    draw = np.random.default_rng(5)
+    for piece in stream:
+        position = int(draw.integers(len(piece)))
+        yield piece[:position] + piece[position + 1 :] if draw.random() < 0.1 else piece
+
+
+@pytest.mark.parametrize("trouble", ["none", "restarts", "damage"])
+def test_a_press_is_found_and_rest_is_no_touch(board, trouble):
+    restart = 2.5 if trouble == "restarts" else None
+    stream = frames(board, counted(force(14, (7, 11, 4, 6.0))), restart)
+    seen = view_of(board, damaged(stream) if trouble == "damage" else stream)
+    assert "no touch" in seen.states(4, 7)
+    assert 7 <= seen.first(3 if trouble == "none" else 7) <= 7.5 + LATE
+    assert seen.kept(7.5 + LATE, 11)
+
+
+def test_frozen_values_and_silence_are_unknown(board):
+    values = counted(force(20))
+    values[600:1500] = values[600]
+    seen = view_of(board, [*frames(board, values), 3.0, *frames(board, counted(force(1)))])
+    assert seen.states(11 + LATE, 15) == {"unknown"}
+    assert seen.states(16.5, 20) == {"no touch"}
+    assert seen.states(20.7, 23) == {"unknown"}
+
+
+@pytest.mark.parametrize("sent", [NUMBER, -1, 0, 125])
+def test_a_token_for_a_missing_value_or_a_cut_wire_is_unknown_and_keeps_the_alarm(board, sent):
+    """Without a header nobody knows what the converter can give: the channel falls far below rest."""
+    values = counted(force(24, (6, 12, 7, 6.0), (20, 21, 7, 6.0)))
+    values[800:1400, 7] = sent
+    seen = view_of(board, frames(board, values))
+    assert seen.first(3) <= 6.5 + LATE
+    assert seen.kept(6.5 + LATE, 12)
+    assert "no touch" not in seen.states(6.2 + LATE, 14)
+    assert not seen.kept(19, 20)
+    assert 20 <= seen.first(19.5) <= 20.5 + LATE
+    assert sent != NUMBER or seen.states(17, 18) == {"no touch"}

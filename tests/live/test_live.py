@@ -1,4 +1,4 @@
-"""The command, with an emulated skin before it and a browser behind it."""
+"""The command, with an emulated skin before it and a browser behind it; what is said of a run at a port."""
 
 import json
 import os
@@ -12,7 +12,8 @@ import pytest
 from mcap.reader import make_reader
 
 from skin.core.files import ROOT
-from tests.live.waiting import until
+from skin.runs.build import build_device, equation10_warning
+from tests.wire.memory import until
 
 SMALL = [
     "experiment=rules",
@@ -88,20 +89,6 @@ def test_the_simulator_is_watched_without_hardware(run, store, tmp_path):
     assert topics == {"/skin/readings", "/skin/verdict", "/skin/contacts"}
 
 
-@pytest.mark.parametrize(
-    ("override", "needed"),
-    [
-        ("live.patience.alarm=0.2", "must be less than or equal to 0.1"),
-        ("run=none", "no finished training run none"),
-    ],
-)
-def test_bad_input_is_one_sentence(run, tmp_path, override, needed):
-    done = run(tmp_path, "live.py", override)
-    assert done.returncode == 2
-    assert needed in done.stderr
-    assert done.stderr.count("\n") == 1
-
-
 COLLECTING = """
 import gc, runpy, sys, time
 from skin.live.loop import LiveLoop
@@ -136,3 +123,22 @@ def test_a_search_for_garbage_does_not_delay_a_verdict(tmp_path):
     count, pause = done.stderr.split()[-2:]
     assert int(count) > 10
     assert float(pause) < 0.05
+
+
+PORT = ("device=serial", "device.port=/dev/ttyACM0", "device.scale=0.04")
+
+
+@pytest.mark.parametrize(
+    ("trained", "warned"),
+    [
+        (["simulator=fem"], True),
+        (["simulator=fem", "simulator.reading=interface"], False),
+        (["simulator=solid"], False),
+    ],
+)
+def test_a_run_on_equation_10_is_announced_at_a_port_only(configured, trained, warned):
+    stored = configured(*trained)
+    said = equation10_warning(stored, build_device(configured(*PORT)))
+    assert (said is not None) == warned
+    assert said is None or "simulator=solid" in said
+    assert equation10_warning(stored, build_device(configured("simulator=naive"))) is None

@@ -7,14 +7,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from skin.body.base import Sheet
-from skin.body.layout import Grid
-from skin.device.simulated import Simulated
-from skin.errors import InputError
+from skin import InputError
 from skin.live.engine import DebounceSettings, Detection, Engine
 from skin.live.engine_builder import SelfTest
 from skin.live.loop import STALE, Display, LiveLoop
-from skin.mechanics.simulator.naive import Naive
 from skin.touch.labels import TOUCH
 from skin.wire.channels import RawRange, UnitConversion
 from skin.wire.decoder import Decoder
@@ -24,6 +20,7 @@ from skin.wire.reader import Port, SkinDisconnected, SkinTimeout
 from skin.wire.skin import SerialSource
 from skin.wire.tare import Tare
 from tests.live.memory_view import MemoryView
+from tests.made_up import naive_skin
 
 RATE, SENSORS = 100, 9
 HEADER = encode_header(Header(n=SENSORS, rate=RATE, unit="N"))
@@ -49,6 +46,11 @@ def force(seconds, *touches):
     return values
 
 
+def counted(row):
+    """Return the counts of readings, N, by a converter of 10 bits."""
+    return np.clip(np.round(200 + row / SCALE), 0, 1023).astype(int)
+
+
 def lines(values, restart=None, header=HEADER, encode=lambda row: row.round(4)):
     """Yield the bytes of each frame; the device restarts every ``restart`` s, with its counter and clock."""
     every = len(values) if restart is None else round(restart * RATE)
@@ -71,9 +73,9 @@ def arriving(stream, each=1):
             waiting = b""
 
 
-def watch(stream, each=1, verify=None, inwards=False, **port):
+def watch(stream, each=1, engine=None, verify=None, inwards=False, **port):
     """Return the live view of the bytes of frames."""
-    return MemoryView(arriving(stream, each), settings(), verify, inwards, **port)
+    return MemoryView(arriving(stream, each), engine or settings(), verify, inwards, **port)
 
 
 @pytest.mark.parametrize("broken", ["nothing", "saturated", "dead", "frozen", "touched"])
@@ -91,10 +93,9 @@ def test_what_channels_along_the_surface_do_changes_no_verdict(broken):
         "touched": along + 3 * np.sin(np.arange(len(values)))[:, None, None],
     }[broken]
     every = np.concatenate([along, values[..., None]], axis=2).reshape(len(values), -1)
-    counts = lambda row: np.clip(np.round(200 + row / SCALE), 0, 1023).astype(int)  # noqa: E731
-    alone = watch(lines(values, header=COUNTS, encode=counts), scale=SCALE)
+    alone = watch(lines(values, header=COUNTS, encode=counted), scale=SCALE)
     header = encode_header(Header(n=3 * SENSORS, rate=RATE, unit="adc", bits=10))
-    seen = watch(lines(every, header=header, encode=counts), inwards=True, scale=SCALE)
+    seen = watch(lines(every, header=header, encode=counted), inwards=True, scale=SCALE)
     assert seen.said == alone.said
     assert 6 <= seen.first(3) <= 6.5 + LATE
     assert list(map(vars, seen.looks)) == list(map(vars, alone.looks))
@@ -126,50 +127,20 @@ class Paced:
 LATE = 0.02  # s: a frame, and the interval between decisions is in the limits
 
 
-def test_a_press_is_found_though_the_device_restarts_every_two_and_a_half_seconds():
-    seen = watch(lines(force(22, (8, 18, 4, 6.0)), restart=2.5))
-    assert seen.first(4) <= 8 + 0.5 + LATE
-    assert seen.kept(8 + 0.5 + LATE, 18)
-    assert seen.first(4) >= 8
-
-
-def test_frozen_readings_are_unknown():
-    values = force(24)
-    values[600:2100] = values[600]
-    seen = watch(lines(values))
-    assert seen.states(3, 6) == {"no touch"}
-    assert seen.states(11 + LATE, 21) == {"unknown"}
-    assert seen.states(22.5, 24) == {"no touch"}
-
-
 def test_a_channel_at_its_limit_is_not_tared():
     """All at the limit: there is no baseline. One: its place is unknown, and a press on others is found."""
-    counts = lambda row: np.clip(np.round(200 + row / SCALE), 0, 1023).astype(int)  # noqa: E731
     full = np.full((600, SENSORS), 1023.0)
     seen = watch(lines(full, header=COUNTS, encode=lambda row: row.astype(int)), scale=SCALE)
-    assert {reason for _, _, reason, _ in seen.said} >= {
-        "no baseline: all channels at the limit or without a value"
-    }
+    reasons = {reason for _, _, reason, _ in seen.said}
+    assert "no baseline: all channels at the limit or without a value" in reasons
     assert seen.states(0, 6) == {"unknown"}
     values = force(12, (6, 7, 4, 6.0))
     values[:, 2] = 50.0
-    seen = watch(lines(values, header=COUNTS, encode=counts), scale=SCALE)
+    seen = watch(lines(values, header=COUNTS, encode=counted), scale=SCALE)
     assert seen.states(4, 5.9) == {"unknown"}
     assert {verdict.unknown for at, verdict, _, _ in seen.said if verdict and at > 4} == {(2,)}
     assert "channel 2 at the limit" in seen.loop.line
     assert 6 <= seen.first(3) <= 6.5 + LATE
-
-
-@pytest.mark.parametrize("broken", [-20.0, -1.5])
-def test_a_broken_wire_does_not_clear_the_alarm(broken):
-    values = force(24, (6, 14, 7, 6.0), (20, 21, 7, 6.0))
-    values[900:1500, 7] = broken
-    seen = watch(lines(values))
-    assert seen.first(3) <= 6.5 + LATE
-    assert seen.kept(6.5 + LATE, 14)
-    assert "no touch" not in seen.states(6.2 + LATE, 15)
-    assert not seen.kept(19, 20)
-    assert 20 <= seen.first(19.5) <= 20.5 + LATE
 
 
 def test_bursts_without_a_clock_are_decided_like_single_frames():
@@ -232,9 +203,9 @@ def test_a_channel_of_an_emulated_skin_that_fails_at_rest_or_later_is_unknown_an
     """From 8 s on; touches begin at 14 s."""
     written = []
     port = SimpleNamespace(write=lambda data: written.append(data) or len(data), connected=lambda: True)
-    body = Sheet((0.16, 0.16), (16, 16), [{"material": "EcoFlex 00-30", "thickness": 0.005}])
-    device = Simulated(body=body, layout=Grid(3, 3), simulator=Naive, gestures=10)
-    emulator = Emulator(device, port, EmulatorSettings(speed=200.0, idle=14.0, since=8.0, **{fault: [4]}))
+    emulator = Emulator(
+        naive_skin(), port, EmulatorSettings(speed=200.0, idle=14.0, since=8.0, **{fault: [4]})
+    )
     emulator.run(19.0)
     frames = re.findall(rb"(?m)^\d.*\n", b"".join(written))
     seen = watch(frames, scale=emulator.converter.scale)
@@ -242,13 +213,6 @@ def test_a_channel_of_an_emulated_skin_that_fails_at_rest_or_later_is_unknown_an
     assert seen.states(8 + late, 14) == {"unknown"}
     assert "no touch" not in seen.states(14, 19)
     assert "sensor 4 stuck" in seen.loop.line
-
-
-def test_sensors_that_break_later_end_no_live_view():
-    values = force(15)
-    values[700:, :6] = values[700, :6]
-    seen = watch(lines(values), verify=lambda conversion: None)
-    assert seen.states(13, 15) == {"unknown"}
 
 
 COUNTED = RawRange(0.0, 1023.0, True, (None, 1023.0))
@@ -279,10 +243,8 @@ def patient(engine=None, **changes):
 
 
 def test_nominal_settings_pass():
-    assert selftest() == [
-        "self-test: 14 of 14 dangerous presses raise the alarm, 14 with nominal settings; only its range "
-        "tests the scale"
-    ]
+    nominal = r"self-test: 14 of 14 dangerous presses raise the alarm, 14 with nominal .* its range tests the"
+    assert re.match(nominal, *selftest())
     assert "its scale is not checked" in selftest(device=RawRange())[0]
     selftest(patient(above=0.9999999))
     # Its place is shown as unknown.
@@ -303,10 +265,7 @@ ONE = np.where(np.arange(SENSORS) == 3, 1e-9, SCALE)
         ({"presses": FEW}, "even with nominal settings: train another run"),
         *(({"converted": conversion(scale), "slowly": 1}, DEVICE) for scale in (1e-9, 1e-300, 1e9, 2e-8)),
         ({"converted": conversion(ONE)}, "sensor 3 cannot raise it"),
-        (
-            {"converted": conversion(broken=3)},
-            r"9 of 14 .* 3 of 9 sensors have no valid reading .*: they are dead, or the mask of broken",
-        ),
+        ({"converted": conversion(broken=3)}, r"9 of 14 .* 3 of 9 sensors have no valid reading .*: they"),
         ({"nominal": detecting(threshold=1e308)}, "the contact threshold of the model"),
     ],
 )

@@ -6,9 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from skin.body.base import Sheet
-from skin.body.layout import Grid
-from skin.device.files import read_recording
+from skin import Grid, read_recording
 from skin.device.touches import Touches
 from skin.live.engine import Detection, Engine
 from skin.live.loop import Display, LiveLoop
@@ -20,9 +18,9 @@ from skin.wire.decoder import Decoder
 from skin.wire.protocol import Announcement, Header, encode_announcement, encode_header, encode_line
 from skin.wire.reader import WireFeed
 from skin.wire.tare import Tare
+from tests.made_up import SHEET
 from tests.wire.memory import Sent
 
-SHEET = Sheet((0.16, 0.16), (32, 32), [{"material": "EcoFlex 00-30", "thickness": 0.005}])
 LAYOUT = Grid(2, 3)
 # A window ends with a frame at a tick, so that it is decided on.
 RATE, LENGTH, IDLE, GESTURES = 50, 150, 151, 3
@@ -53,9 +51,8 @@ def pieces(late=0):
             data += encode_header(Header(n=6, rate=RATE, unit="adc"))
         gesture, position = divmod(number - IDLE, LENGTH + 30)
         if number >= IDLE and position == 0 and gesture < GESTURES:
-            data += encode_announcement(
-                Announcement(gesture, number, LENGTH, dict.fromkeys(TOUCH.names, gesture % 2))
-            )
+            labels = dict.fromkeys(TOUCH.names, gesture % 2)
+            data += encode_announcement(Announcement(gesture, number, LENGTH, labels))
         if number not in lost:
             data += encode_line(row.tolist(), number, number * 1_000_000 // RATE)
         if data:

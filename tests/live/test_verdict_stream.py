@@ -10,7 +10,7 @@ from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from time import monotonic, sleep
-from types import ModuleType
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -20,17 +20,21 @@ from skin.errors import InputError
 from skin.live.loop import Display, watch_age
 from skin.live.verdict import Verdict
 from skin.live.view import HEARTBEAT, VERDICTS, write_events, write_file
-from tests.live.waiting import PATIENCE, until
+from tests.wire.memory import PATIENCE, until
 
 
 def display(calm=2.0):
     return Display("run", "port", np.zeros((4, 3)), (0.1, 0.1), 4.0, calm=calm)
 
 
+@pytest.fixture
+def shown():
+    return display()
+
+
 def logged(dangerous):
-    return replace(
-        verdict(dangerous), probabilities={"dangerous": 0.9}, labels={"dangerous": dangerous}, masked=()
-    )
+    certain = {"probabilities": {"dangerous": 0.9}, "labels": {"dangerous": dangerous}}
+    return replace(verdict(dangerous), masked=(), **certain)
 
 
 def verdict(dangerous=False, probability=0.25):
@@ -52,23 +56,15 @@ def piped(shown):
         yield lines
 
 
-@contextmanager
-def connected(shown):
-    """Yield a function that returns the next message of a pipe."""
+def wait_for(lines, accepted):
+    """Return the first message of a pipe that is accepted."""
+    return next(filter(accepted, map(json.loads, lines)))
+
+
+def test_a_verdict_is_a_line(shown):
     with piped(shown) as lines:
-        yield lambda: json.loads(lines.readline())
-
-
-def wait_for(take, accepted):
-    """Return the first message that is accepted."""
-    return next(message for message in iter(take, None) if accepted(message))
-
-
-def test_a_verdict_is_a_line():
-    shown = display()
-    with connected(shown) as take:
         shown.set_verdict(verdict(dangerous=True, probability=float("nan")), monotonic())
-        found = wait_for(take, lambda message: message["event"] == "verdict")
+        found = wait_for(lines, lambda message: message["event"] == "verdict")
     assert found["schema"] == 1
     assert (found["alarm"], found["stale"], found["touched"], found["reason"]) == (True, False, True, "")
     assert found["labels"] == {"big": True, "dangerous": True}
@@ -77,14 +73,13 @@ def test_a_verdict_is_a_line():
     assert found["time"].endswith("Z")
 
 
-def test_a_verdict_that_is_too_old_is_stale_and_keeps_its_alarm():
+def test_a_verdict_that_is_too_old_is_stale_and_keeps_its_alarm(shown):
     """Also where the engine hangs, which would tell nothing itself."""
-    shown = display()
-    with connected(shown) as take:
+    with piped(shown) as lines:
         shown.set_verdict(verdict(dangerous=True), monotonic())
         began = monotonic()
-        fresh = wait_for(take, lambda message: message["event"] == "verdict")
-        old = wait_for(take, lambda message: message["stale"])
+        fresh = wait_for(lines, lambda message: message["event"] == "verdict")
+        old = wait_for(lines, lambda message: message["stale"])
         assert 0.5 < monotonic() - began < PATIENCE
         told = [old[name] for name in ("event", "alarm", "dangerous", "state")]
         assert told == ["change", True, True, "unknown"]
@@ -93,19 +88,17 @@ def test_a_verdict_that_is_too_old_is_stale_and_keeps_its_alarm():
         assert "labels" not in old
 
 
-def test_a_reason_is_sent_once_and_then_with_each_heartbeat():
-    shown = display()
-    with connected(shown) as take:
+def test_a_reason_is_sent_once_and_then_with_each_heartbeat(shown):
+    with piped(shown) as lines:
         for _ in range(3):
             shown.set_verdict(None, monotonic(), "unplugged", True)
-        events = [take() for _ in range(3)]
+        events = [json.loads(lines.readline()) for _ in range(3)]
     told = [one["event"] for one in events if one["reason"] == "unplugged"]
     assert told == ["change", "heartbeat", "heartbeat"]
     assert all(one["alarm"] for one in events)
 
 
-def test_a_reader_that_is_slow_delays_nothing_and_misses_the_oldest():
-    shown = display()
+def test_a_reader_that_is_slow_delays_nothing_and_misses_the_oldest(shown):
     with piped(shown) as lines:
         began = monotonic()
         for _ in range(5_000):
@@ -118,16 +111,14 @@ def test_a_reader_that_is_slow_delays_nothing_and_misses_the_oldest():
     assert len(numbers) < 4_000
 
 
-def test_the_view_closes_with_the_reader_of_its_lines():
-    shown = display()
+def test_the_view_closes_with_the_reader_of_its_lines(shown):
     with suppress(BrokenPipeError), piped(shown) as lines:
         lines.readline()
         lines.close()
         assert shown.closed.wait(PATIENCE)
 
 
-def test_what_waits_is_written_before_the_end():
-    shown = display()
+def test_what_waits_is_written_before_the_end(shown):
     reading, writing = os.pipe()
     with os.fdopen(reading, "rb") as lines:
         with os.fdopen(writing, "w", buffering=1) as file, write_events(shown, file, shown.close, VERDICTS):
@@ -167,14 +158,11 @@ def test_each_change_is_a_line_with_its_time(tmp_path):
 
 def test_a_folder_that_cannot_be_written_is_refused(tmp_path):
     (tmp_path / "file").write_text("")
-    with (
-        pytest.raises(InputError, match=r"live\.log=FILE"),
-        write_file(display(0.0), tmp_path / "file" / "log"),
-    ):
+    writing = write_file(display(0.0), tmp_path / "file" / "log")
+    with pytest.raises(InputError, match=r"live\.log=FILE"), writing:
         pass
 
 
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no such device")
 def test_a_full_disk_does_not_hide_how_the_view_ends(capsys):
     """Closing the file raised an error of its own: SIGTERM ended with code 2."""
     shown = display(0.0)
@@ -216,39 +204,33 @@ def test_a_command_whose_reader_leaves_ends_with_code_0():
     assert live.returncode == 0
 
 
-def stand_in(published):
+def stand_in(published, parameters):
     """Return modules with the part of rclpy and std_msgs that the node uses."""
-    rclpy, node, std_msgs, msg = map(ModuleType, ("rclpy", "rclpy.node", "std_msgs", "std_msgs.msg"))
-
-    class Message:
-        def __init__(self, data):
-            self.data = data
 
     class Node:
         def __init__(self, name):
             self.name = name
 
         def declare_parameter(self, name, default):
-            return type("Parameter", (), {"value": rclpy.parameters.get(name, default)})
+            return SimpleNamespace(value=parameters.get(name, default))
 
         def create_publisher(self, kind, topic, depth):
-            send = lambda message: published.append((topic, message.data))  # noqa: E731
-            return type("Publisher", (), {"publish": staticmethod(send)})
+            return SimpleNamespace(publish=lambda message: published.append((topic, message.data)))
 
         def get_logger(self):
-            return type("Logger", (), {"warning": staticmethod(lambda text: None)})
+            return SimpleNamespace(warning=lambda text: None)
 
         def destroy_node(self):
             published.append(("destroyed", self.name))
 
-    node.Node, msg.Bool, msg.String, rclpy.parameters = Node, Message, Message, {}
-    return {"rclpy": rclpy, "rclpy.node": node, "std_msgs": std_msgs, "std_msgs.msg": msg}
+    node, msg = SimpleNamespace(Node=Node), SimpleNamespace(Bool=SimpleNamespace, String=SimpleNamespace)
+    packages = {"rclpy": SimpleNamespace(node=node), "std_msgs": SimpleNamespace(msg=msg)}
+    return packages | {"rclpy.node": node, "std_msgs.msg": msg}
 
 
 def test_the_ros_node_publishes_verdicts_and_marks_their_loss(monkeypatch):
     published = []
-    modules = stand_in(published)
-    for name, module in modules.items():
+    for name, module in stand_in(published, {"command": [sys.executable, "-c", LIVE]}).items():
         monkeypatch.setitem(sys.modules, name, module)
     path = ROOT / "docs" / "examples" / "ros2_node.py"
     assert len(path.read_text().splitlines()) <= 90
@@ -257,7 +239,6 @@ def test_the_ros_node_publishes_verdicts_and_marks_their_loss(monkeypatch):
     spec.loader.exec_module(example)
     monkeypatch.setattr(example, "SILENCE", 2 * HEARTBEAT)
 
-    modules["rclpy"].parameters = {"command": [sys.executable, "-c", LIVE]}
     node = example.SkinNode()
     for entry in (("~/stale", True), ("~/danger", False), ("~/danger", True), ("~/stale", False)):
         until(lambda entry=entry: entry in published)

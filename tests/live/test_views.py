@@ -15,16 +15,15 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from skin import FingertipPrior, InputError
 from skin.device.resampling import Frame
-from skin.errors import InputError
-from skin.inference.candidates import FingertipPrior
 from skin.live import loop, web
 from skin.live.contacts import unknown_contacts
 from skin.live.loop import Display
-from skin.live.verdict import Note, Verdict, contact_text, verdict_message
+from skin.live.verdict import Note, Verdict, verdict_message
 from skin.live.view import screen, show_in_terminal
 from skin.wire.channels import UnitConversion
-from tests.live.waiting import until
+from tests.wire.memory import until
 
 PLACES = np.array([[0.02, 0.02, 0], [0.14, 0.03, 0], [0.03, 0.1, 0], [0.13, 0.11, 0], [0.08, 0.06, 0]])
 SIZE = 0.16, 0.12
@@ -36,8 +35,22 @@ PLAIN = UnitConversion(np.ones(5), np.zeros(5), np.zeros(5, bool))
 PRESSED = Verdict(0, 0, {"big": 0.2, "dangerous": 0.9}, True, {"big": False, "dangerous": True}, True, False)
 
 
-def display():
-    return Display("rules naive 0", "/dev/skin", PLACES, SIZE, 4.0)
+SAFE = replace(PRESSED, dangerous=False)
+IDLE = replace(SAFE, touched=False)
+LAST_INVALID = np.array([True, True, True, True, False])
+
+
+def display(*values, **more):
+    """Return what is displayed after a frame of these values, N, if there are any."""
+    subject = Display("rules naive 0", "/dev/skin", PLACES, SIZE, 4.0)
+    if values:
+        subject.add(frame(values, **more))
+    return subject
+
+
+@pytest.fixture
+def subject():
+    return display()
 
 
 def frame(values, valid=None, **more):
@@ -65,8 +78,7 @@ def fetch(address, data=None, **headers):
 
 
 def test_no_peak_between_two_looks_is_missed():
-    subject = display()
-    subject.add(frame(np.zeros(5)))
+    subject = display(0, 0, 0, 0, 0)
     seen = subject.state(monotonic()).number
     for height in (1, 7, 2):
         subject.add(frame(height * np.eye(5)[3]))
@@ -75,29 +87,22 @@ def test_no_peak_between_two_looks_is_missed():
     assert subject.state(monotonic(), state.number).values[3] == 2
 
 
-def test_where_output_is_no_terminal_a_line_tells_each_change(tmp_path):
-    subject = display()
-    with (
-        (tmp_path / "said").open("w") as file,
-        show_in_terminal(subject, Console(file=file, width=60)),
-    ):
+def test_where_output_is_no_terminal_a_line_tells_each_change(subject, tmp_path):
+    with (tmp_path / "said").open("w") as file, show_in_terminal(subject, Console(file=file, width=60)):
         for verdict in (None, None, PRESSED, PRESSED):
             subject.set_verdict(verdict, monotonic(), "" if verdict else "taking the baseline: do not touch")
             sleep(0.2)
     said = [json.loads(line) for line in (tmp_path / "said").read_text().splitlines()]
     assert [line["event"] for line in said] == ["started", "change", "resumed", "alarm", "ended"]
-    assert [said[n]["reason"] for n in (0, 1)] == [
-        "waiting for the first frame",
-        "taking the baseline: do not touch",
-    ]
+    reasons = ["waiting for the first frame", "taking the baseline: do not touch"]
+    assert [line["reason"] for line in said[:2]] == reasons
     assert (said[3]["alarm"], said[3]["labels"]) == (True, {"big": False, "dangerous": True})
 
 
-def test_the_terminal_shows_the_alarm_and_the_probability():
-    subject = display()
-    subject.set_verdict(replace(PRESSED, dangerous=False, contact=0.1), monotonic())
+def test_the_terminal_shows_the_alarm_and_the_probability(subject):
+    subject.set_verdict(replace(SAFE, contact=0.1), monotonic())
     subject.add(frame([0, 0, 6.25, 0, 0]))
-    subject.set_verdict(PRESSED, monotonic())
+    subject.set_verdict(replace(PRESSED, contact=75.0), monotonic())
     subject.line = "99.9 Hz"
     text = shown(subject)
     assert "DANGEROUS" in text
@@ -105,10 +110,10 @@ def test_the_terminal_shows_the_alarm_and_the_probability():
     assert "strongest reading 6.2 N, sensor 2" in text
     assert "contacts unknown: this view estimates none" in text
     assert "99.9 Hz" in text
+    assert re.search(r"contact since \d\d:\d\d:\d\d \(75 s\).*take a new tare", text, re.DOTALL)
 
 
-def test_a_valid_guarantee_is_no_reason_and_hides_none():
-    subject = display()
+def test_a_valid_guarantee_is_no_reason_and_hides_none(subject):
     subject.add_note(Note("guarantee_valid", detail="at most 0.1 % missed"))
     for verdict in (replace(PRESSED, touched=False), PRESSED):
         subject.set_verdict(verdict, now := monotonic())
@@ -121,18 +126,16 @@ def test_a_valid_guarantee_is_no_reason_and_hides_none():
 
 
 def test_the_page_gets_pictures_and_needs_nothing_from_elsewhere():
-    subject = display()
-    subject.add(frame([0, 0, 2.0, 0, 0], np.array([True, True, True, True, False])))
+    subject = display(0, 0, 2.0, 0, 0, valid=LAST_INVALID)
     with web.serve_page(subject, 0) as address:
         code, page = fetch(address)
         assert code == 200
         assert not re.search(r"(src|href)\s*=|https?://|@import|url\(", page)
-        info = json.loads(fetch(f"{address}/skin.json")[1])
-        assert info["positions"] == PLACES.tolist()
+        assert json.loads(fetch(f"{address}/skin.json")[1])["positions"] == PLACES.tolist()
         subject.set_verdict(PRESSED, monotonic())
         with urllib.request.urlopen(f"{address}/pictures", timeout=30) as answer:
             line = answer.readline().decode()
-        picture = json.loads(line.removeprefix("data: "))
+    picture = json.loads(line.removeprefix("data: "))
     assert (picture["schema"], picture["dangerous"], picture["stale"]) == (1, True, False)
     assert picture["words"] == [["small", 0.8], ["dangerous", 0.9]]
     assert picture["values"][2] == 2.0
@@ -141,8 +144,7 @@ def test_the_page_gets_pictures_and_needs_nothing_from_elsewhere():
 
 @pytest.mark.parametrize("value", [1e300, -1e300, 1e10])
 def test_the_page_gets_valid_json_whatever_the_device_sends(value):
-    subject = display()
-    subject.add(frame([0, value, 2.0, 0, 0]))
+    subject = display(0, value, 2.0, 0, 0)
     subject.set_verdict(Verdict(0, 0, {"big": float("inf")}, True, {"big": True}, False, False), monotonic())
     with web.serve_page(subject, 0) as address, urllib.request.urlopen(f"{address}/pictures") as answer:
         line = answer.readline().decode().removeprefix("data: ")
@@ -151,9 +153,8 @@ def test_the_page_gets_valid_json_whatever_the_device_sends(value):
 
 
 def test_a_saturated_sensor_shows_its_limit_and_an_unknown_one_nothing():
-    subject = display()
-    valid, saturated = np.array([True, True, True, True, False]), np.array([False, False, True, False, False])
-    subject.add(frame([1.0, 1.0, 4.0, 1.0, 9.0], valid, saturated=saturated))
+    saturated = np.array([False, False, True, False, False])
+    subject = display(1.0, 1.0, 4.0, 1.0, 9.0, valid=LAST_INVALID, saturated=saturated)
     state = subject.state(monotonic())
     assert state.values.tolist() == [1, 1, 4, 1, 0]
     assert state.saturated.tolist() == saturated.tolist()
@@ -161,8 +162,7 @@ def test_a_saturated_sensor_shows_its_limit_and_an_unknown_one_nothing():
     assert (sent["saturated"][2], sent["valid"][4], sent["values"][2]) == (True, False, 4.0)
 
 
-def test_an_alarm_outlives_silence_in_every_view():
-    subject = display()
+def test_an_alarm_outlives_silence_in_every_view(subject):
     subject.set_verdict(PRESSED, monotonic())
     subject.set_verdict(None, monotonic(), "the device has stopped sending", alarm=True)
     state = subject.state(monotonic())
@@ -173,15 +173,11 @@ def test_an_alarm_outlives_silence_in_every_view():
     assert "stopped sending" in text
 
 
-def test_the_views_say_since_when_something_touches():
-    assert contact_text(None) == contact_text(1.0) == ""
-    assert re.fullmatch(r"contact since \d\d:\d\d:\d\d \(12 s\)", contact_text(12.0))
-    assert "take a new tare" in contact_text(75.0)
-
-
-def test_the_page_asks_for_a_tare_and_another_site_cannot():
-    subject = display()
+def test_the_page_asks_for_a_tare_and_other_sites_and_ports_in_use_are_refused(subject):
     with web.serve_page(subject, 0) as address:
+        assert fetch(f"{address}/skin.json", Host="evil.example")[0] == 400
+        with pytest.raises(InputError, match=r"live\.web_port="):
+            web.serve_page(display(), int(address.rsplit(":", 1)[1])).__enter__()
         for headers, code in (({}, 403), ({"Origin": "http://evil.example"}, 403), ({"X-Skin": "tare"}, 204)):
             assert subject.take_tare() == ""
             assert fetch(f"{address}/tare", b"", **headers)[0] == code
@@ -190,8 +186,7 @@ def test_the_page_asks_for_a_tare_and_another_site_cannot():
 
 
 def test_the_operator_types_t_for_a_tare(monkeypatch, tmp_path):
-    pty = pytest.importorskip("pty", reason="pseudo-terminals need a POSIX system")
-    master, slave = pty.openpty()
+    master, slave = os.openpty()
     subject = display()
     with os.fdopen(slave) as typed, (tmp_path / "said").open("w") as file:
         monkeypatch.setattr("sys.stdin", typed)
@@ -224,7 +219,7 @@ def test_a_tare_is_refused_under_a_touch_until_it_is_confirmed():
     subject, events = display(), []
     subject.observers.append(lambda assessment, now, event: event and events.append(event))
     assert subject.request_tare(monotonic(), force=True) != ""  # there is nothing to confirm
-    for verdict in (PRESSED, replace(PRESSED, dangerous=False, contact=0.5)):
+    for verdict in (PRESSED, replace(SAFE, contact=0.5)):
         subject.set_verdict(verdict, monotonic())
         assert "something touches the skin" in subject.request_tare(monotonic())
         assert subject.take_tare() == ""
@@ -232,15 +227,14 @@ def test_a_tare_is_refused_under_a_touch_until_it_is_confirmed():
         assert subject.take_tare() == "tare_forced"
     subject.set_verdict(None, monotonic(), "the device has stopped sending", alarm=True)
     assert subject.request_tare(monotonic()) != ""
-    subject.set_verdict(replace(PRESSED, dangerous=False, touched=False), monotonic())
+    subject.set_verdict(IDLE, monotonic())
     assert subject.request_tare(monotonic()) == ""
     refused = "tare_refused"
     assert events == [refused, refused, "tare_forced", refused, "tare_forced", refused, "tare"]
 
 
 def test_a_refused_tare_is_said_while_it_may_be_forced():
-    subject, idle = display(), replace(PRESSED, touched=False, dangerous=False)
-    refused = loop.REFUSALS["touched"]
+    subject, refused = display(), loop.REFUSALS["touched"]
     subject.line = "99.9 Hz"
     subject.set_verdict(PRESSED, 100.0)
     assert subject.request_tare(100.0) == refused
@@ -249,21 +243,19 @@ def test_a_refused_tare_is_said_while_it_may_be_forced():
     assert subject.request_tare(100.0, force=True) == refused  # a refusal is for one
     assert subject.state(159.0).line == f"{refused}, 99.9 Hz"
     assert subject.state(161.0).line == "99.9 Hz"
-    subject.set_verdict(idle, 161.0)
+    subject.set_verdict(IDLE, 161.0)
     assert "nothing to force" in subject.request_tare(161.0, force=True)
     assert subject.state(161.0).line == "there is nothing to force, 99.9 Hz"
 
 
-def test_the_map_of_an_alarm_is_held_and_goes_with_the_touch():
-    subject = display()
-    idle = replace(PRESSED, touched=False, dangerous=False)
-    subject.set_verdict(idle, monotonic())
+def test_the_map_of_an_alarm_is_held_and_goes_with_the_touch(subject):
+    subject.set_verdict(IDLE, monotonic())
     subject.add(frame([0, 0, 6.0, 0, 0]))
-    subject.set_verdict(replace(PRESSED, dangerous=False, contact=0.1), monotonic())
+    subject.set_verdict(replace(SAFE, contact=0.1), monotonic())
     state = subject.state(monotonic())
     assert (state.held, state.peak[2]) == (False, 6.0)
     subject.add(frame([0, 0, 0.1, 0, 0]))
-    for verdict in (PRESSED, replace(PRESSED, dangerous=False, contact=None)):
+    for verdict in (PRESSED, replace(SAFE, contact=None)):
         subject.set_verdict(verdict, monotonic())
         state = subject.state(monotonic(), state.number)
         assert (state.held, state.peak[2], state.values[2]) == (True, 6.0, 0.1)
@@ -271,16 +263,15 @@ def test_the_map_of_an_alarm_is_held_and_goes_with_the_touch():
     for _ in range(20):
         subject.add(frame(np.zeros(5)))
     subject.add(frame([0, 1.0, 0, 0, 0]))
-    subject.set_verdict(replace(PRESSED, dangerous=False, contact=0.05), monotonic())
+    subject.set_verdict(replace(SAFE, contact=0.05), monotonic())
     assert subject.state(monotonic()).peak.tolist() == [0, 1, 0, 0, 0]
-    subject.set_verdict(idle, monotonic())
+    subject.set_verdict(IDLE, monotonic())
     assert subject.state(monotonic()).peak.max() == 0
 
 
-def test_an_unknown_place_is_not_shown_as_no_touch():
-    subject = display()
+def test_an_unknown_place_is_not_shown_as_no_touch(subject):
     masked = {"unknown": (2,), "masked": (2,), "notes": (Note("masked", (2,)), Note("pause", seconds=0.7))}
-    subject.set_verdict(replace(PRESSED, touched=False, labels={}, dangerous=False, **masked), monotonic())
+    subject.set_verdict(replace(IDLE, labels={}, **masked), monotonic())
     sent = web.message(subject.state(monotonic()), monotonic())
     assert (sent["state"], sent["unknown"]) == ("unknown", [2])
     text = shown(subject)
@@ -292,15 +283,7 @@ def test_an_unknown_place_is_not_shown_as_no_touch():
     assert "unknown: readings are frozen" in shown(subject)
 
 
-def test_other_sites_and_ports_in_use_are_refused():
-    with web.serve_page(display(), 0) as address:
-        assert fetch(f"{address}/skin.json", Host="evil.example")[0] == 400
-        with pytest.raises(InputError, match=r"live\.web_port="):
-            web.serve_page(display(), int(address.rsplit(":", 1)[1])).__enter__()
-
-
-def test_the_page_goes_when_the_watching_ends():
-    subject = display()
+def test_the_page_goes_when_the_watching_ends(subject):
     with web.serve_page(subject, 0) as address:
         answer = urllib.request.urlopen(f"{address}/pictures", timeout=30)
         answer.readline()
@@ -330,16 +313,13 @@ def repeated(subject, verdict):
 
 
 def test_the_page_draws_what_it_is_sent(browser):
-    subject = display()
-    subject.add(frame([0, 0, 2.0, 0, 0], np.array([True, True, True, True, False])))
+    subject = display(0, 0, 2.0, 0, 0, valid=LAST_INVALID)
     subject.line = "99.9 Hz"
     with web.serve_page(subject, 0) as address, repeated(subject, PRESSED):
         browser.open(address)
         shows(browser, "pictures >= 5", True)
         text = browser.run("return document.body.innerText")
-        colour = browser.run(
-            AT.format(*(position / size for position, size in zip(PLACES[2], SIZE, strict=False)))
-        )
+        colour = browser.run(AT.format(*PLACES[2, :2] / SIZE))
         assert browser.run("return document.body.dataset.state") == "danger"
         shows(browser, "document.documentElement.scrollHeight <= innerHeight", True)
     for said in ("DANGEROUS", "80 %", "90 %", "about the last 3 s", "99.9 Hz", "/dev/skin"):
@@ -382,7 +362,7 @@ def test_pressure_is_drawn_where_contacts_explain_the_readings(browser, state):
         "large": 1.0, "device_time": 1.0, "contacts": [contact] * (state != "unknown"),
     }, np.inf  # fmt: skip
     subject.add(frame([0, 0, 2.0, 0, 0]))
-    with web.serve_page(subject, 0) as address, repeated(subject, replace(PRESSED, dangerous=False)):
+    with web.serve_page(subject, 0) as address, repeated(subject, SAFE):
         browser.open(address)
         shows(browser, "pictures >= 3", True)
         colour = browser.run(AT.format(0.078 / SIZE[0], 0.083 / SIZE[1]))
@@ -394,8 +374,7 @@ ANNOUNCED = "pictures > 0 && [...document.querySelectorAll('[role=alert]')].map(
 
 
 def test_the_page_announces_an_alarm_and_its_end_once(browser):
-    subject = display()
-    subject.add(frame([0, 0, 2.0, 0, 0]))
+    subject = display(0, 0, 2.0, 0, 0)
     subject.set_verdict(None, monotonic(), "taking the baseline")
     with web.serve_page(subject, 0) as address:
         browser.open(address)
@@ -425,7 +404,7 @@ def test_the_page_goes_on_after_a_restart_with_more_sensors(browser):
         shows(browser, CROSSED, "5 of 5 on /dev/skin")
     positions = np.concatenate([PLACES, PLACES + np.array([0.01, 0.01, 0])])
     other = Display("any_skin", "/dev/other", positions, SIZE, 4.0)
-    verdict = replace(PRESSED, touched=False, dangerous=False, unknown=(7, 9), masked=(7, 9))
+    verdict = replace(IDLE, unknown=(7, 9), masked=(7, 9))
     with web.serve_page(other, int(address.rsplit(":", 1)[1])), repeated(other, verdict):
         shows(browser, CROSSED, "10 of 10 on /dev/other")
         before = browser.run("return pictures")
@@ -434,13 +413,12 @@ def test_the_page_goes_on_after_a_restart_with_more_sensors(browser):
 
 
 def test_the_map_of_a_program_that_has_ended_is_outdated(browser):
-    subject = display()
-    subject.add(frame([0, 0, 2.0, 0, 0]))
+    subject = display(0, 0, 2.0, 0, 0)
     subject.line = "99.9 Hz"
     bright = "getComputedStyle($('map')).filter"
     with web.serve_page(subject, 0) as address:
         browser.open(address)
-        with repeated(subject, replace(PRESSED, touched=False, dangerous=False)):
+        with repeated(subject, IDLE):
             shows(browser, "$('time').textContent", "Map: now")
             assert browser.run(f"return {bright}") == "none"
         shows(browser, "$('head').textContent", "unknown: no decision for longer than usual")
@@ -460,22 +438,17 @@ def test_a_page_without_an_answer_says_unknown_and_keeps_the_alarm(browser, monk
         browser.open(address)
         with repeated(subject, PRESSED):
             shows(browser, "$('head').textContent", "⚠ DANGEROUS")
-        hangs = monkeypatch.context()
-        with hangs as patch:
+        said = "⚠ DANGEROUS; unknown: no answer from the program for 1.5 s"
+        with monkeypatch.context() as patch:
             patch.setattr(subject, "state", lambda *_: over.wait(60))
-            shows(
-                browser,
-                "$('head').textContent",
-                "⚠ DANGEROUS; unknown: no answer from the program for 1.5 s",
-            )
+            shows(browser, "$('head').textContent", said)
         over.set()
 
 
 def test_the_page_shows_the_gravest_note_and_no_probability_beside_an_alarm_of_late_frames(browser):
-    subject = display()
-    subject.add(frame([0, 0, 6.0, 0, 0]))
+    subject = display(0, 0, 6.0, 0, 0)
     notes = (Note("over_range", (2,)), Note("masked", (4,)))
-    safe = replace(PRESSED, dangerous=False, labels={"big": False, "dangerous": False}, notes=notes)
+    safe = replace(SAFE, labels={"big": False, "dangerous": False}, notes=notes)
     with web.serve_page(subject, 0) as address:
         browser.open(address)
         with repeated(subject, safe):

@@ -7,19 +7,15 @@ from itertools import islice
 import numpy as np
 import pytest
 
-from skin.body.base import Sheet
-from skin.body.layout import Grid
+from skin import Grid, InputError
 from skin.calibration.bench import build_bench_data, write_bench_session
 from skin.calibration.known_loads import choose_presses, emulate_session, stair_gauge
 from skin.core.files import CONF
 from skin.core.safe_loading import load_yaml
 from skin.device.resampling import Frame, Window
-from skin.device.simulated import Simulated
-from skin.errors import InputError
 from skin.evaluation.guarantee import describe_presses
 from skin.live.engine import Detection, Engine
 from skin.live.engine_builder import raises_alarm
-from skin.mechanics.simulator.naive import Naive
 from skin.record.comparison import (
     compare_gestures,
     compare_session,
@@ -32,15 +28,14 @@ from skin.touch.labels import TOUCH
 from skin.wire.channels import UnitConversion
 from skin.wire.emulator import emulated_gestures, upsample
 from skin.wire.segmentation import ContinuousSegmenter
+from tests.made_up import PERFECT, naive_skin
 
-SHEET = Sheet((0.16, 0.16), (32, 32), [{"material": "EcoFlex 00-30", "thickness": 0.005}])
 RATE, COUNT, GAIN = 50.0, 6, 0.8
 
 
 @pytest.fixture(scope="module")
 def device():
-    perfect = {"gain_spread": 0.0, "offset": 0.3, "noise": 0.0, "clip": 100.0}
-    return Simulated(body=SHEET, layout=Grid(3, 3), simulator=Naive, gestures=10, **perfect)
+    return naive_skin(**(PERFECT | {"offset": 0.3, "clip": 100.0}))
 
 
 def session(device, path, labels, known=True):
@@ -68,15 +63,14 @@ def test_a_gain_between_session_and_simulation_is_found(device, tmp_path):
     assert [pair.same for pair in comparison.pairs] == [True] * COUNT
     for pair, played in zip(comparison.pairs, emulated_gestures(device), strict=False):
         assert pair.measures["ratio"] == pytest.approx(GAIN, rel=1e-3)
-        assert pair.measures["rmse"] == pytest.approx(
-            (1 - GAIN) * np.sqrt((played.force**2).mean()), rel=2e-3
-        )
+        error = (1 - GAIN) * np.sqrt((played.force**2).mean())
+        assert pair.measures["rmse"] == pytest.approx(error, rel=2e-3)
         # The applied force is the sum of the pressure, told by the movie and not by any sensor.
         assert pair.applied.max() > pair.measures["simulated"]
-    page = publish_comparison(comparison, [], "Here.", 2, tmp_path)[0].read_text()
-    assert "gain ratio of readings (recorded over simulated), median: 0.800" in page
     path, picture = publish_comparison(comparison, [], "Here.", 2, tmp_path)
-    assert path.read_text() == page
+    page = path.read_text()
+    assert "gain ratio of readings (recorded over simulated), median: 0.800" in page
+    assert publish_comparison(comparison, [], "Here.", 2, tmp_path)[0].read_text() == page
     assert picture.stat().st_size > 10_000
     simulated, recorded = comparison.touches
     assert recorded.readings.numpy() == pytest.approx(GAIN * simulated.readings.numpy(), abs=2e-3)
@@ -130,9 +124,7 @@ def test_presses_are_compared_as_gestures_are(device, tmp_path):
     settings = load_yaml(CONF / "compare.yaml")["compare"]
     comparison = compare_session(device, str(path), None, settings)
     assert comparison.things == "presses"
-    assert [pair.number for pair in comparison.pairs] == [
-        number for number in range(len(rows)) if number % 9 != 8
-    ]
+    assert [pair.number for pair in comparison.pairs] == [n for n in range(len(rows)) if n % 9 != 8]
     first = comparison.pairs[0]
     assert first.measures["ratio"] == pytest.approx(GAIN, rel=1e-3)
     assert first.measures["recorded"] == pytest.approx(GAIN * first.measures["simulated"], rel=1e-3)

@@ -1,4 +1,4 @@
-"""The C file of a model, compiled with a compiler of this machine, against the model and its live view."""
+"""The C file of a model and the sketches of the documentation, compiled with a compiler of this machine."""
 
 import shutil
 import subprocess
@@ -21,8 +21,11 @@ from skin.robot.board import STEP, write_header
 from skin.runs.build import TorchModel, build_data, build_device, build_learner
 from skin.touch.labels import TOUCH, Task
 from skin.wire.channels import NewtonFrame
+from skin.wire.decoder import Decoder
+from skin.wire.protocol import Header
 from tests.live.test_safety import RATE, SENSORS, force
 
+SKETCHES = ROOT / "docs" / "firmware"
 MAIN = Path(__file__).with_name("board.c")
 STRICT = ["-std=c99", "-Wall", "-Wextra", "-Werror", "-O1", "-fsanitize=address,undefined"]
 SMALL = ["layout=grid", "layout.rows=3", "layout.columns=3", "simulator=naive", "data.gestures=400"]
@@ -113,7 +116,7 @@ def test_the_self_test_fails_with_another_number(board, tmp_path):
     assert subprocess.run([compiled(tmp_path, "-std=c99")]).returncode == 10
 
 
-# Nine sensors; the fifth is pressed for a second after 8 s. Constants stay in flash, as on an Uno.
+# Pins of an Uno: the converter takes 100 us, and what it reads at a time is given. The clock wraps early.
 STAND_IN = """
 #include <stdint.h>
 #include <stdio.h>
@@ -121,19 +124,19 @@ enum { A0, A1, A2, A3, A4, A5, A6, A7, A8, OUTPUT, LOW = 0, HIGH = 1 };
 static uint32_t clock_us = 4294000000u;
 static uint32_t passed() { return clock_us - 4294000000u; }
 static uint32_t micros() { return clock_us += 4; }
-static int analogRead(uint8_t pin) {
-  clock_us += 100;
-  return 100 + passed() / 10000 * (pin + 7) % 5 % 2 + (pin == 4 && passed() / 1000000 == 8 ? 400 : 0);
-}
+static int analogRead(uint8_t pin) { clock_us += 100; return READING; }
 static int lamp;
-static void pinMode(int, int) {}
-static void digitalWrite(int, int level) { lamp = level; }
+static inline void pinMode(int, int) {}
+static inline void digitalWrite(int, int level) { lamp = level; }
 struct {
   void begin(uint32_t) {}
   void print(const char *text) { fputs(text, stdout); }
   void println(const char *text) { printf("%s %d\\n", text, lamp); }
 } Serial;
 """
+# The fifth pin is pressed for a second after 8 s.
+PRESSED = "100 + passed() / 10000 * (pin + 7) % 5 % 2 + (pin == 4 && passed() / 1000000 == 8 ? 400 : 0)"
+# Constants stay in flash, as on an Uno.
 FLASH = """
 #define PROGMEM
 #define pgm_read_float(at) (*(const float *)(at))
@@ -141,7 +144,16 @@ FLASH = """
 #define pgm_read_word(at) (*(const uint16_t *)(at))
 #define pgm_read_dword(at) (*(const uint32_t *)(at))
 """
-RUN = "\nint main() { setup(); while (passed() < 15000000u) loop(); }\n"
+
+
+def printed(folder, sketch, reading, end, *flags):
+    """Return the lines that a sketch prints until a condition holds, with the readings of its pins."""
+    (folder / "Arduino.h").write_text(f"#define READING {reading}\n{STAND_IN}")
+    assert len(sketch.splitlines()) < 60
+    main = folder / "main.cpp"
+    main.write_text(f"{sketch}\nint main() {{ setup(); while ({end}) loop(); }}\n")
+    program = compiled(folder, "-Wall", *flags, source=main, compiler="g++")
+    return subprocess.run([program], capture_output=True, text=True, timeout=60).stdout.splitlines(True)
 
 
 def test_the_sketch_prints_state_and_alarm(board, tmp_path):
@@ -149,13 +161,9 @@ def test_the_sketch_prints_state_and_alarm(board, tmp_path):
     (tmp_path / "model.h").write_text((folder / "model.h").read_text())
     (tmp_path / "avr").mkdir()
     (tmp_path / "avr" / "pgmspace.h").write_text(FLASH)
-    (tmp_path / "Arduino.h").write_text(STAND_IN)
-    sketch = (ROOT / "docs" / "firmware" / "alarm" / "alarm.ino").read_text()
-    assert len(sketch.splitlines()) < 60
-    main = tmp_path / "main.cpp"
-    main.write_text(sketch.replace("A4, A5}", "A4, A5, A6, A7, A8}") + RUN)
-    program = compiled(tmp_path, "-Wall", "-Wextra", "-Werror", "-D__AVR__", source=main, compiler="g++")
-    said = subprocess.run([program], capture_output=True, text=True, timeout=60).stdout.splitlines()
+    sketch = (SKETCHES / "alarm" / "alarm.ino").read_text().replace("A4, A5}", "A4, A5, A6, A7, A8}")
+    strict = "-Wextra", "-Werror", "-D__AVR__"
+    said = [line.rstrip() for line in printed(tmp_path, sketch, PRESSED, "passed() < 15000000u", *strict)]
     assert said[0] == "# self-test passed: do not touch the skin 1"
     assert said[1] == said[-1] == "no touch,- 0"
     alarms = [number for number, line in enumerate(said) if line == "touch,ALARM 1"]
@@ -163,6 +171,24 @@ def test_the_sketch_prints_state_and_alarm(board, tmp_path):
     assert len(alarms) == alarms[-1] - alarms[0] + 1
     assert 11 <= 3 + alarms[-1] / 20 <= 11.5
     assert len(said) == 2 + 20 * (15 - 3)
+
+
+def test_every_frame_of_the_sketch_of_a_skin_is_read(tmp_path):
+    sketch = (SKETCHES / "skin" / "skin.ino").read_text()
+    lines = printed(tmp_path, sketch, "100 * pin + clock_us / 10000 % 97", "seq < 1200", "-Wno-format")
+    decoder = Decoder()
+    frames = decoder.feed("".join(lines).encode())
+    assert (decoder.sensors, [frame.seq for frame in frames]) == (6, list(range(1200)))
+    assert decoder.frame_format.check == "crc16"
+    assert decoder.header == Header(1, 6, 100.0, "adc", 10, "uno")
+    assert decoder.stats.bad.total() + decoder.stats.lost + decoder.stats.resets == 0
+    values = np.stack([frame.values for frame in frames])
+    assert values[:, 5] - values[:, 0] == pytest.approx(500, abs=97)
+    assert np.diff([frame.t for frame in frames]) == pytest.approx(0.01, abs=2e-4)
+    # The header comes each second.
+    positions = [position for position, line in enumerate(lines) if line.startswith("# skin ")]
+    assert positions[0] == 0
+    assert max(np.diff([*positions, len(lines)])) <= 102
 
 
 @pytest.mark.parametrize(

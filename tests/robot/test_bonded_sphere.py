@@ -10,9 +10,7 @@ from scipy.sparse.linalg import splu
 from skfem import Basis, BilinearForm, ElementQuad1, ElementQuad2, ElementVector, LinearForm, MeshQuad
 from skfem.helpers import grad
 
-from skin.body.layout import Grid
-from skin.body.sheet import Sheet
-from skin.mechanics.simulator.solid import Solid
+from skin import Grid, Sheet, Solid
 from skin.robot.mujoco_skin import Press, Pressing
 
 THICKNESS, YOUNG, POISSON, EXTENT = 0.03, 170e3, 0.499, 0.0339

@@ -38,9 +38,8 @@ from skin.touch.labels import Task
 from skin.wire.channels import UnitConversion
 
 CASES = ["plain", "everything"]
-SENSORS = Sensors(
-    np.array([[0.02, 0.02, 0], [0.06, 0.02, 0], [0.02, 0.06, 0], [0.06, 0.06, 0]]), (0.01, 0.01)
-)
+SQUARE = np.array([[0.02, 0.02, 0], [0.06, 0.02, 0], [0.02, 0.06, 0], [0.06, 0.06, 0]])
+SENSORS = Sensors(SQUARE, (0.01, 0.01))
 ROWS, INFO = "data/chunk-000/file-000.parquet", "meta/info.json"
 
 
@@ -93,13 +92,8 @@ def test_a_set_is_as_lerobot_documents_it(tmp_path):
     """Files, fields, columns and types of docs/source/lerobot-dataset-v3.mdx and of its loader."""
     before, folder = recording(), tmp_path / "set"
     write_lerobot(before, folder)
-    assert sorted(str(path.relative_to(folder)) for path in folder.rglob("*.*")) == [
-        "data/chunk-000/file-000.parquet",
-        "meta/episodes/chunk-000/file-000.parquet",
-        "meta/info.json",
-        "meta/stats.json",
-        "meta/tasks.parquet",
-    ]
+    meta = ["meta/episodes/chunk-000/file-000.parquet", INFO, "meta/stats.json", "meta/tasks.parquet"]
+    assert sorted(str(path.relative_to(folder)) for path in folder.rglob("*.*")) == [ROWS, *meta]
     info = json.loads((folder / "meta/info.json").read_text(), parse_constant=pytest.fail)
     assert (info["codebase_version"], info["fps"], info["splits"]) == ("v3.0", 33.3, {"train": "0:3"})
     assert (info["total_episodes"], info["total_frames"], info["total_tasks"]) == (3, 12, 1)
@@ -153,9 +147,8 @@ def foreign(folder, lengths=(7, 3), shape=(2, 2)):
 
 @pytest.mark.parametrize(("frames", "starts"), [(None, [0, 100]), (3, [0, 12, 24, 100])])
 def test_an_episode_of_another_set_is_a_touch_or_several(tmp_path, frames, starts):
-    found = read_lerobot(
-        foreign(tmp_path / "set"), SENSORS, (0.08, 0.08), "observation.grid", scale=2.0, frames=frames
-    )
+    read = partial(read_lerobot, feature="observation.grid", scale=2.0, frames=frames)
+    found = read(foreign(tmp_path / "set"), SENSORS, (0.08, 0.08))
     touches = found.touches
     assert touches.readings[:, 0, 0].tolist() == [2 * start for start in starts]
     assert touches.readings.shape == (len(starts), frames or 7, 4)
@@ -176,11 +169,7 @@ def unlike(path):
     ("name", "damage", "message"),
     [
         (ROWS, lambda path: path.write_bytes(path.read_bytes()[:-20]), "is damaged"),
-        (
-            ROWS,
-            lambda path: pq.write_table(pq.read_table(path)[:11], path),
-            "it has 11 rows, not 3 touches of 4",
-        ),
+        (ROWS, lambda path: pq.write_table(pq.read_table(path)[:11], path), "11 rows, not 3 touches of 4"),
         (INFO, unlike, "is damaged"),
         (INFO, lambda path: path.write_text("[1"), "is damaged"),
     ],
@@ -234,11 +223,9 @@ def read():
                 plain(json.loads(schema.data))
             (metadata,) = opened.iter_metadata()
             layout = {name: json.loads(text) for name, text in metadata.metadata.items()}
-            found = [
-                (channel.topic, message.log_time, json.loads(message.data, parse_constant=pytest.fail))
-                for _, channel, message in opened.iter_messages()
-            ]
-        return found, layout
+            parse = partial(json.loads, parse_constant=pytest.fail)
+            sent = [(channel.topic, message) for _, channel, message in opened.iter_messages()]
+        return [(topic, message.log_time, parse(message.data)) for topic, message in sent], layout
 
     return messages
 
@@ -323,7 +310,6 @@ def test_messages_of_a_live_view_keep_their_order():
     assert [moment // 1_000_000 % 1000 for moment in moments] == [2, 2, 3]
 
 
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="no processes of POSIX")
 def test_a_killed_process_leaves_all_complete_chunks(tmp_path):
     writer = pytest.importorskip("mcap.writer")
     from mcap.exceptions import EndOfFile

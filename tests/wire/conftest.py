@@ -1,6 +1,8 @@
 """A device made of a real pseudo-terminal: what is written to one end comes out of a serial port."""
 
 import os
+import termios
+import tty
 from collections.abc import Callable, Sequence
 from contextlib import contextmanager, suppress
 from itertools import count
@@ -9,10 +11,7 @@ from time import monotonic
 
 import pytest
 
-pytest.importorskip("termios", reason="pseudo-terminals need a POSIX system")
-import termios
-import tty
-
+from skin.wire.decoder import Decoder
 from skin.wire.protocol import encode_line
 
 
@@ -70,3 +69,8 @@ def plug():
     cable = Plug()
     yield cable
     cable.unplug()
+
+
+@pytest.fixture
+def decoder():
+    return Decoder(4)

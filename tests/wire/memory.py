@@ -1,19 +1,20 @@
-"""Streams of bytes from memory in place of ports."""
+"""Streams of bytes from memory in place of ports; waiting for other threads and processes."""
 
 from time import monotonic, sleep
 
-from skin.device.resampling import FrameError
-from skin.wire.adapter import Adapter
 from skin.wire.skin import open_skin
 
-PATIENT = 60.0  # s: machines are busy at times
+PATIENCE = 300  # s, on a machine that is busy with other things
 
 
-def wait_for(condition):
-    deadline = monotonic() + PATIENT
-    while not condition():
-        assert monotonic() < deadline
-        sleep(0.005)
+def until(found, process=None, wanted=None):
+    """Wait until a function gives ``wanted``, or anything true, and return it; ``process`` must not end."""
+    deadline = monotonic() + PATIENCE
+    while not (result := found()) if wanted is None else (result := found()) != wanted:
+        assert monotonic() < deadline, f"waited in vain: {result}"
+        assert process is None or process.poll() is None, "ended while waited for"
+        sleep(0.05)
+    return result
 
 
 class Sent:
@@ -50,12 +51,3 @@ class Sent:
 
 def opened(*pieces, layout=4, end=False, **settings):
     return open_skin("memory", range(layout), opener=lambda: Sent(*pieces, end=end), **settings)
-
-
-def parse_line(line):
-    """Return the numbers of a line of our protocol; FrameError if it holds anything else."""
-    *_, layout = Adapter().layouts(3 * (line + b"\n"))
-    read = layout.reader(line)
-    if read.strange:
-        raise FrameError("number")
-    return read

@@ -1,23 +1,22 @@
-"""The emulator: its gestures, its converter, and how it ends."""
+"""The emulator: its gestures, its converter and how it ends; its ports: who listens, and what they hear."""
 
+import os
 import socket
+from functools import partial
 from threading import Thread
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from skin.body.base import Sheet
-from skin.body.layout import Grid
+from skin import Grid, InputError
 from skin.device.resampling import resample
-from skin.device.simulated import Simulated
-from skin.errors import InputError
-from skin.mechanics.simulator.naive import Naive
 from skin.wire.decoder import Decoder
-from skin.wire.emulator import Converter, Emulator, EmulatorSettings, TcpPort, upsample
-from tests.wire.memory import wait_for
+from skin.wire.emulator import Converter, Emulator, EmulatorSettings, PtyPort, TcpPort, upsample
+from skin.wire.reader import PortStream, check_port
+from tests.made_up import naive_skin
+from tests.wire.memory import until
 
-SHEET = Sheet((0.16, 0.16), (16, 16), [{"material": "EcoFlex 00-30", "thickness": 0.005}])
 RATE = 10.0
 
 
@@ -57,7 +56,7 @@ def test_counts_are_those_of_a_converter():
 
 @pytest.mark.parametrize("waits_for", ["a reader", "the next frame", "its power"])
 def test_it_stops_wherever_it_waits(waits_for):
-    device = Simulated(body=SHEET, layout=Grid(2, 2), simulator=Naive, gestures=10)
+    device = naive_skin(layout=Grid(2, 2))
     port = TcpPort(0)
     rate = 0.005 if waits_for == "the next frame" else 100.0
     unplug = [0.01] if waits_for == "its power" else []
@@ -69,7 +68,7 @@ def test_it_stops_wherever_it_waits(waits_for):
             with socket.create_connection(("127.0.0.1", int(port.address.rpartition(":")[2]))) as reader:
                 assert reader.recv(1)
                 if waits_for == "its power":
-                    wait_for(lambda: not port.connected())
+                    until(lambda: not port.connected())
     finally:
         emulator.stop()
         thread.join(20)
@@ -81,7 +80,7 @@ def test_it_says_that_it_is_emulated_and_fails_when_it_should():
     """Nobody must check its scale. Channel 1 sticks and 2 dies from 0.5 s on; nothing is sent for 0.3 s."""
     written = []
     port = SimpleNamespace(write=lambda data: written.append(data) or len(data), connected=lambda: True)
-    device = Simulated(body=SHEET, layout=Grid(2, 2), simulator=Naive, gestures=10, noise=0.3)
+    device = naive_skin(layout=Grid(2, 2), noise=0.3)
     faults = {"stuck": [1], "dead": [2], "since": 0.5, "silence": [1.2], "away": 0.3}
     Emulator(device, port, EmulatorSettings(speed=50.0, idle=2.0, **faults)).run(2.0)
     decoder = Decoder(4)
@@ -94,3 +93,53 @@ def test_it_says_that_it_is_emulated_and_fails_when_it_should():
     assert after[0, 1:3].tolist() == [before[-1, 1], 0]
     with pytest.raises(InputError, match=r"emulate.dead=\[4\] must be below 4"):
         Emulator(device, SimpleNamespace(), EmulatorSettings(dead=[4]))
+
+
+@pytest.mark.parametrize("kind", ["pty", "tcp"])
+def test_it_knows_who_listens_and_is_heard_and_is_plugged_in_at_the_same_address(kind, tmp_path):
+    link = str(tmp_path / "skin")
+    make = partial(PtyPort, link) if kind == "pty" else partial(TcpPort, 0)
+    port = make()
+    assert not port.connected()
+    stream, address, data = PortStream(port.address, 115200), port.address, bytes(range(256)) * 8
+    try:
+        until(port.connected)
+        assert port.write(data) == len(data)
+        heard = bytearray()
+        until(lambda: heard.extend(stream.read()) or len(heard) == len(data))
+        assert heard == data
+        port.unplug()
+        with pytest.raises(OSError, match=r"disconnected|Input/output"):
+            list(iter(stream.read, None))
+        with pytest.raises(InputError, match=r"cannot reach|no port"):
+            PortStream(address, 115200)
+        port.plug()
+        assert port.address == address == (link if kind == "pty" else address)
+        match = r"cannot make link=.* another name|cannot listen .* give port=0"
+        with pytest.raises(InputError, match=match):
+            make() if kind == "pty" else TcpPort(int(address.rpartition(":")[2]))
+        PortStream(address, 115200).close()
+    finally:
+        stream.close()
+        port.unplug()
+    assert not os.path.lexists(link)
+
+
+def test_a_port_that_does_not_exist_is_refused_before_a_run_is_loaded():
+    for port in ("/dev/none", "./skin-port"):
+        with pytest.raises(InputError, match=f"no port {port}"):
+            check_port(port)
+    for port in ("COM3", "rfc2217://host:1", "socket://192.0.2.1:7", "null"):
+        check_port(port)  # these cannot be checked
+
+
+def test_a_file_is_left_alone_and_a_link_that_leads_nowhere_is_taken_over(tmp_path):
+    link = tmp_path / "skin"
+    link.write_text("keep")
+    with pytest.raises(InputError, match="cannot make link"):
+        PtyPort(str(link))
+    assert link.read_text() == "keep"
+    link.unlink()
+    link.symlink_to("/dev/pts/nothing")
+    PtyPort(str(link)).unplug()
+    assert not link.is_symlink()

@@ -1,4 +1,4 @@
-"""A skin on a real pseudo-terminal or socket, and everything that goes wrong with one."""
+"""A skin on a real pseudo-terminal or socket, what goes wrong with one, and a recording in place of one."""
 
 import errno
 import os
@@ -14,24 +14,26 @@ import numpy as np
 import pytest
 import serial
 
+from skin.device.resampling import Frame
 from skin.errors import InputError
 from skin.live.engine import Detection, Engine
 from skin.live.loop import LiveLoop
+from skin.runs.build import build_device
 from skin.touch.labels import TOUCH
 from skin.wire.channels import Reason
 from skin.wire.decoder import Decoder
 from skin.wire.emulator import PtyPort
 from skin.wire.protocol import Header, encode_header, encode_line
-from skin.wire.reader import SkinDisconnected, SkinTimeout, WireFeed
-from skin.wire.skin import open_skin
+from skin.wire.reader import PlaybackFeed, SkinDisconnected, SkinTimeout, WireFeed
+from skin.wire.skin import Source, open_skin, play
 from skin.wire.tare import Tare
-from tests.wire.memory import PATIENT, Sent, opened, wait_for
+from tests.wire.memory import PATIENCE, Sent, opened, until
 
 LAYOUT = range(4)
 
 
-def line(number, values=(500, 501, 502, 503), check="crc16", period=10_000):
-    return encode_line(values, number, number * period, check)
+def line(number, values=(500, 501, 502, 503), period=10_000):
+    return encode_line(values, number, number * period)
 
 
 def lines(*numbers, **how):
@@ -42,12 +44,16 @@ def numbers(frames):
     return [frame.seq for frame in frames]
 
 
-def test_frames_of_a_serial_port(plug):
+def test_frames_of_a_serial_port_until_it_is_unplugged(plug):
     with open_skin(plug.port, LAYOUT) as skin:
         before = monotonic()
         plug.send(*(encode_line([1, 0, 3, number], number, 10_000 * number) for number in range(300)))
-        frames = skin.read(300, timeout=PATIENT)
+        frames = skin.read(300, timeout=PATIENCE)
         stats = skin.stats
+        plug.unplug()
+        for read in (lambda: skin.read(1, timeout=PATIENCE), lambda: next(iter(skin))):
+            with pytest.raises(SkinDisconnected, match="unplugged"):
+                read()
     assert numbers(frames) == list(range(300))
     assert frames[9].values.tolist() == [1, 0, 3, 9]
     assert frames[9].t == pytest.approx(0.09)
@@ -59,16 +65,14 @@ def test_frames_of_a_serial_port(plug):
 def test_a_peer_at_a_socket_that_stops_sending_is_left_and_found_again_and_its_end(caplog):
     """A connection stays open after a power cut in the middle of a frame."""
     with socket.create_server(("127.0.0.1", 0)) as server:
-        server.settimeout(PATIENT)
+        server.settimeout(PATIENCE)
         address = f"socket://127.0.0.1:{server.getsockname()[1]}"
-        with (
-            open_skin(address, LAYOUT, reconnect=True, silence=0.3, backoff=(0.01, 0.04)) as skin,
-            server.accept()[0] as first,
-        ):
+        settings = {"reconnect": True, "silence": 0.3, "backoff": (0.01, 0.04)}
+        with open_skin(address, LAYOUT, **settings) as skin, server.accept()[0] as first:
             first.sendall(lines(*range(5)) + b"5,50000,500,5")
             with server.accept()[0] as second:
                 second.sendall(lines(*range(3)))
-                frames = skin.read(8, timeout=PATIENT)
+                frames = skin.read(8, timeout=PATIENCE)
                 assert (skin.stats.reconnects, skin.stats.bad_frames) == (1, 0)
             assert first.recv(1) == b""
     assert numbers(frames) == [0, 1, 2, 3, 4, 0, 1, 2]
@@ -85,7 +89,7 @@ def test_the_end_of_a_socket_is_an_error_after_what_came_before():
         device.sendall(lines(50, 51, 52))
         device.close()
         with pytest.raises(SkinDisconnected, match="disconnected") as caught:
-            skin.read(4, timeout=PATIENT)
+            skin.read(4, timeout=PATIENCE)
         assert numbers(caught.value.frames) == [50, 51, 52]
 
 
@@ -106,26 +110,18 @@ def test_silence_is_told_apart_from_nonsense_and_carries_what_came(pieces, reaso
             next(iter(skin))
 
 
-def test_unplugging_is_an_error(plug):
-    with open_skin(plug.port, LAYOUT) as skin:
-        plug.unplug()
-        for read in (lambda: skin.read(1, timeout=PATIENT), lambda: next(iter(skin))):
-            with pytest.raises(SkinDisconnected, match="unplugged"):
-                read()
-
-
 def test_a_pseudo_terminal_is_unplugged_and_plugged_in_again(tmp_path):
     port = PtyPort(str(tmp_path / "skin"))
     try:
         with open_skin(port.address, LAYOUT, reconnect=True, backoff=(0.01, 0.02)) as skin:
             for connection in range(3):
-                wait_for(port.connected)
+                until(port.connected)
                 port.write(lines(*range(50)))
-                frames = skin.read(50, timeout=PATIENT)
+                frames = skin.read(50, timeout=PATIENCE)
                 assert frames[0].after == ("reconnect" if connection else "")
                 assert numbers(frames) == list(range(50))
                 port.unplug()
-                wait_for(lambda: skin.away)
+                until(lambda: skin.away)
                 port.plug()
     finally:
         port.unplug()
@@ -141,19 +137,19 @@ def test_while_it_is_away_it_is_tried_again_and_said():
         return streams.pop() if streams else Sent(other, end=False)
 
     with open_skin("x", LAYOUT, opener=opener, reconnect=True, backoff=(0.01, 0.02)) as skin:
-        skin.read(3, timeout=PATIENT)
-        wait_for(lambda: skin.away)
+        skin.read(3, timeout=PATIENCE)
+        until(lambda: skin.away)
         with pytest.raises(SkinTimeout, match="unplugged; trying again"):
             skin.read(1, timeout=0.1)
         back.set()
         with pytest.raises(InputError, match="sends 3 values per frame, the layout has 4"):
-            skin.read(1, timeout=PATIENT)
+            skin.read(1, timeout=PATIENCE)
 
 
 def test_who_is_late_loses_the_oldest_frames_and_is_informed():
     with opened(lines(*range(100)), queue=10) as skin:
         # A frame counts when it is decoded, before it waits to be read.
-        wait_for(lambda: skin.stats.dropped == 90)
+        until(lambda: skin.stats.dropped == 90)
         frames = skin.read(10)
         assert (numbers(frames), skin.stats.dropped) == (list(range(90, 100)), 90)
     assert [(frame.lost, frame.after) for frame in frames[:2]] == [(90, "gap"), (0, "")]
@@ -175,12 +171,10 @@ def test_a_port_that_is_none_is_refused(port, reason):
         open_skin(port, LAYOUT)
 
 
-def test_a_port_in_use_is_refused(plug):
+def test_a_port_in_use_and_a_forbidden_one_are_refused(plug, monkeypatch):
     with open_skin(plug.port), pytest.raises(InputError, match="in use: close the serial monitor"):
         open_skin(plug.port)
 
-
-def test_a_forbidden_port_is_refused(monkeypatch):
     def refuse(*_, **__):
         raise serial.SerialException(errno.EACCES, "Permission denied")
 
@@ -197,7 +191,7 @@ def status(skin):
 @pytest.mark.parametrize(("rate", "said"), [(10, " (short taps read low below 100 Hz)"), (100, "")])
 def test_a_rate_that_misses_the_peaks_of_taps_stands_in_the_status_line(rate, said):
     with opened(lines(*range(60), period=1_000_000 // rate)) as skin:
-        skin.read(60, timeout=PATIENT)
+        skin.read(60, timeout=PATIENCE)
         assert status(skin).startswith(f"{rate}.0 Hz{said}")
 
 
@@ -209,7 +203,7 @@ def test_channels_that_mean_nothing_are_masked_and_named():
     values[-1, 3] = 1023
     data = b"".join(line(number, row.tolist()) for number, row in enumerate(values))
     with opened(encode_header(Header(n=6, bits=10)), data, layout=6) as skin:
-        frames = skin.read(800, timeout=PATIENT)
+        frames = skin.read(800, timeout=PATIENCE)
         assert skin.channels == ("ok", "dead", "stuck", "saturated", "ok", "ok")
         assert "sensor 1 dead, sensor 2 stuck, sensor 3 saturated" in status(skin)
     assert frames[100].valid.all()
@@ -224,7 +218,7 @@ def test_tare_and_a_touch(plug):
     def values(number):
         return rng.integers(499, 502, 4) + np.array([0, 0, 300 * bool(pressed), 0])
 
-    with open_skin(plug.port, LAYOUT, timeout=PATIENT) as skin, plug.sending(values):
+    with open_skin(plug.port, LAYOUT, timeout=PATIENCE) as skin, plug.sending(values):
         baseline = skin.tare(0.5)
         assert baseline == pytest.approx([500] * 4, abs=1.01)
         pressed.append(True)
@@ -236,7 +230,7 @@ def test_tare_and_a_touch(plug):
 
 
 def test_tare_while_the_device_restarts_is_refused():
-    with opened(*[lines(*range(20))] * 5000, timeout=PATIENT) as skin:
+    with opened(*[lines(*range(20))] * 5000, timeout=PATIENCE) as skin:
         with pytest.raises(InputError, match="restarted"):
             skin.tare(0.1)
         assert skin.baseline is None
@@ -254,7 +248,7 @@ def test_ctrl_c_ends_a_read_that_waits(plug):
         assert process.stdout.readline() == b"open\n"
         sleep(0.2)
         process.send_signal(signal.SIGINT)
-        assert b"KeyboardInterrupt" in process.communicate(timeout=PATIENT)[1]
+        assert b"KeyboardInterrupt" in process.communicate(timeout=PATIENCE)[1]
 
 
 def polled(pieces, silence, step=0.1):
@@ -315,3 +309,38 @@ def test_a_silent_port_is_left_open(address, settings):
         with pytest.raises(SkinTimeout):
             skin.read(1)
         assert skin.stats.reconnects == 0
+
+
+@pytest.fixture(scope="module")
+def touches(configured):
+    device = build_device(configured("simulator=naive", "device.dead=1"))
+    return device.replace(gestures=12).recording().touches
+
+
+def test_touches_are_played_in_their_time_to_their_end(touches):
+    feed, times = PlaybackFeed([touches[:4]]), count(100.0, 0.5)
+    frames = [frame for _ in range(120) for frame in feed.poll(lambda: next(times))]
+    with pytest.raises(EOFError):
+        feed.poll(lambda: next(times))
+    assert frames[5].t_host - frames[0].t_host == pytest.approx(0.5)
+    played = np.stack([frame.values for frame in frames]).reshape(4, 30, 25)
+    assert played == pytest.approx(touches[:4].readings.numpy())
+    assert np.stack([frame.valid for frame in frames]).sum() == 120 * 24
+    assert [frame.after for frame in frames[28:32]] == ["", "", "cut", ""]
+    assert frames[-1].segment == 3
+
+
+def test_a_skin_that_is_played_ends(touches):
+    with play([touches[:1]]) as skin:
+        assert len(list(skin)) == skin.stats.frames == 30
+        with pytest.raises(SkinDisconnected, match="recording has ended"):
+            skin.read(1)
+
+
+def test_values_in_newtons_stay_what_they_are():
+    values, valid = np.array([0.5, -1.0, 7.0]), np.array([True, True, False])
+    source = Source.in_newtons("recording", None, 3)
+    source.tare.add(Frame(0, 0.0, 0.0, values, valid))
+    said, known = source.tare.conversion(values, valid)
+    assert said.tolist() == [0.5, -1.0, 0.0]
+    assert known.tolist() == valid.tolist()

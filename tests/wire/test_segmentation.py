@@ -34,13 +34,10 @@ def announced(sequence, *said, seconds=0.3, task=TOUCH):
     return shown(AnnouncedSegmenter(window(seconds), deque(said), task), sequence)
 
 
-def test_an_announced_gesture_is_its_frames():
+def test_an_announced_gesture_is_its_frames_and_keeps_its_place_where_the_first_are_lost():
     (gesture,) = announced(frames(range(60)), Announcement(0, 10, 30, LABELS))
     assert [frame.seq for frame in gesture.frames] == list(range(10, 40))
     assert (gesture.labels, gesture.lost) == (LABELS, 0)
-
-
-def test_a_window_keeps_its_place_where_its_first_frames_are_lost():
     (gesture,) = announced(frames([*range(10), *range(14, 60)]), Announcement(0, 10, 30, LABELS))
     assert gesture.begin == pytest.approx(0.1)
     assert (gesture.frames[0].seq, gesture.frames[-1].seq, gesture.lost) == (14, 39, 4)
@@ -81,29 +78,21 @@ def test_a_person_begins_skips_and_ends():
     said = []
     plan, typed = enumerate(label_plan(TOUCH.names, 1, 0)), iter(["\n", "s\n", "\n"])
     segmenter = PromptedSegmenter(window(0.1), plan, said.append, lambda seen: True, typed)
-    gestures = []
-    for frame in frames(range(2000)):
-        if gesture := segmenter.add(frame):
-            gestures.append(gesture)
-        if segmenter.over:
-            break
-        # Frames come while the person types.
-        sleep(0.001)
+    gestures, arriving = [], iter(frames(range(2000)))
+    while not segmenter.over:
+        gestures += shown(segmenter, [next(arriving)])
+        sleep(0.001)  # frames come while the person types
     assert [gesture.number for gesture in gestures] == [0, 2]
     assert [len(gesture.frames) for gesture in gestures] == [10, 10]
     assert sum(line.startswith("next: ") for line in said) == 4
     assert gestures[0].labels == next(label_plan(TOUCH.names, 1, 0))
 
 
-def test_windows_one_after_the_other():
+def test_windows_one_after_the_other_or_that_wait_for_a_touch():
     gestures = shown(ContinuousSegmenter(window(0.1), first=5), frames(range(35)))
     assert [(gesture.number, gesture.frames[0].seq) for gesture in gestures] == [(5, 0), (6, 10), (7, 20)]
-
-
-def test_windows_that_wait_for_a_touch():
-    gestures = shown(
-        ContinuousSegmenter(window(0.1), begins=lambda values: values[0] % 50 > 40), frames(range(120))
-    )
+    segmenter = ContinuousSegmenter(window(0.1), begins=lambda values: values[0] % 50 > 40)
+    gestures = shown(segmenter, frames(range(120)))
     assert [gesture.frames[0].seq for gesture in gestures] == [41, 91]
 
 

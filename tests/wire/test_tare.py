@@ -34,6 +34,14 @@ def watched(scale=None, tare=1.0, known=None, header=None):
     return Tare(conversion, tare, RATE, lambda: header)
 
 
+def fed(*streams, **settings):
+    """Return what has taken a baseline from streams of frames."""
+    watch = watched(**settings)
+    for stream in streams:
+        list(map(watch.add, stream))
+    return watch
+
+
 def test_force_is_counted_from_the_first_quiet_second():
     watch = watched(scale=0.01)
     touched = noisy(150)
@@ -72,15 +80,13 @@ def test_a_device_may_declare_its_unit_a_little_late(late):
 def test_counts_without_a_scale_are_refused():
     with pytest.raises(InputError, match=r"sends adc, .* device\.scale="):
         watched(header=Header(unit="adc", bits=10)).add(frames(noisy(1))[0])
-    watch = watched()
     with pytest.raises(InputError, match=r"values of no unit, .* device\.scale="):
-        list(map(watch.add, frames(noisy(700))))
+        fed(frames(noisy(700)))
 
 
 def test_a_calibration_gives_scale_gains_and_broken_sensors():
-    known = Calibration(
-        {"gain": [0.5, 1.0, 1.0], "offset": [0.1, 0.2, 0.0]}, {"dead": [2]}, scale=0.02, zero=512
-    )
+    gains = {"gain": [0.5, 1.0, 1.0], "offset": [0.1, 0.2, 0.0]}
+    known = Calibration(gains, {"dead": [2]}, scale=0.02, zero=512)
     raw = np.array([612.0, 612.0, 0.0])
     one = watched(tare=0, known=known).add(frames([raw])[0])
     np.testing.assert_allclose(one.newtons[:2], known.corrected(raw)[:2])
@@ -93,11 +99,10 @@ class Played:
     def __init__(self, force, rate=FAST, segments=None):
         noise = np.random.default_rng(0).normal(scale=0.1, size=(len(force), 2))
         values = 500 + noise + np.column_stack([force, np.zeros(len(force))])
-        segments = np.zeros(len(force), dtype=int) if segments is None else segments
-        self.frames = [
-            Frame(n, n / rate, n / rate, row, np.ones(2, dtype=bool), segment=int(segment))
-            for n, (row, segment) in enumerate(zip(values, segments, strict=True))
-        ]
+        times = np.arange(len(force)) / rate
+        segments = np.zeros(len(force)) if segments is None else segments
+        rows = zip(times, values, segments.astype(int).tolist(), strict=True)
+        self.frames = [Frame(n, t, t, row, np.ones(2, bool), some) for n, (t, row, some) in enumerate(rows)]
         self.taken, self.header = 0, Header()
 
     def read(self, count):
@@ -161,45 +166,37 @@ def limited(values, channels, limit=1023.0):
 
 
 def test_a_channel_at_its_limit_has_no_baseline_and_keeps_an_old_one():
-    watch = watched(scale=0.01)
-    list(map(watch.add, limited(noisy(150), [1])))
+    watch = fed(limited(noisy(150), [1]), scale=0.01)
     assert watch.conversion.broken.tolist() == [False, True, False]
     assert watch.warning == "channel 1 at the limit or without a value: no baseline"
-    watch = watched(scale=0.01)
-    list(map(watch.add, frames(noisy(150))))
+    watch = fed(frames(noisy(150)), scale=0.01)
     assert watch.warning == ""
     before = watch.conversion.zero
     watch.restart()
     list(map(watch.add, later(limited(noisy(150, 1), [1]))))
     after = watch.conversion
     assert (watch.count, after.broken.any(), after.zero[1]) == (2, False, before[1])
-    watch = watched(scale=0.01)
-    list(map(watch.add, limited(noisy(400), [0, 1, 2])))
+    watch = fed(limited(noisy(400), [0, 1, 2]), scale=0.01)
     assert watch.conversion is None
     assert watch.status == "no baseline: all channels at the limit or without a value"
 
 
 def test_the_noise_of_the_untouched_skin_is_known():
-    watch = watched(scale=0.01)
-    list(map(watch.add, frames(np.tile(REST, (150, 1)))))
-    assert "this device shows no noise" in watch.warning
-    watch = watched(scale=0.01)
-    list(map(watch.add, frames(REST + np.random.default_rng(0).normal(scale=5.0, size=(400, 3)))))
+    assert "this device shows no noise" in fed(frames(np.tile(REST, (150, 1))), scale=0.01).warning
+    noise = np.random.default_rng(0).normal(scale=5.0, size=(400, 3))
+    watch = fed(frames(REST + noise), scale=0.01)
     np.testing.assert_allclose(watch.conversion.noise, 0.05, rtol=0.3)
     assert (watch.conversion.changing > 0.9).all()
 
 
 def test_a_device_that_restarts_often_gets_a_baseline():
     """Its clock begins again every 0.6 s; the baseline needs a second."""
-    watch = watched(scale=0.01)
-    for number, one in enumerate(frames(noisy(300))):
-        watch.add(one._replace(t=number % 60 / 100, segment=number // 60))
-    assert watch.conversion is not None
+    stream = (one._replace(t=n % 60 / 100, segment=n // 60) for n, one in enumerate(frames(noisy(300))))
+    assert fed(stream, scale=0.01).conversion is not None
 
 
 def test_a_new_baseline_waits_for_the_end_of_a_touch_unless_it_is_forced():
-    tare, touched = watched(scale=0.01), frames(noisy(150) + 100)
-    list(map(tare.add, frames(noisy(150))))
+    tare, touched = fed(frames(noisy(150)), scale=0.01), frames(noisy(150) + 100)
     tare.restart()
     for one in later(touched):
         tare.add(one, touched=True)
@@ -213,10 +210,9 @@ def test_a_new_baseline_waits_for_the_end_of_a_touch_unless_it_is_forced():
 
 def test_few_frames_are_waited_for():
     """Frames of a bridge without a clock come in bursts: only some intervals have any."""
-    watch = watched(scale=1.0, tare=2.0)
-    for burst in range(6):
-        for one in frames(noisy(25)):
-            watch.add(one._replace(t=0.5 * burst + 0.5, t_host=0.5 * burst + 0.5))
+    times = np.repeat(0.5 + 0.5 * np.arange(6), 25)
+    stream = (one._replace(t=t, t_host=t) for t, one in zip(times, frames(noisy(150)), strict=True))
+    watch = fed(stream, scale=1.0, tare=2.0)
     assert watch.status == "taking the baseline: waiting for more frames"
 
 

@@ -1,5 +1,5 @@
 // Send the values of analogue sensors: one line per frame, seq,t_us,v0,...,vN-1*HHHH (docs/hardware.md).
-// Tested on a computer with a stand-in for Arduino.h (tests/wire/test_firmware.py), not on a board.
+// Tested on a computer with a stand-in for Arduino.h (tests/robot/test_board.py), not on a board.
 #include <Arduino.h>
 
 const uint8_t PINS[] = {A0, A1, A2, A3, A4, A5};  // in the order of the layout's rows

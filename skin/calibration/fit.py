@@ -3,14 +3,14 @@
 import math
 import warnings
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import pandas as pd
 import torch
 
-from skin.calibration.bench import BenchData, BenchSession
+from skin.calibration.bench import BenchData, BenchSession, per_newton, warn_of_thickness
 from skin.calibration.channel import Channel, Loads, fit_channel
 from skin.calibration.wiring import (
     MAD,
@@ -23,6 +23,7 @@ from skin.calibration.wiring import (
 )
 from skin.device.calibration import BROKEN, QUANTITIES, Calibration, Curves, Table
 from skin.device.imperfection import Imperfection
+from skin.device.simulated import Simulated
 from skin.errors import InputError
 
 # Of the largest true reading: less determines no gain. Of the strongest one of a press: sensors that count.
@@ -265,12 +266,18 @@ def estimate_force(raw: np.ndarray, each: np.ndarray, calibration: Calibration) 
     Returns:
         NaN if every sensor that responds to the press is broken or at its limit.
     """
-    true, values = calibration.corrected(raw), calibration.values()
-    below = calibration.newtons(raw) - values["offset"] < _CLIPPED * values["clip"]
+    true = _below_limit(raw, calibration)
     felt = np.isfinite(true) & (each > _RESPONDING * each.max(axis=-1, keepdims=True))
-    weights = np.where(below & felt, each, 0.0)
+    weights = np.where(felt, each, 0.0)
     square = (weights**2).sum(axis=-1)
     return (weights * np.nan_to_num(true)).sum(axis=-1) / np.where(square > 0, square, np.nan)
+
+
+def _below_limit(raw: np.ndarray, calibration: Calibration) -> np.ndarray:
+    """Return true readings (..., S), N; NaN for broken sensors, and for values at the limit of a sensor."""
+    values = calibration.values()
+    below = calibration.newtons(raw) - values["offset"] < _CLIPPED * values["clip"]
+    return np.where(below, calibration.corrected(raw), np.nan)
 
 
 def check_force(calibration: Calibration, clip: float) -> None:
@@ -299,22 +306,34 @@ def check_force(calibration: Calibration, clip: float) -> None:
             )
 
 
-def fit_presses(bench: BenchData, fraction: float, clip: float | None) -> tuple[Calibration, HeldOutErrors]:
+def fit_presses(
+    device: Simulated, bench: BenchData, fraction: float, known_unit: bool
+) -> tuple[Calibration, HeldOutErrors]:
     """Return a calibration by presses of a gauge, and its errors on held-out ones.
 
     Args:
+        device: with the skin as designed.
         bench: data of the session.
         fraction: of the presses that are held out.
-        clip: of the designed device, N, with which the unit of the gauge is compared; None: it is known.
+        known_unit: whether the unit of the gauge is known; otherwise the limit of the device tells it.
 
     Raises:
         InputError: the unit of the gauge is wrong, or too few sensors can be used.
     """
     calibration = fit_calibration(bench)
     check_usable(calibration)
-    if clip is not None:
-        check_force(calibration, clip)
-    return calibration, evaluate_held_out(bench, fraction)
+    if not known_unit:
+        check_force(calibration, device.imperfection.clip)
+    force, press = (values[bench.loading] for values in bench.applied)
+    ratios = _below_limit(bench.session.raw[bench.loading], calibration) / force[:, None]
+    fits = warn_of_thickness(
+        device,
+        bench.each,
+        pd.DataFrame(ratios).groupby(press).median().to_numpy(),
+        calibration.values()["noise"] / force.max(),
+        lambda body, sensors: per_newton(device.simulator(body, sensors), body, bench.gauge),
+    )
+    return replace(calibration, about={**calibration.about, **fits}), evaluate_held_out(bench, fraction)
 
 
 def print_calibration(calibration: Calibration, errors: HeldOutErrors | None = None) -> None:

@@ -19,7 +19,6 @@ from skin.calibration.bench import (
     Gauge,
     check_channels,
     per_newton,
-    pressed_images,
     warn_of_thickness,
     write_bench_session,
 )
@@ -30,6 +29,7 @@ from skin.device.resampling import Frame, StreamClock
 from skin.device.simulated import Simulated
 from skin.errors import InputError
 from skin.mechanics.simulator.base import AbstractSimulator
+from skin.touch.shapes import pressed_images
 from skin.wire.channels import UnitConversion
 from skin.wire.emulator import Converter
 
@@ -257,7 +257,8 @@ def base_readings(
             body that is not flat.
     """
     positions = np.clip(sensors.positions[:: sensors.axes, :2], load.base, np.array(body.size) - load.base)
-    images = torch.cat([*pressed_images(body, stair_gauge(positions, indenter="disc", radius=load.base))])
+    presses = stair_gauge(positions, indenter="disc", radius=load.base).presses
+    images = torch.cat([*pressed_images(body, presses)])
     x, y = (
         size * (torch.arange(count) + 0.5) - torch.from_numpy(places)[:, None]
         for size, count, places in zip(body.cell, body.cells, positions.T, strict=True)

@@ -59,9 +59,9 @@ def main(
     if load is not None:
         calibration, errors = fit_known_load(device, ordered(recorded, settings), load), None
     else:
-        clip = device.imperfection.clip if settings.force_scale is None else None
+        bench = wired_bench(device, recorded, settings)
         calibration, errors = fit_presses(
-            wired_bench(device, recorded, settings), calibrate["held_out"], clip
+            device, bench, calibrate["held_out"], settings.force_scale is not None
         )
     print_calibration(calibration, errors)
     if errors and not errors.helps:

@@ -20,8 +20,6 @@ from skin.calibration.bench import (
     BenchData,
     BenchSettings,
     build_bench_data,
-    pressed_images,
-    pressed_peaks,
     read_bench_session,
 )
 from skin.core.files import write
@@ -36,6 +34,7 @@ from skin.plot.figures import COLOURS, save_figure
 from skin.record.session import check_session, read_session
 from skin.runs.configuration import Config
 from skin.touch.labels import RELEASE, TOUCH
+from skin.touch.shapes import pressed_images, pressed_peaks
 from skin.wire.channels import NewtonFrame, unit_conversion
 from skin.wire.emulator import Gesture, emulated_gestures, gestures_with_labels
 from skin.wire.segmentation import label_text
@@ -296,7 +295,7 @@ def compare_presses(device: Simulated, bench: BenchData, scale: float | None) ->
             pairs.append(Pair(number, None, True, applied, first.values, second.values, first.valid))
     if not pairs:
         raise InputError("no press has frames in the session: check the clocks, see compare.delay")
-    peaks = pressed_peaks(device.body, gauge)
+    peaks = pressed_peaks(device.body, gauge.presses)
     contacts = torch.from_numpy(np.stack([gauge.contacts(times[pair.number], peaks) for pair in pairs]))
     touches = [replace(side, contacts=contacts.float()) for side in _touches(device, pairs)]
     return SessionComparison("presses", pairs, touches, bench)
@@ -330,7 +329,7 @@ def judge_presses(
     gauge, time, raw = bench.gauge, bench.session.time, bench.session.raw
     force, calibration = np.maximum.reduceat(gauge.force, gauge.first), device.imperfection.calibration
     end = np.maximum.reduceat(np.where(gauge.force > 0, gauge.time, -np.inf), gauge.first)
-    settings, pressure = device.sampler.settings, force * pressed_peaks(device.body, gauge)
+    settings, pressure = device.sampler.settings, force * pressed_peaks(device.body, gauge.presses)
     peak = settings.danger.excess(
         pressure, force, end - gauge.time[gauge.first] > settings.thresholds.duration
     )
@@ -342,7 +341,7 @@ def judge_presses(
         *(rate, time, raw, press, len(gauge)),
     )
     column, row = (device.sensors.positions[:, :2] / device.body.cell).astype(int).T
-    shares = [image[0, row, column] / image.max() for image in pressed_images(device.body, gauge)]
+    shares = [image[0, row, column] / image.max() for image in pressed_images(device.body, gauge.presses)]
     return peak, peak * (np.stack(shares) * works).max(axis=1), alarmed
 
 

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
-from functools import cache
 from typing import Annotated, Any, final
 
 import numpy as np
@@ -26,7 +25,7 @@ from skin.touch.paths import (
     draw_until_fit,
     sample_paths,
 )
-from skin.touch.shapes import Shapes, load_image
+from skin.touch.shapes import half_extents, peak_per_newton
 
 
 @checked("touch")
@@ -164,30 +163,6 @@ def draw_groups(
 
     placed = draw_until_fit(count, draw, refuse, tries)
     return placed | {"number": number, "tips": shape, "radius": radius, "forces": force}
-
-
-def half_extents(shapes: Shapes) -> np.ndarray:
-    """Return half the larger extent of each shape, (N,), in scales: a picture has a black border."""
-    return np.array([np.ptp(hull, axis=0).max() / 2 for hull in shapes.hulls])
-
-
-def peak_per_newton(shapes: Shapes, shape: np.ndarray, radius: np.ndarray) -> np.ndarray:
-    """Return the highest pressure of shapes under 1 N, Pa; of the whole pictures, whatever the cells.
-
-    Args:
-        shapes: the pictures.
-        shape: indices.
-        radius: half the larger extent of each, m.
-    """
-    return 1 / (np.array([_cover(name, shapes.contact) for name in shapes.names])[shape] * radius**2)
-
-
-@cache
-def _cover(name: str, contact: float) -> float:
-    """Return the force of a picture of 1 Pa by the square of its radius: pi for a disc."""
-    picture = load_image(name)
-    extents = [np.ptp(pixels) + 1 for pixels in np.nonzero(picture > contact)]
-    return picture.sum() / (max(extents) / 2) ** 2
 
 
 @final

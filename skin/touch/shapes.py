@@ -6,9 +6,9 @@ import hashlib
 import math
 from collections.abc import Callable, Iterator, Sequence
 from copy import copy
-from functools import cached_property, lru_cache
+from functools import cache, cached_property, lru_cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
@@ -23,6 +23,9 @@ from skin.body.base import AbstractBody
 from skin.body.sheet import Sheet
 from skin.core.files import BUNDLED, candidates
 from skin.errors import InputError
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 # Grey-scale images of objects.
 
@@ -541,3 +544,54 @@ def _interpolate(shape: np.ndarray, at: np.ndarray, nodes: np.ndarray, values: n
         mine = shape == number
         result[mine] = np.interp(at[mine], nodes[number], values[number])
     return result
+
+
+# Presses at known forces.
+
+
+def half_extents(shapes: Shapes) -> np.ndarray:
+    """Return half the larger extent of each shape, (N,), in scales: a picture has a black border."""
+    return np.array([np.ptp(hull, axis=0).max() / 2 for hull in shapes.hulls])
+
+
+def peak_per_newton(shapes: Shapes, shape: np.ndarray, radius: np.ndarray) -> np.ndarray:
+    """Return the highest pressure of shapes under 1 N, Pa; of the whole pictures, whatever the cells.
+
+    Args:
+        shapes: the pictures.
+        shape: indices.
+        radius: half the larger extent of each, m.
+    """
+    return 1 / (np.array([_cover(name, shapes.contact) for name in shapes.names])[shape] * radius**2)
+
+
+@cache
+def _cover(name: str, contact: float) -> float:
+    """Return the force of a picture of 1 Pa by the square of its radius: pi for a disc."""
+    picture = load_image(name)
+    extents = [np.ptp(pixels) + 1 for pixels in np.nonzero(picture > contact)]
+    return picture.sum() / (max(extents) / 2) ** 2
+
+
+def pressed_images(body: AbstractBody, presses: pd.DataFrame) -> Iterator[Tensor]:
+    """Yield the pressure of each press under 1 N, (1, H, W), Pa.
+
+    Args:
+        body: that is pressed.
+        presses: a row per press, as of :class:`skin.calibration.bench.Gauge`.
+    """
+    shapes, kind = _indenters(body, presses)
+    scale = presses["radius_m"].to_numpy() / half_extents(shapes)[kind]
+    for pose in zip(kind, presses["angle"], scale, presses[["x_m", "y_m"]].to_numpy(), strict=True):
+        yield shapes.render(*(np.array([value]) for value in pose)) / float(np.prod(body.cell))
+
+
+def pressed_peaks(body: AbstractBody, presses: pd.DataFrame) -> np.ndarray:
+    """Return the highest pressure of each press under 1 N, (P,), Pa, by the picture of its indenter."""
+    return peak_per_newton(*_indenters(body, presses), presses["radius_m"].to_numpy())
+
+
+def _indenters(body: AbstractBody, presses: pd.DataFrame) -> tuple[Shapes, np.ndarray]:
+    """Return the shapes that press, and the index of the shape of each press."""
+    names, kind = np.unique(presses["indenter"], return_inverse=True)
+    return Shapes(names.tolist(), body), kind

@@ -19,6 +19,7 @@ from skin.record.comparison import compare_session
 from skin.record.serial import Serial, convert_session, record_session
 from skin.record.session import read_session
 from skin.touch.labels import TOUCH, TOUCH_OR_NOT
+from skin.touch.shapes import pressed_peaks
 from skin.wire.channels import UnitConversion
 from skin.wire.emulator import Emulator, EmulatorSettings, PtyPort, emulated_gestures
 from skin.wire.segmentation import label_plan
@@ -143,7 +144,7 @@ def test_a_gauge_tells_its_contacts():
     columns = {"time": [1.0, 1.5, 2.0, 2.5], "force": [0.0, 10.0, 20.0, 0.0], "x_m": [0.05] * 4}
     table = pd.DataFrame(columns | {"y_m": [0.06] * 4})
     rows = bench.Gauge.of(table, "x", bench.BenchSettings())
-    peaks = bench.pressed_peaks(SHEET, rows)
+    peaks = pressed_peaks(SHEET, rows.presses)
     assert peaks == pytest.approx(1 / (np.pi * 0.01**2), rel=0.02)
     contacts = rows.contacts(np.array([0.5, 1.25, 2.0, 3.0]), peaks)
     assert contacts.shape == (4, 1, 5)

@@ -64,13 +64,12 @@ def test_a_session_with_other_axes_is_refused_until_that_is_confirmed(run, tmp_p
 
 
 SOLID = [*SMALL, "simulator=solid", "simulator.divisions=1"]
-PRESSES = ["calibrate.protocol.rest=1.5", "calibrate.protocol.peak=60"]
 WATCHED = ["run=any_skin", "evaluation.safe_gestures=64"]
 
 
 @pytest.mark.slow("chooses a threshold")
 def test_eight_presses_show_a_little_and_no_more(run, tmp_path):
-    run(tmp_path, "calibrate", *SOLID, *PRESSES, "session=bench.csv", "calibrate.demo=true", store=False)
+    run(tmp_path, "calibrate", *SOLID, "session=bench.csv", "calibrate.demo=true", store=False)
     words = ["compare", "session=bench.csv", *SOLID]
     done = run(tmp_path, *words, *WATCHED, "out=enough", "compare.miss_rate=0.5", store=False)
     page = (tmp_path / "enough" / "compare.md").read_text()
@@ -82,7 +81,7 @@ def test_eight_presses_show_a_little_and_no_more(run, tmp_path):
     assert "88 presses are needed" in done.stderr
     assert not (tmp_path / "few").exists()
     done = run(tmp_path, *words, "compare.miss_rate=0.05", store=False, code=2)
-    assert "needs presses of known force, and run= whose alarm they test" in done.stderr
+    assert "needs presses of known force, and run= with an alarm to test" in done.stderr
 
 
 NAIVE = [*SMALL, "simulator=naive"]

@@ -520,7 +520,7 @@ def warn_of_thickness(
     """
     known, residuals = np.isfinite(readings).all(axis=0), list[np.ndarray]()
     sizes = np.abs([described, readings])[..., known]
-    felt = (sizes > _FELT * sizes.max(axis=2, keepdims=True)).sum(axis=2)
+    felt = (sizes > _FELT * sizes.max(axis=2, keepdims=True, initial=0.0)).sum(axis=2)
     if not (device.body.flat and device.model.feels_shear and np.median(felt, axis=1).max() > 1):
         return {}
     error = np.hypot(np.hypot(_MODEL * described, noise), _BESIDE * described.max())
@@ -537,7 +537,7 @@ def warn_of_thickness(
     warnings.warn(
         f"readings fit layers of {1e3 * fitted:.2g} mm in all better than the described "
         f"{1e3 * device.body.thickness:.3g} mm: a wrong thickness or width of the load makes gains wrong; "
-        "measure both, correct body.layers or base=, and calibrate again (live.thickness takes a range, but "
+        "measure both, correct the one that is wrong, and calibrate again (live.thickness takes a range, but "
         "leaves the gains as they are)",
         UserWarning,
         stacklevel=3,

@@ -326,12 +326,13 @@ def fit_presses(
         check_force(calibration, device.imperfection.clip)
     force, press = (values[bench.loading] for values in bench.applied)
     ratios = _below_limit(bench.session.raw[bench.loading], calibration) / force[:, None]
+    each = pd.DataFrame(ratios).groupby(press).median()  # of the presses that have frames
     fits = warn_of_thickness(
         device,
-        bench.each,
-        pd.DataFrame(ratios).groupby(press).median().to_numpy(),
+        bench.each[each.index],
+        each.to_numpy(),
         calibration.values()["noise"] / force.max(),
-        lambda body, sensors: per_newton(device.simulator(body, sensors), body, bench.gauge),
+        lambda body, sensors: per_newton(device.simulator(body, sensors), body, bench.gauge)[each.index],
     )
     return replace(calibration, about={**calibration.about, **fits}), evaluate_held_out(bench, fraction)
 

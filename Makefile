@@ -20,7 +20,7 @@ ROUNDINGS := OMP_NUM_THREADS=1 OMP_NUM_THREADS=2 MKL_CBWR=COMPATIBLE MKL_CBWR=AV
 	ATEN_CPU_CAPABILITY=default OPENBLAS_CORETYPE=Haswell
 NUMERICAL := $(addprefix tests/,body design evaluation wire/test_segmentation.py wire/test_tare.py calibration record/test_session.py \
 	learning mechanics studies/test_embeddings.py touch laws \
-	$(addprefix device/test_,calibration.py imperfection.py resampling.py device_sampling.py)) experiments/laws
+	$(addprefix device/test_,calibration.py imperfection.py resampling.py)) experiments/laws
 
 # Hundreds of tests start a command of this project; without bytecode each of them would compile the modules again.
 unexport PYTHONDONTWRITEBYTECODE

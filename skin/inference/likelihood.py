@@ -69,8 +69,13 @@ class Observation:
 
 
 def blend(readings: np.ndarray, tangent: np.ndarray) -> np.ndarray:
-    """Return readings (N, J, S), of (N, L, S), under tangential forces (N, J, L - 1), in their deviations."""
-    return readings[:, :1] + tangent.astype(readings.dtype) @ readings[:, 1:]
+    """Return readings of (N, L, S) under tangential forces (N, J, L - 1), in their deviations.
+
+    Their shape is (N, J, S), or without friction (N, 1, S), as all tangential forces are 0.
+    """
+    return (
+        readings[:, :1] + tangent.astype(readings.dtype) @ readings[:, 1:] if tangent.shape[2] else readings
+    )
 
 
 def spread_readings(noise: Noise, rows: np.ndarray, width: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -72,7 +72,7 @@ def _reader(device: Simulated, sensors: Sensors) -> Callable[[Movie], Tensor]:
     rows = None if device.sampler.settings.shear else device.model.pressure_rows(sensors)
     if rows is None:
         model = build_model(device.simulator, device.body, sensors, device.model_rate)
-        return lambda movie: model.respond(movie, displacement=False).readings[movie.scale > 0]
+        return lambda movie: model.respond(movie).readings[movie.scale > 0]
     operator = torch.from_numpy(rows.T.copy()).float()
 
     def read(movie: Movie) -> Tensor:

@@ -165,7 +165,7 @@ def _measure_touches(
     device: Simulated, movie: Movie, live: LiveConditions, draw: np.random.Generator
 ) -> tuple[Tensor, Tensor]:
     """Return what devices read of touches after a window of rest, (B, F, S), N, and their valid sensors."""
-    force = device.model.respond(movie, displacement=False).readings
+    force = device.model.respond(movie).readings
     before, after = device.window, ceil(1.0 * device.model_rate)  # a second behind the window of a touch
     padded, rate = pad(force, (0, 0, before, after)), _round_rate(device, live)
     if rate > device.model_rate or not live.aligned:

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.ndimage import map_coordinates
 from scipy.special import expit, gammaincc, ndtr
+from threadpoolctl import ThreadpoolController
 
 from skin.body.base import AbstractBody
 from skin.errors import InputError
@@ -30,6 +31,8 @@ _PER_CONTACT = 3  # sensors that a contact takes at least: it has a position and
 _FITS = 0.01  # a smaller predictive probability says that no contacts give such readings
 _POOR, _LIKELY = 1e-3, 0.5  # a further contact is tried below this probability, or above these odds
 _CELLS = 160  # of a region, along an axis at most
+
+_THREADS = ThreadpoolController()  # matrices are small: several contacts take twice as long on two threads
 
 
 # Hands and bars: touches that are no fingertips.
@@ -269,6 +272,7 @@ class Posterior:
         self.candidates, self.noise = candidates, noise
         self._first, self._search = blur_first(candidates, noise), Search(candidates, self.prior)
 
+    @_THREADS.wrap(limits=1, user_api="blas")
     def estimate(
         self, readings: np.ndarray, valid: np.ndarray | None = None, saturated: np.ndarray | None = None
     ) -> "FrameEstimate | list[FrameEstimate]":
@@ -300,6 +304,7 @@ class Posterior:
         clips = values >= self.noise.clip if saturated is None else np.asarray(saturated, bool)
         return values, np.isfinite(values) & (True if valid is None else np.asarray(valid, bool)), clips
 
+    @_THREADS.wrap(limits=1, user_api="blas")
     def estimate_touch(
         self, readings: np.ndarray, valid: np.ndarray | None = None, saturated: np.ndarray | None = None
     ) -> FrameEstimate:

@@ -163,9 +163,9 @@ class Relaxing(AbstractSimulator):
         """Return mean pressures of cells as loads of the elastic body."""
         return self._relaxed.loads(pressure)
 
-    def press(self, loads: Tensor, shear: Tensor | None = None) -> Response:
+    def press(self, loads: Tensor, shear: Tensor | None = None, displacement: bool = False) -> Response:
         """Return the steady-state response to loads (..., H, W), Pa."""
-        return self._relaxed.press(loads, shear)
+        return self._relaxed.press(loads, shear, displacement)
 
     def motion(self, pressure: Tensor, shear: Tensor | None = None) -> Tensor:
         """Return the steady-state displacement of sensors, (..., S, 3), m."""
@@ -189,10 +189,11 @@ class Relaxing(AbstractSimulator):
         index: Tensor,
         scale: Tensor,
         shear: Tensor | None = None,
-        displacement: bool = True,
+        displacement: bool = False,
     ) -> Response:
         """Return the response to movies with a skin that is initially at rest."""
-        parts = [model.linear(frames, shear)[index] * scale[..., None] for model in self.models]  # type: ignore[operator]
+        linear = [model.linear(frames, shear, displacement) for model in self.models]  # type: ignore[operator]
+        parts = [part[index] * scale[..., None] for part in linear]
         time = torch.arange(index.shape[1], device=scale.device) / self.rate
         motion = parts[-1]
         # A difference of operators that are alike; in float32 the lags' fractions would magnify its rounding.

@@ -237,7 +237,7 @@ def simulate_scene(
     generator = np.random.default_rng(seed)
     holds = np.array([[name in labels for name in TOUCH.names]])
     movie = device.sampler.sample(1, generator, holds)
-    true = device.model.respond(movie, displacement=False).readings
+    true = device.model.respond(movie).readings
     readings, *_ = device.imperfection.apply(true, device.constants, generator)
     moved = surface_motion(device.model, device.body, movie.frames) if field else None
     if moved is not None:

@@ -100,7 +100,7 @@ def _batch(device: Simulated, seed: int, number: int) -> list[Gesture]:
 @torch.no_grad()
 def _draw_gestures(device: Simulated, labels: np.ndarray, draw: np.random.Generator) -> list[Gesture]:
     movie = device.sampler.sample(len(labels), draw, labels)
-    readings = device.model.respond(movie, displacement=False).readings.double().numpy()
+    readings = device.model.respond(movie).readings.double().numpy()
     names, rows, force = device.task.names, movie.labels.int().tolist(), movie.force.double().numpy()
     contacts = [None] * len(movie) if movie.contacts is None else movie.contacts.numpy()
     return [

@@ -157,7 +157,7 @@ def test_is_that_of_clipped_readings_during_contact(configured, simulator, setti
     found, frames = covariance(device, clip=0.5)
     labels = balanced(40, generator(Stream.PLACEMENT, 0, 0))
     movie = device.sampler.sample(40, generator(Stream.PLACEMENT, 0, 1), labels)
-    readings = device.model.respond(movie, displacement=False).readings[movie.scale > 0]
+    readings = device.model.respond(movie).readings[movie.scale > 0]
     assert readings.abs().max() > 0.5
     expected = np.cov(readings.clamp(-0.5, 0.5).double().numpy().T, bias=True)
     assert frames == len(readings) == int((movie.scale > 0).sum())

@@ -40,7 +40,7 @@ def movie(frames: int = 40) -> torch.Tensor:
 
 def play(simulator, pressure: torch.Tensor):
     index = torch.arange(pressure.shape[1])[None]
-    return simulator.play(pressure[0], index, torch.ones(1, pressure.shape[1]))
+    return simulator.play(pressure[0], index, torch.ones(1, pressure.shape[1]), displacement=True)
 
 
 def stepped(body: Sheet, pressure: torch.Tensor) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -34,7 +34,7 @@ class Response(NamedTuple):
     Attributes:
         readings: (..., S), N.
         displacement: (..., S, 2), m: D_s at each sensor's depth and D_t at the surface above it, positive
-            into the skin; None if the simulator does not compute displacements.
+            into the skin; None if the simulator has none, or computes them only where asked.
     """
 
     readings: Tensor
@@ -77,11 +77,17 @@ class AbstractSimulator(nn.Module, ABC):
         """Return mean pressures of cells (..., H, W), Pa, as loads, Pa."""
         return pressure
 
-    def press(self, loads: Tensor, shear: Tensor | None = None) -> Response:
-        """Return the response to loads (..., H, W), Pa; ``shear`` (..., 2) is that of :meth:`forward`."""
+    def press(self, loads: Tensor, shear: Tensor | None = None, displacement: bool = False) -> Response:
+        """Return the response to loads (..., H, W), Pa.
+
+        Args:
+            loads: of :meth:`loads`.
+            shear: (..., 2), that of :meth:`forward`.
+            displacement: whether to compute the displacement.
+        """
         return self(loads, shear)
 
-    def linear(self, loads: Tensor, shear: Tensor | None = None) -> Tensor:
+    def linear(self, loads: Tensor, shear: Tensor | None = None, displacement: bool = False) -> Tensor:
         """Return the quantities (..., R) that are linear in the loads, the input of :meth:`read`.
 
         Raises:
@@ -102,7 +108,7 @@ class AbstractSimulator(nn.Module, ABC):
         index: Tensor,
         scale: Tensor,
         shear: Tensor | None = None,
-        displacement: bool = True,
+        displacement: bool = False,
     ) -> Response:
         """Return the response to movies, (B, T, ...); each distinct frame is solved once.
 
@@ -113,16 +119,16 @@ class AbstractSimulator(nn.Module, ABC):
             shear: (U, 2), as in :meth:`forward`.
             displacement: whether to compute the displacement.
         """
-        readings, moves = self.press(frames, shear)
+        readings, moves = self.press(frames, shear, displacement)
         scaled = readings[index] * scale[..., None]
         if moves is None or not displacement:
             return Response(scaled, None)
         return Response(scaled, moves[index] * scale[..., None, None])
 
-    def respond(self, movie: Movie, displacement: bool = True) -> Response:
-        """Return the readings (B, T, S), N, of gestures, and the displacement (B, T, S, 2), m.
+    def respond(self, movie: Movie, displacement: bool = False) -> Response:
+        """Return the readings (B, T, S), N, of gestures, and the displacement (B, T, S, 2), m, if asked for.
 
-        The displacement is None if the simulator does not compute it, or if ``displacement`` is false.
+        It is None if the simulator does not compute it.
         """
         home = next(self.buffers(), movie.frames).device
         shear = None if movie.shear is None else movie.shear.to(home)

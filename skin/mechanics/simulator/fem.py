@@ -512,7 +512,7 @@ class PlatesAndBeams(AbstractSimulator):
         """
         return self.read(self.linear(pressure, shear))
 
-    def linear(self, loads: Tensor, shear: Tensor | None = None) -> Tensor:
+    def linear(self, loads: Tensor, shear: Tensor | None = None, displacement: bool = False) -> Tensor:
         """Return D_s, D_t and the force that the reading is made of, (..., 3 S)."""
         if shear is not None:
             self.refuse_shear()

@@ -2,7 +2,7 @@
 
 import hashlib
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar
@@ -14,6 +14,7 @@ import torch
 from pydantic import PositiveInt
 from scipy.linalg import cholesky
 from scipy.linalg.blas import dsyrk, dtrsm
+from threadpoolctl import threadpool_limits
 from torch import Tensor
 
 from skin.body.base import AbstractBody, Sensors, require_memory
@@ -91,6 +92,8 @@ class Cholesky:
             first, *_ = numbers = (ranks[:, None] * deep + np.arange(deep)).ravel()
             yield slice(first, first + inner), numbers[inner:], diagonal, below
 
+    # Fronts are so small that two threads take six to sixteen times as long as one.
+    @threadpool_limits.wrap(limits=1, user_api="blas")
     def solve(self, forces: np.ndarray) -> np.ndarray:
         """Return the solutions (n, L) of right-hand sides (n, L)."""
         order = self._order.ravel()
@@ -309,15 +312,13 @@ class Solid(AbstractSimulator):
         self._folder = array_cache.folder(cache)
         warn_of_cut(sensors, (*body.size, body.thickness))
         self._parts, self._strained = self._elastic(sensors), dict[int, list[Tensor]]()
-        rows = self._operator(sensors)
-        # (3, rows, cells) -> the moments of a pressure times this give all rows for each axis of the load.
-        self.register_buffer("transfer", torch.from_numpy(rows.transpose(0, 2, 1).copy()).float())
+        self._sensors, self.axes = sensors, sensors.axes
+        self.register_buffer("transfer", self._operator(reading_rows, len(sensors)))
         for name, count in zip(("spread_x", "spread_y"), body.cells, strict=True):
             self.register_buffer(name, torch.from_numpy(cell_moments(count).copy()).float())
-        self._sensors, self.axes = len(sensors), sensors.axes
 
     def forward(self, pressure: Tensor, shear: Tensor | None = None) -> Response:
-        """Return the response to pressure (..., H, W), Pa, and shear (..., 2), with D_s and D_t."""
+        """Return the readings under pressure (..., H, W), Pa, and shear (..., 2)."""
         return self.press(self.loads(pressure), shear)
 
     def loads(self, pressure: Tensor) -> Tensor:
@@ -325,33 +326,36 @@ class Solid(AbstractSimulator):
         flatten(pressure, self.shape, self.spread_x.dtype)  # refuses what is no pressure
         return self.spread_y @ pressure.to(self.spread_x.dtype) @ self.spread_x.T
 
-    def press(self, loads: Tensor, shear: Tensor | None = None) -> Response:
-        """Return the response to moments (..., H, W), Pa, and shear (..., 2), with D_s and D_t."""
-        return self.read(self.linear(loads, shear))
+    def press(self, loads: Tensor, shear: Tensor | None = None, displacement: bool = False) -> Response:
+        """Return the response to moments (..., H, W), Pa, and shear (..., 2), also with D_s and D_t."""
+        return self.read(self.linear(loads, shear, displacement))
 
-    def linear(self, loads: Tensor, shear: Tensor | None = None) -> Tensor:
-        """Return readings, D_s and D_t, (..., 3 S)."""
-        return self._rows(loads, shear, slice(3 * self._sensors))
+    def linear(self, loads: Tensor, shear: Tensor | None = None, displacement: bool = False) -> Tensor:
+        """Return the readings (..., S), or with D_s and D_t (..., 3 S)."""
+        readings = self._rows(self.transfer, loads, shear)
+        if not displacement:
+            return readings
+        moves = self._rows(self._moves[..., : 2 * len(self._sensors)], loads, shear)
+        return torch.cat([readings, moves], dim=-1)
 
-    def _rows(self, loads: Tensor, shear: Tensor | None, chosen: slice) -> Tensor:
-        """Return some rows of the operator times the loads along each axis."""
-        cells = flatten(loads, self.shape, self.transfer.dtype)
-        felt = cells @ self.transfer[_INWARDS, :, chosen]
+    def _rows(self, operator: Tensor, loads: Tensor, shear: Tensor | None) -> Tensor:
+        """Return the rows of an operator times the loads along each axis."""
+        cells, operator = flatten(loads, self.shape, operator.dtype), operator.to(loads.device)
+        felt = cells @ operator[_INWARDS]
         if shear is not None:
             for axis in (0, 1):
-                part = cells @ self.transfer[axis, :, chosen]
+                part = cells @ operator[axis]
                 felt = felt + shear[..., axis, None].to(part) * part
         return felt
 
     def read(self, linear: Tensor) -> Response:
-        """Return the response for readings, D_s and D_t (..., 3 S)."""
-        readings, sensor, surface = linear.chunk(3, dim=-1)
-        return Response(readings, torch.stack([sensor, surface], dim=-1))
+        """Return the response for readings (..., S), or with D_s and D_t (..., 3 S)."""
+        readings, *moves = linear.split(len(self._sensors), dim=-1)
+        return Response(readings, torch.stack(moves, dim=-1) if moves else None)
 
     def motion(self, pressure: Tensor, shear: Tensor | None = None) -> Tensor:
         """Return the displacement of each sensor along x, along y and into the skin, (..., S, 3), m."""
-        rows = slice(self._sensors, 5 * self._sensors)
-        inwards, _, x, y = self._rows(self.loads(pressure), shear, rows).chunk(4, dim=-1)
+        inwards, _, x, y = self._rows(self._moves, self.loads(pressure), shear).chunk(4, dim=-1)
         return torch.stack([x, y, inwards], dim=-1)
 
     def compliance(self) -> Tensor:
@@ -464,36 +468,39 @@ class Solid(AbstractSimulator):
         bodies = [[weight, *elastic.cells, elastic.key] for weight, elastic in parts]
         return array_cache.hashed({"bodies": bodies, "about": about}, _SOURCES)
 
-    def _operator(self, sensors: Sensors) -> np.ndarray:
-        """Return the rows of readings, D_s, D_t and displacements along x and y, (3, 5 S, cells)."""
+    @cached_property
+    def _moves(self) -> Tensor:
+        """How D_s, D_t and the sensors along x and y move, (3, cells, 4 S), m/Pa; solved when first used."""
+        return self._operator(_motions, 4 * len(self._sensors))
+
+    def _operator(self, read: Callable[[Hexahedra, Sensors], sp.csr_matrix], count: int) -> Tensor:
+        """Return what rows of a mesh read: moments times this (3, cells, rows), for each axis of the load."""
+        sensors = self._sensors
         about = {
+            "rows": read.__name__,
             "positions": sensors.positions.tolist(),
             "normals": sensors.normals.tolist(),
             "directions": sensors.measured.tolist(),
             "footprint": sensors.footprint,
         }
         key = self._key(self._parts, about)
-        shape = (3, 5 * len(sensors), self.shape[0] * self.shape[1])
+        shape = (3, count, math.prod(self.shape))
 
         def build() -> dict[str, np.ndarray]:
-            total = np.zeros(shape)
-            for weight, elastic in self._parts:
-                rows = [reading_rows(elastic.mesh, sensors), *_motions(elastic.mesh, sensors)]
-                total += weight * elastic.transfer(sp.vstack(rows).tocsr())
-            return {"rows": total}
+            parts = [weight * body.transfer(read(body.mesh, sensors)) for weight, body in self._parts]
+            return {"rows": np.sum(parts, axis=0)}
 
-        return array_cache.kept(self._folder / f"solid-{key}.npz", key, {"rows": shape}, build)["rows"]
+        rows = array_cache.kept(self._folder / f"solid-{key}.npz", key, {"rows": shape}, build)["rows"]
+        return torch.from_numpy(rows.transpose(0, 2, 1).copy()).float()
 
 
-def _motions(mesh: Hexahedra, sensors: Sensors) -> list[sp.csr_matrix]:
-    """Return rows (S, 3 N) that give D_s, D_t and the displacements of each sensor along x and y, m."""
+def _motions(mesh: Hexahedra, sensors: Sensors) -> sp.csr_matrix:
+    """Return rows (4 S, 3 N) that give D_s, D_t and the displacements of each sensor along x and y, m."""
     positions = sensors.positions
     above = positions * np.array([1.0, 1.0, 0.0])
     x, y, inwards = (np.tile(axis, (len(positions), 1)) for axis in np.eye(3))
-    return [
-        mesh.motion(*motion_axes)
-        for motion_axes in ((positions, inwards), (above, inwards), (positions, x), (positions, y))
-    ]
+    axes = ((positions, inwards), (above, inwards), (positions, x), (positions, y))
+    return sp.vstack([mesh.motion(*motion_axes) for motion_axes in axes]).tocsr()
 
 
 def _corners(elastic: Elastic) -> sp.csr_matrix:

@@ -36,7 +36,7 @@ def pressure(*lead: int) -> torch.Tensor:
 
 @pytest.mark.parametrize("lead", [(), (4,), (2, 3)])
 def test_shapes_and_types(simulator, lead):
-    response = simulator(pressure(*lead))
+    response = simulator.press(simulator.loads(pressure(*lead)), displacement=True)
     assert isinstance(response, Response)
     assert response.readings.shape == (*lead, len(SENSORS))
     assert response.readings.dtype == torch.float32
@@ -53,8 +53,8 @@ def test_frames_do_not_see_each_other(simulator):
 
 @pytest.mark.parametrize("factor", [0.0, 0.3, 7.0])
 def test_positively_homogeneous(simulator, factor):
-    frames = pressure(5)
-    once, more = simulator(frames), simulator(factor * frames)
+    loads = simulator.loads(pressure(5))
+    once, more = (simulator.press(each, displacement=True) for each in (loads, factor * loads))
     torch.testing.assert_close(more.readings, factor * once.readings, rtol=1e-5, atol=1e-5)
     if once.displacement is not None:
         rounded = 2e-6 * float(more.displacement.abs().max())  # single precision

@@ -7,9 +7,11 @@ import pytest
 import scipy.sparse as sp
 import skfem as fem
 import torch
+from scipy.linalg.blas import dtrsm
 from scipy.sparse.linalg import splu, spsolve
 from skfem import MeshHex
 from skfem.helpers import ddot, div, sym_grad
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from experiments.laws.references import Discs, Slab
 from skin.body.base import Sensors, Sheet
@@ -46,8 +48,7 @@ def bent(points):
     return np.stack([x + 0.2 * y * x, y + 0.1 * x * x - 0.1 * z, -z + 0.3 * x * z], axis=-1)
 
 
-def identity(points):
-    return np.broadcast_to(np.eye(3), (*points.shape[:-1], 3, 3))
+identity = lambda points: np.broadcast_to(np.eye(3), (*points.shape[:-1], 3, 3))  # noqa: E731
 
 
 def test_middles_of_elements_tell_a_cubic_everywhere():
@@ -127,6 +128,21 @@ def test_simulators_of_one_body_share_its_factors(tmp_path, monkeypatch):
     assert len(made) == 5
 
 
+def test_readings_alone_are_solved_for_on_one_thread(tmp_path, monkeypatch):
+    solved = set()
+
+    def noted(scale, triangle, values, **named):
+        if "overwrite_b" not in named:  # a solve, not a factor
+            blas = [library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"]
+            solved.add((len(values), *blas))
+        return dtrsm(scale, triangle, values, **named)
+
+    monkeypatch.setattr("skin.mechanics.simulator.solid.dtrsm", noted)
+    with threadpool_limits(2):
+        solid(TWO, cache=tmp_path)
+    assert solved == {(2, 1, 1)}  # sensors; threads of scipy and of numpy
+
+
 def test_too_few_rows_are_said_with_the_error_to_expect():
     thick = Sheet([0.08, 0.08], [8, 8], [{"material": "EcoFlex 00-30", "thickness": 0.03}])
     where = sensors((0.04, 0.04, 0.0295))
@@ -135,28 +151,18 @@ def test_too_few_rows_are_said_with_the_error_to_expect():
 
 
 @pytest.mark.parametrize(
-    ("size", "thickness", "reason"),
+    ("size", "thickness", "settings", "reason"),
     [
-        (0.08, 0.0009, r"layer 1 of the body is 0\.0009 m thick; simulator=solid takes layers from 0\.001 m"),
-        (0.02, 0.021, r"layer 1 of the body is 0\.021 m thick.*to the width of the skin, 0\.02 m"),
+        (0.08, 0.0009, {}, r"layer 1 of the body is 0\.0009 m thick;.* takes layers from 0\.001 m"),
+        (0.02, 0.021, {}, r"layer 1 of the body is 0\.021 m thick.*to the width of the skin, 0\.02 m"),
+        (0.08, 0.01, {"divisions": 0}, r"simulator.divisions=0 must be greater than 0"),
+        (0.08, 0.01, {"poisson": {"mussel": 0.4}}, r"names mussel, but the body is made of EcoFlex 00-30"),
     ],
 )
-def test_layers_that_no_mesh_can_hold(size, thickness, reason):
+def test_what_no_solid_can_be(size, thickness, settings, reason):
     body = Sheet([size, 0.08], [4, 8], [{"material": "EcoFlex 00-30", "thickness": thickness}])
     with pytest.raises(InputError, match=reason):
-        solid(sensors((0.01, 0.04, 0.0005)), body)
-
-
-@pytest.mark.parametrize(
-    ("settings", "reason"),
-    [
-        ({"divisions": 0}, r"simulator.divisions=0 must be greater than 0"),
-        ({"poisson": {"mussel": 0.4}}, r"names mussel, but the body is made of EcoFlex 00-30, muscle"),
-    ],
-)
-def test_what_no_solid_can_be(settings, reason):
-    with pytest.raises(InputError, match=reason):
-        solid(**settings)
+        solid(sensors((0.01, 0.04, 0.0005)), body, **settings)
 
 
 def test_the_measured_ratio_of_dragon_skin_is_replaced_in_python_as_in_the_configuration():
@@ -198,16 +204,10 @@ SOFT_SHEET = Sheet([0.2, 0.2], [10, 10], [{"material": SOFT, "thickness": high} 
 SENSOR = Sensors(np.array([[0.1, 0.1, 0.005]]), (0.01, 0.01))
 
 
-def test_plates_and_beams_are_squeezed_like_a_column():
-    """Under even pressure each layer is a column: p / E, but at the free edges."""
-    strain = PlatesAndBeams(SOFT_SHEET, SENSOR).strain(torch.full((1, 10, 10), 2e4))
-    assert strain.item() == pytest.approx(0.2, rel=0.1)
-
-
-def test_a_wide_solid_is_squeezed_as_in_an_oedometer():
-    """Confined: p (1 + nu) (1 - 2 nu) / (E (1 - nu)) in the middle; the free edges bulge further."""
-    confined = 2e4 * 1.3 * 0.4 / (1e5 * 0.7)
-    even = torch.full((1, 10, 10), 2e4)
+def test_even_pressure_squeezes_plates_like_a_column_and_a_wide_solid_as_in_an_oedometer():
+    """p / E; confined p (1 + nu) (1 - 2 nu) / (E (1 - nu)) in the middle, and more at the free edges."""
+    even, confined = torch.full((1, 10, 10), 2e4), 2e4 * 1.3 * 0.4 / (1e5 * 0.7)
+    assert PlatesAndBeams(SOFT_SHEET, SENSOR).strain(even).item() == pytest.approx(0.2, rel=0.1)
     assert confined < Solid(SOFT_SHEET, SENSOR, divisions=2).strain(even).item() < 2 * confined
 
 

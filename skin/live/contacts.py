@@ -218,18 +218,16 @@ def estimate_contacts(posterior: "Posterior", nominal: "Noise", readings: MeanRe
 
 def serve(mechanics: Mechanics, pipe: Connection) -> None:
     """Prepare the mechanics, then answer readings with messages until the pipe is closed."""
-    import torch
-
     from skin.inference.likelihood import Observation
     from skin.inference.watch import Thickness, Watch
 
     if hasattr(os, "nice"):
         os.nice(5)  # below what shows verdicts
     os.dup2(2, 1)  # what a library prints is no JSON line
-    torch.set_num_threads(1)
+    threadpool_limits(1)  # of BLAS and of torch, which the mechanics have loaded
     posterior, tare = mechanics.posterior(), -1
     thickness = Thickness(mechanics, posterior)
-    with threadpool_limits(1), suppress(EOFError, OSError):  # the command has ended
+    with suppress(EOFError, OSError):  # the command has ended
         while True:
             readings = pipe.recv()
             if readings.tare != tare:

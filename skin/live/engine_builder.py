@@ -74,8 +74,9 @@ class SelfTest:
                 hides weaker ones.
         """
         unit = unit_conversion(len(self.presses), None, 1.0, None, None)
-        expected = self.find(self._nominal, unit, RawRange())
         raised = self.find(self.used, conversion, device)
+        # Where all presses raise it, there is nothing that nominal settings would find in addition.
+        expected = raised if raised.all() else self.find(self._nominal, unit, RawRange())
         # A place without a valid sensor is shown as unknown, which hides nothing, unless there are many.
         valid = ~conversion.broken[self._sensors]
         silent, missed = (
@@ -88,7 +89,8 @@ class SelfTest:
             if device.maximum is not None  # too large or too small a force would leave the range
             else "the device declares no range, so its scale is not checked"
         )
-        say(f"{text}, {expected.sum()} with nominal settings; {silent and f'not on {silent}; '}{scale}")
+        more = "" if raised.all() else f", {expected.sum()} with nominal settings"
+        say(f"{text}{more}; {silent and f'not on {silent}; '}{scale}")
         text += f", not {expected.sum()}" + (f"; {missed} cannot raise it" if missed else "")
         if expected.mean() < self.minimum:
             raise InputError(

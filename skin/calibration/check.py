@@ -88,8 +88,11 @@ def describe_setup(
 
 def _path(setup: dict[str, Any]) -> Path:
     """Return the file of the check of a device: below the variable SKIN_DATA, else below the user's data."""
-    folder = Path(os.environ.get("SKIN_DATA") or platformdirs.user_data_dir("skin")).expanduser() / "checks"
-    return folder / f"{hashlib.sha256(setup['device'].encode()).hexdigest()[:16]}.json"
+    return (
+        Path(os.environ.get("SKIN_DATA") or platformdirs.user_data_dir("skin")).expanduser()
+        / "checks"
+        / f"{hashlib.sha256(setup['device'].encode()).hexdigest()[:16]}.json"
+    )
 
 
 def store_check(check: Check) -> Path:
@@ -129,6 +132,9 @@ def verify_source(
         conversion: of its values to N.
         positions: of the sensors, (S, 2 or 3), m.
         size: of the body, m.
+
+    Raises:
+        InputError: the scale contradicts the check of this skin.
     """
     port, header = source.port, source.skin.header
     if port is None or (header is not None and (header.id or "").startswith(EMULATED)):
@@ -139,6 +145,13 @@ def verify_source(
         differing = [name for name in setup if json_text(setup[name]) != json_text(check.setup.get(name))]
         if not differing:
             return Verification("checked", f"scale checked on {check.date[:10]}", check)
+        before = np.array(check.setup["scale"], float)
+        if differing == ["scale"] and not np.allclose(conversion.scale / before, 1, rtol=AGREES):
+            raise InputError(
+                f"the scale is {np.median(conversion.scale / before):.3g} times that of the check of "
+                f"{check.date[:10]}: touches would be judged by a wrong force: correct device.scale or "
+                "device.calibration, or repeat skin check"
+            )
         reason = f"the check of {check.date[:10]} was made with another {', '.join(differing)}"
     if port.settings.sensitivity:
         return Verification("declared", "scale agrees with device.sensitivity")

@@ -89,8 +89,9 @@ def find_placements(session: BenchSession) -> Placements:
     # Of a block without a value, what is between those before and after it; 0 of a channel without any.
     values = medians.interpolate(limit_direction="both").fillna(0.0).to_numpy()
     steps = np.array([find_quantum(column[np.isfinite(column)]) for column in session.raw.T])
-    noise = MAD / np.sqrt(2) * np.median(np.abs(np.diff(values, axis=0)), axis=0)
-    noise = np.maximum(noise, steps / np.sqrt(12))
+    noise = np.maximum(
+        MAD / np.sqrt(2) * np.median(np.abs(np.diff(values, axis=0)), axis=0), steps / np.sqrt(12)
+    )
     loaded = _find_loads(values, np.maximum(_LOADED * noise, _STEPS * steps))
     # From the block before a load to those in which the skin settles after it.
     resting = np.convolve(loaded, np.ones(2 + _SETTLE))[1:-_SETTLE] == 0
@@ -102,8 +103,10 @@ def find_placements(session: BenchSession) -> Placements:
         low, high = (begin + round(fraction * (end + 1 - begin)) for fraction in _STEADY)
         steady = values[low : max(high, low + 3)]
         rests = values[:begin][resting[:begin]][-_REST:], values[end:][resting[end:]][:_REST]
-        change = np.median(steady, axis=0) - np.vstack(rests).mean(axis=0)
-        if (np.ptp(steady, axis=0) > _UNSTEADY * np.abs(change).max() + _LOADED * noise).any():
+        change = np.median(steady, axis=0) - (
+            np.vstack(rests).mean(axis=0) if any(map(len, rests)) else np.nan
+        )
+        if not (np.ptp(steady, axis=0) <= _UNSTEADY * np.abs(change).max() + _LOADED * noise).all():
             unsteady += 1
             continue
         rows.append(change)
@@ -203,8 +206,8 @@ def fit_known_load(device: Simulated, session: BenchSession, load: KnownLoad) ->
     gains, signs, loaded, site = _fit_gains(expected, placements)
     if len(missed := np.flatnonzero(np.isnan(gains) & loaded)) > _MISSED * loaded.sum():
         raise InputError(
-            f"sensors {list_numbers(missed)} were never loaded, or do not respond: put the load on every "
-            "sensor and record again, or check the wiring"
+            f"sensors {list_numbers(missed)} were never loaded, do not respond, or a load lay on the skin in "
+            "the first second: put the load on every sensor and record again, or check the wiring"
         )
     # Slow drift is left to the tare: placements move the rest a little, too.
     centred = replace(session, time=session.time - session.time[placements.idle].mean())

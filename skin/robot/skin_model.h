@@ -41,7 +41,7 @@ typedef float skin_float32, skin_float64; /* 32 bits of numbers of 64 */
 #define SKIN_TOUCHES ((int)(sizeof(SKIN_EXPECTED) / sizeof(float) / SKIN_LABELS))
 #define SKIN_USES(block) (SKIN_USED >> (block) & 1)
 
-enum { SKIN_TARING, SKIN_NO_TOUCH, SKIN_TOUCH };
+enum { SKIN_TARING, SKIN_NO_TOUCH, SKIN_TOUCH, SKIN_UNKNOWN };
 
 static struct {
   int16_t ring[SKIN_PHASES][SKIN_FRAMES][SKIN_SENSORS]; /* largest reading of each interval, SKIN_STEP */
@@ -694,6 +694,8 @@ static inline void skin_decide(void) {
   skin.alarm = skin.danger || (skin.alarm && contact); /* latched until the contact ends */
   skin.touch = skin_debounce(skin.touch, contact || risen || learned, &skin.wanting, SKIN_WAIT, SKIN_WAIT);
   skin.state = skin.touch || skin.alarm || contact ? SKIN_TOUCH : SKIN_NO_TOUCH;
+  for (int s = 0; s < SKIN_SENSORS; s++) /* clearly below its rest, or no number */
+    if (skin.state == SKIN_NO_TOUCH && skin_below(SKIN_FRAMES - 1, s)) skin.state = SKIN_UNKNOWN;
 }
 
 /* Forget everything; the tare begins with the next frame. */

@@ -366,7 +366,9 @@ class LiveSetup:
             add_note(Note("unverified", detail=found.text))
         if engine.guarantee is not None:
             engine.guarantee = engine.guarantee.on_device(
-                engine.detection == nominal.detection, found.state != "unverified"
+                engine.detection == nominal.detection,
+                # The mechanics of an emulated skin may be others than those of the guarantee.
+                source.port is None or found.state in ("checked", "declared"),
             )
         stored, raised = found.check.rest if found.check else source.calibrated_rest, None
         if stored is not None and conversion.rest is not None:

@@ -397,7 +397,7 @@ class LiveLoop:
 
     def take(self, frames: list[Frame], now: float) -> None:
         """Take frames that have arrived at ``now``, s, and show what follows from them."""
-        self._received_at = now
+        self._received_at, began = now, self._clock()
         if request := self._display.take_tare():
             self._tare.restart(force=request == "tare_forced")
         stream = self._convert(frames)
@@ -411,12 +411,11 @@ class LiveLoop:
         if frozen := self._tare.freshness.frozen:
             self._display.set_verdict(None, now, FROZEN_READINGS[frozen], self._engine.alarm)
             return
+        now += self._clock() - began  # a slow machine shows them later than the frames arrived
         for verdict in verdicts:
             self.verdicts += 1
-            if now - verdict.t_host < STALE:
-                self._display.set_verdict(verdict, now)
-            else:
-                self._display.set_verdict(None, now, OLD_READINGS, verdict.dangerous)
+            old = now - verdict.t_host >= STALE
+            self._display.set_verdict(None if old else verdict, now, OLD_READINGS * old, verdict.dangerous)
         if verdicts:
             self._delays.append(self._clock() - verdicts[-1].t_host)
         # After the verdict is shown: it waits for nothing.

@@ -33,7 +33,7 @@ class MemoryView:
         stream: (s of the host's clock, bytes that arrive then).
         engine: with its settings.
         verify: called with the conversion before the first decision.
-        inwards: the stream has three channels for each sensor of the engine.
+        inwards, clock: three channels for each sensor of the engine; of the loop, whose work takes no time.
         port: settings of the port.
 
     Attributes:
@@ -41,7 +41,7 @@ class MemoryView:
         said: (s, verdict or None, reason, alarm) of all assessments for observers.
     """
 
-    def __init__(self, stream, engine, verify=None, inwards=False, **port):
+    def __init__(self, stream, engine, verify=None, inwards=False, clock=float, **port):
         self.looks, self.said = [], []
         port = Port(**port)
         source = SerialSource(port, engine.sensors, engine.rate, inwards=inwards)
@@ -55,7 +55,7 @@ class MemoryView:
         positions = np.zeros((engine.sensors, 3))
         self.display = Display("memory", "memory", positions, (0.1, 0.1), 4.0)
         self.display.observers.append(lambda assessment, now, event: self.said.append((now, *assessment)))
-        self.loop = LiveLoop(skin, tare, replace(engine), self.display, verify)
+        self.loop = LiveLoop(skin, tare, replace(engine), self.display, verify, clock=clock)
         for arrival, data in stream:
             self.look(arrival)
             frames = feed.decode(data, arrival)

@@ -266,8 +266,12 @@ class Network(AbstractLearner):
         self._begin(network)
         try:
             with torch.no_grad():
-                network.eval()(data.show(data.example))
-        except RuntimeError as error:
+                shape = network.eval()(data.show(data.example)).shape
+            if len(shape) != 2 or shape[0] != 1:
+                raise RuntimeError(f"one touch gives an output of {tuple(shape)}")
+        except InputError:
+            raise
+        except (RuntimeError, ValueError) as error:
             raise InputError(
                 "model and fusion must return embeddings (N, E), as wide as their attribute width says: "
                 f"{one_line(error)}"

@@ -60,9 +60,16 @@ class Training(LightningModule):
         return self._data.frames(batch) if isinstance(batch, Touches) else batch
 
     def _step(self, batch: Batch, stage: str) -> Tensor:
+        """Return the loss of one batch, and keep it with the accuracy.
+
+        Raises:
+            InputError: it is not a number.
+        """
         frames, labels = batch
         logits = self.network(frames)
         loss = self.network.loss(logits, labels)
+        if not loss.isfinite():
+            raise InputError(f"the loss is {loss:g}: lower optimizer.lr, or correct the model")
         values = {"loss": loss.detach()} | self.network.accuracy(logits.detach(), labels)
         self._batches[stage].append((len(labels), values))
         return loss
@@ -76,15 +83,8 @@ class Training(LightningModule):
             self.log(f"{stage}_{name}", mean, sync_dist=True)  # the mean over processes that train together
 
     def training_step(self, batch: Batch, index: int) -> Tensor:
-        """Return the loss of one batch.
-
-        Raises:
-            InputError: it is not a number.
-        """
-        loss = self._step(batch, "train")
-        if not loss.isfinite():
-            raise InputError(f"the loss is {loss:g}: lower optimizer.lr, or correct the model")
-        return loss
+        """Return the loss of one batch."""
+        return self._step(batch, "train")
 
     def validation_step(self, batch: Batch, index: int) -> None:
         """Keep the loss and the accuracy of one batch."""

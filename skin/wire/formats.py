@@ -279,7 +279,8 @@ class SensorCountError(InputError):
         self.sent = sent
         super().__init__(
             f"the device sends {sent} values per frame, the layout has {sensors} sensors: give its own "
-            "layout, as in layout=file layout.path=FILE.csv"
+            "layout, as in layout=file layout.path=FILE.csv; or an adapter, if a value is a clock or a "
+            "counter: skin listen adapter=auto proposes one"
         )
 
 

@@ -145,7 +145,7 @@ def verify_source(
         differing = [name for name in setup if json_text(setup[name]) != json_text(check.setup.get(name))]
         if not differing:
             return Verification("checked", f"scale checked on {check.date[:10]}", check)
-        before = np.array(check.setup["scale"], float)
+        before = np.array(check.setup.get("scale", np.nan), float)
         if differing == ["scale"] and not np.allclose(conversion.scale / before, 1, rtol=AGREES):
             raise InputError(
                 f"the scale is {np.median(conversion.scale / before):.3g} times that of the check of "

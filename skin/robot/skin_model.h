@@ -694,8 +694,10 @@ static inline void skin_decide(void) {
   skin.alarm = skin.danger || (skin.alarm && contact); /* latched until the contact ends */
   skin.touch = skin_debounce(skin.touch, contact || risen || learned, &skin.wanting, SKIN_WAIT, SKIN_WAIT);
   skin.state = skin.touch || skin.alarm || contact ? SKIN_TOUCH : SKIN_NO_TOUCH;
-  for (int s = 0; s < SKIN_SENSORS; s++) /* clearly below its rest, or no number */
-    if (skin.state == SKIN_NO_TOUCH && skin_below(SKIN_FRAMES - 1, s)) skin.state = SKIN_UNKNOWN;
+  for (int s = 0; s < SKIN_SENSORS; s++) { /* clearly below its rest, or no number now or at the tare */
+    int sound = !skin_below(SKIN_FRAMES - 1, s) && isfinite(skin.zero[s] + skin.noise[s]);
+    if (skin.state == SKIN_NO_TOUCH && !sound) skin.state = SKIN_UNKNOWN;
+  }
 }
 
 /* Forget everything; the tare begins with the next frame. */

@@ -31,7 +31,6 @@ def main(config: Config, out: str, step: str | None, steps: dict[str, Any]) -> N
     if step not in (None, *steps):
         raise InputError(f"there is no step={step}: give one of {', '.join(steps)}")
     folder, given = results(out), [word for word in overrides() if not word.startswith("step=")]
-    port = shlex.join(word for word in given if word.startswith("device."))
     order, done = list(steps), [(folder / about.get("file", "")).is_file() for about in steps.values()]
     number = order.index(step) if step else done.index(False)
     with suppress(EOFError, KeyboardInterrupt):
@@ -46,16 +45,16 @@ def main(config: Config, out: str, step: str | None, steps: dict[str, Any]) -> N
             elif answer:
                 notify(f"there is no step {answer}")
             else:
-                number += _succeeds(folder, port, **about)
+                number += _succeeds(folder, [word for word in given if word.startswith("device.")], **about)
     notify(f"\nto continue: skin setup {shlex.join(given)}")
 
 
-def _succeeds(folder: Path, port: str, aim: str, command: str, file: str = "", load: str = "") -> bool:
+def _succeeds(folder: Path, port: list[str], aim: str, command: str, file: str = "", load: str = "") -> bool:
     """Ask what a step needs, print its command and run it; return whether it succeeded.
 
     Args:
         folder: of the guide.
-        port: settings of the port.
+        port: settings of the port, as overrides.
         aim, command, file, load: of the step, as in conf/setup.yaml.
     """
     if command.startswith("design"):
@@ -63,7 +62,9 @@ def _succeeds(folder: Path, port: str, aim: str, command: str, file: str = "", l
     if load:
         mass, radius = _ask("its mass, kg, and the radius of its round base, mm", load)
         load = f"weight={mass:g} base={1e-3 * radius:g}"
-    words = [os.path.expanduser(word) for word in shlex.split(command.format(port=port, load=load))]
+    words = [
+        os.path.expanduser(word) for word in shlex.split(command.format(port=shlex.join(port), load=load))
+    ]
     notify(f"$ skin {shlex.join(words)}" + f" | tee {folder / file}" * bool(file))
     # This command lets Hydra raise its errors; the other one shall explain them.
     environment = {name: value for name, value in os.environ.items() if name != "HYDRA_FULL_ERROR"}
@@ -123,11 +124,17 @@ def _describe(folder: Path) -> None:
         return
     size, layers, young, area, grid = (_ask(*question) for question in _QUESTIONS)
     rows, columns = map(ceil, grid)
+    pitch = _ask(
+        f"pitch of the sensors along x and y, mm (centred; {path} may say otherwise)",
+        " ".join(f"{1e3 * side / count:g}" for side, count in zip(size, (columns, rows), strict=True)),
+        1e-3,
+    )
     places = [
-        f"{size[0] * (column + 0.5) / columns:.6g},{size[1] * (row + 0.5) / rows:.6g}"
+        f"{size[0] / 2 + pitch[0] * (column - (columns - 1) / 2):.6g},"
+        f"{size[1] / 2 + pitch[1] * (row - (rows - 1) / 2):.6g}"
         for row in range(rows)
         for column in range(columns)
     ]
-    cells = [max(8, round(side / 0.005)) for side in size]  # m, as that page advises
     write("\n".join(["x_m,y_m", *places, ""]), path)
+    cells = [max(8, round(side / 0.005)) for side in size]  # m, as that page advises
     write(_SKIN.format(size=size, cells=cells, layers=layers, young=young, path=path, area=area), body)

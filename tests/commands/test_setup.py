@@ -133,7 +133,7 @@ def test_a_step_that_fails_is_offered_again_and_the_guide_goes_on_where_it_was(r
 
 
 def test_its_commands_are_those_of_a_skin_as_described(run, monkeypatch, tmp_path):
-    described = "200 100", "8 4", "560 70", "8 6", "2 4"
+    described = "200 100", "8 4", "560 70", "8 6", "2 4", "40 30"
     answers = "", *described, "", "", "1.5 15", "", "0.4 6", ""
     said = asked(run, monkeypatch, tmp_path, *answers, program="true", words=["step=skin"])
     board = "device.port=/dev/null device.adapter=mine/board.yaml"
@@ -155,7 +155,7 @@ def test_its_commands_are_those_of_a_skin_as_described(run, monkeypatch, tmp_pat
     monkeypatch.chdir(tmp_path)
     sensors = instantiate(shown.layout).sensors(body)
     assert sensors.footprint == (0.008, 0.006)
-    assert sensors.positions[[0, 7]].tolist() == [[0.025, 0.025, 0.004], [0.175, 0.075, 0.004]]
+    assert sensors.positions[[0, 7]].tolist() == [[0.04, 0.035, 0.004], [0.16, 0.065, 0.004]]
 
 
 @pytest.mark.slow("runs commands in processes of their own, and waits for nine loads")

@@ -218,13 +218,15 @@ class SweepCallback(Callback):
         # A single run has no number.
         if self._store is None or str(config.hydra.job.num) in os.environ.get(LEFT_OUT, "").split():
             return
-        number, value = config.hydra.job.num, job_return._return_value
+        number, value = config.hydra.job.num, job_return._return_value  # of a failed job, its exception
         count = f"{self._jobs.index(number) + 1}/{len(self._jobs)}" if self._jobs else f"{number + 1}"
-        job = _parse_choices(_words(config))
+        job, failed = _parse_choices(_words(config)), job_return.status == JobStatus.FAILED
         label = f"[{count}] {' '.join(f'{key}={job[key]}' for key in self._swept or job)}"
-        failed = job_return.status == JobStatus.FAILED
+        scored = "" if failed or value is None else f", {value:.4f} on validation gestures"
         print(
-            f"{label}: {value if failed else 'done'}", file=sys.stderr if failed else sys.stdout, flush=True
+            f"{label}: {value if failed else 'done'}{scored}",
+            file=sys.stderr if failed else sys.stdout,
+            flush=True,
         )
 
     def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:

@@ -98,8 +98,7 @@ def test_a_bad_job_fails_and_the_others_run(run, tmp_path, opened):
     assert "[1/2] device.offset=-1: device.offset=-1 must be" in done.stderr
     store = opened(tmp_path)
     assert [each[:2] for each in runs(store) if each[2]] == [(named(0, " offset=0.1"), "FINISHED")]
-    (parent,) = parents(store)
-    assert parent.info.status == "FAILED"
+    assert parents(store)[0].info.status == "FAILED"
 
 
 @pytest.mark.slow("trains several runs")
@@ -107,6 +106,7 @@ def test_a_run_is_nested_under_the_sweep_that_trained_it(run, tmp_path, opened):
     for seeds in ("0,1,0", "1,0", "shuffle(0,1,2)"):
         done = run(tmp_path, *sweep(tmp_path, f"seed={seeds}"), store=False)
     assert done.stderr.count("did this before") == 2
+    assert done.stdout.count(" on validation gestures\n") == 3
     store = opened(tmp_path)
     second, first = (parent.info for parent in parents(store))  # the one in between trained nothing
     assert (first.run_name, first.status) == ("seed=0,1", "FINISHED")

@@ -9,13 +9,11 @@ from time import process_time
 import pytest
 
 __all__ = ["Budget", "charge", "free"]
-
 LIMIT = 2.0  # s of processor time; 25 of 599 cases took half of the time of all
 REFERENCE = 0.22  # s that :func:`slowness` computes on the machine on which the limit was set
 # By which the time of a case varied: beside other work by 2, between machines by 3.3 (a frame of
 # docs/results/contact.csv took 5.4 and 18 ms).
 SPREAD = 3.5
-
 _others = 0.0  # s, of the commands that the starter has run for this process
 _free = 0.0  # s, that no case is charged with
 _depth = 0  # of blocks that are free

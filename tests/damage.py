@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from skin.errors import InputError
 
 Content = TypeVar("Content")
-
 DAMAGED_FILES = settings(
     max_examples=int(os.environ.get("DAMAGED", "100")),
     derandomize=True,

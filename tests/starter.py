@@ -25,7 +25,6 @@ from select import select
 from typing import Any, TextIO
 
 __all__ = ["copying", "main", "remembering"]
-
 WARM = ["alembic.command", "mlflow.store.tracking.sqlalchemy_store", "scipy.stats"]
 WARM += [
     f"skin.{name}"

@@ -278,16 +278,21 @@ class ContactDetector:
         """
         middle = np.median(np.where(valid, readings, self.baseline), axis=0)
         rise = 0.0 if self.since is not None else self._drift * passed
-        self.baseline = self.baseline + self._step(middle - self.baseline, rise, passed)
-        step = self._step(np.median(np.where(valid, readings, self.rest), axis=0) - self.rest, rise, passed)
-        self.rest = self.rest + np.where(sound, step, 0.0)
+        # What a touch lifts comes back when it ends.
+        lift = _LIMITS.lift * float(np.where(valid, readings - self.rest, 0.0).max())
+        self.baseline = self.baseline + self._step(middle - self.baseline, rise, lift, passed)
+        rest = np.median(np.where(valid, readings, self.rest), axis=0)
+        self.rest = self.rest + np.where(sound, self._step(rest - self.rest, rise, lift, passed), 0.0)
         back = sound & ~self._touched & (np.abs(readings - self.rest) < self._threshold).all(axis=0)
         self.baseline = np.where(back, self.rest, self.baseline)
 
-    def _step(self, away: np.ndarray, rise: float, passed: float) -> np.ndarray:
-        """Return how far baselines (S,) move in ``passed`` s towards readings that are ``away``, N."""
+    def _step(self, away: np.ndarray, rise: float, lift: float, passed: float) -> np.ndarray:
+        """Return how far baselines (S,) move in ``passed`` s towards readings that are ``away``, N.
+
+        They rise by ``rise`` at most, and stay above the readings by what a touch may ``lift``, N.
+        """
         fast = _LIMITS.sink * self._threshold * passed
         slow = np.clip(away, -rise, rise)
         # Noise alone must not lower the baseline, because it rises slowly.
-        far = np.clip(away + _LIMITS.margin * self._threshold, -fast, 0.0)
+        far = np.clip(away + _LIMITS.margin * self._threshold + max(lift, 0.0), -fast, 0.0)
         return np.where(self._touched, 0.0, np.where(far < 0, far, slow))

@@ -130,8 +130,11 @@ def anytime_bound(misses: int, presses: int, confidence: float = CONFIDENCE) -> 
 
 def presses_needed(rate: float, misses: int = 0) -> int:
     """Return the least number of presses, with some missed, whose anytime-valid bound is at most ``rate``."""
-    most = range(math.ceil(100 * (misses + 1) / rate))  # whose bound is far below the rate
-    return bisect_left(most, True, key=lambda presses: anytime_bound(misses, presses) <= rate)
+    return bisect_left(
+        range(math.ceil(100 * (misses + 1) / rate)),  # the bound of the most is far below the rate
+        True,
+        key=lambda presses: anytime_bound(misses, presses) <= rate,
+    )
 
 
 def describe_presses(
@@ -254,14 +257,16 @@ class Guarantee:
         """Return whether it holds for a live view; ``changed``: sensors that a watch reports."""
         return "lapsed" if self.lapsed or changed else "valid" if self.verified else "unverified"
 
+    def at(self, rate: float) -> "Guarantee":
+        """Return the guarantee for a device of ``rate``, Hz: it lapses at another than its own."""
+        other = f"the device sends {rate:.3g} frames a second, and not {self.device_rate:.3g}"
+        return replace(self, lapsed=self.lapsed or other * (abs(self.device_rate / rate - 1) > _SAME))
+
     def under(self, live: LiveConditions) -> "Guarantee":
         """Return the guarantee for a live view: it lapses at another rate or patience than its own."""
-        lapsed = ""
-        if abs(self.device_rate / live.rate - 1) > _SAME:
-            lapsed = f"the device sends {live.rate:.3g} frames a second, and not {self.device_rate:.3g}"
-        elif live.patience != self.patience:
-            lapsed = f"live.patience.alarm is {live.patience:g} s, and not {self.patience:g}"
-        return replace(self, lapsed=lapsed)
+        other = live.patience != self.patience
+        lapsed = f"live.patience.alarm is {live.patience:g} s, and not {self.patience:g}" * other
+        return replace(self, lapsed=lapsed).at(live.rate)
 
     def sentence(self) -> str:
         """Return the promise in words, with its conditions."""

@@ -8,6 +8,7 @@ Gauss-Newton, and importance samples give its evidence. Further ones, around the
 
 import math
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from scipy.ndimage import map_coordinates
@@ -164,6 +165,36 @@ class ContactEstimate:
         """Return the probability that the highest pressure is above a limit, Pa."""
         return float(self.weights[self.peaks > pressure].sum())
 
+    def to_json(self, probability: float = 0.9, cell: float = 0.002) -> dict[str, Any]:
+        """Return the contact as JSON data.
+
+        Args:
+            probability: of its region.
+            cell: m, least width of its cells: a region of the default skin would have a thousand smaller.
+        """
+        region = self.region(probability, cell)
+        origin = region.cells.min(axis=0)
+        position, spread = self.position.round(5).tolist(), self.position_deviation.round(5).tolist()
+        return {
+            "x": position[0],
+            "y": position[1],
+            "x_deviation": spread[0],
+            "y_deviation": spread[1],
+            "force": round(self.force, 4),
+            "force_deviation": round(self.force_deviation, 4),
+            "radius": round(self.radius, 5),
+            "radius_deviation": round(self.radius_deviation, 5),
+            "peak": round(self.peak),
+            "peak_interval": [round(limit) for limit in self.peak_interval],
+            "region": {
+                "share": round(float(region.probabilities.sum()), 4),
+                "origin": origin.round(6).tolist(),
+                "cell": region.width.round(6).tolist(),
+                "cells": ((region.cells - origin) / region.width).round().astype(int).tolist(),
+                "probabilities": region.probabilities.round(5).tolist(),
+            },
+        }
+
     def region(self, fraction: float = 0.9, minimum: float = 0.0) -> Region:
         """Return the smallest set of cells that holds the position with a probability; it may have parts.
 
@@ -221,6 +252,31 @@ class FrameEstimate:
     def exceeds(self, pressure: float) -> float:
         """Return the probability that some contact's highest pressure is above a limit, Pa."""
         return 1 - math.prod(1 - contact.exceeds(pressure) for contact in self.contacts)
+
+    def to_json(self, time: float, noise_fit: float = 1e-4) -> dict[str, Any]:
+        """Return the estimate as JSON data, the fields of ``docs/export.md``.
+
+        Args:
+            time: s, the device's clock at the latest frame of the readings.
+            noise_fit: predictive probability below which readings without contact are not explained by noise.
+        """
+        none = self.number == 0 and self.fit >= noise_fit and self.large < 0.5
+        known = self.fingertip or none
+        # The strongest of the fingertips that fit best: a reader must find where a hard touch is.
+        contacts = self.contacts if known else self.contacts[:1]
+        return {
+            "state": "no contact" if none else "contacts" if known else "not a fingertip",
+            "reason": self.unknown or "",
+            "device_time": time,
+            "fit": round(self.fit, 6),
+            "large": round(self.large, 6),
+            "changed": [],
+            "thickness": None,
+            "number": self.number if known else None,
+            "probability": round(float(self.probabilities[self.number]), 6) if known else None,
+            "probabilities": self.probabilities.round(6).tolist() if known else None,
+            "contacts": [contact.to_json() for contact in contacts],
+        }
 
 
 class Posterior:

@@ -27,7 +27,7 @@ from skin.wire.tare import Tare
 
 if TYPE_CHECKING:
     from skin.inference.noise import Noise
-    from skin.inference.posterior import ContactEstimate, FrameEstimate, Posterior
+    from skin.inference.posterior import Posterior
 
 # What is known of contacts, as JSON data.
 
@@ -36,72 +36,6 @@ def unknown_contacts(reason: str) -> dict[str, Any]:
     """Return the message that nothing is known of contacts, with the reason."""
     names = "device_time", "number", "probability", "probabilities", "fit", "large", "thickness"
     return {"state": "unknown", "reason": reason, **dict.fromkeys(names), "contacts": [], "changed": []}
-
-
-def contact_message(estimate: "FrameEstimate", time: float, noise_fit: float = 1e-4) -> dict[str, Any]:
-    """Return an estimate as JSON data, the fields of ``docs/export.md``.
-
-    Args:
-        estimate: of the readings.
-        time: s, the device's clock at their latest frame.
-        noise_fit: predictive probability below which readings without contact are not explained by noise.
-    """
-    none = estimate.number == 0 and estimate.fit >= noise_fit and estimate.large < 0.5
-    base = {
-        "reason": estimate.unknown or "",
-        "device_time": time,
-        "fit": round(estimate.fit, 6),
-        "large": round(estimate.large, 6),
-        "changed": [],
-        "thickness": None,
-    }
-    if not (estimate.fingertip or none):
-        # The strongest of the fingertips that fit best: a reader must find where a hard touch is.
-        return (
-            unknown_contacts("")
-            | base
-            | {"state": "not a fingertip", "contacts": [*map(_contact, estimate.contacts[:1])]}
-        )
-    return {
-        "state": "no contact" if none else "contacts",
-        **base,
-        "number": estimate.number,
-        "probability": round(float(estimate.probabilities[estimate.number]), 6),
-        "probabilities": estimate.probabilities.round(6).tolist(),
-        "contacts": [_contact(contact) for contact in estimate.contacts],
-    }
-
-
-def _contact(contact: "ContactEstimate", probability: float = 0.9, cell: float = 0.002) -> dict[str, Any]:
-    """Return a contact as JSON data.
-
-    Args:
-        contact: the estimate.
-        probability: of its region.
-        cell: m, least width of its cells: a region of the default skin would have a thousand smaller ones.
-    """
-    region = contact.region(probability, cell)
-    origin = region.cells.min(axis=0)
-    position, spread = contact.position.round(5).tolist(), contact.position_deviation.round(5).tolist()
-    return {
-        "x": position[0],
-        "y": position[1],
-        "x_deviation": spread[0],
-        "y_deviation": spread[1],
-        "force": round(contact.force, 4),
-        "force_deviation": round(contact.force_deviation, 4),
-        "radius": round(contact.radius, 5),
-        "radius_deviation": round(contact.radius_deviation, 5),
-        "peak": round(contact.peak),
-        "peak_interval": [round(limit) for limit in contact.peak_interval],
-        "region": {
-            "share": round(float(region.probabilities.sum()), 4),
-            "origin": origin.round(6).tolist(),
-            "cell": region.width.round(6).tolist(),
-            "cells": ((region.cells - origin) / region.width).round().astype(int).tolist(),
-            "probabilities": region.probabilities.round(5).tolist(),
-        },
-    }
 
 
 def contact_text_lines(message: dict[str, Any]) -> list[str]:
@@ -123,9 +57,11 @@ def contact_text_lines(message: dict[str, Any]) -> list[str]:
 
 def _words(contact: dict[str, Any]) -> str:
     x, y, *near = (1000 * contact[name] for name in ("x", "y", "x_deviation", "y_deviation"))
-    force = f"{contact['force']:.1f} ± {contact['force_deviation']:.1f}"
     low, high = (pressure / 1000 for pressure in contact["peak_interval"])
-    return f"({x:.0f}, {y:.0f}) ± {max(near):.0f} mm, {force} N, {low:.0f} to {high:.0f} kPa"
+    return (
+        f"({x:.0f}, {y:.0f}) ± {max(near):.0f} mm, {contact['force']:.1f} ± "
+        f"{contact['force_deviation']:.1f} N, {low:.0f} to {high:.0f} kPa"
+    )
 
 
 # What is sent to the process.
@@ -197,6 +133,8 @@ def estimate_contacts(posterior: "Posterior", nominal: "Noise", readings: MeanRe
         nominal: noise of such devices: its gains and positions hold for this one, too.
         readings: of a moment.
     """
+    if not readings.valid.any():
+        return unknown_contacts("no sensor has a valid reading")
     rounding = readings.step / 12**0.5
     # Without a tare, the device's offsets are unknown, too.
     frame, offset = (nominal.frame, nominal.offset) if readings.noise is None else (readings.noise, rounding)
@@ -208,9 +146,7 @@ def estimate_contacts(posterior: "Posterior", nominal: "Noise", readings: MeanRe
     )
     estimate = posterior.estimate(readings.values, readings.valid, readings.saturated)
     assert not isinstance(estimate, list)
-    if not readings.valid.any():
-        return unknown_contacts("no sensor has a valid reading")
-    return contact_message(estimate, readings.time)
+    return estimate.to_json(readings.time)
 
 
 # The process.

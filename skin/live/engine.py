@@ -264,14 +264,16 @@ class Engine:
             self.window.clear()
             if frame.after in ("reset", "reconnect"):
                 self.detector.restart()
-        self._pause = 0.0 if self._latest is None else t - self._latest.t
-        self._latest, self._decided = readings, False
+        before, self._latest, self._decided = self._latest or readings, readings, False
+        self._pause = t - before.t
         # What is frozen now is left out of this whole window, and of no later one. An interval with a
         # reading that no skin can have is unknown: the force may be beyond the range.
         sent = readings._replace(mask=readings.mask & ~(Reason.FROZEN | Reason.IMPLAUSIBLE))
         newtons = np.where(readings.mask & Reason.IMPLAUSIBLE, np.inf, readings.newtons)
         self.window.add(Frame(None, t, t, newtons, sent.usable, 0, frame.lost, frame.after, sent.saturated))
-        self._losses.add(frame.lost + (not frame.valid.all()), t, self.contact)
+        # What a channel does all the time must not hide what frames do in a contact.
+        failed = readings.mask & ~before.mask & (Reason.MISSING | Reason.IMPOSSIBLE)
+        self._losses.add(frame.lost + failed.any(), t, self.contact)
         tick, self._tick = self._tick, floor((t + 1e-6) * DECISIONS)  # a rounding of the clock
         return tick != self._tick
 
@@ -306,10 +308,12 @@ class Engine:
 
     def _fill(self, readings: np.ndarray, valid: np.ndarray, before: int) -> tuple[np.ndarray, np.ndarray]:
         """Return readings and valid, (T, S), with the rest where there is none: in the first rows, too."""
+        # A skin that has sunk since the tare, by more than noise, would hide as much of each touch.
+        sunk = np.where(self.detector.baseline < -self.detection.threshold / 2, self.detector.baseline, 0.0)
         # To the model a sensor below its rest is as one without a reading.
-        readings = np.where(valid, readings, 0.0).astype(np.float32)
+        readings = np.where(valid, readings - sunk, 0.0).astype(np.float32)
         # Unknown history counts as the rest of the sensors that are valid now.
-        readings[:before] = self.detector.baseline
+        readings[:before] = self.detector.baseline - sunk
         valid[:before] = valid[before:].any(axis=0)
         return readings, valid
 
@@ -323,7 +327,7 @@ class Engine:
         # A tap may come and go; but a device of the rate of a slow model may lose two frames, too.
         paused = bool(self._pause > max(_GAP / 2, 2.5 / self.rate))
         changed = np.isin(np.arange(self.sensors), self.changed)
-        blind = ~self._responds[:, valid & ~void].any(axis=1) | paused | changed
+        blind = ~self._responds[:, valid & ~void].any(axis=1) | void | paused | changed
         masked = blind & ~(void | below | beyond | lost | paused | changed)
         sensors = {
             "below": below,
@@ -335,9 +339,8 @@ class Engine:
         }
         notes = [Note(code, _numbers(which)) for code, which in sensors.items() if which.any()]
         if self.guarantee is not None:
-            notes.append(
-                Note(f"guarantee_{self.guarantee.state(self.changed)}", detail=self.guarantee.sentence())
-            )
+            guarantee = self.guarantee.at(1 / self.window.period)
+            notes.append(Note(f"guarantee_{guarantee.state(self.changed)}", detail=guarantee.sentence()))
         notes += [Note("unreadable")] * self._losses.excessive + [Note("pause", seconds=self._pause)] * paused
         return _numbers(blind), tuple(notes)
 
@@ -418,7 +421,7 @@ def _numbers(which: np.ndarray | np.bool) -> tuple[int, ...]:
 
 
 class _Losses:
-    """Compares the frames lost in a contact, or without a value of some sensor, with those lost at rest.
+    """Compares the frames lost in a contact, or with which some sensor loses its value, with those at rest.
 
     Attributes:
         excessive: since half a second before the present contact, so many frames were lost or unreadable that

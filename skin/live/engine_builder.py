@@ -20,7 +20,7 @@ from skin.errors import InputError
 from skin.evaluation.alarm import choose_alarm_threshold
 from skin.evaluation.decisions import DRIFT, minimum_visible
 from skin.evaluation.guarantee import Guarantee
-from skin.evaluation.operating_point import DangerScore, FinalThreshold
+from skin.evaluation.operating_point import DangerScore, FinalThreshold, OperatingPoint
 from skin.inference.mechanics import Mechanics
 from skin.live.engine import DebounceSettings, Detection, Engine
 from skin.live.verdict import Note, sensor_list
@@ -96,8 +96,10 @@ class SelfTest:
             raise InputError(
                 f"{text}, even with nominal settings: train another run, or a longer one; {_OVERRIDE}"
             )
-        few = raised[valid].sum() < self.found * expected[valid].sum()
-        if missed or few or conversion.broken.mean() > self.masked:
+        few = (
+            raised[valid].sum() < self.found * expected[valid].sum() or conversion.broken.mean() > self.masked
+        )
+        if missed or few:
             raise InputError(f"{text}: {self._suspect(conversion)} is most likely wrong; {_OVERRIDE}")
         # A threshold above the nominal one may hide weaker touches alone.
         if self.used.above > self.nominal.above:
@@ -327,12 +329,10 @@ class LiveSetup:
         if conditions is not None and self.port is not None:
             # Of the frames that waited, the latest give the baseline; others would delay verdicts about now.
             self.port.skin.skip(self.port.tare.seconds + 0.2)
-            self.port.skin.stats.dropped = 0  # nor are those lost that the queue could not hold
         nominal = engine_settings(model, DebounceSettings(above=usual), danger=danger)
         patience = replace(live.patience, above=usual if given is None else given)
-        engine = engine_settings(model, patience, live.touch, live.drift, danger, promise)
-        source = self.port or self.begin()
-        return source, engine, nominal, final
+        used = engine_settings(model, patience, live.touch, live.drift, danger, promise)
+        return self.port or self.begin(), used, nominal, final
 
     def check(
         self,
@@ -370,9 +370,6 @@ class LiveSetup:
                 # The mechanics of an emulated skin may be others than those of the guarantee.
                 source.port is None or found.state in ("checked", "declared"),
             )
-        stored, raised = found.check.rest if found.check else source.calibrated_rest, None
-        if stored is not None and conversion.rest is not None:
-            raised = conversion.rest - conversion.newtons(np.asarray(stored))
         presses = nominal.presses
         if not test:
             say("no self-test: live.selftest=false")
@@ -384,7 +381,37 @@ class LiveSetup:
             visible = presses >= minimum_visible(conversion.noise, engine.detection.threshold)
             if alone := np.flatnonzero(visible.sum(axis=1) < 2).tolist():
                 say(f"no neighbour would show that the wire of {sensor_list(alone)} breaks to its rest value")
-        return raised
+        stored = found.check.rest if found.check else source.calibrated_rest
+        return (
+            None
+            if stored is None or conversion.rest is None
+            else np.asarray(conversion.rest - conversion.newtons(np.asarray(stored)))
+        )
+
+    def check_final(
+        self,
+        source: Source,
+        engine: Engine,
+        nominal: Engine,
+        test: bool,
+        say: Callable[[str], None],
+        point: OperatingPoint,
+    ) -> None:
+        """Run the self-test with the threshold that follows a provisional one, once there is a baseline.
+
+        Args:
+            source, engine, nominal, test, say: as in :meth:`check`.
+            point: the threshold.
+
+        Raises:
+            InputError: it hides dangerous touches.
+        """
+        while (conversion := source.tare.conversion) is None:
+            sleep(0.1)
+        patience = replace(engine.patience, above=point.threshold)
+        used, usual = (replace(each, patience=patience, danger=point.score) for each in (engine, nominal))
+        if test and used.presses is not None:
+            SelfTest(used.presses, used, usual).run(conversion, source.raw_range, say)
 
 
 def watch_exported(

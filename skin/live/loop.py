@@ -32,8 +32,8 @@ _ONSET = 10  # frames of a touch before its contact is decided
 Refusal = Literal["", "touched", "unforced"]
 REFUSALS: dict[Refusal, str] = {
     "": "",
-    "touched": "tare refused: something touches the skin; if nothing does, confirm it "
-    "(terminal: force and Enter)",
+    "touched": "tare refused: something touches the skin, or did at the latest tare; if nothing does now, "
+    "confirm it (terminal: force and Enter)",
     "unforced": "there is nothing to force",
 }
 """Why the latest request for a new baseline was refused, in words."""
@@ -43,7 +43,7 @@ _TARES: dict[TareRequest, str] = {"tare": "new tare", "tare_forced": "tare force
 
 STALE = 1.5
 """s without frames after which nothing is known of the skin."""
-OLD_READINGS = f"the latest readings are over {STALE:g} s old"
+OLD_READINGS = f"the latest readings are over {STALE:g} s old: the link is too slow, or the device's clock is"
 LATE = "no decision for longer than usual"
 FROZEN_READINGS: dict[Frozen, str] = {
     "still": "readings are frozen: no channel has changed for 5 s",
@@ -149,7 +149,7 @@ class Display:
         self._alarm_at, self._decided = -inf, deque([-inf])
         self._request: TareRequest = ""
         self._refusal: Refusal = ""
-        self._refused_at = -inf
+        self._refused_at = self._requested_at = -inf
 
     def place(self, positions: np.ndarray) -> None:
         """Take the positions of the sensors (S, 3), m, before the first frame."""
@@ -231,27 +231,29 @@ class Display:
     def request_tare(self, now: float, force: bool = False) -> str:
         """Request a new baseline at ``now``, s; return why it is refused, or an empty text.
 
-        It is refused while something touches the skin. Within a minute after that it can be forced once, by
-        a second and explicit confirmation of the operator; :meth:`state` says so as long.
+        It is refused while something touches the skin, or did at the latest tare. Within a minute after that
+        it can be forced once, by a second and explicit confirmation of the operator; :meth:`state` says so
+        as long.
         """
         with self._lock:
             forced = force and self._refusal == "touched" and now - self._refused_at <= self.confirm
-            touched = self._latest.alarm or self._contact
+            notes = self._latest.verdict.notes if self._latest.verdict else ()
+            touched = self._latest.alarm or self._contact or any(note.code == "void" for note in notes)
             self._refusal = "" if forced else "touched" if touched else "unforced" if force else ""
             request: TareRequest = "tare_forced" if forced else "tare"
             if self._refusal:
                 self._refused_at = now
             else:
-                self._request = request
+                self._request, self._requested_at = request, now
             _log.warning("%s", REFUSALS[self._refusal] or _TARES[request])
             self.refresh(now, "tare_refused" if self._refusal else request)
             return REFUSALS[self._refusal]
 
-    def take_tare(self) -> TareRequest:
-        """Return the latest request for a new baseline, once."""
+    def take_tare(self, now: float) -> TareRequest:
+        """Return the latest request for a new baseline, once; one that is old forces nothing any more."""
         with self._lock:
             request, self._request = self._request, ""
-        return request
+        return "tare" if request and now - self._requested_at > STALE else request
 
     def state(self, now: float, since: int | None = None) -> DisplayState:
         """Return the state.
@@ -398,7 +400,7 @@ class LiveLoop:
     def take(self, frames: list[Frame], now: float) -> None:
         """Take frames that have arrived at ``now``, s, and show what follows from them."""
         self._received_at, began = now, self._clock()
-        if request := self._display.take_tare():
+        if request := self._display.take_tare(now):
             self._tare.restart(force=request == "tare_forced")
         stream = self._convert(frames)
         if self._tare.conversion is None:
@@ -435,9 +437,10 @@ class LiveLoop:
 
     def _begin(self, conversion: UnitConversion) -> None:
         """Begin anew with another conversion; test it if it is the first."""
-        raised, self._display.contacts.three = None, self._tare.three
-        if self._verify is not None:
-            raised, self._verify = self._verify(conversion), None
+        verify, self._verify, self._display.contacts.three = self._verify, None, self._tare.three
+        # A tare that nobody forced may have been taken under what made the one before it void.
+        void = self._engine.detector.void & (not self._tare.forced)
+        raised = verify(conversion) if verify else np.where(void, np.inf, 0.0)
         self._engine.reset(raised, conversion.noise)
         self._engine.remember(self._tare.take_earlier())
 

@@ -117,8 +117,9 @@ class Verdict:
     @property
     def state(self) -> State:
         """``touch``; ``unknown``, if a dangerous touch on a sensor would stay undetected; or ``no touch``."""
-        touching = self.touched or self.contact is not None
-        return "touch" if touching else "unknown" if self.unknown else "no touch"
+        return (
+            "touch" if self.touched or self.contact is not None else "unknown" if self.unknown else "no touch"
+        )
 
     @property
     def danger(self) -> bool | None:
@@ -225,5 +226,7 @@ def contact_text(contact: float | None, short: float = 3.0, long: float = 60.0) 
     """
     if contact is None or contact < short:
         return ""
-    hint = "; if nothing touches the skin, take a new tare" if contact >= long else ""
-    return f"contact since {datetime.now() - timedelta(seconds=contact):%H:%M:%S} ({contact:.0f} s){hint}"
+    return (
+        f"contact since {datetime.now() - timedelta(seconds=contact):%H:%M:%S} ({contact:.0f} s)"
+        f"{'; if nothing touches the skin, take a new tare' * (contact >= long)}"
+    )

@@ -23,8 +23,9 @@ from rich.text import Text
 from skin.core.files import json_line, unwritable
 from skin.core.interrupt import ends_on_signal
 from skin.core.messages import quiet
+from skin.device.base import in_background
 from skin.errors import InputError
-from skin.evaluation.operating_point import FinalThreshold
+from skin.evaluation.operating_point import FinalThreshold, OperatingPoint
 from skin.live.contacts import LiveContacts, contact_text_lines
 from skin.live.engine import Engine
 from skin.live.engine_builder import LiveSettings, LiveSetup, watch_exported, watch_run
@@ -319,7 +320,8 @@ def show(
             if live.verdicts is None:
                 opened.enter_context(show_in_terminal(display, Console()))
             check = partial(setup.check, source, engine, nominal, live.selftest, _say, display.add_note)
-            adopt = partial(adopt_final, final, engine, display)
+            test = partial(setup.check_final, source, engine, nominal, live.selftest, _say)
+            adopt = partial(next, adopt_final(final, test, engine, display), None)
             loop = LiveLoop(source.skin, source.tare, engine, display, check, adopt)
             opened.callback(lambda: _say(f"{loop.verdicts} verdicts, {loop.line}"))
             gc.collect()  # a search among all that is loaded would stop the loop for 0.3 s, again and again
@@ -392,16 +394,34 @@ def _open_views(display: Display, setup: LiveSetup, live: LiveSettings, opened: 
         )
     if live.verdicts is not None:
         # A file of its own, and never closed: lines that a reader did not take would fail once more.
-        stdout = open(sys.stdout.fileno(), "w", closefd=False)  # noqa: SIM115
-        opened.enter_context(write_events(display, stdout, display.close, VERDICTS))
+        lines = open(sys.stdout.fileno(), "w", closefd=False)  # noqa: SIM115
+        opened.enter_context(write_events(display, lines, display.close, VERDICTS))
 
 
-def adopt_final(final: FinalThreshold | None, engine: Engine, display: Display) -> None:
-    """Replace a provisional threshold once the final one is known; where there is none, say why."""
-    point = None if final is None else final.take()
+def adopt_final(
+    final: FinalThreshold | None, test: Callable[[OperatingPoint], object], engine: Engine, display: Display
+) -> Iterator[None]:
+    """Replace a provisional threshold once the final one is known and tested; where there is none, say why.
+
+    Args:
+        final: chooses it; None: the threshold is final.
+        test: raises InputError where the alarm could not be raised with it; it may take seconds.
+        engine: that decides.
+        display: with the note that the threshold is provisional.
+
+    Yields:
+        While it is not known.
+    """
+    while (point := None if final is None else final.take()) is None:
+        yield
+    if isinstance(point, OperatingPoint):
+        tested = in_background(partial(test, point))
+        while not tested.done():
+            yield
+        point = point if tested.exception() is None else str(tested.exception())
     if isinstance(point, str):
         display.add_note(Note("provisional", detail=f", and stays so: {point}"))
-    elif point is not None:
-        # From the next decision on; an alarm stays as it is.
-        engine.above, engine.danger = point.announced(_say), point.score
-        display.notes = tuple(note for note in display.notes if note.code != "provisional")
+        return
+    # From the next decision on; an alarm stays as it is.
+    engine.above, engine.danger = point.announced(_say), point.score
+    display.notes = tuple(note for note in display.notes if note.code != "provisional")

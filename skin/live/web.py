@@ -132,8 +132,7 @@ def _application(display: Display) -> Starlette:
 
 
 async def _events(display: Display) -> AsyncIterator[str]:
-    due = monotonic()
-    number = display.state(due).number  # of the first picture: the latest frame
+    due, number = monotonic(), display.state(monotonic()).number  # of the first picture: the latest frame
     while not display.closed.is_set():
         now = monotonic()
         state = display.state(now, number)

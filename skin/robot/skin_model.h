@@ -3,7 +3,7 @@
    skin_self_test();    0: ten stored touches have the probabilities that Python computed
    skin_begin();        nothing may touch the skin until skin.state is no longer SKIN_TARING
    skin_add(newtons);   SKIN_RATE times a second; returns 1 after a decision
-   skin.state, skin.alarm, skin.probability[SKIN_LABELS]
+   skin.state, skin.alarm, skin.unknown, skin.probability[SKIN_LABELS]
 
    C99 or C++, numbers of 32 bits, no allocation, math.h only. Include it in one file.
    Comments name the Python function that a part follows. */
@@ -63,6 +63,7 @@ static struct {
   float feature[SKIN_SLOTS];
   /* What a program reads: */
   uint8_t state, alarm, touch;
+  uint8_t unknown; /* a sensor is below its rest, or gives no number: a touch on it is not known */
   float probability[SKIN_LABELS];
 } skin;
 
@@ -75,14 +76,20 @@ static inline int16_t skin_reading(int t, int s) {
 
 static inline int skin_below(int t, int s) { return skin.below[t][s / 8] >> (s % 8) & 1; }
 
-/* Return a reading as the model sees it; present_as_press. */
+static inline int16_t skin_clamp(float steps) {
+  return (int16_t)lroundf(steps > 32767.0f ? 32767.0f : steps > -32767.0f ? steps : -32767.0f);
+}
+
+/* Return a reading as the model sees it; Engine._fill, present_as_press. */
 static inline int16_t skin_show(int t, int s) {
   if (skin.held) {
     if (t < SKIN_BEFORE) return skin.idle[t][s];
     if (t >= SKIN_BEFORE + SKIN_HELD) return skin.idle[t - SKIN_HELD][s];
     t += SKIN_FRAMES - SKIN_HELD - SKIN_BEFORE;
   }
-  return skin.any_below && skin_below(t, s) ? SKIN_NONE : skin_reading(t, s);
+  int16_t value = skin_reading(t, s);
+  if (value == SKIN_NONE || (skin.any_below && skin_below(t, s))) return SKIN_NONE;
+  return skin.baseline[s] < -0.5f * SKIN_CONTACT ? skin_clamp(value - skin.baseline[s] / SKIN_STEP) : value;
 }
 
 #if SKIN_RULES /* no memory for a copy of the window */
@@ -580,9 +587,12 @@ static inline void skin_classify(void) {
 
 /* Contact: ContactDetector, with valid readings only. */
 
+/* Return whether a sensor gave numbers at the tare. */
+static inline int skin_tared(int s) { return isfinite(skin.zero[s] + skin.noise[s]); }
+
 static inline int skin_rises(int t, int s) {
   float newtons = skin_reading(t, s) * SKIN_STEP;
-  if (skin_reading(t, s) == SKIN_NONE) return 0;
+  if (skin_reading(t, s) == SKIN_NONE || !skin_tared(s)) return 0;
   return newtons - skin.baseline[s] >= SKIN_CONTACT && !(fabsf(newtons - skin.rest[s]) < SKIN_CONTACT);
 }
 
@@ -605,22 +615,22 @@ static inline void skin_mark_below(void) {
 }
 
 /* ContactDetector._step */
-static inline float skin_step(float away) {
+static inline float skin_step(float away, float lift) {
   float rise = skin.contact < 0 ? SKIN_DRIFT : 0.0f;
-  float far = skin_max(away + SKIN_MARGIN, -SKIN_SINK);
+  float far = skin_max(away + SKIN_MARGIN + lift, -SKIN_SINK);
   return far < 0.0f ? far : away > rise ? rise : skin_max(away, -rise);
 }
 
 /* ContactDetector._follow */
-static inline void skin_follow(int s, int sound) {
+static inline void skin_follow(int s, int sound, float lift) {
   int16_t values[SKIN_RECENT];
   for (int i = 0; i < SKIN_RECENT; i++) values[i] = skin_reading(SKIN_FRAMES - 1 - i, s);
   skin_sort(values, SKIN_RECENT);
   if (skin.touched[s]) return;
   float middle = skin_middle(values, SKIN_RECENT) * SKIN_STEP;
-  skin.baseline[s] += skin_step(middle - skin.baseline[s]);
+  skin.baseline[s] += skin_step(middle - skin.baseline[s], lift);
   if (!sound) return;
-  skin.rest[s] += skin_step(middle - skin.rest[s]);
+  skin.rest[s] += skin_step(middle - skin.rest[s], lift);
   if (fabsf(values[0] * SKIN_STEP - skin.rest[s]) < SKIN_CONTACT &&
       fabsf(values[SKIN_RECENT - 1] * SKIN_STEP - skin.rest[s]) < SKIN_CONTACT)
     skin.baseline[s] = skin.rest[s];
@@ -656,7 +666,13 @@ static inline int skin_detect(void) {
     }
     skin.contact = (SKIN_FRAMES - 1 - idle) * SKIN_PHASES;
   }
-  for (int s = 0; s < SKIN_SENSORS; s++) skin_follow(s, sound[s]);
+  float lift = 0.0f;
+  for (int age = 0; age < SKIN_RECENT; age++)
+    for (int s = 0; s < SKIN_SENSORS; s++) {
+      float rise = skin_reading(SKIN_FRAMES - 1 - age, s) * SKIN_STEP - skin.rest[s];
+      lift = skin_max(lift, SKIN_LIFT * rise);
+    }
+  for (int s = 0; s < SKIN_SENSORS; s++) skin_follow(s, sound[s], lift);
   for (int s = 0; s < SKIN_SENSORS; s++)
     for (int t = 0; t < SKIN_FRAMES; t++)
       if (skin_rises(t, s)) return 1;
@@ -693,11 +709,10 @@ static inline void skin_decide(void) {
   skin.danger = skin_debounce(skin.danger, dangerous, &skin.calming, SKIN_RISE, SKIN_FALL);
   skin.alarm = skin.danger || (skin.alarm && contact); /* latched until the contact ends */
   skin.touch = skin_debounce(skin.touch, contact || risen || learned, &skin.wanting, SKIN_WAIT, SKIN_WAIT);
-  skin.state = skin.touch || skin.alarm || contact ? SKIN_TOUCH : SKIN_NO_TOUCH;
-  for (int s = 0; s < SKIN_SENSORS; s++) { /* clearly below its rest, or no number now or at the tare */
-    int sound = !skin_below(SKIN_FRAMES - 1, s) && isfinite(skin.zero[s] + skin.noise[s]);
-    if (skin.state == SKIN_NO_TOUCH && !sound) skin.state = SKIN_UNKNOWN;
-  }
+  skin.unknown = 0;
+  for (int s = 0; s < SKIN_SENSORS; s++) skin.unknown |= skin_below(SKIN_FRAMES - 1, s) || !skin_tared(s);
+  int touch = skin.touch || skin.alarm || contact;
+  skin.state = touch ? SKIN_TOUCH : skin.unknown ? SKIN_UNKNOWN : SKIN_NO_TOUCH;
 }
 
 /* Forget everything; the tare begins with the next frame. */
@@ -706,10 +721,6 @@ static inline void skin_begin(void) {
   skin.contact = -1;
   for (int p = 0; p < SKIN_PHASES; p++)
     for (int s = 0; s < SKIN_SENSORS; s++) skin.ring[p][0][s] = SKIN_NONE;
-}
-
-static inline int16_t skin_clamp(float steps) {
-  return (int16_t)lroundf(steps > 32767.0f ? 32767.0f : steps > -32767.0f ? steps : -32767.0f);
 }
 
 /* take_baseline: end the tare, unless something touched the skin in the window. */

@@ -93,10 +93,11 @@ class ChannelHealth:
         self.limits, self.largest, self._judges = limits, inf, judges
         self._silent, self._active, self._far, self._below = silent, active, far, below
         self._last: np.ndarray | None = None
+        self._clock = self._time = 0.0
         self._begins, self.mask = True, np.zeros(0, dtype=int)
 
     def restart(self) -> None:
-        """Reset the times after a restart of the device; the known range of each channel is kept."""
+        """Let the device's clock begin anew; what is known of each channel is kept, also that it is stuck."""
         self._begins = True
 
     def check(self, values: np.ndarray, t: float, limited: np.ndarray | None = None) -> np.ndarray:
@@ -107,14 +108,15 @@ class ChannelHealth:
             t: s, rising.
             limited: (S,), bool, channels that are known to be at a limit; None: none is.
         """
+        self._clock += 0.0 if self._begins else t - self._time
+        self._time, self._begins, t = t, False, self._clock
         if self._last is None or len(values) != len(self._last):
-            self._last, self._begins = values, True
+            self._last = values
             self._minimum, self._maximum = np.array(values, dtype=float), np.array(values, dtype=float)
             self._smallest = np.full(len(values), np.inf)
             self._ever = np.zeros(len(values), dtype=bool)
-        if self._begins:
             self._changed_at, self._noisy_since, self._large_step_at = np.full((3, len(values)), t)
-            self._active_since, self._begins = t, False
+            self._active_since = t
         step, self._last = np.abs(values - self._last), values
         changed = step > 0
         self._changed_at[changed] = t

@@ -17,7 +17,8 @@ _ROUND = frozenset([*(2**bits for bits in range(4, 33)), *(10**digits for digits
 
 
 _NONE = np.zeros(0)
-_STEADY = 2.0  # s after which the shortest delay is renewed: 0.5 % clock error is 20 ms of t_host
+_STEADY = 2.0  # s after which the shortest delay is renewed
+_SLOW = 0.01  # by which a device's clock may be slow: twice the error of a ceramic resonator, 0.5 %
 
 
 class FrameClock:
@@ -69,8 +70,7 @@ class FrameClock:
 
     def _compare_anew(self) -> None:
         """Forget the relation of both clocks: another segment has begun."""
-        self._minimum = self._minimum_before = inf
-        self._minimum_since = -inf
+        self._least, self._since = inf, 0.0
         self._deliveries = deque[tuple[float, float, int, int]]()
         self._frames = self._steps = 0
         self._doubtful_since: float | None = None
@@ -267,9 +267,11 @@ class FrameClock:
         return time
 
     def _to_host(self, t: float, arrival: float) -> float:
-        """Return the host's time of a frame, s: by the least delayed frames of the last seconds."""
-        if arrival - self._minimum_since > _STEADY:
-            self._minimum_before, self._minimum, self._minimum_since = self._minimum, inf, arrival
-        self._minimum = min(self._minimum, arrival - t)
-        self._latest = max(self._latest, t + min(self._minimum, self._minimum_before))
+        """Return the host's time of a frame, s: by the least delayed frame, and the slowest clock since.
+
+        Frames that come later and later, through a link that is too slow, become older and older by that.
+        """
+        slowed = self._least + _SLOW * (arrival - self._since)
+        self._least, self._since = min(slowed, arrival - t), arrival
+        self._latest = max(self._latest, t + self._least)
         return self._latest

@@ -117,10 +117,8 @@ class Freshness:
         self._clock, self._time = self._clock + min(t - self._time, self._pause), t
         if self._values is None:
             self._changed_at = np.zeros(len(frame.values))
-        if self._values is None or frame.after not in ("", "gap"):
-            changed = np.ones(len(frame.values), dtype=bool)
-        else:
-            changed = frame.values != self._values
+        # Nor is a restart a sign of life.
+        changed = frame.values != (np.nan if self._values is None else self._values)
         self._changed_at[changed] = self._clock
         self._unchanged = 0 if changed.any() else self._unchanged + 1
         self._values = frame.values
@@ -196,6 +194,7 @@ class Tare:
         warning: message about what the latest baseline lacks; empty if nothing.
         count: number of baselines taken.
         freshness: tells whether the device still works.
+        forced: the latest baseline is taken even if the skin seems touched.
     """
 
     def __init__(
@@ -221,7 +220,7 @@ class Tare:
         self._first: float | None = None
         self._tried = -inf
         self._deadline: float | None = None
-        self._forced = False
+        self.forced = False
 
     @property
     def status(self) -> str:
@@ -240,7 +239,7 @@ class Tare:
             self.three.restart(force)
         if self.seconds and self.conversion is not None:
             self._quiet.clear()
-            self._tried, self._deadline, self._forced = -inf, inf, force
+            self._tried, self._deadline, self.forced = -inf, inf, force
             self.state = "quiet"
 
     def add(self, frame: Frame, touched: bool = False) -> NewtonFrame | None:
@@ -289,7 +288,7 @@ class Tare:
             return
         if not self.seconds:
             self.conversion, self.state = untared, ""
-        elif touched and not self._forced:
+        elif touched and not self.forced:
             self._quiet.clear()
             self.state = "waits"
         else:
@@ -319,7 +318,7 @@ class Tare:
             return
         values, valid = seen.values[complete], seen.valid[complete]
         try:
-            baseline = take_baseline(values, valid, force=self._forced)
+            baseline = take_baseline(values, valid, force=self.forced)
         except SkinTouched as touched:
             self.state, self._detail = "touched", str(touched).split(";")[0]
             return
@@ -347,7 +346,7 @@ class Tare:
         if changing.sum() * (len(self._quiet) - 1) * silence / passed < EXPECTED:
             lacks.append(f"this device shows no noise: readings that freeze for {silence:g} s cannot be seen")
         self.warning = "; ".join(lacks)
-        self.count, self.state, self._deadline, self._forced = self.count + 1, "", None, False
+        self.count, self.state, self._deadline = self.count + 1, "", None
         self._quiet.clear()
 
 

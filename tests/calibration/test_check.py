@@ -20,7 +20,6 @@ SENSORS, RATE, HOLD, GAP = 9, 25.0, 11.0, 2.5
 EXPECTED = 3.0 * np.eye(SENSORS) + 0.05
 POSITIONS = np.stack(np.meshgrid([0.04, 0.12, 0.2], [0.01, 0.04, 0.07]), -1).reshape(-1, 2)
 SIZE = (0.24, 0.08)
-
 LAYERS = [Layer(Material("silicone", 1e5, 0.4), 0.005)]
 
 

@@ -16,10 +16,7 @@ PORT = "device.port=/dev/ttyACM77"
         ("check weight=0 layout=grid simulator=naive", "is no known load: give a mass in kg, up to 50"),
         ("compare", "which session?"),
         ("convert", "skin convert needs from= or reader=, and out=, as in from=map.yaml out=x.parquet"),
-        (
-            "convert from=map.yaml out=x.txt",
-            "out=x.txt must be a .parquet file or a .csv file or a .mcap",
-        ),
+        ("convert from=map.yaml out=x.txt", "out=x.txt must be a .parquet file or a .csv file or a .mcap"),
         ("convert from=none.yaml out=x.csv", "cannot read the mapping none.yaml"),
         ("convert from=efles out=x.csv", "from=efles is no format: give map.yaml, or one of folder, sdu"),
         ("convert from=sdu out=x.csv", "from=sdu needs path=FOLDER"),

@@ -55,8 +55,7 @@ def test_values_are_final(position, value):
 
 
 @pytest.mark.parametrize(
-    ("made", "name"),
-    [(Grid(), "grid"), (Blank(None, (1.0, 1.0), None), "base"), (partial, "functools")],
+    ("made", "name"), [(Grid(), "grid"), (Blank(None, (1.0, 1.0), None), "base"), (partial, "functools")]
 )
 def test_an_option_is_named_after_its_file_of_settings_or_its_module(made, name):
     assert option_name(made) == name

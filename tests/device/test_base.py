@@ -20,8 +20,6 @@ from skin.runs.build import build_device
 
 POINT = OperatingPoint(0.5, 0.02)
 SMALL = ["data.gestures=50", "device.test_gestures=20", "simulator=naive"]
-
-
 EVERYWHERE = ("recording", "simulated")  # others need what is not everywhere: a corpus, a port
 
 

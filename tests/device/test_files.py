@@ -245,11 +245,7 @@ def exchange(path: Path) -> None:
             for text in ("", "{", "[]", "3", "null")
         ),
         ("shards/00001.parquet", Path.unlink, r"1 of 3 shards are missing, as 00001.parquet is: repeat"),
-        (
-            "shards/00002.parquet",
-            lambda path: os.truncate(path, 1000),
-            r"2.parquet is damaged .*: delete it",
-        ),
+        ("shards/00002.parquet", lambda path: os.truncate(path, 1000), r"2.parquet is damaged .*: delete it"),
         ("shards/00000.parquet", exchange, r"00000.parquet is not the shard"),
     ],
 )

@@ -25,7 +25,6 @@ from skin.live.contacts import (
     LiveContacts,
     MeanReadings,
     average_readings,
-    contact_message,
     contact_text_lines,
     estimate_contacts,
     unknown_contacts,
@@ -42,8 +41,6 @@ CONVERSION = UnitConversion(np.ones(SENSORS), np.zeros(SENSORS), np.zeros(SENSOR
 TOUCHED = Verdict(0.0, 0.0, {"dangerous": 0.1}, True, {}, False, False)
 SECONDS = count(1000)
 TRUTH = np.array([[0.022, 0.035, 0.008]])
-
-
 PLACES = Grid(3, 3, (0.01, 0.01), depth=0.005).sensors(BODY)
 MECHANICS = Mechanics(Solid, BODY, PLACES, NOISE)
 
@@ -173,7 +170,7 @@ def test_what_no_fingertip_gives_is_none_and_not_no_contact(posterior, values, s
 def test_where_a_hard_touch_is_is_shown_though_no_fingertip_fits_it(posterior, felt):
     """On many sensors, gains that differ by more than was assumed show only there, where they are large."""
     estimate = replace(posterior.estimate(5 * felt), fingertip=False, fit=0.00213, large=0.3)
-    message = contact_message(estimate, 0.0)
+    message = estimate.to_json(0.0)
     assert (message["state"], message["number"], message["fit"]) == ("not a fingertip", None, 0.00213)
     (best,) = message["contacts"]
     assert np.hypot(best["x"] - TRUTH[0, 0], best["y"] - TRUTH[0, 1]) < 0.005
@@ -206,7 +203,7 @@ def test_messages_of_every_state_have_the_same_fields(posterior, felt):
     assert contact_text_lines(none) == ["contacts unknown: why"]
     empty = replace(estimate, number=0, contacts=(), fingertip=False, fit=1.0)
     for changed in (estimate, replace(estimate, fingertip=False), empty):
-        assert set(contact_message(changed, 0.0)) == set(none)
+        assert set(changed.to_json(0.0)) == set(none)
 
 
 def test_readings_are_means_above_the_rest_of_the_sensors_that_work():

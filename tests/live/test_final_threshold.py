@@ -60,10 +60,9 @@ def watched(source):
     return display, engine, FinalThreshold(source, LIVE)
 
 
-def until_known(display, engine, final):
-    deadline, before = monotonic() + PATIENCE, display.notes
-    while display.notes == before and monotonic() < deadline:
-        adopt_final(final, engine, display)
+def until_known(display, engine, final, test=bool):
+    deadline, adopted = monotonic() + PATIENCE, adopt_final(final, test, engine, display)
+    while next(adopted, "done") != "done" and monotonic() < deadline:
         sleep(0.02)
     final.process.join(PATIENCE)
     return [note.text for note in display.notes]
@@ -79,8 +78,13 @@ def test_the_final_threshold_is_adopted_and_an_alarm_stays(source):
     assert until_known(display, engine, final) == []
     chosen = choose_alarm_threshold(source, LIVE, say=pytest.fail)  # the process has kept it
     assert (engine.above, engine.danger, engine.alarm) == (chosen.threshold, chosen.score, True)
-    adopt_final(final, engine, display)
     assert final.process.exitcode is not None
+
+
+def test_a_threshold_with_which_no_press_raises_the_alarm_is_not_adopted(source):
+    display, engine, final = watched(source)
+    (note,) = until_known(display, engine, final, refuse)
+    assert (note[-14:], engine.above) == (": no such skin", 0.5)
 
 
 @pytest.mark.parametrize(
@@ -98,4 +102,3 @@ def test_a_threshold_stays_provisional_where_none_is_chosen(source, change, reas
     (note,) = until_known(display, engine, final)
     assert note.endswith(f"is provisional and raises more false alarms, and stays so: {reason}")
     assert (engine.above, engine.alarm) == (0.5, True)
-    adopt_final(final, engine, display)

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from skin.errors import InputError
+from skin.evaluation.guarantee import Guarantee
 from skin.live.engine import DebounceSettings
 from skin.wire.protocol import Header, encode_header, encode_line
-from tests.live.memory_view import LOOK
+from tests.live.memory_view import LOOK, MemoryView
 from tests.live.test_safety import HEADER, LATE, RATE, SCALE, SENSORS, counted, force, lines, settings, watch
 
 HIDDEN = 0.5 + 2 * LOOK  # s: a decision may be so old, and the display is looked at so often
@@ -90,16 +91,17 @@ def test_a_device_that_tares_itself(restart):
     assert "void" in seen.notes(17, 30)
 
 
-def test_a_tare_under_a_load():
-    values = force(24, (0, 8, 4, 13.0), (14, 22, 4, 13.0))
-    seen = watch(lines(values))
+@pytest.mark.parametrize(("load", "beside"), [(13.0, 0.0), (2.0, 0.2)])
+def test_a_tare_under_a_load(load, beside):
+    values = force(24, (0, 8, 4, load), (14, 22, 4, 5.0))
+    seen = watch(lines(values), engine=overlapping(beside))
     assert seen.states(3, 7.9) == {"no touch"}  # nothing shows yet
     assert seen.states(8.5, 13.9) == {"unknown"}
     assert seen.hidden(8.5, 24) == 0
 
 
 def test_a_baseline_above_the_stored_rest_is_void_at_once():
-    """As `verify` finds it: nothing is shown as no touch, and the next tare counts."""
+    """As `verify` finds it: nothing is shown as no touch."""
     raised = np.where(np.arange(SENSORS) == 4, 6.0, 0.01)
     values = force(12, (0, 12, 4, 6.0), (8, 9, 2, 6.0))
     seen = watch(lines(values), verify=lambda conversion: raised)
@@ -109,8 +111,8 @@ def test_a_baseline_above_the_stored_rest_is_void_at_once():
 
 
 def test_slow_drift_voids_nothing():
-    """Five thresholds in 20 s; presses alarm afterwards."""
-    presses = [(26 + 5 * n, 27 + 5 * n, n, 13.0) for n in range(2)]
+    """Five thresholds in 20 s; presses alarm afterwards, though they end below the limit above the tare."""
+    presses = [(26 + 5 * n, 27 + 5 * n, n, 5.0) for n in range(2)]
     values = force(34, *presses) - np.interp(np.arange(3400) / RATE, [4, 24], [0, 1.5])[:, None]
     seen = watch(lines(values))
     for begin, *_ in presses:
@@ -143,6 +145,38 @@ def test_values_that_are_lost_under_a_press(write, length):
         touch = [look for look in seen.looks if begin + 0.2 < look.t < end]
         assert all(look.danger is not False for look in touch)
     assert seen.states(5, 7.9) == {"no touch"}
+
+
+def test_a_dead_channel_hides_no_frames_that_are_lost_under_a_touch():
+    values = force(16, (12, 16, 2, 2.0))
+    values[:, 7] = 0.0
+    stream = enumerate(zip(lines(values), values, strict=True))
+    kept = ((n / RATE, data) for n, (data, row) in stream if row.max() < 1 or n % 4 == 0)
+    assert "unreadable" in MemoryView(kept, settings()).notes(13, 16)
+
+
+def test_frames_that_come_later_and_later_are_unknown():
+    """The link is a tenth slower than the board: what would be shown is older and older."""
+    late = ((1.1 * n / RATE, data) for n, data in enumerate(lines(force(60, (50, 52, 4, 6.0)))))
+    assert MemoryView(late, settings()).states(20, 66) == {"unknown"}
+
+
+@pytest.mark.parametrize(("rate", "state"), [(100.0, "lapsed"), (20.0, "valid")])
+def test_a_guarantee_holds_at_its_own_rate(rate, state):
+    engine = replace(settings(), guarantee=Guarantee(0.01, 300, 0, "mild", device_rate=rate))
+    slow = ((n / 20, data) for n, data in enumerate(clocked(force(4), lambda t: 5 * t)))
+    assert MemoryView(slow, engine).notes(10, 20) == {f"guarantee_{state}"}
+
+
+def test_what_a_long_touch_lifts_beside_it_is_no_touch_afterwards():
+    seen = watch(lines(force(30, (8, 20, 4, 20.0), (8, 20, 5, -0.8))))
+    assert seen.states(25, 30) == {"no touch"}
+
+
+def test_a_restart_is_no_sign_of_life():
+    values = force(30)
+    values[1000:, 4] = values[999, 4]
+    assert watch(lines(values, restart=4.0)).states(16, 30) == {"unknown"}
 
 
 def test_frames_that_are_lost_at_random_make_no_touch_doubtful():

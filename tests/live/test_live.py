@@ -24,7 +24,6 @@ SMALL = [
     "evaluation.layouts=1",
     "evaluation.safe_gestures=64",
 ]
-
 WATCH = """
 window.log = [];
 const note = () => log.push([document.body.dataset.state, document.getElementById("head").textContent,

@@ -33,8 +33,6 @@ return [...pen.getImageData({} * map.width + 7, {} * map.height, 1, 1).data];
 """
 PLAIN = UnitConversion(np.ones(5), np.zeros(5), np.zeros(5, bool))
 PRESSED = Verdict(0, 0, {"big": 0.2, "dangerous": 0.9}, True, {"big": False, "dangerous": True}, True, False)
-
-
 SAFE = replace(PRESSED, dangerous=False)
 IDLE = replace(SAFE, touched=False)
 LAST_INVALID = np.array([True, True, True, True, False])
@@ -179,9 +177,9 @@ def test_the_page_asks_for_a_tare_and_other_sites_and_ports_in_use_are_refused(s
         with pytest.raises(InputError, match=r"live\.web_port="):
             web.serve_page(display(), int(address.rsplit(":", 1)[1])).__enter__()
         for headers, code in (({}, 403), ({"Origin": "http://evil.example"}, 403), ({"X-Skin": "tare"}, 204)):
-            assert subject.take_tare() == ""
+            assert subject.take_tare(monotonic()) == ""
             assert fetch(f"{address}/tare", b"", **headers)[0] == code
-        assert subject.take_tare() == "tare"
+        assert subject.take_tare(monotonic()) == "tare"
         assert fetch(f"{address}/tare")[0] == 405
 
 
@@ -193,13 +191,13 @@ def test_the_operator_types_t_for_a_tare(monkeypatch, tmp_path):
         with show_in_terminal(subject, Console(file=file)):
             os.write(master, b"x\n")
             sleep(0.3)
-            assert subject.take_tare() == ""
+            assert subject.take_tare(monotonic()) == ""
             os.write(master, b"t\n")
             assert requested(subject) == "tare"
             subject.set_verdict(PRESSED, monotonic())
             os.write(master, b"t\n")
             until(lambda: "tare refused" in subject.state(monotonic()).line)
-            assert subject.take_tare() == ""
+            assert subject.take_tare(monotonic()) == ""
             os.write(master, b"force\n")
             assert requested(subject) == "tare_forced"
             os.write(master, b"\x04")
@@ -212,25 +210,29 @@ def shows(browser, script, wanted):
 
 
 def requested(subject):
-    return until(subject.take_tare)
+    return until(lambda: subject.take_tare(monotonic()))
 
 
 def test_a_tare_is_refused_under_a_touch_until_it_is_confirmed():
     subject, events = display(), []
     subject.observers.append(lambda assessment, now, event: event and events.append(event))
     assert subject.request_tare(monotonic(), force=True) != ""  # there is nothing to confirm
-    for verdict in (PRESSED, replace(SAFE, contact=0.5)):
+    for verdict in (PRESSED, replace(SAFE, contact=0.5), replace(IDLE, notes=(Note("void", (4,)),))):
         subject.set_verdict(verdict, monotonic())
         assert "something touches the skin" in subject.request_tare(monotonic())
-        assert subject.take_tare() == ""
+        assert subject.take_tare(monotonic()) == ""
         assert subject.request_tare(monotonic(), force=True) == ""
-        assert subject.take_tare() == "tare_forced"
+        assert subject.take_tare(monotonic()) == "tare_forced"
     subject.set_verdict(None, monotonic(), "the device has stopped sending", alarm=True)
     assert subject.request_tare(monotonic()) != ""
     subject.set_verdict(IDLE, monotonic())
     assert subject.request_tare(monotonic()) == ""
     refused = "tare_refused"
-    assert events == [refused, refused, "tare_forced", refused, "tare_forced", refused, "tare"]
+    assert events == [refused, *(refused, "tare_forced") * 3, refused, "tare"]
+    subject.set_verdict(PRESSED, monotonic())
+    subject.request_tare(monotonic())
+    subject.request_tare(monotonic(), force=True)
+    assert subject.take_tare(monotonic() + 2) == "tare"  # no frame came meanwhile: who knows what touches it
 
 
 def test_a_refused_tare_is_said_while_it_may_be_forced():

@@ -2,12 +2,10 @@
 
 import logging
 import os
-import resource
 import shutil
 import signal
 import subprocess
 import sys
-from contextlib import contextmanager
 
 import numpy as np
 import pyarrow.parquet
@@ -22,6 +20,7 @@ from skin.errors import InputError
 from skin.record.session import SessionLog, locked, read_session
 from skin.wire.channels import UnitConversion
 from skin.wire.segmentation import ContinuousSegmenter
+from tests.core.test_files import full
 from tests.damage import DAMAGED_FILES, damaged, opened
 
 METADATA = {"positions": [[0.0, 0.0, 0.0]] * 2, "unit": "adc", "bits": 10, "id": "arm-L"}
@@ -29,9 +28,7 @@ METADATA |= {"window": 5, "rate": 50.0, "started_unix": 1.0}
 CONVERSION = UnitConversion(np.array([0.1, 0.2]), np.array([512.0, 500.0]), np.array([False, False]))
 BENT = Curves(np.array([0.5, 1.0]), np.array([2.0, 3.0]), {1: [[0.0, 1.0], [0.0, 2.0]]})
 OTHER = UnitConversion(np.array([0.3, -0.4]), np.array([300.0, 2.0]), np.array([False, True]), curves=BENT)
-
 NUMBERS = [0, 1, 2, 3, 5, 6]  # gesture 4 was broken off
-
 WRITER = """
 import sys
 from pathlib import Path
@@ -246,17 +243,6 @@ def test_a_session_goes_on_as_it_was_begun(copied, change, reason):
     assert SessionLog(copied, METADATA | {"started_unix": 9.0}).metadata == METADATA
 
 
-@contextmanager
-def room(size):
-    """Let files grow to ``size`` bytes: a write beyond takes a part, the next one fails."""
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
-
-
 @pytest.mark.parametrize("size", [0, 1000, 90_000])
 def test_a_full_disk_keeps_what_was_finished_and_goes_on(tmp_path, size):
     folder = tmp_path / "s"
@@ -264,10 +250,10 @@ def test_a_full_disk_keeps_what_was_finished_and_goes_on(tmp_path, size):
     def attempt():
         log = SessionLog(folder, METADATA)
         segmented(log, [frame(n) for n in range(11)], CONVERSION)
-        with room(min(size, 1000)):
+        with full(min(size, 1000)):
             segmented(log, [frame(n) for n in range(11, 30)], CONVERSION)
 
-    with pytest.raises(InputError, match=r"cannot write \S+: File too large") as refused, room(size):
+    with pytest.raises(InputError, match=r"cannot write \S+: File too large") as refused, full(size):
         attempt()
     assert "\n" not in str(refused.value)
     assert not [path for path in tmp_path.rglob("*") if path.name.startswith(".")]

@@ -22,8 +22,6 @@ LEARNERS = {
 }
 RATE = 10.0  # Hz, of the device
 COURSES = OmegaConf.to_container(OmegaConf.load(CONF / "study/holds.yaml").measure.courses)
-
-
 SLOW = {"ensemble": pytest.mark.slow("trains all members, and asks each of them at every frame")}
 
 

@@ -195,11 +195,6 @@ def test_a_device_that_restarts_is_compared_anew(decoder):
     assert decoder.stats.resets == 13
 
 
-def test_a_counter_that_stands_still_restarts_nothing(decoder):
-    frames = play(decoder, lambda t: t, 5, counter=lambda number: min(number, 200))
-    assert (len(frames), decoder.stats.resets, decoder.stats.lost) == (500, 0, 0)
-
-
 def test_a_header_that_changes_ends_the_reading(decoder):
     """On an open connection the device was flashed or exchanged: its frames do not count any more."""
     assert play(decoder, lambda t: t, 3, header=encode_header(FIRST))

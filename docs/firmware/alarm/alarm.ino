@@ -37,10 +37,9 @@ void loop() {
   for (uint8_t sensor = 0; sensor < SKIN_SENSORS; sensor++)
     newtons[sensor] = NEWTONS_PER_COUNT * analogRead(PINS[sensor]);
   if (!skin_add(newtons)) return;
-  bool unknown = skin.state == SKIN_UNKNOWN;  // a broken wire
-  digitalWrite(ALARM_PIN, skin.alarm || late || unknown ? HIGH : LOW);
-  Serial.print(unknown ? "unknown" : skin.state == SKIN_TOUCH ? "touch" : "no touch");
+  digitalWrite(ALARM_PIN, skin.alarm || late || skin.unknown ? HIGH : LOW);
+  Serial.print(skin.state == SKIN_UNKNOWN ? "unknown" : skin.state == SKIN_TOUCH ? "touch" : "no touch");
   Serial.print(skin.alarm ? ",ALARM" : ",-");
-  Serial.println(late ? ",late" : "");
+  Serial.println(late ? ",late" : skin.unknown ? ",unknown" : "");  // a broken wire, also beside a touch
   late = false;
 }

@@ -279,17 +279,21 @@ def profile_settings(name: str) -> dict[str, Any]:
 def _remaining(path: str, inwards: bool) -> dict[str, Any]:
     """Return the imperfections that a calibrated device is left with: its gains are known to 2 %.
 
-    Readings are linear after the conversion: the limit is that of the force, and the noise is that at the
-    reading at which the curves meet.
+    Where some are unknown, all are taken to spread as the known ones do. Readings are linear after the
+    conversion: the limit is that of the force, and the noise is that at the reading at which the curves meet.
     """
     calibration = read_calibration(path, inwards)
     values, curves = calibration.values(), calibration.curves
     if curves is not None:
         values |= {"clip": curves.straighten(values["clip"]), "noise": values["noise"] / curves.slopes}
-    left = {name: float(np.median(values[name])) for name in ("noise", "hysteresis", "time_constant", "clip")}
-    if math.isinf(left["clip"]):
-        del left["clip"]  # as of a device without a limit
-    return _EVERY | left | {"gain_spread": 0.02, "dead": 0, "tare": True}
+    left = {
+        name: middle
+        for name in ("noise", "hysteresis", "time_constant", "clip")
+        if math.isfinite(middle := float(np.median(values[name])))  # a clip is not: there is no limit
+    }
+    gains = np.log(np.array(calibration.sensors.get("gain", [1.0]), dtype=float))  # NaN: unknown
+    spread = float(np.nanstd(gains)) if np.isnan(gains).any() else 0.02
+    return _EVERY | left | {"gain_spread": max(spread, 0.02), "dead": 0, "tare": True}
 
 
 # The choice on gestures, one window of each.

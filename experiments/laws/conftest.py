@@ -129,7 +129,7 @@ PyNite.
 {notes}
 ## Limits
 
-- Only the linear theory is verified; most default gestures strain the skin beyond its
+- Only the linear theory is verified; many default gestures strain the skin beyond its
   [range](limitations.md).
 - Surface displacements converge slowly where the skin is thin and nearly incompressible. Readings are more
   accurate, but an error of 1 % of the reading under an object can be a large part of a reading beside it.

@@ -291,8 +291,11 @@ def _remaining(path: str, inwards: bool) -> dict[str, Any]:
         for name in ("noise", "hysteresis", "time_constant", "clip")
         if math.isfinite(middle := float(np.median(values[name])))  # a clip is not: there is no limit
     }
-    gains = np.log(np.array(calibration.sensors.get("gain", [1.0]), dtype=float))  # NaN: unknown
-    spread = float(np.nanstd(gains)) if np.isnan(gains).any() else 0.02
+    # NaN: unknown
+    gains = np.log(
+        np.array(calibration.sensors.get("gain", [1.0] * len(calibration)), float)[~values["dead"]]
+    )
+    spread = float(np.nanstd(gains)) if 0 < np.isnan(gains).sum() < len(gains) else 0.02
     return _EVERY | left | {"gain_spread": max(spread, 0.02), "dead": 0, "tare": True}
 
 

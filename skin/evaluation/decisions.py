@@ -281,18 +281,18 @@ class ContactDetector:
         # What a touch lifts comes back when it ends.
         lift = _LIMITS.lift * float(np.where(valid, readings - self.rest, 0.0).max())
         self.baseline = self.baseline + self._step(middle - self.baseline, rise, lift, passed)
-        rest = np.median(np.where(valid, readings, self.rest), axis=0)
-        self.rest = self.rest + np.where(sound, self._step(rest - self.rest, rise, lift, passed), 0.0)
+        away = np.median(np.where(valid, readings, self.rest), axis=0) - self.rest
+        self.rest = self.rest + np.where(sound, self._step(away, rise, lift, passed), 0.0)
         back = sound & ~self._touched & (np.abs(readings - self.rest) < self._threshold).all(axis=0)
         self.baseline = np.where(back, self.rest, self.baseline)
 
     def _step(self, away: np.ndarray, rise: float, lift: float, passed: float) -> np.ndarray:
         """Return how far baselines (S,) move in ``passed`` s towards readings that are ``away``, N.
 
-        They rise by ``rise`` at most, and stay above the readings by what a touch may ``lift``, N.
+        They rise by ``rise`` at most, and fall fast to what a touch may ``lift``, N, below it by the drift.
         """
-        fast = _LIMITS.sink * self._threshold * passed
-        slow = np.clip(away, -rise, rise)
+        falls = [[-_LIMITS.sink * self._threshold * passed], [-self._drift * passed]]
         # Noise alone must not lower the baseline, because it rises slowly.
-        far = np.clip(away + _LIMITS.margin * self._threshold + max(lift, 0.0), -fast, 0.0)
-        return np.where(self._touched, 0.0, np.where(far < 0, far, slow))
+        least = np.stack([away + max(lift, 0.0), away]) + _LIMITS.margin * self._threshold
+        far = np.clip(least, falls, 0.0).min(axis=0)
+        return np.where(self._touched, 0.0, np.where(far < 0, far, np.clip(away, -rise, rise)))

@@ -260,7 +260,9 @@ class Guarantee:
     def at(self, rate: float) -> "Guarantee":
         """Return the guarantee for a device of ``rate``, Hz: it lapses at another than its own."""
         other = f"the device sends {rate:.3g} frames a second, and not {self.device_rate:.3g}"
-        return replace(self, lapsed=self.lapsed or other * (abs(self.device_rate / rate - 1) > _SAME))
+        return replace(
+            self, lapsed=self.lapsed or ("" if abs(self.device_rate / rate - 1) <= _SAME else other)
+        )
 
     def under(self, live: LiveConditions) -> "Guarantee":
         """Return the guarantee for a live view: it lapses at another rate or patience than its own."""

@@ -108,8 +108,8 @@ def average_readings(
         whole: the device sends whole numbers.
     """
     newtons, frame = np.stack([readings.newtons for readings in stream]), stream[-1].frame
-    works = np.logical_and.reduce([readings.usable for readings in stream])
-    works[list(masked)] = False
+    usable = [readings.usable for readings in stream]
+    works = np.logical_and.reduce(usable) & ~np.isin(np.arange(len(usable[0])), masked)
     # The zero is that of largest values of intervals, which noise raises above the mean.
     rest = baseline if conversion.rest is None else baseline + conversion.rest
     noise = None if conversion.noise is None or not works.any() else conversion.noise[works]

@@ -153,6 +153,7 @@ class Engine:
         above: probability above which a touch is dangerous.
         alarm: the latest verdict was dangerous, and the contact has not ended.
         changed: sensors that a watch reports, whose positions are unknown.
+        device_rate: frames a second, Hz, as measured; 0: unknown.
     """
 
     classify: Classify
@@ -166,15 +167,19 @@ class Engine:
     danger: DangerScore | None = None
     guarantee: Guarantee | None = None
     changed: tuple[int, ...] = field(default=(), init=False)
+    device_rate: float = field(default=0.0, init=False)
 
     def __post_init__(self) -> None:
         self.window = Window(self.frames, self.rate, self.sensors)
-        threshold, drift = self.detection.threshold, self.detection.drift
-        self.detector = ContactDetector(self.sensors, self.rate, threshold, drift, self.fractions)
+        self.detector = ContactDetector(
+            self.sensors, self.rate, self.detection.threshold, self.detection.drift, self.fractions
+        )
         self._held = held_frames(self.detection.longest, self.rate, self.frames)
         self._shown = longest_shown(self._held, ceil(RELEASE * self.rate - 1e-9), self.frames)
         self.above = 0.5 if self.patience.above is None else self.patience.above
-        self._responds = np.eye(self.sensors) > 0 if self.presses is None else self.presses >= threshold
+        self._responds = (
+            np.eye(self.sensors) > 0 if self.presses is None else self.presses >= self.detection.threshold
+        )
         self._losses = _Losses()
         self._latest: NewtonFrame | None = None
         self._pause = 0.0  # s between the latest readings and those before
@@ -188,11 +193,6 @@ class Engine:
             return None
         own = np.maximum(np.diagonal(self.presses), 1e-9)
         return np.asarray(self.presses / own[:, None] - np.eye(self.sensors))
-
-    @property
-    def contact(self) -> bool:
-        """Whether something touches the skin, at the latest decision."""
-        return self.detector.since is not None
 
     def reset(self, raised: np.ndarray | None = None, noise: np.ndarray | None = None) -> None:
         """Forget readings, alarm and contact, after a tare of the untouched skin.
@@ -273,7 +273,7 @@ class Engine:
         self.window.add(Frame(None, t, t, newtons, sent.usable, 0, frame.lost, frame.after, sent.saturated))
         # What a channel does all the time must not hide what frames do in a contact.
         failed = readings.mask & ~before.mask & (Reason.MISSING | Reason.IMPOSSIBLE)
-        self._losses.add(frame.lost + failed.any(), t, self.contact)
+        self._losses.add(frame.lost + failed.any(), t, self.detector.since is not None)
         tick, self._tick = self._tick, floor((t + 1e-6) * DECISIONS)  # a rounding of the clock
         return tick != self._tick
 
@@ -308,10 +308,16 @@ class Engine:
 
     def _fill(self, readings: np.ndarray, valid: np.ndarray, before: int) -> tuple[np.ndarray, np.ndarray]:
         """Return readings and valid, (T, S), with the rest where there is none: in the first rows, too."""
-        # A skin that has sunk since the tare, by more than noise, would hide as much of each touch.
+        # A skin that has sunk since the tare, by more than noise, would hide as much of each touch. A reading
+        # that is back at its rest is none, though its baseline has followed a broken wire.
         sunk = np.where(self.detector.baseline < -self.detection.threshold / 2, self.detector.baseline, 0.0)
         # To the model a sensor below its rest is as one without a reading.
-        readings = np.where(valid, readings - sunk, 0.0).astype(np.float32)
+        shift = np.where(
+            np.abs(readings - self.detector.rest) < self.detection.threshold,
+            np.maximum(sunk, np.minimum(self.detector.rest, 0.0)),
+            sunk,
+        )
+        readings = np.where(valid, readings - shift, 0.0).astype(np.float32)
         # Unknown history counts as the rest of the sensors that are valid now.
         readings[:before] = self.detector.baseline - sunk
         valid[:before] = valid[before:].any(axis=0)
@@ -339,7 +345,7 @@ class Engine:
         }
         notes = [Note(code, _numbers(which)) for code, which in sensors.items() if which.any()]
         if self.guarantee is not None:
-            guarantee = self.guarantee.at(1 / self.window.period)
+            guarantee = self.guarantee.at(self.device_rate) if self.device_rate else self.guarantee
             notes.append(Note(f"guarantee_{guarantee.state(self.changed)}", detail=guarantee.sentence()))
         notes += [Note("unreadable")] * self._losses.excessive + [Note("pause", seconds=self._pause)] * paused
         return _numbers(blind), tuple(notes)

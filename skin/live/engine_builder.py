@@ -491,8 +491,9 @@ def watch_run(
     whole = build_device(trained) if configured.device.get("inwards") else model.device
     mechanics = partial(Mechanics.of, whole.reference, bool(config.device.get("calibration")))
 
-    name = device.name if port is None else port.name
-    return LiveSetup(model, name, port, partial(open_source, device), mechanics)
+    return LiveSetup(
+        model, device.name if port is None else port.name, port, partial(open_source, device), mechanics
+    )
 
 
 def engine_settings(

@@ -65,7 +65,7 @@ class DisplayState:
         line: text with rate, lost frames and latency.
         peak: (S,), N, the largest of each sensor in the touch that the verdict is about; 0 without touch.
         notes: on what may be wrong, the gravest first.
-        contacts: what is known of them, as in :func:`skin.live.contacts.contact_message`.
+        contacts: what is known of them, as :meth:`skin.inference.posterior.FrameEstimate.to_json` gives it.
         tangential: (S, 2), N along x and y at the latest frame, of sites with three axes; None: unknown.
     """
 
@@ -143,13 +143,13 @@ class Display:
         self.observers: list[Observer] = []
         self.recent: deque[NewtonFrame] = deque(maxlen=0)
         self.line = ""
-        self._lock, self._number, self._contact = RLock(), 0, False
+        self._lock, self._number, self._contact, self._void = RLock(), 0, False, False
         self.place(self.positions)
         self._latest = Assessment(None, "waiting for the first frame", False)
         self._alarm_at, self._decided = -inf, deque([-inf])
         self._request: TareRequest = ""
         self._refusal: Refusal = ""
-        self._refused_at = self._requested_at = -inf
+        self._asked_at = -inf
 
     def place(self, positions: np.ndarray) -> None:
         """Take the positions of the sensors (S, 3), m, before the first frame."""
@@ -198,6 +198,7 @@ class Display:
                 recent = [values for values, _ in list(self._frames)[-_ONSET:]]
                 self._peak = np.max(recent, axis=0) if contact else np.zeros_like(self._peak)
             self._contact = contact
+            self._void = any(note.code == "void" for note in verdict.notes) if verdict else self._void
             self.refresh(now)
 
     def refresh(self, now: float, event: str = "") -> None:
@@ -233,27 +234,27 @@ class Display:
 
         It is refused while something touches the skin, or did at the latest tare. Within a minute after that
         it can be forced once, by a second and explicit confirmation of the operator; :meth:`state` says so
-        as long.
+        as long. Where nothing touches the skin now, the confirmed tare still waits for a quiet stretch.
         """
         with self._lock:
-            forced = force and self._refusal == "touched" and now - self._refused_at <= self.confirm
-            notes = self._latest.verdict.notes if self._latest.verdict else ()
-            touched = self._latest.alarm or self._contact or any(note.code == "void" for note in notes)
-            self._refusal = "" if forced else "touched" if touched else "unforced" if force else ""
-            request: TareRequest = "tare_forced" if forced else "tare"
-            if self._refusal:
-                self._refused_at = now
-            else:
-                self._request, self._requested_at = request, now
+            confirmed = force and self._refusal == "touched" and now - self._asked_at <= self.confirm
+            touched = self._latest.alarm or self._contact
+            refused: Refusal = "touched" if touched or self._void else "unforced" if force else ""
+            self._refusal = "" if confirmed else refused
+            request: TareRequest = "tare_forced" if confirmed and touched else "tare"
+            self._request, self._asked_at = "" if self._refusal else request, now
             _log.warning("%s", REFUSALS[self._refusal] or _TARES[request])
             self.refresh(now, "tare_refused" if self._refusal else request)
             return REFUSALS[self._refusal]
 
     def take_tare(self, now: float) -> TareRequest:
-        """Return the latest request for a new baseline, once; one that is old forces nothing any more."""
+        """Return the latest request for a new baseline, once; an old forced one must be confirmed again."""
         with self._lock:
             request, self._request = self._request, ""
-        return "tare" if request and now - self._requested_at > STALE else request
+            if request == "tare_forced" and now - self._asked_at > STALE:
+                self._refusal, self._asked_at, request = "touched", now, ""
+                self.refresh(now, "tare_refused")
+        return request
 
     def state(self, now: float, since: int | None = None) -> DisplayState:
         """Return the state.
@@ -266,7 +267,7 @@ class Display:
             assessment = self.assess(now)
             fresh = 1 if since is None else min(max(1, self._number - since), len(self._frames))
             latest = [self._frames[-1 - back] for back in range(fresh)]
-            refusal = REFUSALS[self._refusal] if now - self._refused_at <= self.confirm else ""
+            refusal = REFUSALS[self._refusal] if now - self._asked_at <= self.confirm else ""
             line = ", ".join(filter(None, (refusal, self.line)))
             peak, number, valid = self._peak, self._number, self._valid
         values, saturated = (np.max(part, axis=0) for part in zip(*latest, strict=True))
@@ -381,6 +382,7 @@ class LiveLoop:
             self._updated_at = now
             self._display.line = self.line
             self._refine()
+            self._engine.device_rate = self._skin.stats.rate_hz
             if not self._skin.stats.timing.trusted:
                 self._display.add_note(Note("clock", detail=self._skin.stats.clock))
 
@@ -428,7 +430,7 @@ class LiveLoop:
         stream = list[NewtonFrame]()
         for frame in frames:
             before = self._tare.conversion
-            readings = self._tare.add(frame, self._engine.contact or self._engine.alarm)
+            readings = self._tare.add(frame, self._engine.detector.since is not None or self._engine.alarm)
             if (conversion := self._tare.conversion) is not None and conversion is not before:
                 self._begin(conversion)
                 stream.clear()
@@ -437,10 +439,9 @@ class LiveLoop:
 
     def _begin(self, conversion: UnitConversion) -> None:
         """Begin anew with another conversion; test it if it is the first."""
-        verify, self._verify, self._display.contacts.three = self._verify, None, self._tare.three
-        # A tare that nobody forced may have been taken under what made the one before it void.
-        void = self._engine.detector.void & (not self._tare.forced)
-        raised = verify(conversion) if verify else np.where(void, np.inf, 0.0)
+        raised, self._display.contacts.three = None, self._tare.three
+        if self._verify is not None:
+            raised, self._verify = self._verify(conversion), None
         self._engine.reset(raised, conversion.noise)
         self._engine.remember(self._tare.take_earlier())
 

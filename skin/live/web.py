@@ -26,7 +26,6 @@ from skin.live.verdict import contact_text, verdict_message
 HERTZ = 33
 """Pictures per second: 30, with a margin for a busy machine."""
 _HOST = "127.0.0.1"
-_PAGE = Path(__file__).with_name("page.html")
 
 
 @contextmanager
@@ -122,7 +121,14 @@ def _application(display: Display) -> Starlette:
     local = Middleware(TrustedHostMiddleware, allowed_hosts=[_HOST, "localhost"])
     return Starlette(
         routes=[
-            Route("/", FileResponse(_PAGE, media_type="text/html", headers={"Cache-Control": "no-store"})),
+            Route(
+                "/",
+                FileResponse(
+                    Path(__file__).with_name("page.html"),
+                    media_type="text/html",
+                    headers={"Cache-Control": "no-store"},
+                ),
+            ),
             Route("/skin.json", info),
             Route("/pictures", pictures),
             Route("/tare", tare, methods=["POST"]),

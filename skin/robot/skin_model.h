@@ -89,7 +89,9 @@ static inline int16_t skin_show(int t, int s) {
   }
   int16_t value = skin_reading(t, s);
   if (value == SKIN_NONE || (skin.any_below && skin_below(t, s))) return SKIN_NONE;
-  return skin.baseline[s] < -0.5f * SKIN_CONTACT ? skin_clamp(value - skin.baseline[s] / SKIN_STEP) : value;
+  if (!(skin.baseline[s] < -0.5f * SKIN_CONTACT)) return value;
+  int back = fabsf(value * SKIN_STEP - skin.rest[s]) < SKIN_CONTACT; /* of a broken wire: no touch */
+  return skin_clamp(value - (back ? fmaxf(skin.baseline[s], fminf(skin.rest[s], 0.0f)) : skin.baseline[s]) / SKIN_STEP);
 }
 
 #if SKIN_RULES /* no memory for a copy of the window */
@@ -617,7 +619,7 @@ static inline void skin_mark_below(void) {
 /* ContactDetector._step */
 static inline float skin_step(float away, float lift) {
   float rise = skin.contact < 0 ? SKIN_DRIFT : 0.0f;
-  float far = skin_max(away + SKIN_MARGIN + lift, -SKIN_SINK);
+  float far = fminf(skin_max(away + SKIN_MARGIN + lift, -SKIN_SINK), skin_max(away + SKIN_MARGIN, -SKIN_DRIFT));
   return far < 0.0f ? far : away > rise ? rise : skin_max(away, -rise);
 }
 

@@ -18,7 +18,7 @@ _ROUND = frozenset([*(2**bits for bits in range(4, 33)), *(10**digits for digits
 
 _NONE = np.zeros(0)
 _STEADY = 2.0  # s after which the shortest delay is renewed
-_SLOW = 0.01  # by which a device's clock may be slow: twice the error of a ceramic resonator, 0.5 %
+_SLOW = 0.03  # by which a device's clock may be slow: that of an oscillator without crystal
 
 
 class FrameClock:

@@ -194,7 +194,6 @@ class Tare:
         warning: message about what the latest baseline lacks; empty if nothing.
         count: number of baselines taken.
         freshness: tells whether the device still works.
-        forced: the latest baseline is taken even if the skin seems touched.
     """
 
     def __init__(
@@ -220,7 +219,7 @@ class Tare:
         self._first: float | None = None
         self._tried = -inf
         self._deadline: float | None = None
-        self.forced = False
+        self._forced = False
 
     @property
     def status(self) -> str:
@@ -239,7 +238,7 @@ class Tare:
             self.three.restart(force)
         if self.seconds and self.conversion is not None:
             self._quiet.clear()
-            self._tried, self._deadline, self.forced = -inf, inf, force
+            self._tried, self._deadline, self._forced = -inf, inf, force
             self.state = "quiet"
 
     def add(self, frame: Frame, touched: bool = False) -> NewtonFrame | None:
@@ -288,7 +287,7 @@ class Tare:
             return
         if not self.seconds:
             self.conversion, self.state = untared, ""
-        elif touched and not self.forced:
+        elif touched and not self._forced:
             self._quiet.clear()
             self.state = "waits"
         else:
@@ -318,7 +317,7 @@ class Tare:
             return
         values, valid = seen.values[complete], seen.valid[complete]
         try:
-            baseline = take_baseline(values, valid, force=self.forced)
+            baseline = take_baseline(values, valid, force=self._forced)
         except SkinTouched as touched:
             self.state, self._detail = "touched", str(touched).split(";")[0]
             return
@@ -346,7 +345,7 @@ class Tare:
         if changing.sum() * (len(self._quiet) - 1) * silence / passed < EXPECTED:
             lacks.append(f"this device shows no noise: readings that freeze for {silence:g} s cannot be seen")
         self.warning = "; ".join(lacks)
-        self.count, self.state, self._deadline = self.count + 1, "", None
+        self.count, self.state, self._deadline, self._forced = self.count + 1, "", None, False
         self._quiet.clear()
 
 

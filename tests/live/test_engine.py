@@ -9,6 +9,7 @@ import torch
 from skin.device.resampling import Frame
 from skin.device.touches import Touches
 from skin.errors import InputError
+from skin.evaluation.guarantee import Guarantee
 from skin.live.engine import Debounce, DebounceSettings, Detection, Engine
 from skin.touch.labels import TOUCH, Task
 from skin.wire.channels import UnitConversion
@@ -289,6 +290,14 @@ def test_labels_that_exclude_each_other_have_one_winner():
 def test_patience_that_would_be_too_late_is_refused(name, value):
     with pytest.raises(InputError, match="patience"):
         DebounceSettings(**{name: value})
+
+
+@pytest.mark.parametrize(("rate", "state"), [(0.0, "valid"), (95.0, "valid"), (20.0, "lapsed")])
+def test_a_guarantee_holds_at_its_own_rate(rate, state):
+    subject = rested()
+    subject.guarantee, subject.device_rate = Guarantee(0.01, 300, 0, "mild", device_rate=100.0), rate
+    (note,) = play(subject, np.zeros((10, 4)), start=0.6)[-1].notes
+    assert note.code == f"guarantee_{state}"
 
 
 def test_where_a_sensor_has_changed_no_touch_is_safe():

@@ -236,7 +236,7 @@ def play_touch(
     alarm = pd.Series({verdict.t: verdict.dangerous for verdict in verdicts}, dtype=bool)
     early, after = bool(alarm[alarm.index < begin].any()), alarm[alarm.index >= begin]
     if not after.any():
-        return AlarmTiming(np.nan, True, np.nan, early)
+        return AlarmTiming(np.nan, False, np.nan, early)
     raised, last = after.idxmax(), alarm[alarm].index[-1]
     cleared = np.nan if last >= alarm.index[-1] else max(0.0, last - end)
     kept = bool(alarm[(alarm.index >= raised) & (alarm.index <= end)].all())

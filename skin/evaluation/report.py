@@ -81,8 +81,10 @@ def touch_sets(device: AbstractDevice, settings: Evaluation) -> dict[str, Iterat
     """
     sets: dict[str, Iterator[Touches]] = {"holdout": (device.touches("holdout") for _ in range(1))}
     if (simulation := device.simulation) is not None:
-        # Devices of the same kind; the default one has seed 0.
-        siblings = (simulation.replace(seed=1 + number) for number in range(settings.devices))
+        # Devices of the same kind, none of them that of the training.
+        siblings = (
+            simulation.replace(seed=simulation.seed + 1 + number) for number in range(settings.devices)
+        )
         sets["device_shift"] = _share_out(siblings, settings.devices)
         # A gesture whose dangerous pressure no sensor of a layout would feel takes another path there.
         sets["unseen_layout"] = _share_out(scattered_devices(simulation, settings.layouts), settings.layouts)

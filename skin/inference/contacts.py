@@ -241,10 +241,11 @@ class Search:
     def _draw(self, frame: Observation, middles: np.ndarray, spread: np.ndarray, mode: np.ndarray) -> Mixture:
         """Return weighted samples of Student's distributions around guesses (M, n, P).
 
-        ``spread`` (M, P n, P n) holds the roots of their covariances; they are drawn in turns.
+        ``spread`` (M, P n, P n) holds the roots of their covariances. Each has a block of the points: every
+        fourth one of Sobol's lies in one half of the first axis.
         """
         number, size = middles.shape[1], spread.shape[1]
-        owner = np.arange(2**_SAMPLES) % len(middles)
+        owner = np.arange(2**_SAMPLES) * len(middles) // 2**_SAMPLES
         moved = np.matmul(spread[owner], (self._normal[:, :size] * self._stretch[:, None])[..., None])
         guess = middles[owner] + moved.reshape(-1, *middles.shape[1:])
         away = (guess - middles[:, None]).reshape(len(middles), -1, size).transpose(0, 2, 1)

@@ -367,16 +367,18 @@ class Posterior:
         """Return one estimate from the frames of a touch that does not move.
 
         Readings are proportional to the force, so that the mean of the frames is the reading of the mean
-        force. A sensor that is invalid or clips in a frame is so in all.
+        force. A sensor that is invalid or clips in a frame is so in all, its mean a lower bound.
 
         Args:
             readings: (T, S), N.
             valid, saturated: as of :meth:`estimate`.
         """
         values, valued, clips = map(np.atleast_2d, self._checked(readings, valid, saturated))
-        noise = replace(self.noise, frames=self.noise.frames * len(values))
         works, limited = np.logical_and.reduce(valued), np.logical_or.reduce(valued & clips)
-        return self._frame(Observation.of(values.mean(0), works, limited, noise))
+        mean, frames = values.mean(0), self.noise.frames * len(values)
+        clip = max(float(mean[works & limited].min(initial=self.noise.clip)), self.noise.frame)
+        noise = replace(self.noise, frames=frames, clip=clip)
+        return self._frame(Observation.of(mean, works, limited, noise))
 
     def _frame(self, frame: Observation) -> FrameEstimate:
         """Return the estimate of a frame, which depends on nothing else."""

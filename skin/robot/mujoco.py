@@ -206,20 +206,16 @@ class Mujoco(ImperfectionSettings, AbstractDevice):
 
     def _simulate(self, drawn: Draws) -> Recording:
         """Return the true readings of touches, with labels."""
-        pressing, settings, count = (
-            Pressing(self.simulator(self.body, self.sensors), self.body),
-            self.settings,
-            len(drawn["force"]),
-        )
+        pressing, settings = Pressing(self.simulator(self.body, self.sensors), self.body), self.settings
         pressures, readings, travels = zip(
             *(
                 self._press({name: values[row] for name, values in drawn.items()}, pressing)
-                for row in range(count)
+                for row in range(len(drawn["force"]))
             ),
             strict=True,
         )
         frames, window = torch.cat(pressures), settings.frames.window
-        index, scale = torch.arange(len(frames)).view(count, window), torch.ones(count, window)
+        index, scale = torch.arange(len(frames)).view(-1, window), torch.ones(len(pressures), window)
         force = frames.sum((1, 2))[index] * float(np.prod(self.body.cell))
         footprints = self.body.footprints(
             self.sensors if settings.over_sensors else cover_surface(self.body, self.sensors.footprint)
@@ -239,9 +235,17 @@ class Mujoco(ImperfectionSettings, AbstractDevice):
             "travel": torch.tensor(travels).float(),
             "force": force.amax(1),
             "peak": frames.flatten(1).amax(1)[index].amax(1),
+            "excess": torch.from_numpy(
+                settings.danger.excess(
+                    *map(
+                        np.asarray,
+                        (measures.pressure, force.amax(1), measures.frames > settings.frames.duration),
+                    )
+                )
+            ).float(),
         }
         movie = Movie(frames, index, scale, torch.empty(0), parameters)
-        limits = report_labels(settings.thresholds, settings.rate) | dict(settings.labels)
+        limits = report_labels(settings.thresholds, settings.rate, settings.limits) | dict(settings.labels)
         labels = [label.measure(movie, self.body) > label.above for label in limits.values()]
         true = torch.stack(readings)
         return Recording(

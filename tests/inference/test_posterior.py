@@ -326,6 +326,10 @@ def test_frames_of_a_touch_tell_more_together():
     assert together.contacts[0].region().area < 0.5 * alone.contacts[0].region().area
     mean = posterior().estimate(frames.mean(0))
     np.testing.assert_allclose(together.contacts[0].position, mean.contacts[0].position, rtol=1e-9)
+    peaked = true_readings(touches) * np.r_[np.full(9, 0.2), 1.0][:, None]  # clips in its last frame alone
+    clip = 0.7 * peaked.max()
+    clipped = posterior(noise=Noise(0.02, clip=clip)).estimate_touch(np.minimum(peaked, clip)).contacts[0]
+    assert abs(clipped.force - 0.28 * touches[0, 0, 3]) < 2.5 * clipped.force_deviation
 
 
 def test_two_sensors_say_what_cannot_be_known():

@@ -238,8 +238,9 @@ def test_labels_are_those_of_the_true_pressure(device):
 
 def test_forces_follow_the_controller_and_readings_the_forces(configured):
     quiet = [f"device.{name}=0" for name in ("gain_spread", "offset", "noise")]
-    recording = build_device(configured(*SMALL, *quiet, "device.clip=1000")).recording("test")
+    recording = build_device(configured(*SMALL, *quiet, "device.clip=1000", "limits=cuff")).recording("test")
     force, touches = recording.force, recording.touches
+    assert torch.equal(touches.labels[:, 3] > 0, recording.parameters["pressure"] > 22.8e3)
     frames = recording.parameters["duration"].long()
     for touch, first, count in zip(force, recording.parameters["onset"].long(), frames, strict=True):
         assert touch[first : first + count].max() == touch.max() > 0

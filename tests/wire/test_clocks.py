@@ -189,12 +189,6 @@ def test_a_replay_states_its_speed():
         assert (DISTRUST not in decoder.stats.clock) is trusted
 
 
-def test_a_device_that_restarts_is_compared_anew(decoder):
-    play(decoder, lambda t: t % 1.5, 20, counter=lambda number: number % 150)
-    assert DISTRUST not in decoder.stats.clock
-    assert decoder.stats.resets == 13
-
-
 def test_a_header_that_changes_ends_the_reading(decoder):
     """On an open connection the device was flashed or exchanged: its frames do not count any more."""
     assert play(decoder, lambda t: t, 3, header=encode_header(FIRST))

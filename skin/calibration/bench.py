@@ -166,10 +166,16 @@ def _join(folder: Path) -> tuple[dict[str, Any], pd.DataFrame]:
     intact = [part for part in parts.values() if part is not None]
     if not intact:
         raise ValueError("it has no frames: record some")
-    table = pa.concat_tables(intact).sort_by("time")
-    return metadata, table.select(
-        [name for name in table.column_names if name in _OTHER or name.startswith("raw_")]
-    ).to_pandas()
+    table = pa.concat_tables(intact).sort_by("time").to_pandas()
+    # A channel without a value repeats its last one.
+    return metadata, pd.DataFrame(
+        {name: table[name] for name in table if name in _OTHER}
+        | {
+            name: table[name].mask(table[f"state_{name.removeprefix('raw_')}"] & 1 > 0)
+            for name in table
+            if name.startswith("raw_")
+        }
+    )
 
 
 def _numbers(table: pd.DataFrame, names: Sequence[str], where: str) -> np.ndarray:
@@ -313,8 +319,8 @@ class BenchSession:
     """Raw readings of a skin, and the force gauge during the same time.
 
     Attributes:
-        time: (T,), s.
-        raw: (T, S), in ``unit``; NaN where a frame was lost.
+        time: (T,), s since its first frame.
+        raw: (T, S), in ``unit``; NaN where a frame was lost, or the device sent no value.
         unit: ``N``, or ``adc`` for counts of a converter.
         gauge: rows of the force gauge; None if there are none.
         bits: of the converter; None if unknown.
@@ -360,13 +366,18 @@ def read_bench_session(
     gauge = Gauge.of(table, str(path), settings) if "force" in table and presses is None else None
     if presses is not None:
         gauge = Gauge.of(load_table(presses, "gauge file")[0], str(presses), settings)
-        gauge = replace(gauge, time=gauge.time + settings.delay)
     unit: Any = settings.unit or metadata.get("unit", "N")
     try:
         session = BenchSession(time, raw, unit, gauge, metadata.get("bits"), metadata.get("channels"))
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
-    return replace(session, time=settings.seconds(time, str(path)))
+    time = settings.seconds(time, str(path))
+    # Offsets are those at the beginning: a clock may have run for hours.
+    return replace(
+        session,
+        time=time - time[0],
+        gauge=gauge and replace(gauge, time=gauge.time - time[0] + settings.delay * (presses is not None)),
+    )
 
 
 def write_bench_session(session: BenchSession, path: str | Path) -> Path:

@@ -60,8 +60,10 @@ def find_quantum(values: np.ndarray) -> float:
     Values are quantised if fewer than a fifth of them are distinct.
     """
     distinct = np.unique(values)
-    # Single precision splits a step into two that differ in the last digit.
-    steps = np.diff(distinct)[np.diff(distinct) > 1e-5 * np.abs(distinct).max(initial=0.0)]
+    # Single precision splits a step into two that differ in the last digit; it does not split counts.
+    steps = np.diff(distinct)[
+        np.diff(distinct) > (0.5 if (distinct % 1 == 0).all() else 1e-5 * np.abs(distinct).max(initial=0.0))
+    ]
     return float(steps.min()) if len(steps) and len(distinct) <= 0.2 * len(values) else 0.0
 
 

@@ -128,6 +128,8 @@ def check_session(path: Path, stored: Mapping[str, Any], now: Mapping[str, Any])
     for name, words in _SAME.items():
         if name in now and stored[name] not in (None, now[name]):
             raise InputError(f"{path} was recorded {words.format(stored[name], now[name] or _UNKNOWN)}")
+    if stored.get("channels") != now.get("channels"):
+        raise InputError(f"{path} was recorded with channels in another order: give another out=")
     window, rate = stored["window"], stored["rate"]
     if (window, rate) != (now["window"], now["rate"]):
         raise InputError(
@@ -198,7 +200,8 @@ class SessionLog:
         """
         if frame.segment != self._segment:
             self._segment, self._anchor = frame.segment, max(now, self.time + _STEP) - frame.t
-        self.time = round(frame.t + self._anchor, 9)
+        # Without a clock of the device, frames that were decoded together have one time.
+        self.time = max(round(frame.t + self._anchor, 9), self.time + 1e-6)
         self.frames.append((self.time, frame))
 
     def write(self, taken: Taken | None = None) -> None:

@@ -251,9 +251,9 @@ def test_a_drift_is_told_from_none():
 def test_the_smallest_step_is_found_in_single_precision():
     values = np.round(hum(3, 1.0) / 0.07) * 0.07
     assert find_quantum(values.astype(np.float32)) == pytest.approx(0.07, rel=1e-3)
-    assert find_quantum(hum(3, 1.0)) == 0
+    assert find_quantum(np.round(8.4e6 + hum(3, 9.0))) == 1.0  # counts of 24 bits
     last = np.where(np.arange(100) % 2, 512.0, np.nextafter(np.float32(512), np.float32(600)))
-    assert find_quantum(last) == 0
+    assert find_quantum(hum(3, 1.0)) == find_quantum(last) == 0
 
 
 def channel(each, steps, shown) -> Channel | None:

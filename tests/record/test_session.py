@@ -127,7 +127,8 @@ def test_calibration_reads_it(recorded):
     assert [None if np.isnan(number) else number for number in table["gesture"]] == gestures
     session = read_bench_session(recorded[0], BenchSettings())
     assert (session.raw.shape, session.unit, session.bits) == ((74, 2), "adc", 10)
-    assert np.array_equal(session.time, table["time"].to_numpy())
+    assert np.flatnonzero(np.isnan(session.raw[:, 1])).tolist() == [*range(15, 35)]
+    assert np.array_equal(session.time, table["time"])
 
 
 def test_contacts_and_unknown_labels_come_back(tmp_path):
@@ -235,6 +236,7 @@ def test_what_is_no_session_is_refused_and_left_alone(copied, tmp_path, content)
         ({"id": None}, r"recorded from the device arm-L, this is unknown \(header missing"),
         ({"bits": 12}, "recorded with 10 bits, the device sends 12: give another out="),
         ({"positions": [[1.0, 0.0, 0.0]] * 2}, "another layout: give it"),
+        ({"channels": [1, 0]}, "channels in another order"),
     ],
 )
 def test_a_session_goes_on_as_it_was_begun(copied, change, reason):

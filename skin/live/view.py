@@ -23,7 +23,6 @@ from rich.text import Text
 from skin.core.files import json_line, unwritable
 from skin.core.interrupt import ends_on_signal
 from skin.core.messages import quiet
-from skin.device.base import in_background
 from skin.errors import InputError
 from skin.evaluation.operating_point import FinalThreshold, OperatingPoint
 from skin.live.contacts import LiveContacts, contact_text_lines
@@ -415,6 +414,8 @@ def adopt_final(
     while (point := None if final is None else final.take()) is None:
         yield
     if isinstance(point, OperatingPoint):
+        from skin.device.base import in_background  # with torch, which an exported model does without
+
         tested = in_background(partial(test, point))
         while not tested.done():
             yield

@@ -39,7 +39,7 @@ $(READY): pyproject.toml constraints.txt
 
 install: $(READY)  ## create .venv; run by the other targets if needed
 
-test: $(READY)  ## run the tests that are not slow, in 14 minutes; MARK=slow: the others, MARK=: all
+test: $(READY)  ## run the tests that are not slow, in 15 minutes; MARK=slow: the others, MARK=: all
 	$(TEST)
 
 roundings: $(READY)  ## run the numerical tests (TESTS=tests: all) under several rounding settings

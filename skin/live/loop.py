@@ -43,7 +43,7 @@ _TARES: dict[TareRequest, str] = {"tare": "new tare", "tare_forced": "tare force
 
 STALE = 1.5
 """s without frames after which nothing is known of the skin."""
-OLD_READINGS = f"the latest readings are over {STALE:g} s old: the link is too slow, or the device's clock is"
+OLD_READINGS = f"readings are over {STALE:g} s old: the computer, the link or the device's clock is too slow"
 LATE = "no decision for longer than usual"
 FROZEN_READINGS: dict[Frozen, str] = {
     "still": "readings are frozen: no channel has changed for 5 s",

@@ -22,6 +22,7 @@ from skin.wire.channels import UnitConversion
 from skin.wire.segmentation import ContinuousSegmenter
 from tests.core.test_files import full
 from tests.damage import DAMAGED_FILES, damaged, opened
+from tests.wire.memory import until
 
 METADATA = {"positions": [[0.0, 0.0, 0.0]] * 2, "unit": "adc", "bits": 10, "id": "arm-L"}
 METADATA |= {"window": 5, "rate": 50.0, "started_unix": 1.0}
@@ -273,8 +274,7 @@ def test_kill_9_keeps_finished_gestures_and_lets_go_of_the_lock(tmp_path):
         assert writer.stdout.readline() == b"locked\n"
         with pytest.raises(InputError, match="being recorded by another process: end that, or give another"):
             locked(folder)
-        while len(list(folder.glob("gesture_*"))) < 20:
-            assert writer.poll() is None
+        until(lambda: len(list(folder.glob("gesture_*"))) >= 20, writer)
         writer.send_signal(signal.SIGKILL)
     with locked(folder):
         done = SessionLog(folder, METADATA).done

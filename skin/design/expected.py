@@ -106,7 +106,8 @@ def local_covariance(sensitivity: Sensitivity, noise: Noise, priors: Tensor) -> 
         noise: of the readings.
         priors: standard deviation of each parameter before the touch, (4,) or (B, 4), m and N.
     """
-    weights = 1 / noise.variance(sensitivity.readings)
+    variance = noise.floor + (noise.relative * sensitivity.readings).square()
+    weights = (1 / variance).masked_fill(sensitivity.readings >= noise.clip, 0.0)
     # Parameters in units of their priors: the matrix is then well conditioned.
     slopes = sensitivity.slopes * priors[..., None, :].to(sensitivity.slopes)
     information = torch.einsum("bsi,bs,bsj->bij", slopes, weights, slopes) + torch.eye(len(PARAMETERS))
@@ -188,7 +189,7 @@ def try_touches(
     valid = np.ones(readings.shape[1], bool)
     frames = (Observation.of(frame, valid, frame >= noise.clip, noise) for frame in measured)
     moments = [_moments(one_contact(candidates, prior, frame, first)) for frame in frames]
-    raised = noise.exceeds(torch.from_numpy(readings).abs()).numpy()
+    raised = noise.exceeds(np.abs(readings))
     return Trials(touches, raised, *(np.array(part) for part in zip(*moments, strict=True)))
 
 
@@ -320,8 +321,8 @@ class ExpectedPosterior:
     ) -> np.ndarray:
         """Return how many of the forces raise no sensor, (N,), at places (N, 2), m, by a medium fingertip."""
         discs = np.column_stack([places, np.full(len(places), sum(self.radii) / 2)])
-        largest = torch.from_numpy(disc_readings(simulator, body, discs, self.rim).max(axis=1))
-        return np.sum([~self._noise.exceeds(force * largest).numpy() for force in self.forces], axis=0)
+        largest = disc_readings(simulator, body, discs, self.rim).max(axis=1)
+        return np.sum([~self._noise.exceeds(force * largest) for force in self.forces], axis=0)
 
     def _local_precision(self, responses: Sensitivity, force: float, body: AbstractBody) -> float:
         """Return the median local precision of the position, m."""

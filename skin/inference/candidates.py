@@ -51,9 +51,9 @@ class FingertipPrior:
 
     def __post_init__(self) -> None:
         known = self.friction is None or 0 <= self.friction < math.inf
-        if not (min(*self.numbers, self.large) >= 0 and any(self.numbers[1:]) and known):
+        if not (min(*self.numbers, self.large) >= 0 < self.numbers[1] and known):
             raise InputError(
-                "a prior of fingertips needs probabilities of 0 or more, one above 0 of a contact, and "
+                "a prior of fingertips needs probabilities of 0 or more, above 0 of one contact, and "
                 f"friction of 0 or more, got numbers={list(self.numbers)}, large={self.large:g} and "
                 f"friction={self.friction}"
             )

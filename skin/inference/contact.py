@@ -6,16 +6,18 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.special import log_ndtr, logsumexp
+from scipy.special import log_ndtr, logsumexp, softmax
 
 from skin.inference.candidates import Boxes, CandidateReadings, FingertipPrior
 from skin.inference.likelihood import (
+    LEAST,
     Forces,
     Observation,
     blend,
     fit_force,
     integrate_force,
     invert_on_prior,
+    needed_force,
     refit_force,
     spread_readings,
 )
@@ -171,8 +173,8 @@ def _expand(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return slope (N, 3), 1/m, and information (N, 3, 3), 1/m^2, of the log likelihood in boxes.
 
-    Derivatives are by position and radius, at the most probable force, which depends on both: the last result
-    is the derivative of its logarithm, (N, 3), 1/m.
+    Derivatives are by position and radius, with the force integrated, which depends on both: the last result
+    is the derivative of its mean logarithm, (N, 3), 1/m.
     """
     rows, force = leaves.rows, np.exp(leaves.forces.mode)[:, None]
     mean, *_ = leaves.forces.tangent(force)
@@ -183,13 +185,6 @@ def _expand(
     variance = np.float32(frame.noise.floor) + force * force * leaves.spread
     weight = frame.counts / variance
     pull = weight * (frame.readings - predicted)
-    if len(frame.clipped):
-        # A sensor that clips is most informative where its predicted reading is near its limit.
-        clipped = frame.clipped
-        deviation = np.sqrt(variance[:, clipped])
-        above = (predicted[:, clipped] - np.float32(frame.noise.clip)) / deviation
-        hazard = np.exp(-0.5 * above**2 - log_ndtr(above)) / math.sqrt(2 * math.pi)
-        weight[:, clipped], pull[:, clipped] = hazard * (hazard + above) / deviation**2, hazard / deviation
     left = (every[:, :4] @ pull[..., None])[..., 0]
     gram = (every * weight[:, None]) @ every.transpose(0, 2, 1)
     # The tangential force follows what changes, and then the force.
@@ -198,7 +193,18 @@ def _expand(
     distance = (leaves.forces.mode - math.log(prior.force)) / prior.spread**2
     turn = -gram[:, 1:, 0] / (gram[:, :1, 0] + 1 / prior.spread**2)
     slope = left[:, 1:] + turn * (left[:, 0] - distance)[:, None]
-    return slope, gram[:, 1:, 1:] + gram[:, 1:, :1] * turn[:, None], turn
+    information = gram[:, 1:, 1:] + gram[:, 1:, :1] * turn[:, None]
+    if len(frame.clipped):
+        # A sensor that clips is most informative where it needs the most probable force.
+        needed, _, width, sensor = needed_force(frame, rows[:, 0], leaves.spread, leaves.forces)
+        above = ((leaves.forces.mode - needed) / width)[:, None]
+        hazard = np.exp(-0.5 * above**2 - log_ndtr(above)) / math.sqrt(2 * math.pi)
+        which = rows[np.arange(len(rows)), :, 0, sensor]
+        rise = (turn + which[:, 1:] / which[:, :1]) * (which[:, :1] > LEAST) / width[:, None]
+        share = hazard * (hazard + above)  # of the force that follows what the sensor needs
+        sharper = information + (share * rise)[..., None] * rise[:, None]
+        return slope + hazard * rise, sharper, turn - share * rise * width[:, None]
+    return slope, information, turn
 
 
 def _average(
@@ -221,8 +227,7 @@ def _average(
     factor = 0.5 * (np.vecdot(slope, moved) - np.log(np.maximum(np.linalg.det(information), 1)))
     inside = np.clip(moved, -1.5, 1.5)
     factor = np.where((inside == moved).all(1), factor, np.vecdot(slope, inside) / 2)
-    narrow = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
-    turn = turn * unit
+    narrow, turn = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)), turn * unit
     shift = np.vecdot(turn, inside)
     wider = np.maximum(np.vecdot(turn, np.vecdot(covariance, turn[:, None])), 0)
     return Boxes(centre + inside * unit, width * narrow), factor, np.stack([shift, wider])
@@ -237,25 +242,23 @@ def _weigh(
     leaves = leaves._replace(forces=fit)
     boxes, factor, further = _average(frame, prior, leaves)
     force, logs, tangent, variances = integrate_force(frame, prior, readings, spread, fit)
+    share, logarithm = softmax(logs, axis=1), np.log(force)
+    middle = np.vecdot(share, logarithm)[:, None]
     side = candidates.friction * force[..., None]
-    shift, stretch = np.clip(further[0], -1, 1), np.sqrt(1 + fit.curvature * further[1])
-    force = np.exp(
-        fit.mode[:, None] + shift[:, None] + (np.log(force) - fit.mode[:, None]) * stretch[:, None]
-    )
+    logarithm -= middle
+    stretch = np.sqrt(1 + further[1] / np.maximum(np.vecdot(share, logarithm**2), 0.01 / fit.curvature))
+    force = np.exp(middle + np.clip(further[0], -1, 1)[:, None] + logarithm * stretch[:, None])
+    middle = np.exp(middle)
     logs = logs + (np.log(leaves.boxes.width.prod(1)) + factor)[:, None]
-    top = logs.max()
-    weight = np.exp(logs - top)
-    total = weight.sum()
-    weight /= total
-    middle = np.exp(fit.mode)[:, None]
+    total = logsumexp(logs)
+    weight = np.exp(logs - total)
     mean, covariance, _ = fit.tangent(middle)
     variance = frame.noise.floor + middle * middle * spread
     misfit = ((frame.readings - middle * blend(readings, mean)[:, 0]) ** 2 / variance) @ frame.counts
     # Each parameter that readings determine and that is integrated misses by a variance.
     misfit += 1 + mean.shape[2] - np.trace(covariance[:, 0], axis1=1, axis2=2)
-    extent = float(np.prod(candidates.size) * candidates.span)
-    evidence = float(top + math.log(total) - math.log(extent))
+    evidence = float(total - np.log(np.prod(candidates.size) * candidates.span))
     sides, best = side * tangent, np.unravel_index(weight.argmax(), weight.shape)
     mode = np.array([*boxes.centre[best[0]], force[best], *sides[best]])
-    sure = float(weight.sum(1) @ misfit)
-    return Cloud(boxes, force, weight, evidence, sure, sides, side**2 * variances, mode)
+    misfit = float(weight.sum(1) @ misfit)
+    return Cloud(boxes, force, weight, evidence, misfit, sides, side**2 * variances, mode)

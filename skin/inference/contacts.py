@@ -5,7 +5,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import permutations
-from typing import NamedTuple
 
 import numpy as np
 from scipy.special import logsumexp, ndtr, ndtri, softmax
@@ -54,21 +53,6 @@ class Mixture:
     evidence: float
     misfit: float
     mode: np.ndarray
-
-
-class Addition(NamedTuple):
-    """What a further contact would explain, at each of N positions.
-
-    Attributes:
-        mode: (N,), the most probable log force.
-        ratio: (N,), log of the likelihood ratio to no further contact, integrated over the force.
-        factor: log factor of the evidence: the mean of the ratio over all positions, also where no sensor
-            responds, times the orders that the contact can have among the others.
-    """
-
-    mode: np.ndarray
-    ratio: np.ndarray
-    factor: float
 
 
 class Search:
@@ -179,10 +163,15 @@ class Search:
         information = information + np.diag(np.tile(self._scale**-2, guess.shape[1]))
         return score, pull, information
 
-    def add(self, frame: Observation, guess: np.ndarray) -> "Addition":
-        """Return what a further contact, beside a guess (n, P), would explain.
+    def extend(self, frame: Observation, guess: np.ndarray) -> tuple[np.ndarray, float]:
+        """Return guesses (M, n + 1, P) that have the best further contacts beside a guess (n, P).
 
         The contacts of the guess may move, to first order. The further one has no friction.
+
+        Returns:
+            The guesses, and the log factor of the evidence: the mean of the likelihood ratio to no further
+            contact over all positions, also where no sensor responds, times the orders that the contact can
+            have among the others.
         """
         predicted, columns = self.predict(guess[None])
         weight = frame.counts / self.variance(frame, predicted, columns)[0]
@@ -191,17 +180,11 @@ class Search:
         projected = np.diag(weight) - scaled.T @ np.linalg.solve(information, scaled)
         left = (frame.readings - predicted[0]) * frame.counts
         mode, ratio = fit_residual(self.prior, self._lattice, left, projected)
-        top = ratio.max()
-        factor = float(top + np.log(np.exp(ratio - top).mean())) + math.log(len(guess) + 1)
-        return Addition(mode, ratio, factor)
-
-    def extend(self, guess: np.ndarray, addition: "Addition") -> np.ndarray:
-        """Return guesses (M, n + 1, P) with the best further contacts."""
-        best = np.argsort(-addition.ratio)[:60]
-        force = np.exp(addition.mode[best, None])
-        new = self.guess(np.concatenate([self._positions[best], force], axis=1))[:, None]
-        new = new[_distinct(new, addition.ratio[best], 2 * _LATTICE, 3)]
-        return np.concatenate([np.repeat(guess[None], len(new), 0), new], axis=1)
+        factor = float(logsumexp(ratio)) + math.log((len(guess) + 1) / len(ratio))
+        best = np.argsort(-ratio)[:60]
+        new = self.guess(np.column_stack([self._positions[best], np.exp(mode[best])]))[:, None]
+        new = new[_distinct(new, ratio[best], 2 * _LATTICE, 3)]
+        return np.concatenate([np.repeat(guess[None], len(new), 0), new], axis=1), factor
 
     def pairs(self, frame: Observation, predicted: np.ndarray) -> np.ndarray:
         """Return the pairs (M, 2, P) that explain best what contacts with readings (S,), N, leave over."""

@@ -1,7 +1,7 @@
 """Likelihood of a frame: noise, gains, positions of sensors, clipping; the force integrated."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -10,8 +10,11 @@ from scipy.special import log_ndtr
 from skin.inference.candidates import FingertipPrior
 from skin.inference.noise import Noise
 
+LEAST = 1e-4
+"""N/N, a reading so small that a sensor of it never clips."""
+
 _NEWTON = 3  # steps towards the most probable force; the last one changes it by less than 1 %
-_NODES = {clips: np.polynomial.hermite_e.hermegauss(count) for clips, count in ((False, 5), (True, 15))}
+_NODES, _CUT_NODES = np.polynomial.hermite_e.hermegauss(5), np.polynomial.legendre.leggauss(20)
 
 
 @dataclass(frozen=True)
@@ -43,10 +46,6 @@ class Observation:
         """Return the log likelihood of no contact at all."""
         nothing = np.zeros((1, len(self.readings)), np.float32)
         return float(self.likelihood(nothing, nothing)[0])
-
-    def misfit_empty(self) -> float:
-        """Return the squared misfit of no contact, in variances."""
-        return float(self.readings**2 @ self.counts / self.noise.floor)
 
     def likelihood(self, predicted: np.ndarray, spread: np.ndarray) -> np.ndarray:
         """Return the log likelihood (...,) of true readings (..., S), N, with further variances, N^2."""
@@ -92,7 +91,7 @@ def spread_readings(noise: Noise, rows: np.ndarray, width: np.ndarray) -> tuple[
 
 
 class Forces(NamedTuple):
-    """Posterior of the force of each of N candidates, to second order.
+    """Posterior of the force of each of N candidates, to second order, without the sensors that clip.
 
     Attributes:
         mode: (N,), of the logarithm of the force.
@@ -135,6 +134,8 @@ def fit_force(
 ) -> tuple[Forces, np.ndarray]:
     """Return the force of candidates, and the log of the likelihood (N,) integrated over its prior.
 
+    Of the sensors that clip, the one counts that needs the largest force.
+
     Args:
         frame: the frame.
         prior: of the force.
@@ -148,8 +149,28 @@ def fit_force(
     forces = refit_force(frame, prior, readings, spread, mode)
     force = np.exp(forces.mode)[:, None]
     tangent, _, added = forces.tangent(force)
-    fit = frame.likelihood(force * blend(readings, tangent)[:, 0], force * force * spread) + added[:, 0]
-    return forces, fit + _density(prior, forces.mode) - np.float32(0.5) * np.log(forces.curvature)
+    predicted, further = force * blend(readings, tangent)[:, 0], force * force * spread
+    fit = replace(frame, clipped=frame.clipped[:0]).likelihood(predicted, further) + added[:, 0]
+    fit += _density(prior, forces.mode) - np.float32(0.5) * np.log(forces.curvature)
+    if len(frame.clipped):
+        needed, _, width, _ = needed_force(frame, readings, spread, forces)
+        fit += log_ndtr((forces.mode - needed) / width)
+    return forces, fit
+
+
+def needed_force(
+    frame: Observation, readings: np.ndarray, spread: np.ndarray, fit: Forces
+) -> tuple[np.ndarray, ...]:
+    """Return the log force (N,) at which all sensors that clip do so.
+
+    The further results are its standard deviation (N,), that of its difference to the log force of a
+    candidate (N,), and the index (N,) of the sensor that needs it.
+    """
+    needed = math.log(frame.noise.clip) - np.log(np.maximum(readings[:, 0, frame.clipped], LEAST))
+    own = (frame.noise.floor + np.exp(2 * needed) * spread[:, frame.clipped]) / frame.noise.clip**2
+    width = np.sqrt(own + 1 / fit.curvature[:, None])
+    largest = range(len(needed)), ((fit.mode[:, None] - needed) / width).argmin(1)
+    return needed[largest], np.sqrt(own[largest]), width[largest], frame.clipped[largest[1]]
 
 
 def refit_force(
@@ -218,16 +239,24 @@ def integrate_force(
         spread: (N, S), further variance per square newton.
         fit: where the forces are.
     """
-    nodes, weights = _NODES[bool(len(frame.clipped))]
-    deviation = 1 / np.sqrt(fit.curvature)
-    logarithm = fit.mode[:, None] + nodes.astype(np.float32) * deviation[:, None]
+    deviation, mode = 1 / np.sqrt(fit.curvature)[:, None], fit.mode[:, None]
+    nodes, weights = _CUT_NODES if len(frame.clipped) else _NODES
+    if len(frame.clipped):
+        # What is probable is cut off where a sensor would not clip yet.
+        needed, own, *_ = (each[:, None] for each in needed_force(frame, readings, spread, fit))
+        needed = np.minimum(needed, mode + 8 * deviation)
+        low = np.maximum(mode - 4 * deviation, needed - 4 * own)
+        half = (np.maximum(mode + 4 * deviation, needed + deviation) - low) / 2
+        logarithm, factor = low + half * (1 + nodes), np.log(weights * half)
+    else:
+        logarithm = mode + nodes.astype(np.float32) * deviation
+        factor = np.log(weights * deviation) + nodes**2 / 2
     force = np.exp(logarithm)
     tangent, covariance, added = fit.tangent(force)
     further = (force * force)[..., None] * spread[:, None]
     likelihood = added + frame.likelihood(force[..., None] * blend(readings, tangent), further)
-    factor = np.log(weights / math.sqrt(2 * math.pi)) + nodes**2 / 2 + np.log(deviation)[:, None]
-    variances = np.diagonal(covariance, axis1=-2, axis2=-1)
-    return force, likelihood + _density(prior, logarithm) + factor, tangent, variances
+    logs = likelihood + _density(prior, logarithm) + factor - math.log(2 * math.pi) / 2
+    return force, logs, tangent, np.diagonal(covariance, axis1=-2, axis2=-1)
 
 
 def fit_residual(

@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from skin.errors import InputError
+from skin.inference.noise import Noise
 
 if TYPE_CHECKING:
     from skin.body.base import AbstractBody, Sensors
     from skin.device.simulated import Simulated
     from skin.inference.candidates import CandidateReadings, FingertipPrior
-    from skin.inference.noise import Noise
     from skin.inference.posterior import Posterior
     from skin.mechanics.simulator.base import AbstractSimulator
 
@@ -42,7 +42,7 @@ class Mechanics:
     simulator: "Callable[[AbstractBody, Sensors], AbstractSimulator]"
     body: "AbstractBody"
     sensors: "Sensors"
-    noise: "Noise"
+    noise: Noise
 
     @classmethod
     def of(
@@ -66,18 +66,21 @@ class Mechanics:
         Raises:
             InputError: there are no mechanics, or readings of contacts do not add up.
         """
-        advice = "use run=any_skin, or a run of simulator=solid"
-        if device is None:
-            raise InputError(f"this model has no simulated skin: {advice}")
-        if getattr(device.model, "reading", None) == "equation10":
-            raise InputError(f"readings of equation 10 do not add up: {advice}")
-        from skin.inference.noise import Noise  # imports torch
-
+        if device is None or getattr(device.model, "reading", None) == "equation10":
+            lacks = (
+                "this model has no simulated skin"
+                if device is None
+                else "readings of equation 10 do not add up"
+            )
+            raise InputError(f"{lacks}: use run=any_skin, or a run of simulator=solid")
         settings = device.imperfection
-        noise = max(float(np.mean(settings.noise)), QUIET)
-        gain = gain if calibrated else float(np.mean(settings.gain_spread))
-        offset = 0.0 if settings.tare else settings.offset
-        nominal = Noise(noise, gain=gain, offset=offset, position=placed, thickness=thickness)
+        nominal = Noise(
+            max(float(np.mean(settings.noise)), QUIET),
+            gain=gain if calibrated else float(np.mean(settings.gain_spread)),
+            offset=0.0 if settings.tare else settings.offset,
+            position=placed,
+            thickness=thickness,
+        )
         return cls(device.simulator, device.body, device.sensors, nominal)
 
     def thicker(self, factor: float, prior: "FingertipPrior") -> "CandidateReadings":

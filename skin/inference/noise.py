@@ -3,8 +3,7 @@
 import math
 from dataclasses import dataclass
 
-import torch
-from torch import Tensor
+import numpy as np
 
 from skin.errors import InputError
 
@@ -66,14 +65,6 @@ class Noise:
         """
         return math.hypot(self.gain, math.log(self.thickness[1] / self.thickness[0]) / math.sqrt(12))
 
-    def variance(self, readings: Tensor) -> Tensor:
-        """Return the variance (B, S), N^2, of the mean of the frames of readings (B, S), N.
-
-        It is infinite where a sensor clips: its reading does not depend on the touch. Positions are left out.
-        """
-        variance = self.floor + (self.relative * readings).square()
-        return variance.masked_fill(readings >= self.clip, torch.inf)
-
-    def exceeds(self, readings: Tensor, sigmas: float = 3.0) -> Tensor:
+    def exceeds(self, readings: np.ndarray, sigmas: float = 3.0) -> np.ndarray:
         """Return which readings (B, S), N, exceed the noise of one frame, bool."""
         return readings > sigmas * self.frame

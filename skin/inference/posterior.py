@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 from scipy.ndimage import map_coordinates
-from scipy.special import expit, gammaincc, ndtr
+from scipy.special import expit, gammaincc, logsumexp, ndtr
 from threadpoolctl import ThreadpoolController
 
 from skin.body.base import AbstractBody
@@ -71,8 +71,7 @@ class LargeContacts:
     def evidence(self, frame: Observation) -> float:
         """Return the log of the mean likelihood of a frame."""
         _, evidence = fit_force(frame, self.prior, self._readings, self._spread)
-        top = float(evidence.max())
-        return top + math.log(float(np.exp(evidence - top).mean()))
+        return float(logsumexp(evidence)) - math.log(len(evidence))
 
 
 def draw_large(candidates: CandidateReadings, count: int, rng: np.random.Generator) -> np.ndarray:
@@ -234,7 +233,8 @@ class FrameEstimate:
     Attributes:
         number: the most probable number of contacts.
         probabilities: (4,), of 0, 1, 2 and 3 contacts, if they are fingertips.
-        contacts: ``number`` of them, the strongest first.
+        given: (4,), the contacts if there are 0, 1, 2 and 3 of them, the strongest first. Where more are
+            improbable, the one contact stands for each further one.
         fit: posterior predictive p-value: how often such contacts would give readings that fit worse.
         large: probability of a larger contact, such as a hand, beside those of fingertips.
         fingertip: whether there are contacts, they fit, and a larger one is less probable.
@@ -243,15 +243,21 @@ class FrameEstimate:
 
     number: int
     probabilities: np.ndarray
-    contacts: tuple[ContactEstimate, ...]
+    given: tuple[tuple[ContactEstimate, ...], ...]
     fit: float
     large: float
     fingertip: bool
     unknown: str | None
 
+    @property
+    def contacts(self) -> tuple[ContactEstimate, ...]:
+        """``number`` contacts, the strongest first."""
+        return self.given[self.number]
+
     def exceeds(self, pressure: float) -> float:
-        """Return the probability that some contact's highest pressure is above a limit, Pa."""
-        return 1 - math.prod(1 - contact.exceeds(pressure) for contact in self.contacts)
+        """Return the probability that some fingertip's highest pressure is above a limit, Pa."""
+        below = [math.prod(1 - contact.exceeds(pressure) for contact in each) for each in self.given]
+        return float(self.probabilities @ (1 - np.array(below)))
 
     def to_json(self, time: float, noise_fit: float = 1e-4) -> dict[str, Any]:
         """Return the estimate as JSON data, the fields of ``docs/export.md``.
@@ -386,48 +392,47 @@ class Posterior:
         least = frame.empty() + float(self._numbers[0] - self._numbers[1:].max()) - math.log(10)
         single = one_contact(self.candidates, self.prior, frame, self._first, least)
         sensors = int(frame.counts.sum()) + len(frame.clipped)
-        evidence, mixtures = self._several(frame, single, min(self._maximum, max(1, sensors // _PER_CONTACT)))
-        logs = np.full(len(self._numbers), -np.inf)
-        logs[: len(evidence)] = np.array(evidence) + self._numbers[: len(evidence)]
-        number = int(logs.argmax())
-        total = float(np.logaddexp.reduce(logs))
-        probabilities = np.exp(logs - total)
-        misfit = frame.misfit_empty() if number == 0 else mixtures.get(number, single).misfit
+        maximum = min(self._maximum, max(1, sensors // _PER_CONTACT))
+        evidence, mixtures = self._several(frame, single, maximum)
+        logs = np.array(evidence) + self._numbers[: len(evidence)]
+        number, total = int(logs.argmax()), float(logsumexp(logs))
+        empty = frame.readings**2 @ frame.counts / frame.noise.floor
+        misfit = [empty, single.misfit, *(mixture.misfit for mixture in mixtures)][number]
         fit = float(gammaincc(max(frame.counts.sum(), 1) / 2, misfit / 2))
-        # The most probable number, if there are several, is one that was refined.
-        walked = self._search.walk(frame, mixtures[number]) if number > 1 else None
-        clouds = self._search.clouds(walked) if walked else [single][:number]
-        contacts = tuple(sorted(map(self._summary, clouds), key=lambda each: -each.force))
+        if number > 1:
+            mixtures[number - 2] = self._search.walk(frame, mixtures[number - 2])
+        clouds = [[], [single], *map(self._search.clouds, mixtures)]
+        given = [tuple(sorted(map(self._summary, each), key=lambda one: -one.force)) for each in clouds]
+        while len(given) < len(self._numbers):
+            given.append((*given[-1], *given[1]))
         odds = self._large.evidence(frame) + math.log(self.prior.large) - total if self._large else -math.inf
         large = float(expit(odds))
-        fingertip = number > 0 and fit >= _FITS and large < 0.5
         return FrameEstimate(
             number,
-            probabilities,
-            contacts,
+            np.pad(np.exp(logs - total), (0, len(self._numbers) - len(logs))),
+            tuple(given),
             fit,
             large,
-            fingertip,
-            _unknown(sensors, frame, self.prior, contacts[0].force if contacts else 0.0),
+            number > 0 and fit >= _FITS and large < 0.5,
+            _unknown(sensors, frame, self.prior, given[number][0].force if number else 0.0),
         )
 
-    def _several(
-        self, frame: Observation, single: Cloud, maximum: int
-    ) -> tuple[list[float], dict[int, Mixture]]:
-        """Return the log evidence of each number of contacts, and the posteriors of several."""
-        evidence, mixtures, misfit = [frame.empty(), single.evidence], dict[int, Mixture](), single.misfit
+    def _several(self, frame: Observation, single: Cloud, maximum: int) -> tuple[list[float], list[Mixture]]:
+        """Return the log evidence of each number of contacts, and the posteriors from two contacts on.
+
+        Those of numbers that are improbable are left out.
+        """
+        evidence, mixtures, misfit = [frame.empty(), single.evidence], list[Mixture](), single.misfit
         mode, sensors = self._search.guess(single.mode[None]), max(frame.counts.sum(), 1) / 2
         for number in range(2, maximum + 1):
-            addition = self._search.add(frame, mode)
+            guesses, factor = self._search.extend(frame, mode)
             # It explains no more than the first contact: where no sensor responds, both are hidden.
-            factor = min(addition.factor, single.evidence - evidence[0])
-            odds = factor + self._numbers[number] - self._numbers[number - 1]
+            least = evidence[-1] + min(factor, single.evidence - evidence[0])
+            odds = least + self._numbers[number:].max() - (evidence + self._numbers[:number]).max()
             if gammaincc(sensors, misfit / 2) > _POOR and odds < math.log(_LIKELY):
-                evidence.append(evidence[-1] + factor)
-                continue
-            mixture = self._refine(frame, self._search.extend(mode, addition), mode)
-            evidence.append(max(evidence[-1] + factor, mixture.evidence))
-            mixtures[number] = mixture
+                return evidence + [least] * (maximum + 1 - number), mixtures
+            mixtures.append(mixture := self._refine(frame, guesses, mode))
+            evidence.append(max(least, mixture.evidence))
             mode, misfit = mixture.mode, mixture.misfit
         return evidence, mixtures
 

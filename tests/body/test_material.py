@@ -36,16 +36,11 @@ def test_a_name_is_read_as_people_write_it(name):
         ("rubber", "'name': 'rubber', 'young': 100e3, 'poisson': 0.49. in Python or .name: rubber"),
         ("EcoFlex Gel", "EcoFlex Gel has no constants of its own.*young .Pa. and poisson"),
         ({"name": "EcoFlex Gel", "young": 1e4}, "give poisson"),
-        ({"name": "foam", "yuong": 1e4}, "material has no setting yuong: did you mean young[?]"),
         ({"young": 1e4, "poisson": 0.3}, "material needs name, got young, poisson"),
         (17, "material must be settings by name, got 17"),
-        ({"name": "foam", "young": 0, "poisson": 0.3}, "material.young=0 must be greater than 0"),
-        ({"name": "foam", "young": 1e4, "poisson": 1.0}, "material.poisson=1.0 must be less than 1"),
-        ({"name": "foam", "young": 1e4, "poisson": -1}, "material.poisson=-1 must be greater than -1"),
         (ECOFLEX | {"relaxation": 0.5}, "relaxation must be settings by name, got 0.5"),
         (ECOFLEX | {"relaxation": {"time": 0.5}}, "relaxation needs strength, got time"),
         (ECOFLEX | {"relaxation": {"time": 0, "strength": 1}}, "relaxation.time=0 must be greater than 0"),
-        (ECOFLEX | {"relaxation": {"time": 1, "strength": -1}}, "strength=-1 must be greater than 0"),
     ],
 )
 def test_what_is_no_material_is_refused_by_name(given, says):

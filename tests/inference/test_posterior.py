@@ -305,6 +305,19 @@ def test_a_sensor_that_clips_says_at_least_so_much():
     assert not blind or blind[0].position_deviation.max() > contact.position_deviation.max()
 
 
+def test_touches_that_clip_a_sensor_are_held_as_often_as_said():
+    """The most probable force ignored them: regions held 72 %, and intervals of the pressure 79."""
+    noise, prior, touches = Noise(0.05, 10, clip=6.0), replace(SINGLE, force=10.0), draw(8000, seed=7)
+    touches[..., 3] *= 2
+    true = true_readings(touches, thin=True)
+    rows = np.flatnonzero((true > noise.clip).any(1))
+    estimates = posterior(True, noise, prior).estimate(np.minimum(measure(true[rows], noise, 9), noise.clip))
+    pairs = [(each.contacts[0], touch[0]) for each, touch in zip(estimates, touches[rows], strict=True)]
+    assert 0.83 <= np.mean([contact.region().contains(touch[:2]) for contact, touch in pairs]) <= 1
+    peaks = [(contact.peak_interval, prior.peak(touch[2]) * touch[3]) for contact, touch in pairs]
+    assert 0.83 <= np.mean([low < peak < high for (low, high), peak in peaks]) <= 1
+
+
 def test_a_force_far_above_the_prior_is_held_or_said_to_be_beyond_the_range():
     touches = draw(9, seed=2, margin=0.03)
     touches[..., 3] = 150.0
@@ -351,6 +364,20 @@ def test_a_limit_of_pressure_has_a_probability():
     assert limits[0] == pytest.approx(1)
     assert limits[2] < 0.01
     assert limits == sorted(limits, reverse=True)
+    # Where no touch is most probable, there may be one.
+    nothing = posterior(True, Noise(1.0), FingertipPrior(force=10.0)).estimate(np.zeros(25))
+    assert (nothing.number, nothing.contacts) == (0, ())
+    assert nothing.given[1][0].exceeds(90e3) > nothing.exceeds(90e3) > 0.1
+
+
+def test_a_number_that_is_improbable_is_passed_over():
+    rng, prior = np.random.default_rng(2), FingertipPrior(numbers=(0.6, 0.3, 0.01, 0.09))
+    middle, angle = rng.uniform(0.03, 0.13, (12, 2)), rng.uniform(0, 6.28, 12)
+    away = 0.004 * np.column_stack([np.cos(angle), np.sin(angle)])
+    pairs = np.stack([middle + away, middle - away], 1)  # nearer to each other than sensors
+    touches = np.concatenate([pairs, np.broadcast_to([0.008, 4.0], pairs.shape)], 2)
+    estimates = posterior(prior=prior).estimate(measure(true_readings(touches), NOISE, 6))
+    assert [len(each.contacts) for each in estimates] == [each.number for each in estimates]
 
 
 def test_every_simulator_that_adds_up_and_an_arm_work():

@@ -497,9 +497,10 @@ def ship_thresholds(
 def _snapped(live: LiveConditions, device: "Simulated") -> LiveConditions:
     """Return the conditions at the nearest of some multiples of the model's rate.
 
-    A measured rate is never the same twice, and the threshold would be chosen anew at each start.
+    A measured rate is never the same twice, and the threshold would be chosen anew at each start. From 5
+    times on, one is within 10 %: beyond, a guarantee lapses.
     """
-    ratios = (1, 2, 3, 5, 7, 10, 15, 20, 30, 50, 70, 100)
+    ratios = (*range(1, 13), 14, 16, 18, 20, 22, 25, 30, 35, 40, 45, 50, 60, 70, 80, 90, 100)
     ratio = min(ratios, key=lambda ratio: abs(log(ratio * device.model_rate / live.rate)))
     return replace(live, rate=ratio * device.model_rate)
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
 import torch
@@ -176,7 +176,8 @@ class Mujoco(ImperfectionSettings, AbstractDevice):
                 true,
                 self.imperfection,
                 None if self.randomise else constants,
-                generator(Stream.NOISE, self.seed, stream, *key),
+                # Each split has noise of its own.
+                generator(Stream.NOISE, self.seed, stream, *key, [None, *get_args(Split)].index(split)),
             )
         return self._kept[split]
 
@@ -275,7 +276,7 @@ class Mujoco(ImperfectionSettings, AbstractDevice):
             self.settings.rate,
         )
         model = mujoco.MjModel.from_xml_string(
-            press_world(str(touch["geoms"]), float(touch["angle"]), float(touch["friction"]), self.body)
+            press_world(str(touch["geoms"]), -float(touch["angle"]), float(touch["friction"]), self.body)
         )
         surface, data = MujocoSurface(model, "skin", self.body), mujoco.MjData(model)
         begin, end = (float(frame) / rate for frame in touch["onset"] + np.array([0, touch["duration"]]))
@@ -294,11 +295,11 @@ class Mujoco(ImperfectionSettings, AbstractDevice):
         return *pressing.frames(pressed, window), float(np.linalg.norm(way - way[0], axis=1).max())
 
     def _targets(self, touch: Draws, times: np.ndarray, begin: float, end: float) -> np.ndarray:
-        """Return the target position of an object at some times, (N, 3), m: in the model, z up."""
+        """Return the target position of an object at some times, (N, 3), m: in the model, with y and z up."""
         fraction = np.clip(np.minimum(times - begin, end - times) * self.settings.ramp / (end - begin), 0, 1)
         lift = _LIFT * np.clip(np.maximum(begin - times, times - end) / _APPROACH, 0, 1)
         direction = np.array([np.cos(touch["direction"]), np.sin(touch["direction"])])
         moved = touch["speed"] * self.settings.rate * np.clip(times - begin, 0, None)
         position = fold(touch["start"] + moved[:, None] * direction, touch["span"]) - touch["low"]
         depth = touch["force"] / _STIFFNESS + _OVERLAP * np.cbrt(touch["force"] / _NOMINAL)
-        return np.column_stack([position - np.array(self.size) / 2, lift - fraction * depth])
+        return np.column_stack([(position - np.array(self.size) / 2) * [1, -1], lift - fraction * depth])

@@ -133,8 +133,9 @@ class MujocoSurface:
 
     Args:
         model: ``mujoco.MjModel``.
-        site: name of the site in the middle of the skin's surface. Its x and y axes are those of the chart, z
-            points out of the skin. The geom of the site's body that lies under it carries the skin.
+        site: name of the site in the middle of the skin's surface. Its x axis is that of the chart, its y
+            axis the opposite of the chart's, z points out of the skin. The geom of the site's body that lies
+            under it carries the skin.
         body: the skin.
 
     Attributes:
@@ -153,7 +154,8 @@ class MujocoSurface:
         x, y = ((np.arange(count) + 0.5) * cell for count, cell in zip(body.cells, body.cell, strict=True))
         self._cells = np.stack([*np.meshgrid(x, y), np.zeros(body.shape)], axis=-1).reshape(-1, 3)
         middle = np.array([*body.size, 0.0]) / 2
-        self._axes = body.frame(middle) * np.array([[1.0], [1.0], [-1.0]])
+        # The chart is the skin seen from outside, with y downwards.
+        self._axes = body.frame(middle) * np.array([[1.0], [-1.0], [-1.0]])
         # In the frame of the site.
         self._points = (body.locate(self._cells) - body.locate(middle)) @ self._axes.T
         self._frames = body.frame(self._cells) @ self._axes.T
@@ -276,7 +278,7 @@ class MujocoSkin:
     Args:
         model: ``mujoco.MjModel``. It is changed and restored while rays are cast: threads need models of
             their own.
-        site: name of the site in the middle of the skin's surface, with the chart's axes, and z outwards.
+        site: name of the site in the middle of the skin's surface, as of :class:`MujocoSurface`.
         body: the skin.
         layout: of its sensors.
         simulator: ``simulator(body, sensors)``; it needs a compliant surface.

@@ -4,6 +4,7 @@ import json
 import math
 from dataclasses import astuple, replace
 from functools import partial
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -412,6 +413,13 @@ def test_too_few_touches_or_presses_are_told_how_many_are_needed():
         threshold_for_misses(np.ones(2994), 0.001)
     with pytest.raises(InputError, match="4 of 300 dangerous touches on a sensor are not felt"):
         threshold_for_misses(np.repeat([0.0, 0.5], [4, 296]), 0.027)
+
+
+@pytest.mark.parametrize("rate", [50.0, 60.0, 80.0, 90.0, 125.0, 250.0, 333.3, 480.0, 1000.0])
+def test_a_guarantee_is_for_nearly_the_rate_of_the_device(rate):
+    live = LiveConditions(rate, 0.3, 2, 0.1, 3)
+    chosen = alarm._snapped(live, SimpleNamespace(model_rate=10.0)).rate
+    assert not guarantee.Guarantee(0.001, 10_000, 0, "", device_rate=chosen, patience=0.1).under(live).lapsed
 
 
 def test_a_touch_counts_above_the_margin_and_on_a_valid_sensor():

@@ -161,14 +161,14 @@ def serve(mechanics: Mechanics, pipe: Connection) -> None:
         os.nice(5)  # below what shows verdicts
     os.dup2(2, 1)  # what a library prints is no JSON line
     threadpool_limits(1)  # of BLAS and of torch, which the mechanics have loaded
-    posterior, tare = mechanics.posterior(), -1
-    thickness = Thickness(mechanics, posterior)
+    posterior, tare, thickness = mechanics.posterior(), -1, None
     with suppress(EOFError, OSError):  # the command has ended
         while True:
             readings = pipe.recv()
             if readings.tare != tare:
                 watch, tare = Watch(posterior.candidates, posterior.prior, mechanics.noise), readings.tare
             try:
+                thickness = thickness or Thickness(mechanics, posterior)
                 message = estimate_contacts(posterior, thickness.noise, readings)
                 watch.look(readings.values, readings.valid & ~readings.saturated, posterior.noise)
                 thickness.look(
@@ -177,7 +177,7 @@ def serve(mechanics: Mechanics, pipe: Connection) -> None:
                 )
             except (ArithmeticError, ValueError, AssertionError, InputError) as error:
                 message = unknown_contacts(f"the estimate failed: {error}")
-            pipe.send(message | {"changed": [*watch.changed], "thickness": thickness.doubt})
+            pipe.send(message | {"changed": [*watch.changed], "thickness": thickness and thickness.doubt})
 
 
 class LiveContacts:

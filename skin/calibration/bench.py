@@ -113,10 +113,10 @@ class BenchSettings:
             raise InputError(f"{where}: at least two rows are needed, got {len(time)}")
         steps = np.diff(time)
         if (back := np.flatnonzero(~(steps > 0))).size:
-            before, after = time[back[0] : back[0] + 2]
             raise InputError(
-                f"{where}: time must grow from row to row, but after row {back[0]} it goes from {before:.9g} "
-                f"to {after:.9g} s: check the clock, such as micros() of a board, and record again"
+                f"{where}: time must grow from row to row, but after row {back[0]} it goes from "
+                f"{time[back[0]]:.9g} to {time[back[0] + 1]:.9g} s: check the clock, such as micros() of a "
+                "board, and record again"
             )
         if self.time_scale is None and not _SLOWEST <= (rate := 1 / np.median(steps)) <= _FASTEST:
             raise InputError(
@@ -175,6 +175,11 @@ def _join(folder: Path) -> tuple[dict[str, Any], pd.DataFrame]:
             for name in table
             if name.startswith("raw_")
         }
+        | {
+            name.replace("state", "saturated"): table[name] // 2
+            for name in table
+            if name.startswith("state_") and (table[name] & 2).any()
+        }
     )
 
 
@@ -232,8 +237,9 @@ class Gauge:
                 f"add {settings.command}.force_scale={-(settings.force_scale or 1):g}"
             )
         same = rows[["press", *_PRESS]]
-        new = (same != same.shift()).any(axis=1).to_numpy() | (np.diff(time, prepend=time[0]) > _PAUSE)
-        press = new.cumsum() - 1
+        press = (
+            (same != same.shift()).any(axis=1).to_numpy() | (np.diff(time, prepend=time[0]) > _PAUSE)
+        ).cumsum() - 1
         return cls(time, np.maximum(force, 0), press, rows[_PRESS].groupby(press).first())
 
     def __len__(self) -> int:
@@ -285,8 +291,9 @@ class Gauge:
             The columns :data:`skin.touch.labels.CONTACT`.
         """
         force, press = self.at(time)
-        places = self.presses[["x_m", "y_m", "radius_m"]].to_numpy()[press]
-        values = np.column_stack([places, force, force * peaks[press]])
+        values = np.column_stack(
+            [self.presses[["x_m", "y_m", "radius_m"]].to_numpy()[press], force, force * peaks[press]]
+        )
         return np.where((force > 0)[:, None], values, np.nan)[:, None]
 
 
@@ -326,6 +333,7 @@ class BenchSession:
         bits: of the converter; None if unknown.
         channels: the device's channel of every column, where skin record has put them into the order of the
             layout; None: columns are in the device's order.
+        saturated: (T, S), bool: the value is known to be at a limit; None: of none.
 
     Raises:
         InputError: another unit.
@@ -337,6 +345,24 @@ class BenchSession:
     gauge: Gauge | None = None
     bits: Annotated[int, Ge(1), Le(64)] | None = None
     channels: Sequence[int] | None = None
+    saturated: np.ndarray | None = None
+
+    @property
+    def limited(self) -> np.ndarray:
+        """Where a channel is at its limit, or has no value, (T, S), bool.
+
+        Whole numbers are counts. Unknown bits of a converter, at least 8, are those of the largest number.
+        """
+        valid = np.isfinite(self.raw)
+        bits = self.bits or int(np.max(self.raw, where=valid, initial=255)).bit_length()
+        return (
+            ~valid
+            | (
+                np.isin(self.raw, [0, 2.0**bits - 1])
+                & (self.unit == "adc" or (self.raw[valid] % 1 == 0).all())
+            )
+            | (False if self.saturated is None else self.saturated)
+        )
 
 
 def read_bench_session(
@@ -345,8 +371,9 @@ def read_bench_session(
     """Read a session.
 
     The file has a column ``time`` (s) or ``t_us`` (microseconds) and one per sensor in the layout's order, of
-    any name; ``seq`` is ignored. Columns of a gauge may stand beside them, empty outside the presses. Unit
-    and bits may stand in the Parquet schema: ``{"unit": "adc", "bits": 10}``.
+    any name; ``seq`` is ignored. ``saturated_`` and this name may be 1 where the sensor is at its limit.
+    Columns of a gauge may stand beside them, empty outside the presses. Unit and bits may stand in the
+    Parquet schema: ``{"unit": "adc", "bits": 10}``.
 
     Args:
         path: .csv or .parquet, or the folder of a session of skin record.
@@ -357,7 +384,8 @@ def read_bench_session(
         InputError: a file is invalid.
     """
     table, metadata = load_table(path, "session")
-    names = [name for name in table if name not in _OTHER]
+    names = [name for name in table if name not in _OTHER and not name.startswith("saturated_")]
+    limits = [f"saturated_{name.removeprefix('raw_')}" for name in names]
     if not names:
         raise InputError(f"{path}: no column of a sensor beside {', '.join(table)}")
     if "time" not in table and "t_us" in table:
@@ -368,7 +396,15 @@ def read_bench_session(
         gauge = Gauge.of(load_table(presses, "gauge file")[0], str(presses), settings)
     unit: Any = settings.unit or metadata.get("unit", "N")
     try:
-        session = BenchSession(time, raw, unit, gauge, metadata.get("bits"), metadata.get("channels"))
+        session = BenchSession(
+            time,
+            raw,
+            unit,
+            gauge,
+            metadata.get("bits"),
+            metadata.get("channels"),
+            _numbers(table.filter(limits).reindex(columns=limits, fill_value=0), limits, str(path)) > 0,
+        )
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
     time = settings.seconds(time, str(path))

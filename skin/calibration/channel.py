@@ -294,8 +294,6 @@ def _describe(
     """Return what a solution means, and how well it is determined."""
     count, limit, solution = len(model.spread), float(np.exp(best.x[1])), best.x
     shown = model.curve(solution, edges)
-    below = model.loading & (shown < 0.95 * limit)
-    above = model.loading & (shown > 1.02 * limit + 2 * model.noise)
     own = np.delete(best.jac[: len(model.value)], np.arange(4, 4 + count), axis=1)
     errors = np.sqrt(np.abs(np.diag(np.linalg.pinv(own.T @ own))))
     force, gap = model.felt(solution[2])
@@ -307,8 +305,8 @@ def _describe(
         edges + middle,
         (middle, float(solution[0])),
         (float(seen.min(initial=0.0)) + middle, float(seen.max(initial=0.0)) + middle),
-        float(errors[0]) if below.sum() >= _BELOW else np.inf,
-        limit if above.sum() >= _FEWEST else np.nan,
+        float(errors[0]) if (shown < 0.95 * limit)[model.loading].sum() >= _BELOW else np.inf,
+        limit if (shown > 1.02 * limit + 2 * model.noise)[model.loading].sum() >= _FEWEST else np.nan,
         float(np.interp(solution[2], np.arange(_LAGS), loads.lags)) * (solution[2] >= 1),
         float(bend) if falling.sum() >= _FEWEST else np.nan,
     )

@@ -166,9 +166,8 @@ def convert_to_newton(
         else (1 / float(np.nanmedian(values["gain"])), float(np.median(values["offset"][alive])))
     )
     values = values.assign(offset=polarity * (values["offset"] - zero))
-    forces = values.columns.difference(["hysteresis", "time_constant", "exponent"])
+    values[values.columns.difference(["hysteresis", "time_constant", "exponent"])] *= scale
     # Six digits, and no negative 0.
-    values[forces] *= scale
     values = values.map(lambda value: float(f"{value:.6g}") + 0.0)
     known = values[alive].dropna(axis="columns", how="all")
     ranges = {"dead": [0.0, float((~alive).sum())]} | {

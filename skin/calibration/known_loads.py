@@ -67,6 +67,7 @@ class Placements:
         noise: (S,), standard deviation of ``change``.
         unsteady: number of loads that were left out because they changed.
         reached: (S,), bool: the channel leaves its noise in at least one load.
+        limited: (P, S), part of the time during which the channel was at its limit, or had no value.
     """
 
     change: np.ndarray
@@ -75,6 +76,7 @@ class Placements:
     noise: np.ndarray
     unsteady: int
     reached: np.ndarray
+    limited: np.ndarray
 
 
 def find_placements(session: BenchSession) -> Placements:
@@ -93,6 +95,7 @@ def find_placements(session: BenchSession) -> Placements:
         MAD / np.sqrt(2) * np.median(np.abs(np.diff(values, axis=0)), axis=0), steps / np.sqrt(12)
     )
     loaded = _find_loads(values, np.maximum(_LOADED * noise, _STEPS * steps))
+    limited = pd.DataFrame(session.limited).groupby(block).mean().to_numpy()
     # From the block before a load to those in which the skin settles after it.
     resting = np.convolve(loaded, np.ones(2 + _SETTLE))[1:-_SETTLE] == 0
     rows, spans, unsteady = [], [], 0
@@ -109,11 +112,14 @@ def find_placements(session: BenchSession) -> Placements:
         if not (np.ptp(steady, axis=0) <= _UNSTEADY * np.abs(change).max() + _LOADED * noise).all():
             unsteady += 1
             continue
-        rows.append(change)
+        rows.append((change, limited[low:high].mean(axis=0)))
         spans.append((starts[begin], starts[end]))
-    change, error = np.array(rows).reshape(-1, len(noise)), noise * np.sqrt(1 / 5 + 1 / (2 * _REST))
+    error, (change, parts) = (
+        noise * np.sqrt(1 / 5 + 1 / (2 * _REST)),
+        np.array(rows).reshape(-1, 2, len(noise)).swapaxes(0, 1),
+    )
     reached = (np.abs(change) > np.maximum(_LOADED * error, _STEPS * steps)).any(axis=0)
-    return Placements(change, np.array(spans).reshape(-1, 2), resting[block], error, unsteady, reached)
+    return Placements(change, np.array(spans).reshape(-1, 2), resting[block], error, unsteady, reached, parts)
 
 
 def _find_loads(values: np.ndarray, limits: np.ndarray) -> np.ndarray:
@@ -193,7 +199,7 @@ def fit_known_load(device: Simulated, session: BenchSession, load: KnownLoad) ->
         load: what was put on it.
 
     Raises:
-        InputError: another number of channels, no placement, sensors without one, or a load in another unit.
+        InputError: another number of channels, placements missing or at a limit, or a load in another unit.
     """
     check_channels(device, session)
     placements = find_placements(session)
@@ -260,8 +266,9 @@ def base_readings(
             body that is not flat.
     """
     positions = np.clip(sensors.positions[:: sensors.axes, :2], load.base, np.array(body.size) - load.base)
-    presses = stair_gauge(positions, indenter="disc", radius=load.base).presses
-    images = torch.cat([*pressed_images(body, presses)])
+    images = torch.cat(
+        [*pressed_images(body, stair_gauge(positions, indenter="disc", radius=load.base).presses)]
+    )
     x, y = (
         size * (torch.arange(count) + 0.5) - torch.from_numpy(places)[:, None]
         for size, count, places in zip(body.cell, body.cells, positions.T, strict=True)
@@ -298,6 +305,9 @@ def _fit_gains(
 
     A site is that whose pattern of readings is the most likely. Gains are unknown, so a reading is its
     expectation within a third. A dead sensor is found by the readings of its neighbours.
+
+    Raises:
+        InputError: readings at a limit, or placements whose direction downhill is unknown.
     """
     own, loaded = _find_own(expected)
     directions, sites, axes = own.shape
@@ -310,9 +320,32 @@ def _fit_gains(
     variance = (_SPREAD * pattern) ** 2 + (placements.noise / typical) ** 2 + (_FLOOR * pattern.max()) ** 2
     cost = (change[:, None] / typical - pattern) ** 2 / variance + np.log(variance)
     site = cost[..., used].sum(axis=-1).argmin(axis=1)
-    # The directions follow each other.
-    placed = pd.Series(site).groupby(site)
-    direction = (placed.cumcount() * directions // placed.transform("size")).to_numpy()
+    # Half of the values at the limit make their median the limit. Such a sensor may read so little that the
+    # load seems to lie on another site.
+    limited = (
+        (placements.limited >= 0.5)
+        & placements.reached
+        & loaded.ravel()
+        & (
+            (site[:, None] == np.arange(sites * axes) // axes)
+            | (inwards & (change > _FLOOR * typical * pattern.max()))
+        )
+    )
+    if len(full := np.flatnonzero(limited.any(axis=0))):
+        raise InputError(
+            f"sensors {list_numbers(full)} (from 0) were at their limit, or sent no value, under the load: "
+            "take a lighter weight and record again, or leave them out by "
+            f"'calibrate.broken=[{','.join(map(str, full))}]'"
+        )
+    # All loads of one direction come before those of the next.
+    direction = np.arange(len(site)) * directions // len(site)
+    counts = np.array([np.bincount(site[direction == turn], minlength=sites) for turn in range(directions)])
+    if (counts != counts[0]).any():
+        raise InputError(
+            f"the load lay {list_numbers(counts.sum(axis=0))} times on the sites 0 to {sites - 1} "
+            f"({placements.unsteady} more changed): put it on each site equally often for each of the "
+            f"{directions} directions downhill, one direction after the other, and record again"
+        )
     ratios = pd.DataFrame(
         change.reshape(-1, sites, axes)[np.arange(len(site)), site]
         / np.where(loaded, own, np.nan)[direction, site]
@@ -435,8 +468,7 @@ def stair_gauge(
 def choose_presses(device: Simulated, generator: np.random.Generator) -> np.ndarray:
     """Return two positions per sensor, on it and up to 3 mm beside it, (2 S, 2), m, inside the sheet."""
     centre = device.sensors.positions[:, :2]
-    beside = centre + generator.uniform(-0.003, 0.003, centre.shape)
-    return np.clip(np.concatenate([centre, beside]), 0, device.size)
+    return np.clip(np.r_[centre, centre + generator.uniform(-0.003, 0.003, centre.shape)], 0, device.size)
 
 
 def emulate_session(
@@ -460,10 +492,15 @@ def emulate_session(
     force, press = gauge.at(time)
     true = torch.from_numpy(force[:, None] * each[press])[None].float()
     readings = device.imperfection.raw(true, device.constants, generator, torch.from_numpy(time).float())
-    sent = Converter(bits, device.imperfection.clip)(
-        readings[0].numpy() * device.imperfection.signs(true.shape[2])
+    return BenchSession(
+        time,
+        Converter(bits, device.imperfection.clip)(
+            readings[0].numpy() * device.imperfection.signs(true.shape[2])
+        ),
+        "N" if bits is None else "adc",
+        gauge,
+        bits,
     )
-    return BenchSession(time, sent, "N" if bits is None else "adc", gauge, bits)
 
 
 def emulate_placements(
@@ -482,8 +519,16 @@ def emulate_placements(
         bits: of the converter; None: N are sent.
         idle: before the first one, s.
     """
-    gauge = stair_gauge(np.zeros((len(readings), 2)), 1.0, (1.0,), hold=1.0, idle=idle)
-    return replace(emulate_session(device, gauge, generator, bits, readings), gauge=None)
+    return replace(
+        emulate_session(
+            device,
+            stair_gauge(np.zeros((len(readings), 2)), 1.0, (1.0,), hold=1.0, idle=idle),
+            generator,
+            bits,
+            readings,
+        ),
+        gauge=None,
+    )
 
 
 def write_demo(device: Simulated, load: KnownLoad | None, bits: int | None, path: str) -> str:

@@ -122,8 +122,11 @@ def collect_responses(bench: BenchData) -> Responses:
     rests = raw[bench.idle].groupby(bench.begun[bench.idle]).median()
     rests = rests.reindex(range(len(bench.gauge))).ffill().bfill()
     loading = raw.assign(force=force, press=press)[bench.loading]
-    order = loading.groupby("press").cumcount()
-    step = order * _STEPS // loading.groupby("press")["press"].transform("size").clip(lower=_STEPS)
+    step = (
+        loading.groupby("press").cumcount()
+        * _STEPS
+        // loading.groupby("press")["press"].transform("size").clip(lower=_STEPS)
+    )
     # Of the force as of the readings: a part may hold two levels.
     steps = loading.groupby(["press", step]).median()
     numbers, count = steps.index.get_level_values(0).to_numpy(), len(loading) / len(steps)
@@ -228,8 +231,7 @@ class _Explanation(NamedTuple):
             additions.append(f"calibrate.places={self.turn}")
         if len(self.moved):
             words.append(f"channels {list_numbers(np.sort(order[self.moved]))} are in another order")
-            channels = ",".join(map(str, order[np.argsort(self.sensors)]))
-            additions.append(f"'calibrate.channels=[{channels}]'")
+            additions.append(f"'calibrate.channels=[{','.join(map(str, order[np.argsort(self.sensors)]))}]'")
         return f"the session fits if {' and '.join(words)}; to confirm that, add {' '.join(additions)}."
 
 
@@ -246,7 +248,12 @@ def ordered(session: BenchSession, settings: BenchSettings) -> BenchSession:
         raise InputError(f"calibrate.broken takes sensors from 0 to {last}, got {max(settings.broken)}")
     raw, own = session.raw[:, channels].astype(float), session.channels
     raw[:, list(settings.broken)] = np.nan
-    return replace(session, raw=raw, channels=channels if own is None else [own[n] for n in channels])
+    return replace(
+        session,
+        raw=raw,
+        channels=channels if own is None else [own[n] for n in channels],
+        saturated=None if session.saturated is None else session.saturated[:, channels],
+    )
 
 
 def wired_bench(device: Simulated, session: BenchSession, settings: BenchSettings) -> BenchData:
@@ -336,8 +343,7 @@ def _explain(turn: Turn, responses: Responses, per_newton: np.ndarray) -> list[_
     )
     moved, settled = sensors != channels, cost[channels, sensors] < _NO_FIT
     cost[channels, sensors] = _NO_FIT
-    sure = (cost.min(axis=1) > permuted + _BETTER) & (permuted <= _WELL)
-    sure &= expected[sensors] >= _PRESSED
+    sure = (cost.min(axis=1) > permuted + _BETTER) & (permuted <= _WELL) & (expected[sensors] >= _PRESSED)
     # Of two silent channels, nothing says which is where.
     known = bool(sure[moved & settled].all()) and (moved & ~settled).sum() <= 1
     found = [_Explanation(turn, channels, straight), _Explanation(turn, sensors, permuted, known)]

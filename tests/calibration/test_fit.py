@@ -313,9 +313,7 @@ def test_a_live_device_is_converted_by_the_curves_of_its_file(tmp_path):
     np.testing.assert_allclose(stored.corrected(raw), force, atol=1e-9)
 
 
-@pytest.mark.parametrize(
-    "table", [[[0, 1], [0, 0]], [[1, 2], [0, 1]], [[0, 1]], "x", [[0, 1], [0, float("nan")]]]
-)
+@pytest.mark.parametrize("table", [[[0, 1], [0, 0]], [[1, 2], [0, 1]], "x", [[0, 1], [0, float("nan")]]])
 def test_a_table_that_does_not_rise_is_refused(table):
     with pytest.raises(InputError, match=r"a calibration\.tables="):
         Calibration({"gain": [1.0]}, tables={0: table})

@@ -123,12 +123,13 @@ def test_every_frame_is_in_one_file(recorded):
 
 def test_calibration_reads_it(recorded):
     table, _ = load_table(recorded[0], "session")
-    assert [*table] == ["time", "seq", "gesture", "raw_00", "raw_01"]
+    assert [*table] == ["time", "seq", "gesture", "raw_00", "raw_01", "saturated_00"]
     gestures = [row["gesture"] for row in frames_of(recorded[0])]
     assert [None if np.isnan(number) else number for number in table["gesture"]] == gestures
     session = read_bench_session(recorded[0], BenchSettings())
     assert (session.raw.shape, session.unit, session.bits) == ((74, 2), "adc", 10)
     assert np.flatnonzero(np.isnan(session.raw[:, 1])).tolist() == [*range(15, 35)]
+    assert np.argwhere(session.saturated).tolist() == [[25, 0]]
     assert np.array_equal(session.time, table["time"])
 
 

@@ -22,7 +22,7 @@ import torch
 from annotated_types import Ge, Gt, MinLen
 from scipy.optimize import linear_sum_assignment
 from scipy.special import softmax
-from scipy.stats import binomtest
+from scipy.stats import t
 
 from experiments.laws.references import Discs, Slab
 from experiments.studies.measures import Subject
@@ -130,7 +130,10 @@ class Contact:
             if estimates[-1].fingertip and estimates[-1].number == 1:
                 learned.add(Observation.of(values, works, ~works, posterior.noise))
         counted = np.arange(len(readings)) % length >= first
-        figures = summarise_estimates([*compress(estimates, counted)], contacts[chosen][counted], prior)
+        together = length - first if first else 1
+        figures = summarise_estimates(
+            [*compress(estimates, counted)], contacts[chosen][counted], prior, together
+        )
         if exact and self.grid:
             figures |= grid_errors(exact, body, noise, prior, readings, contacts[chosen, 0], self.grid)
         times = 1e3 * np.quantile(seconds, [0.5, 0.99])
@@ -271,9 +274,12 @@ def turned(estimated: np.ndarray | None, true: np.ndarray) -> float:
 
 
 def summarise_estimates(
-    estimates: Sequence[FrameEstimate], contacts: np.ndarray, prior: FingertipPrior
+    estimates: Sequence[FrameEstimate], contacts: np.ndarray, prior: FingertipPrior, together: int = 1
 ) -> dict[str, Any]:
-    """Return the figures of estimates for true contacts (B, n, 4), of the touches whose number is right."""
+    """Return the figures of estimates for true contacts (B, n, 4), of the touches whose number is right.
+
+    The interval of those covered is over groups of ``together`` estimates that follow each other.
+    """
     number, rows = contacts.shape[1], list[dict[str, Any]]()
     right = [estimate.number == number for estimate in estimates]
     figures: dict[str, Any] = {
@@ -282,7 +288,7 @@ def summarise_estimates(
         "fingertip_%": 100 * float(np.mean([estimate.fingertip for estimate in estimates])),
         **dict.fromkeys(_COLUMNS, ""),
     }
-    for estimate, truths in zip(estimates, contacts, strict=True):
+    for place, (estimate, truths) in enumerate(zip(estimates, contacts, strict=True)):
         if not number or estimate.number != number:
             continue
         centres = np.array([contact.position for contact in estimate.contacts])
@@ -290,13 +296,13 @@ def summarise_estimates(
         for index, true in zip(*linear_sum_assignment(distances**2), strict=True):
             contact, (*position, radius, force) = estimate.contacts[index], truths[true, :4]
             region, pressure = contact.region(), force * prior.peak(radius)
-            low, high = contact.peak_interval
             row = {
+                "group": place // together,
                 "square": distances[index, true] ** 2 / 2,
                 "distance": distances[index, true],
                 "force": abs(contact.force / force - 1),
                 "peak": abs(contact.peak / pressure - 1),
-                "within": low < pressure < high,
+                "within": contact.peak_interval[0] < pressure < contact.peak_interval[1],
                 "covered": region.contains(np.array(position)),
                 "area": region.area,
                 "direction": turned(contact.tangential, truths[true, 4:]),
@@ -306,10 +312,11 @@ def summarise_estimates(
         return figures
     frame = pd.DataFrame(rows)
     median, mean = frame.median(), frame.mean()
-    interval = binomtest(int(frame.covered.sum()), len(frame)).proportion_ci(method="wilson")
+    groups = frame.groupby("group").covered.mean()
+    low, high = t.interval(0.95, len(groups) - 1, mean.covered, groups.sem())
     numbers = (
         1e3 * np.sqrt(mean.square), 1e3 * median.distance, 100 * median.force, 100 * median.peak,
-        100 * mean.within, 100 * mean.covered, 100 * interval.low, 100 * interval.high, 1e6 * median.area,
+        100 * mean.within, 100 * mean.covered, 100 * low, 100 * high, 1e6 * median.area,
         median.direction,
     )  # fmt: skip
     return figures | dict(zip(_COLUMNS, map(float, numbers), strict=False))
@@ -461,8 +468,11 @@ class Barometers:
             | self._rms(1e4 * wrong, np.square(measured).sum(axis=1), 8),
             {"metric": "rms of positions, mm"} | self._rms(squares, np.ones_like(squares), 4),
         ]
-        words = f"solid, {1e3 * strip.body.thickness:g} mm thick, tip of {1e3 * strip.radius:g} mm"
-        start = {"recording": subject.condition, "training": 20, "strip": words}
+        start = {
+            "recording": subject.condition,
+            "training": 20,
+            "strip": f"solid, {1e3 * strip.body.thickness:g} mm thick, tip of {1e3 * strip.radius:g} mm",
+        }
         return pd.DataFrame([start | row for row in rows]).round(3)
 
     def _rms(self, squares: np.ndarray, weights: np.ndarray, stream: int) -> dict[str, float]:

@@ -26,12 +26,11 @@ _HEAD = """# Reproduction of the report's statements
 
 Written by `python -m experiments.studies.reproduce` from the statements of studies and published results.
 
-- `study=…` is short for `skin study study=…`. An empty cell repeats the command above. Finite elements,
-  default settings, three or five seeds. In parentheses: report sections.
+- `study=…` is short for `skin study study=…`. Empty cells repeat the command above. Default settings,
+  three or five seeds. In parentheses: report sections.
 - Differences are in percentage points, ± [margin](protocol.md#intervals-and-comparisons). *agree* and
-  *disagree* need three seeds, or devices of one training. Margins over test gestures are here only where they
-  decide. With so many statements, some verdicts are due to chance.
-- Studies of images have a tenth of the gestures: too few for a GRU or LSTM alone.
+  *disagree* need three seeds, or devices of one training. With so many statements, some are due to chance.
+- Images have a tenth of the gestures: too few for a GRU or LSTM alone.
 """
 
 

@@ -188,10 +188,11 @@ class Adapter:
         """Return the settings that differ from their defaults, as YAML."""
         import yaml
 
-        settings = {name: getattr(self, name) for name in dict.fromkeys(["kind", *self._changed])}
-        plain = {name: list(value) if isinstance(value, tuple) else value for name, value in settings.items()}
+        settings = ((name, getattr(self, name)) for name in dict.fromkeys(["kind", *self._changed]))
         dump = partial(yaml.safe_dump, sort_keys=False, default_flow_style=True, width=10_000)
-        return "\n".join(dump({name: value})[1:-2] for name, value in plain.items())
+        return "\n".join(
+            dump({name: list(value) if isinstance(value, tuple) else value})[1:-2] for name, value in settings
+        )
 
     def may_end(self, data: bytes) -> bool:
         """Return whether a frame may end in ``data``."""
@@ -200,6 +201,7 @@ class Adapter:
     def _delimiter(self, data: bytes) -> bytes:
         return self.end.encode() if self.end else b"\n" if b"\n" in data or self.kind == "protocol" else b"\r"
 
+    @np.errstate(over="ignore", invalid="ignore")  # numbers of a faulty wire
     def detect(self, data: bytes, sensors: int | None) -> FrameFormat | int | None:
         """Return the format of the first bytes of a connection.
 
@@ -242,11 +244,8 @@ class Adapter:
             if re.search(b"(?:" + pattern + b"){%d}" % _RUN, data, re.DOTALL):
                 follow = b"" if tail else head
                 split = fixed_length(len(head) + size + len(tail), pattern, re.escape(follow), len(follow))
-                reader, frame = (
-                    partial(read_struct, self._fields, repeat, len(head)),
-                    re.compile(pattern, re.DOTALL),
-                )
-                yield FrameFormat(split, reader, names, "binary", frame=frame)
+                reader = partial(read_struct, self._fields, repeat, len(head))
+                yield FrameFormat(split, reader, names, "binary", frame=re.compile(pattern, re.DOTALL))
 
     def _reader(self, lines: Sequence[bytes]) -> tuple[Reader, Sequence[str]]:
         """Return what reads the fields of lines like these, and their names."""
@@ -332,7 +331,7 @@ class Adapter:
         numbered, first = [row for row in rows if row], 0.0
         index = self._find_index(numbered, layout) if numbered else None
         if index is not None:
-            numbers = [row.fields[index] for row in numbered if isfinite(row.fields[index])] or [0.0]
+            numbers = [row.fields[index] for row in numbered if abs(row.fields[index]) < 2**53] or [0.0]
             first, count = min(numbers), int(max(numbers) - min(numbers)) + 1
             starts = [row for row in numbered if row.fields[index] == first]
         else:

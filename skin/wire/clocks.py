@@ -184,9 +184,8 @@ class FrameClock:
         frames = round(elapsed / self._period) if clocked else 1
         irregular = abs(elapsed - frames * self._period) > uneven * self._period and clocked
         modulus = before - seq + frames
-        if not 0 < frames <= near or irregular or not 2 <= modulus <= before + frames or seq > frames:
-            return 0
-        if not clocked and modulus not in _ROUND and modulus + 1 not in _ROUND:
+        unusual = not clocked and modulus not in _ROUND and modulus + 1 not in _ROUND
+        if irregular or unusual or not (max(1, seq) <= frames <= near and 2 <= modulus <= before + frames):
             return 0
         self.modulus = modulus
         return frames

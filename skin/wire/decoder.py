@@ -280,9 +280,8 @@ class Decoder:
 
     def _place_frame(self, raw: RawFrame, now: float) -> Frame:
         stats, clock, header = self.stats, self._clock, self.stats.header
-        rate = None if header is None else header.rate
         self._clocked = raw.ticks is not None and clock.trusted
-        frame = clock.place(raw.seq, raw.ticks, now, self._missing, rate)
+        frame = clock.place(raw.seq, raw.ticks, now, self._missing, header.rate if header else None)
         stats.frames += 1
         stats.lost += frame.lost
         stats.resets += frame.after == "reset"

@@ -399,10 +399,11 @@ class Emulator:
         rate = self.settings.rate
         self._on_event(self.frames / rate, f"gesture {number}: {label_text(gesture.labels)}")
         seq, frames = self.frames - self._zero, round(len(gesture.force) * rate / self.device.model_rate)
-        announcement = Announcement(
-            number, seq, frames, gesture.labels, self.device.model_rate, gesture.contacts
+        self._send(
+            encode_announcement(
+                Announcement(number, seq, frames, gesture.labels, self.device.model_rate, gesture.contacts)
+            )
         )
-        self._send(encode_announcement(announcement))
 
     def _unplug(self) -> None:
         """Disconnect and power off; the clock starts from 0 afterwards."""

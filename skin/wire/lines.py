@@ -44,7 +44,11 @@ class NumberWords:
     def __call__(self, words: Sequence[bytes], check: Any = "none") -> Line:
         """Return the numbers of words."""
         if self.base == 16:
-            words = [b"%d" % int(word, 16) if _HEX.fullmatch(word.strip()) else word for word in words]
+            # Python writes no more than 4300 decimal digits; from 2**1024 on, none is a float anyway.
+            words = [
+                b"%d" % min(int(word, 16), 2**1024) if _HEX.fullmatch(word.strip()) else word
+                for word in words
+            ]
         if self.decimal == ",":
             words = [word.translate(_SWAPPED) for word in words]
         return parse_words(words, check, self.invalid, self.over)
@@ -174,8 +178,8 @@ def learn_keys(find: Find, lines: Sequence[bytes]) -> tuple[str, ...]:
         [key for key in first if key in keys] == [key for key in keys if key in first] for keys in seen
     ):
         return tuple(key for key in first if key in common)
-    natural = partial(re.sub, r"\d+", lambda match: match[0].zfill(9))
-    return tuple(sorted(common, key=natural))
+    # By the numbers in them: s10 follows s9.
+    return tuple(sorted(common, key=partial(re.sub, r"\d+", lambda match: match[0].zfill(9))))
 
 
 class StructField(NamedTuple):

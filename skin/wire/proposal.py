@@ -27,13 +27,22 @@ Pieces = Sequence[tuple[float, bytes]]
 _SAME = 0.98
 """Part of the bytes or characters that repeat from frame to frame; others are damaged."""
 _FRAMES = 10  # that a candidate must read
-_NUMBER = re.compile(rb"\d{1,2}:\d\d:\d\d(?:\.\d+)?|(?:(?<!\w)[-+])?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]\d+)?")
+_DATE = (
+    rb"(?:20\d\d[-/.]\d\d?[-/.]\d\d?|\d\d?[-/.]\d\d?[-/.](?:20\d\d|\d\d(?=[T\s,;]+\d\d?:\d\d))|20\d{6}(?=T\d))"
+    rb"(?:T\d[\d:.]*(?:Z|[-+]\d\d(?::?\d\d)?)?)?"
+)
+"""A day, with or without the time of ISO 8601; one with a year of two digits only before a time."""
+_NUMBER = re.compile(
+    _DATE + rb"|\d{1,2}:\d\d:\d\d(?:\.\d+)?|(?:(?<!\w)[-+])?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]\d+)?"
+)
 _WORD = r"[-+.:\w/]+"  # a number, or a word in its position
 _ASIDE = re.compile(r"(?i)temp.*|.*[_\[(](t|temp.*|°?c|deg.?c)[\])]?|.*humid.*|rssi|.*batt.*|temperature")
 _GUIDE = re.compile(r"(?i)min|max|low|lower|high|upper|zero|ref.*|limit")
 """Names of fields that are not forces, and of lines that keep a plotter from scaling."""
-_UNIT = re.compile(rb"[-+]?\d+\.?\d*\s*(?:[^\x00-\x7f]+)?(?:C|F|%|V|dBm?)|\d+:\d\d:\d\d\S*")
-"""Texts with a number in each: a quantity with its unit, and the time of the day."""
+_UNIT = re.compile(
+    rb"[-+]?\d+\.?\d*\s*(?:[^\x00-\x7f]+)?(?:C|F|%|V|dBm?)|(?:" + _DATE + rb"\s*)?(?:\d+:\d\d:\d\d\S*)?"
+)
+"""Texts with a number in each: a quantity with its unit, the day, and the time of the day."""
 
 
 @dataclass(frozen=True)
@@ -59,6 +68,7 @@ class _ImplausibleError(Exception):
     """A candidate reads the stream, but not as frames of a skin; the message says why."""
 
 
+@np.errstate(over="ignore", invalid="ignore")  # numbers of a faulty wire
 def propose(pieces: Pieces, seconds: float | None = None, margin: float = 0.25) -> list[Proposal]:
     """Return the adapters that read a stream, the most plausible first.
 
@@ -125,8 +135,10 @@ def _sample(data: bytes, reasons: Sequence[str]) -> str:
     if is_text(data):
         lines = [line for line in re.split(rb"[\r\n]+", data) if line.strip()]
         texts = "; ".join(repr(line[:100].decode("ascii", "replace")) for line in lines[-3:])
-        hint = "if it waits for a text, give start=; a pattern (docs/hardware.md) reads any lines"
-        return f"the last lines are {texts}: {hint}"
+        return (
+            f"the last lines are {texts}: if it waits for a text, give start=; a pattern (docs/hardware.md) "
+            "reads any lines"
+        )
     return (
         f"{len(data)} bytes that are not text, which begin with {data[:48].hex(' ')}: right baud rate? "
         "Describe binary frames yourself, as in kind: binary, head: aa 55, struct: {force: (16,)<u2}"
@@ -226,8 +238,8 @@ def _typical_step(values: np.ndarray, lag: int) -> np.ndarray:
 def _settle(adapter: Adapter, data: bytes) -> tuple[Adapter, list[str], float]:
     """Return an adapter with the roles of its fields, what it leaves out, in words, and its score."""
     layout = next(adapter.layouts(data))
-    pieces = layout.split(data)[0][1:]
-    reads = [(piece, layout.try_fields(piece)) for piece in pieces]
+    pieces = layout.split(data)[0]
+    reads = [(piece, layout.try_fields(piece)) for piece in pieces[1:]]  # the first may be half a line
     lines = [(piece, read) for piece, read in reads if isinstance(read, Line) and not _is_title(read)]
     if len(lines) < _FRAMES:
         raise FrameError("structure")
@@ -248,6 +260,7 @@ def _settle(adapter: Adapter, data: bytes) -> tuple[Adapter, list[str], float]:
         roles, reasons = _roles(np.array([read.fields for read in table]), names, left_out)
         left_out = reasons | left_out
     else:
+        _refuse_unequal_rows([read for _, read in lines])
         # Text or other data between lines of one sensor each does not make them rows.
         between = {kind_of_line(line) for line in others}
         wordy = re.compile(r"[^#]*[^\W\d_]{2}[^#]*")
@@ -259,8 +272,25 @@ def _settle(adapter: Adapter, data: bytes) -> tuple[Adapter, list[str], float]:
     notes += [f"{count} lines such as {kind!r} are ignored" for kind, count in kinds]
     if by_name and adapter.pattern is None:
         roles["names"] = tuple(names)
-    drop = (*adapter.drop, *described.values())
-    return replace(adapter, drop=drop, ignore=ignore, **roles), notes, score
+    return (
+        replace(adapter, drop=(*adapter.drop, *described.values()), ignore=ignore, **roles),
+        notes,
+        score,
+    )
+
+
+def _refuse_unequal_rows(lines: Sequence[Line]) -> None:
+    """Refuse rows of which those of another length would be left out; a clock may stand between matrices."""
+    lengths = Counter(
+        len(line.fields) for line in lines if np.isfinite(line.fields).any() and not line.strange
+    )
+    alone = np.array([line.fields[0] for line in lines if len(line.fields) == 1])
+    rows = lengths.total() - len(alone) * runs(alone)
+    if max(lengths.values(), default=0) < _SAME * rows or 3 * rows < 2 * lengths.total():
+        raise _ImplausibleError(
+            f"lines have {' or '.join(map(str, sorted(lengths)))} fields, so sensors of some would be lost: "
+            "let the firmware send a line per frame"
+        )
 
 
 def _is_title(read: Line) -> bool:
@@ -287,7 +317,8 @@ def _text_columns(lines: Sequence[Line]) -> list[int]:
     strange = Counter(position for line in lines for position in line.strange)
     columns = [position for position, count in strange.items() if count > 0.9 * len(lines)]
     for position, count in strange.items():
-        words = {line.strange[position] for line in lines if position in line.strange}
+        column = [line.strange[position] for line in lines if position in line.strange]
+        words, changes = {*column}, sum(before != word for before, word in pairwise(column))
         word = min(words).decode("ascii", "replace")
         if position not in columns and (count > 2 or re.fullmatch(r"[0-9A-Fa-f]+", word)):
             raise _ImplausibleError(
@@ -295,8 +326,12 @@ def _text_columns(lines: Sequence[Line]) -> list[int]:
                 f"beyond the range, device.adapter.invalid=[{word}] if it is no value"
             )
         numbers = {tuple(_NUMBER.findall(word)) for word in words}
-        if position in columns and len(numbers - {()}) > 1 and not all(map(_UNIT.fullmatch, words)):
-            raise FrameError("number")  # with a text beside it
+        if (
+            position in columns
+            and (len(numbers - {()}) > 1 or 2 * changes > len(column))
+            and not all(map(_UNIT.fullmatch, words))
+        ):
+            raise FrameError("number")  # with a text beside it, or after the name of one of several boards
     return columns
 
 
@@ -407,8 +442,11 @@ def _lines(lines: Sequence[bytes], end: str | None = None) -> Iterator[Adapter]:
     )
     yield Adapter(kind="json", end=end)
     yield from (text(label=label, decimal=sign) for label in (":", "=") for sign in signs)
-    digits = re.split(rb"[,;\t ]+", b" ".join(lines).strip())
-    if not all(map(bytes.isdigit, digits)) and all(
+    # Names as A0,A1 above decimal numbers, and words as DEAD in their place, look like hexadecimal ones.
+    title = next((line for line in lines if not re.search(rb"\b\d+\b", line)), b"")
+    digits = re.split(rb"[,;\t ]+", b" ".join(line for line in lines if line != title).strip())
+    lettered = [word for word in digits if not word.isdigit()]
+    if (4 * len(lettered) > len(digits) or any(word[:1].isdigit() for word in lettered)) and all(
         re.fullmatch(rb"(?i)(0x)?[0-9a-f]{2,}", word) for word in digits
     ):
         yield text(base=16)
@@ -430,11 +468,13 @@ def _patterns(lines: Sequence[bytes]) -> Iterator[dict[str, Any]]:
         alike = [line for line, other in zip(lines, shapes, strict=True) if other == shape]
         if count < _FRAMES or len(shape) < 2:
             continue
-        texts = zip(*map(_NUMBER.split, alike), strict=True)
-        literals = [Counter(column).most_common(1)[0][0] for column in texts]
+        literals = [
+            Counter(texts).most_common(1)[0][0] for texts in zip(*map(_NUMBER.split, alike), strict=True)
+        ]
         columns = list(zip(*map(_NUMBER.findall, alike), strict=True))
-        if INVALID & {word.lower() for text in literals for word in re.findall(rb"[A-Za-z/]+", text)}:
-            continue  # the text is a value that is missing
+        missing = INVALID & {word.lower() for text in literals for word in re.findall(rb"[A-Za-z/]+", text)}
+        if missing or all(len(set(column)) == 1 for column in columns):
+            continue  # the text is a value that is missing, or names of channels
         whole = [b"".join(column).isdigit() and cycles(np.array(column, float)) for column in columns[:-1]]
         index = whole.index(True) if True in whole else None
         first = len(columns) - 1

@@ -53,8 +53,7 @@ class RecordedGesture:
 def label_plan(names: Sequence[str], repetitions: int, seed: int) -> Iterator[Labels]:
     """Yield every combination of the labels, in another random order each repetition."""
     for repetition in range(repetitions):
-        order = generator(Stream.SPLIT, 2, seed, repetition).permutation(2 ** len(names))
-        for code in order:
+        for code in generator(Stream.SPLIT, 2, seed, repetition).permutation(2 ** len(names)):
             yield {name: int(code) >> position & 1 for position, name in enumerate(names)}
 
 
@@ -137,7 +136,6 @@ class AnnouncedSegmenter(AbstractSegmenter):
     def _begin(self, frame: Frame) -> RecordedGesture | None:
         if frame.seq is None:
             raise InputError("announcements need frames with numbers: give device.labels=prompted")
-        window = self.window.frames, self.window.rate
         while self._announcements and frame.seq >= self._announcements[0].seq:
             announced = self._announcements.popleft()
             late = frame.seq - announced.seq
@@ -146,15 +144,15 @@ class AnnouncedSegmenter(AbstractSegmenter):
             labels = {"touch": 1} | dict(announced.labels)
             if missing := [name for name in self._task.names if name not in labels]:
                 raise InputError(f"the skin announces no {missing[0]}: give device.labels=prompted")
-            contacts = announced.contacts
             return RecordedGesture(
                 announced.number,
                 {name: labels[name] for name in self._task.names},
                 frame.t - late * self._length / announced.frames,
                 frame.segment,
                 lost=late,
-                contacts=contacts
-                if contacts is not None and (len(contacts), announced.rate) == window
+                contacts=announced.contacts
+                if announced.contacts is not None
+                and (len(announced.contacts), announced.rate) == (self.window.frames, self.window.rate)
                 else None,
             )
         return None

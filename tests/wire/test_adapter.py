@@ -26,12 +26,14 @@ OTHERS = {
     "decimal": Adapter(kind="text", decimal=",", separator=";"),
     "struct": Adapter(kind="binary", struct={"counter": "u1", "f": "(3,)<i2"}, head="aa 55"),
     "index": Adapter(kind="text", rows=0, index=0),
+    "hex": Adapter(kind="text", base=16),
 }
 ALL = {name: read_adapter(name) for name in NAMED} | OTHERS | {"protocol": Adapter()}
 ROWS = st.lists(st.lists(st.integers(-9, 2000), min_size=1, max_size=5), max_size=30)
 TEXTS = st.one_of(
     st.binary(max_size=200),
     st.text(alphabet='0123456789,.;:-+eE \t\r\n"{}[]<>|nafov', max_size=300).map(str.encode),
+    st.just(b"1e308,1\n-1e308,1\n" + b"f" * 5000 + b",1\n"),
     ROWS.map(lambda rows: "".join(",".join(map(str, row)) + "\n" for row in rows).encode()),
 )
 
@@ -237,22 +239,20 @@ STREAMS: dict[str, tuple[Callable, np.ndarray, float | None]] = {
     "sixty-four channels": (joined(","), table(64), None),
     "signs and exponents": (joined(",", shape="%+.3e"), np.c_[table(2, 0, -300, 5), table(2)], None),
     "parentheses": (joined(",", before="(", after=")"), table(4), None),
-    "word before": (joined(",", before="DATA,"), table(4), None),
     "nmea-like": (joined(",", before="$FSR,", end="\r\n"), table(6), None),
     "units after": (joined(" N; ", shape=F2, after=" N"), FLOATS, None),
     "millivolts": (labelled("ch{}={}mV", " "), table(4), None),
     "labels blank": (labelled("Sensor {}: {}", ", "), table(3), None),
-    "labels semicolons": (labelled("c{} = {}", "; ", "\r\n"), table(9), None),
     "decimal comma tabs": (lambda n, r: joined("\t", shape=F2)(n, r).replace(b".", b","), FLOATS, None),
     "milliseconds": (clocked(20, first=88_213), table(4), 0.02),
-    "microseconds": (clocked(20_000, ";", first=5_000_000), table(4), 0.02),
     "seconds": (clocked(0.02, "\t", shape="%.3f"), table(4), 0.02),
     "counter of 256, ms": (clocked(20, counter=256), table(4), 0.02),
     "counter of 37, s": (clocked(0.02, counter=37, shape="%.2f"), table(4), 0.02),
-    "counter alone": (clocked(0, counter=10_000), table(4), None),
     "clock of 16 bits": (
         lambda n, r: b"%d,%s" % ((64_000 + 20 * n) % 65_536, joined(",")(n, r)), table(4), 0.02),
     "time of day": (lambda n, r: b"10:59:%06.3f %s" % (20 + n / RATE, joined(" ")(n, r)), table(4), None),
+    "date": (lambda n, r: b"2026/11/29 12:00:%02d;%s" % (n / RATE, joined(";")(n, r)), table(4), None),
+    "ISO": (lambda n, r: b"[2026-11-29T12:00:%06.3fZ] " % (n / RATE) + joined(",")(n, r), table(4), None),
     "json object": (in_json(lambda n, r: {f"s{k}": v for k, v in enumerate(r)}), FLOATS, None),
     "json nested": (
         in_json(lambda n, r: {"at": {"ms": 20 * n}, "pads": [list(r[:2]), list(r[2:])]}), table(4), 0.02),
@@ -266,6 +266,7 @@ STREAMS: dict[str, tuple[Callable, np.ndarray, float | None]] = {
     "word index value": (pairs("ch{}={}\n"), table(8), None),
     "word at the end": (joined(",", "ZZ", before="QQ,"), table(5), None),
     "hex": (lambda n, r: " ".join(f"{int(v):03X}" for v in r).encode() + b"\n", table(5, 0, 500, 90), None),
+    "names like hex": (lambda n, r: b"A0,F1\n" * (n % 20 == 3) + joined(",")(n, r), table(2), None),
     "nul": (joined(",", end="\n\0"), table(4), None),
     "bytes before": (lambda n, r: b"\xff\xfe&" + joined(",")(n, r), table(4), None),
     "colours": (joined(", ", before="\x1b[0;33mW skin: ", after="\x1b[0m"), table(4), None),
@@ -292,6 +293,7 @@ STREAMS: dict[str, tuple[Callable, np.ndarray, float | None]] = {
     "clock last": (lambda n, r: joined(",", "")(n, r) + b",%d\n" % (20 * n), table(4), 0.02),
     "sum last": (lambda n, r: joined(",", "")(n, r) + b",%d\n" % (int(sum(r)) & 255), table(4), None),
     "counter of 16": (clocked(0, counter=16), table(4), None),
+    "a line per board": (lambda n, r: b"L %d %d\nR %d %d\n" % tuple(r), table(4) - 30 * np.arange(4), None),
     "a line per name": (
         lambda n, r: "".join(f">f{k}:{v:.0f}\n" for k, v in enumerate(r)).encode(), table(4), None),
     "a line per pad": (
@@ -365,6 +367,7 @@ REFUSED = {
         lambda n: f"pad 2 = {pressed(n, 2)}\n" if pressed(n, 2) > 300 else "",
         "let the firmware send every frame",
     ),
+    "rows": (lambda n: f"{pressed(n, 0)},{pressed(n, 1)}\n{pressed(n, 2)}\n", "1 or 2 fields.*adapter"),
     "groups of digits": (lambda n: f"{1024 if n % 40 > 20 else 998:,};{500 + n % 7}\n", "no adapter reads"),
     "nothing changes": (lambda n: "12,13,14\n", "no value ever changes"),
 }
@@ -384,6 +387,7 @@ def test_letters_that_only_a_press_shows_are_no_decimal_numbers():
     lines, press = [b"%03X %03X 215\n" % pair for pair in counts], b"29F 212 215\n"
     frames = Decoder(adapter=proposed(lines)).feed(b"".join(lines) + press)
     assert frames[-1].valid.tolist() == [False, True, True]
+    assert proposed([b"A0,A1\n", *(b"%d,%d\n" % pair for pair in counts)]).names == ("A0", "A1")
     assert proposed([press if n % 20 == 7 else line for n, line in enumerate(lines)]).base == 16
 
 

@@ -203,7 +203,6 @@ def test_a_relative_path_is_looked_for_here_first(tmp_path, monkeypatch):
         ("x_m,y_m\n", "no sensor below the header"),
         ("x_m,y_m\n0.1,0.1\n0.1,abc\n", "line 3: y_m must be a number in m, got 'abc'"),
         ("x_m,y_m\n0.1,nan\n", "line 2: y_m must be a number in m, got 'nan'"),
-        ("x_m,y_m\n0.1\n", "line 2: y_m must be a number in m, got None"),
         ("x_m,y_m,depth_m\n0.1,0.1,\n", "line 2: depth_m must be a number in m, got ''"),
         ("x_m,y_m\n0.1,0.1\n80,40\n", "1 of 2 sensors lie outside.*sensor 2 at x = 80 m.*in metres"),
         ("x_m,y_m,depth_m\n0.1,0.1,0.02\n", "outside the body.*depth = 0.02 m"),

@@ -127,7 +127,6 @@ def test_positions_are_of_the_mapping_or_of_the_layout(tmp_path):
         ({"table": {"skip": 1}}, "cannot read .*unexpected keyword argument 'skip'; table has options"),
         ({"rate": 50000.0}, r"rows are 0.1 s apart \(10 Hz\), rate is 50000 Hz: is the time in us\?"),
         ({"time": {"column": "person", "unit": "s"}}, "'anna' in row 1, no number: .*table.parse_dates"),
-        ({"fields": "(?P<a"}, "fields is no regular expression"),
         ({"fields": "(?P<person>[0-9]+)"}, "a.csv does not fit the regular expression"),
         ({"segments": {"by": "contact", "threshold": 100.0}}, "has no touch: lower segments.threshold"),
         ({"positions": [[0, 0]], "size": [0.1, 0.1]}, "readings of 2 sensors, positions are 1"),

@@ -41,6 +41,7 @@ def convert_files(
     folder: Path,
     sensors: Sensors | None = None,
     size: tuple[float, float] | None = None,
+    differ: float = 1.1,
 ) -> Recording:
     """Return the recording of foreign files, as :func:`build_recording` does.
 
@@ -49,9 +50,11 @@ def convert_files(
         folder: of the files; or a file.
         sensors: of the configuration, for ``positions: layout``.
         size: of the configuration's sheet, m, for ``positions: layout``.
+        differ: largest ratio of the rates of files that are not resampled; clocks are not exact.
 
     Raises:
-        InputError: a file, a column, a label or a group is not as the mapping says; one sentence.
+        InputError: a file, a column, a label or a group is not as the mapping says, or files without a
+            common rate; one sentence.
     """
     paths = [folder] if folder.is_file() else sorted(p for p in folder.glob(mapping.files) if p.is_file())
     if not paths:
@@ -61,17 +64,22 @@ def convert_files(
     touches = [touch for path in paths for touch in _read_touches(mapping, path, folder)]
     if not touches:
         raise InputError(f"{folder} has no touch: lower segments.threshold, or segments.frames")
+    rates = [touch["rate"] for touch in touches]
+    if max(rates) > differ * min(rates):
+        raise InputError(
+            f"{folder} has files of {min(rates):.3g} to {max(rates):.3g} Hz: give rate, Hz, to which all of "
+            "them are resampled"
+        )
     parts: dict[str, Any] = {
         part: {name: [touch[part][name] for touch in touches] for name in touches[0][part]}
         for part in ("targets", "labels", "groups")
     }
-    classes = mapping.classes
     return build_recording(
         np.stack([touch["frames"] for touch in touches]),
-        float(np.median([touch["rate"] for touch in touches])),
+        float(np.median(rates)),
         **parts,
-        kinds=None if classes is None else [touch["kind"] for touch in touches],
-        names=None if classes is None or classes.names is None else [*map(str, classes.names)],
+        kinds=[touch["kind"] for touch in touches] if mapping.classes else None,
+        names=[*map(str, mapping.classes.names)] if mapping.classes and mapping.classes.names else None,
         about=mapping.about,
         positions=sensors if mapping.positions == "layout" else mapping.positions,
         size=size if mapping.size is None else mapping.size,
@@ -83,12 +91,10 @@ def _read_touches(mapping: ForeignFormat, path: Path, folder: Path) -> list[_Tou
     """Return the touches of a file."""
     table = read_table(mapping, path, folder)
     values = _readings(mapping, table, path)
-    rate, grid = _rate(mapping, table, path)
-    if grid is not None:
-        times = table[TIME].to_numpy()
-        values = np.stack([np.interp(grid, times, column) for column in values.T], axis=1).astype(np.float32)
-        after = np.searchsorted(times, grid).clip(1, len(times) - 1)
-        table = table.iloc[np.where(grid - times[after - 1] < times[after] - grid, after - 1, after)]
+    rate, step = _rate(mapping, table, path)
+    spans = np.arange(len(table))[:, None] + [0, 1]
+    if step is not None:
+        values, spans = _resample(values, table[TIME].to_numpy(), rate, step)
     if mapping.baseline == "idle":
         values = values - np.nanmedian(values, axis=0)
     elif mapping.baseline is not None:
@@ -100,9 +106,11 @@ def _read_touches(mapping: ForeignFormat, path: Path, folder: Path) -> list[_Tou
     }
     labels, groups = mapping.labels or {}, mapping.groups
     named = groups if isinstance(groups, Mapping) else {str(name): (name,) for name in groups}
-    sources = {f"labels.{name}": rule.column for name, rule in labels.items() if rule.column is not None}
-    sources |= {"classes": mapping.classes.column} if mapping.classes else {}
-    sources |= {f"groups.{name}": columns for name, columns in named.items()}
+    sources = {
+        **{f"labels.{name}": rule.column for name, rule in labels.items() if rule.column is not None},
+        **({"classes": mapping.classes.column} if mapping.classes else {}),
+        **{f"groups.{name}": columns for name, columns in named.items()},
+    }
     texts = {what: _joined(columns, table, path, what) for what, columns in sources.items()}
     touches = []
     for rows in _segments(mapping, values):
@@ -110,14 +118,15 @@ def _read_touches(mapping: ForeignFormat, path: Path, folder: Path) -> list[_Tou
         begin = mapping.segments.before if mapping.segments.by == "row" else 0
         part = values[rows][: len(frames) - begin]
         frames[begin : begin + len(part)] = part
-        where = f"{path}: rows {rows.start + 1} to {rows.stop}"
-        found = {what: [*dict.fromkeys(column[rows])] for what, column in texts.items()}
+        lines = slice(*spans[rows].ravel()[[0, -1]])  # rows of the file, all of its frames
+        where = f"{path}: rows {lines.start + 1} to {lines.stop}"
+        found = {what: [*dict.fromkeys(column[lines])] for what, column in texts.items()}
         for name in named:
             if len(one := found[f"groups.{name}"]) != 1 or one[0] is None:
                 raise InputError(
                     f"{where}: groups: each touch needs one {name}, got {' and '.join(map(str, one[:3]))}"
                 )
-        measured = {name: _reduce(name, column[rows]) for name, column in targets.items()}
+        measured = {name: _reduce(name, column[lines]) for name, column in targets.items()}
         touches.append(
             {
                 "frames": frames,
@@ -139,9 +148,11 @@ def _read_touches(mapping: ForeignFormat, path: Path, folder: Path) -> list[_Tou
 def _readings(mapping: ForeignFormat, table: pd.DataFrame, path: Path) -> np.ndarray:
     """Return the readings of a file, (R, S), float32, N."""
     its = mapping.channels
-    names: Sequence[Column] = its.columns
-    if isinstance(its.columns, str):
-        names = [name for name in table.columns if fnmatch(name, its.columns)] or [its.columns]
+    names: Sequence[Column] = (
+        [name for name in table.columns if fnmatch(name, its.columns)] or [its.columns]
+        if isinstance(its.columns, str)
+        else its.columns
+    )
     require_memory(
         8.0 * len(table) * len(names), f"{path}, {len(table)} rows,", "convert fewer files at a time"
     )
@@ -179,8 +190,8 @@ def _check_missing(values: np.ndarray, name: Column, path: Path, peak: float = 0
 
 def _rate(
     mapping: ForeignFormat, table: pd.DataFrame, path: Path, slower: float = 20.0, faster: float = 2000.0
-) -> tuple[float, np.ndarray | None]:
-    """Return the rate of frames, Hz, and the times to which rows are resampled, s, or None.
+) -> tuple[float, float | None]:
+    """Return the rate of frames, Hz, and the time between rows that are resampled, s; None: rows are frames.
 
     Rows that are ``slower`` or ``faster`` than ``rate`` by these factors have another unit of time.
     """
@@ -202,7 +213,36 @@ def _rate(
             f"{path}: its rows are {step:g} s apart ({1 / step:.3g} Hz), rate is {rate:g} Hz: is the time in "
             f"{unit}? Give time.unit: {unit}, or a rate near the one of the rows"
         )
-    return rate, np.arange(times[0], times[-1] + 0.5 / rate, 1 / rate)
+    return rate, step
+
+
+def _resample(
+    values: np.ndarray, times: np.ndarray, rate: float, step: float, pause: tuple[float, float] = (5, 10)
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the readings of frames (T, S), N, and the rows of each, from and to before, (T, 2).
+
+    A frame of faster rows holds the largest reading of its interval, as on a device
+    (:func:`skin.device.resampling.resample`), so that no short press is lost; missing ones do not count.
+    Slower rows are interpolated; a frame without a row has the nearest one.
+
+    Args:
+        values: of rows, (R, S), N, NaN where there is none.
+        times: (R,), s, rising.
+        rate: of frames, Hz.
+        step: between two rows, s.
+        pause: frames and steps; where rows are further apart than both, frames between them have no value.
+    """
+    half = 0.5 * min(step, 1 / rate)  # edges of frames are between rows
+    grid = np.arange(times[0], times[-1] + half, 1 / rate)
+    begins = np.searchsorted(times[:-1], grid - half)  # the last frame has the last row at least
+    some = np.diff(begins, append=len(times)) > 0
+    frames = np.stack([np.interp(grid, times, column) for column in values.T], axis=1).astype(np.float32)
+    frames[~some & (times[begins] - times[begins - 1] > max(pause[0] / rate, pause[1] * step))] = np.nan
+    if step * rate < 1:
+        frames[some] = np.fmax.reduceat(values, begins[some], axis=0)
+    nearest = np.searchsorted((times[1:] + times[:-1]) / 2, grid)
+    rows = np.stack([begins, np.append(begins[1:], len(times))], axis=1)
+    return frames, np.where(some[:, None], rows, nearest[:, None] + [0, 1])
 
 
 def _segments(mapping: ForeignFormat, values: np.ndarray) -> list[slice]:
@@ -218,7 +258,12 @@ def _segments(mapping: ForeignFormat, values: np.ndarray) -> list[slice]:
         rows = np.flatnonzero((np.abs(np.nan_to_num(values)) > its.threshold).any(axis=1))
         first = np.diff(rows, prepend=-its.gap - 2) > its.gap + 1
         begins = np.maximum(0, rows[first] - its.before)
-    return [slice(int(begin), int(begin) + its.frames) for begin in begins]
+    # A window within a pause shows nothing.
+    return [
+        slice(begin, begin + its.frames)
+        for begin in begins.tolist()
+        if not np.isnan(values[begin : begin + its.frames]).all()
+    ]
 
 
 def _reduce(name: str, values: np.ndarray) -> float:
@@ -311,8 +356,7 @@ def build_recording(
     parameters = {name: torch.tensor(values, dtype=torch.float32) for name, values in (targets or {}).items()}
     lists = {name: sorted(set(values)) for name, values in (groups or {}).items()}
     for name, values in (groups or {}).items():
-        numbers = [float(lists[name].index(text)) for text in values]
-        parameters[GROUP + name] = torch.tensor(numbers, dtype=torch.float32)
+        parameters[GROUP + name] = torch.tensor([float(lists[name].index(text)) for text in values])
     placed: dict[str, Any] = {"positions": positions if isinstance(positions, str) else "stated"}
     if isinstance(positions, Sensors):
         placed = {"positions": "layout", "directions": positions.normals.tolist()}
@@ -381,8 +425,9 @@ def _position(
     elif size is None:
         raise InputError("positions need size, the extent [x, y] of the sheet, m")
     else:
-        points = np.array([[*point, 0.0][:3] for point in positions], dtype=float)
-        sensors = Sensors(points, (footprint[0], footprint[1]))
+        sensors = Sensors(
+            np.array([[*point, 0.0][:3] for point in positions], dtype=float), (footprint[0], footprint[1])
+        )
     if len(sensors) != count:
         raise InputError(
             f"the files have readings of {count} sensors, positions are {len(sensors)}: correct "
@@ -415,9 +460,14 @@ def summarise_conversion(recording: Recording) -> str:
     """Return a line with the numbers of touches, readings, labels that are known, parameters and groups."""
     touches, metadata = recording.touches, recording.metadata
     (batch, time, sensors), labels = touches.readings.shape, touches.labels
-    parts = ["no labels"] if labels is None else []
-    for name, column in zip(recording.task.names, () if labels is None else labels.T, strict=False):
-        parts.append(f"{name} in {int(column.nansum())} of {int((~column.isnan()).sum())}")
+    parts = (
+        ["no labels"]
+        if labels is None
+        else [
+            f"{name} in {int(column.nansum())} of {int((~column.isnan()).sum())}"
+            for name, column in zip(recording.task.names, labels.T, strict=True)
+        ]
+    )
     parts += [f"classes {', '.join(metadata['classes'])}"] if "classes" in metadata else []
     names = [name for name in recording.parameters if name != CLASS and not name.startswith(GROUP)]
     parts += [f"{len(names)} parameters, as {', '.join(names[:3])}"] if names else []

@@ -119,8 +119,9 @@ def column_types(about: dict[str, Any]) -> dict[str, pa.DataType]:
 
 def _contact_names(about: dict[str, Any]) -> list[str]:
     """Return the columns of contacts, one contact after the other."""
-    count = about.get("contacts", 0)
-    return [f"{contact}_{name}" for contact in numbered("contact", count) for name in CONTACT]
+    return [
+        f"{contact}_{name}" for contact in numbered("contact", about.get("contacts", 0)) for name in CONTACT
+    ]
 
 
 _EACH_FRAME = ("reading_", "force", "D_s_", "D_t_", "contact_")

@@ -50,7 +50,8 @@ class ChannelColumns:
     Attributes:
         columns: in the order of the sensors; or a pattern such as ``ch*``.
         unit: a force (N, mN, kN, g, gf, kg, kgf, lbf), or any other with ``scale``.
-        scale: N per unit, one or one per column. A nominal one makes readings nominal.
+        scale: N per unit, one or one per column; negative where values fall with force. A nominal one makes
+            readings nominal.
     """
 
     columns: Annotated[Sequence[Column], MinLen(1)] | str
@@ -130,8 +131,9 @@ class ForeignFormat:
         table: how files are written: options of ``pandas.read_csv``, such as ``sep``, ``skiprows`` or
             ``na_values``, or, for a spreadsheet, of ``pandas.read_excel``.
         time: column of the time; None: there is none, or it means nothing.
-        rate: Hz, to which rows are resampled where there is a time; otherwise their rate. None: the median
-            rate of the rows.
+        rate: Hz, to which rows are resampled where there is a time; otherwise their rate. A frame holds the
+            largest reading of faster rows; slower ones are interpolated, except over a pause. None: the
+            median rate of the rows.
         baseline: what is subtracted from readings: the mean of so many first rows of a file; its median,
             if it is ``idle`` most of the time; None: nothing.
         labels: name -> rule of a binary label.

@@ -290,8 +290,9 @@ class Simulated(ImperfectionSettings, AbstractDevice):
                 "data.stream=true: leave that out, or the materials' relaxation"
             )
         self.size, self.sensors = self.body.size, self.layout.sensors(self.body)
-        errors = self.position_error, self.seed, self.footprint_error
-        self.true_sensors = misplace(self.sensors, self.size, *errors)
+        self.true_sensors = misplace(
+            self.sensors, self.size, self.position_error, self.seed, self.footprint_error
+        )
         settings = read_touch(self.touch)
         task = TOUCH_OR_NOT if self.stream else TOUCH_SLIDING if self.direction else TOUCH
         self.task = task.with_labels(tuple(settings.labels))
@@ -429,9 +430,9 @@ class Simulated(ImperfectionSettings, AbstractDevice):
             jobs = [partial(self._windows, cut, complete, stream, (*key, n)) for n, cut in enumerate(cuts)]
         else:
             labels = self.sampler.balanced(count, generator(stream, *key, 0))
-            arguments = complete, stream
             jobs = [
-                partial(self._batch, labels[cut], *arguments, (*key, 1 + n)) for n, cut in enumerate(cuts)
+                partial(self._batch, labels[cut], complete, stream, (*key, 1 + n))
+                for n, cut in enumerate(cuts)
             ]
         return [Part(cut.stop - cut.start, job) for cut, job in zip(cuts, jobs, strict=True)]
 
@@ -495,8 +496,15 @@ class Simulated(ImperfectionSettings, AbstractDevice):
         true_values = {} if strain is None else {"strain": (strain[movie.index] * movie.scale).amax(1)}
         # Windows of streams get the label touch, too.
         task = TOUCH.with_labels(tuple(self.sampler.settings.labels)) if self.stream else self.task
-        measured = movie.force, displacement, movie.parameters | true_values
-        return Recording(touches, task, self.size, self.sensors.footprint, *measured)
+        return Recording(
+            touches,
+            task,
+            self.size,
+            self.sensors.footprint,
+            movie.force,
+            displacement,
+            movie.parameters | true_values,
+        )
 
     def _apply_imperfections(self, true: Recording, noise: np.random.Generator) -> Recording:
         """Return true readings with the imperfections of the device."""

@@ -401,9 +401,8 @@ class Skins(ImperfectionSettings, AbstractDevice):
 
     def blank(self) -> AbstractDevice:
         """Return a device with a touch of the same shapes on the skin of body and layout."""
-        sensors = len(self.sensors)
-        empty = torch.zeros(1, self.window, sensors)
-        geometry = torch.ones(sensors, len(GEOMETRY))
+        empty = torch.zeros(1, self.window, len(self.sensors))
+        geometry = torch.ones(len(self.sensors), len(GEOMETRY))
         positions = torch.from_numpy(self.sensors.positions).float()
         rate = float(read_touch(self.touch).rate)
         touches = Touches(empty, empty == 0, positions, None, rate, geometry=geometry)

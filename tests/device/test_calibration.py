@@ -61,9 +61,7 @@ def test_true_readings_behind_raw_ones():
 @pytest.mark.parametrize(
     ("text", "reason"),
     [
-        ("hello", "is no calibration"),
         ("format: 2", "is no calibration"),
-        ("format: 1\ncount: 2\n", "is no calibration"),
         ("a: [", "cannot read"),
         ("format: 1\ncount: 2\nsensors: {gian: 1}", "sensors takes gain, .* got gian"),
         ("format: 1\ncount: 2\nsensors: {gain: [1]\n  ,noise: [1, 2]}", "as many numbers"),

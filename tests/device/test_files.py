@@ -142,7 +142,6 @@ def changed(path: Path, change=None, rows=None) -> Path:
         (lambda about: about | {"units": {"reading": "kgf"}}, None, r"has the units .*kgf"),
         (lambda about: about | {"format": 2}, None, r"has format 2, this version reads format 1"),
         (lambda about: about | {"gestures": 0}, None, r"description.gestures=0 must be greater than or equ"),
-        (lambda about: about | {"frames": 0}, None, r"description.frames=0 must be greater than or equal"),
     ],
 )
 def test_other_rows_or_units_are_refused(tmp_path, change, rows, message):
@@ -212,13 +211,10 @@ def test_shards_are_the_whole(folder, whole):
     ("changes", "message"),
     [
         ({"version": 2}, r"has version 2, not 1: use the version of this program that wrote it"),
-        ({"version": None}, r"version=None must be"),
         ({"shards": [20, 30]}, r"00001.parquet is not the shard that manifest.json describes: delete it"),
-        ({"shards": []}, r"manifest.json.shards=\[\]"),
         ({"gestures": 51}, r"has gestures 51, not 50"),
         ({"units": {"reading": "kgf"}}, r"has units {'reading': 'kgf'}, not"),
         ({"config_hash": "456"}, r"00000.parquet is not the shard"),
-        ({"other": 1}, r"has no setting other"),
     ],
 )
 def test_another_manifest_is_refused(folder, changes, message):

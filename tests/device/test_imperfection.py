@@ -178,8 +178,6 @@ def test_further_sensors_of_a_calibrated_device_may_die():
     assert alive == {1, 2}
     with pytest.raises(InputError, match=r"device.dead=25 of 25 sensors leaves none alive"):
         Imperfection(dead=25).constants(25, generator())
-    with pytest.raises(InputError, match=r"device.dead=3 of 3 sensors leaves none alive"):
-        Imperfection(dead=3, calibration=CALIBRATION).constants(3, generator())
     with pytest.raises(InputError, match=r"the calibration has 3 sensors, the layout 25"):
         imperfection.constants(25, generator())
 

@@ -43,11 +43,9 @@ def test_selected_touches(moving, index):
         (touches, {"valid": torch.ones(4, 6, 3)}),
         (touches, {"positions": torch.zeros(2, 3)}),
         (touches, {"labels": torch.zeros(3, 4)}),
-        (touches, {"contacts": torch.zeros(4, 6, 3, 4)}),
         (touches, {"contacts": torch.zeros(4, 5, 3, 5)}),
         (recording, {"touches": touches(moving=True)}),
         (recording, {"force": torch.zeros(4, 5)}),
-        (recording, {"displacement": torch.zeros(4, 6, 3)}),
         (recording, {"parameters": {"speed": torch.zeros(3)}}),
     ],
 )

@@ -148,7 +148,8 @@ class CandidateReadings:
     Attributes:
         radii, span: least and largest radius, and their difference, m.
         size: of the body, (2,), m.
-        sensors: S, their number.
+        sensors: S, their number; of three axes, that of their channels.
+        axes: of a sensor, 1 or 3.
         friction: standard deviation of the tangential force along x and along y per newton; 0: without.
         boxes: the first boxes, which cover the surface and the radii.
         rows: (N, 4, L, S), float32: readings in their centres, N/N, and their derivatives by position and
@@ -158,7 +159,7 @@ class CandidateReadings:
     """
 
     def __init__(self, simulator: AbstractSimulator, body: AbstractBody, prior: FingertipPrior) -> None:
-        self.radii, self.size = prior.radii, np.array(body.size)
+        self.radii, self.size, self.axes = prior.radii, np.array(body.size), simulator.axes
         self.span = prior.radii[1] - prior.radii[0]
         largest = 0.8 * (simulator.axes > 1) if prior.friction is None else prior.friction
         self.friction = largest / math.sqrt(6)  # of a uniform fraction in a uniform direction

@@ -67,12 +67,14 @@ class Mechanics:
             InputError: there are no mechanics, or readings of contacts do not add up.
         """
         if device is None or getattr(device.model, "reading", None) == "equation10":
-            lacks = (
-                "this model has no simulated skin"
-                if device is None
-                else "readings of equation 10 do not add up"
+            raise InputError(
+                (
+                    "this model has no simulated skin"
+                    if device is None
+                    else "readings of equation 10 do not add up"
+                )
+                + ": use run=any_skin, or a run of simulator=solid"
             )
-            raise InputError(f"{lacks}: use run=any_skin, or a run of simulator=solid")
         settings = device.imperfection
         nominal = Noise(
             max(float(np.mean(settings.noise)), QUIET),

@@ -348,23 +348,29 @@ class Posterior:
         Raises:
             InputError: readings of another number of sensors.
         """
-        values, valued, clips = self._checked(readings, valid, saturated)
-        frames = zip(np.atleast_2d(values), np.atleast_2d(valued), np.atleast_2d(clips), strict=True)
-        estimates = [self._frame(Observation.of(*frame, self.noise)) for frame in frames]
-        return estimates if values.ndim == 2 else estimates[0]
+        checked = self._checked(readings, valid, saturated)
+        values, valued, clips = map(np.atleast_2d, checked)
+        estimates = [
+            self._frame(Observation.of(*frame, self.noise))
+            for frame in zip(values, valued, clips, strict=True)
+        ]
+        return estimates if checked[0].ndim == 2 else estimates[0]
 
     def _checked(
         self, readings: np.ndarray, valid: np.ndarray | None, saturated: np.ndarray | None
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return readings, N, which have a value, and which exceed the largest force."""
-        values, sensors = np.asarray(readings, dtype=float), self.candidates.sensors
+        values, sensors, axes = np.asarray(readings, float), self.candidates.sensors, self.candidates.axes
         if values.ndim not in (1, 2) or values.shape[-1] != sensors:
             raise InputError(
                 f"this skin has {sensors} sensors: give readings ({sensors},) or (T, {sensors}), N, got "
                 f"{values.shape}"
             )
         clips = values >= self.noise.clip if saturated is None else np.asarray(saturated, bool)
-        return values, np.isfinite(values) & (True if valid is None else np.asarray(valid, bool)), clips
+        # Of a channel along the surface, it is unknown at which of its two limits it is.
+        bounded = (np.arange(sensors) % axes == axes - 1) & (self.noise.clip < math.inf)
+        works = True if valid is None else np.asarray(valid, bool)
+        return values, np.isfinite(values) & works & (~clips | bounded), clips
 
     @_THREADS.wrap(limits=1, user_api="blas")
     def estimate_touch(
@@ -396,12 +402,12 @@ class Posterior:
         evidence, mixtures = self._several(frame, single, maximum)
         logs = np.array(evidence) + self._numbers[: len(evidence)]
         number, total = int(logs.argmax()), float(logsumexp(logs))
-        empty = frame.readings**2 @ frame.counts / frame.noise.floor
-        misfit = [empty, single.misfit, *(mixture.misfit for mixture in mixtures)][number]
-        fit = float(gammaincc(max(frame.counts.sum(), 1) / 2, misfit / 2))
-        if number > 1:
-            mixtures[number - 2] = self._search.walk(frame, mixtures[number - 2])
+        nothing = frame.readings**2 @ frame.counts / frame.noise.floor
+        misfits = [nothing, single.misfit, *(mixture.misfit for mixture in mixtures)]
+        fit = float(gammaincc(max(frame.counts.sum(), 1) / 2, misfits[number] / 2))
         clouds = [[], [single], *map(self._search.clouds, mixtures)]
+        if number > 1:
+            clouds[number] = self._search.clouds(self._search.walk(frame, mixtures[number - 2]))
         given = [tuple(sorted(map(self._summary, each), key=lambda one: -one.force)) for each in clouds]
         while len(given) < len(self._numbers):
             given.append((*given[-1], *given[1]))

@@ -440,6 +440,8 @@ def test_three_axes_tell_the_vector_of_the_force(three_axes):
     inside = np.mean([c.region().contains(touch[:2]) for c, touch in zip(contacts, touches, strict=True)])
     assert inside == pytest.approx(0.9, abs=0.08)
     assert np.median(np.abs(means[:, 2:4] - force[:, :2])) < 0.5 * np.median(np.abs(force[:, :2]))
+    limited = np.arange(27) == 4  # along the surface: at which of its limits is unknown
+    assert same(posterior.estimate(readings[0], None, limited), posterior.estimate(readings[0], ~limited))
 
 
 def test_precise_readings_of_three_axes_have_finite_regions(three_axes):

@@ -209,11 +209,9 @@ GRAPH, PYG = "representation=graph model=gcn", "representation=graph model=pyg"
         ("model=efficientnet model.weights=random fusion=early", "1 or 3 channels, got 10: set fusion=late"),
         (f"{PYG} +model.network.headz=4", "model.network refuses its settings: .*headz"),
         ("representation=graph model=transformer model.width=10", "got model.width=10: set model.width=12"),
-        (f"{GRAPH} representation.count=0", "representation.count=6"),
         (f"{GRAPH} representation.positions=deformed representation.weight=none", "changes nothing at"),
         ("representation=interp representation.method=[]", r"^representation\.method=.*: as in .*=linear$"),
         ("representation=interp representation.method=[nearest,quintic]", "quintic.*: as in .*=linear$"),
-        ("representation.pixels=7", r"representation\.pixels=64"),
         ("trainer.precision=bf16-true", "give 32-true, 16-mixed or bf16-mixed"),
     ],
 )

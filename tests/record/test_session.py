@@ -1,7 +1,6 @@
 """A session on disk: whole files, one writer, going on; damage costs one gesture and changes none."""
 
 import logging
-import os
 import shutil
 import signal
 import subprocess
@@ -15,18 +14,16 @@ from hypothesis import strategies as st
 
 from skin.calibration.bench import BenchSettings, load_table, read_bench_session
 from skin.device.calibration import Curves
-from skin.device.resampling import Frame, Window
+from skin.device.resampling import Window
 from skin.errors import InputError
 from skin.record.session import SessionLog, locked, read_session
 from skin.wire.channels import UnitConversion
 from skin.wire.segmentation import ContinuousSegmenter
 from tests.core.test_files import full
 from tests.damage import DAMAGED_FILES, damaged, opened
+from tests.record.gestures import CONVERSION, METADATA, frame, segmented
 from tests.wire.memory import until
 
-METADATA = {"positions": [[0.0, 0.0, 0.0]] * 2, "unit": "adc", "bits": 10, "id": "arm-L"}
-METADATA |= {"window": 5, "rate": 50.0, "started_unix": 1.0}
-CONVERSION = UnitConversion(np.array([0.1, 0.2]), np.array([512.0, 500.0]), np.array([False, False]))
 BENT = Curves(np.array([0.5, 1.0]), np.array([2.0, 3.0]), {1: [[0.0, 1.0], [0.0, 2.0]]})
 OTHER = UnitConversion(np.array([0.3, -0.4]), np.array([300.0, 2.0]), np.array([False, True]), curves=BENT)
 NUMBERS = [0, 1, 2, 3, 5, 6]  # gesture 4 was broken off
@@ -34,32 +31,12 @@ WRITER = """
 import sys
 from pathlib import Path
 from itertools import count
-sys.path.insert(0, {tests!r})
-from test_session import CONVERSION, METADATA, frame, segmented
 from skin.record.session import SessionLog, locked
+from tests.record.gestures import CONVERSION, METADATA, frame, segmented
 with locked(Path(sys.argv[1])):
     print("locked", flush=True)
     segmented(SessionLog(Path(sys.argv[1]), METADATA), map(frame, count()), CONVERSION)
 """
-
-
-def frame(number, segment=0, valid=(True, True), limited=(False, False), after=""):
-    """Return a frame at 100 Hz whose first value is its number."""
-    values, t = np.array([number + 0.125, 512.0]), number / 100
-    return Frame(number, t, t, values, np.array(valid), segment, 0, after, np.array(limited))
-
-
-def segmented(log, frames, conversion, pause=0):
-    """Record frames as consecutive gestures of ten, with labels; return them as they were recorded."""
-    segmenter, gestures = ContinuousSegmenter(Window(5, 50.0, 2), max(log.done, default=-1) + 1), {}
-    for one in frames:
-        done = segmenter.add(one)
-        if done is not None:
-            done.labels = {"big": done.number % 2, "dangerous": 1}
-            gestures[done.number] = done, conversion
-            log.write((done, conversion))
-        log.add(one, one.t)
-    return gestures
 
 
 def everything(gestures):
@@ -270,8 +247,7 @@ def test_a_full_disk_keeps_what_was_finished_and_goes_on(tmp_path, size):
 
 def test_kill_9_keeps_finished_gestures_and_lets_go_of_the_lock(tmp_path):
     folder = tmp_path / "s"
-    code = WRITER.format(tests=os.path.dirname(__file__))
-    with subprocess.Popen([sys.executable, "-c", code, str(folder)], stdout=subprocess.PIPE) as writer:
+    with subprocess.Popen([sys.executable, "-c", WRITER, str(folder)], stdout=subprocess.PIPE) as writer:
         assert writer.stdout.readline() == b"locked\n"
         with pytest.raises(InputError, match="being recorded by another process: end that, or give another"):
             locked(folder)

@@ -200,7 +200,9 @@ def _expand(
         above = ((leaves.forces.mode - needed) / width)[:, None]
         hazard = np.exp(-0.5 * above**2 - log_ndtr(above)) / math.sqrt(2 * math.pi)
         which = rows[np.arange(len(rows)), :, 0, sensor]
-        rise = (turn + which[:, 1:] / which[:, :1]) * (which[:, :1] > LEAST) / width[:, None]
+        rise = (
+            (turn + which[:, 1:] / np.maximum(which[:, :1], LEAST)) * (which[:, :1] > LEAST) / width[:, None]
+        )
         share = hazard * (hazard + above)  # of the force that follows what the sensor needs
         sharper = information + (share * rise)[..., None] * rise[:, None]
         return slope + hazard * rise, sharper, turn - share * rise * width[:, None]

@@ -10,7 +10,7 @@ from scipy.special import log_ndtr, logsumexp, softmax
 
 from skin.inference.candidates import Boxes, CandidateReadings, FingertipPrior
 from skin.inference.likelihood import (
-    LEAST,
+    NEGLIGIBLE,
     Forces,
     Observation,
     blend,
@@ -201,7 +201,9 @@ def _expand(
         hazard = np.exp(-0.5 * above**2 - log_ndtr(above)) / math.sqrt(2 * math.pi)
         which = rows[np.arange(len(rows)), :, 0, sensor]
         rise = (
-            (turn + which[:, 1:] / np.maximum(which[:, :1], LEAST)) * (which[:, :1] > LEAST) / width[:, None]
+            (turn + which[:, 1:] / np.maximum(which[:, :1], NEGLIGIBLE))
+            * (which[:, :1] > NEGLIGIBLE)
+            / width[:, None]
         )
         share = hazard * (hazard + above)  # of the force that follows what the sensor needs
         sharper = information + (share * rise)[..., None] * rise[:, None]

@@ -10,7 +10,7 @@ from scipy.special import log_ndtr
 from skin.inference.candidates import FingertipPrior
 from skin.inference.noise import Noise
 
-LEAST = 1e-4
+NEGLIGIBLE = 1e-4
 """N/N, a reading so small that a sensor of it never clips."""
 
 _NEWTON = 3  # steps towards the most probable force; the last one changes it by less than 1 %
@@ -166,7 +166,7 @@ def needed_force(
     The further results are its standard deviation (N,), that of its difference to the log force of a
     candidate (N,), and the index (N,) of the sensor that needs it.
     """
-    needed = math.log(frame.noise.clip) - np.log(np.maximum(readings[:, 0, frame.clipped], LEAST))
+    needed = math.log(frame.noise.clip) - np.log(np.maximum(readings[:, 0, frame.clipped], NEGLIGIBLE))
     own = (frame.noise.floor + np.exp(2 * needed) * spread[:, frame.clipped]) / frame.noise.clip**2
     width = np.sqrt(own + 1 / fit.curvature[:, None])
     largest = range(len(needed)), ((fit.mode[:, None] - needed) / width).argmin(1)

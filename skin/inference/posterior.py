@@ -344,6 +344,7 @@ class Posterior:
             readings: (S,), N, or (T, S) of several frames.
             valid: same shape, bool: which have a value; None: those that are finite.
             saturated: same shape, bool: which exceed the largest force; None: those from ``noise.clip`` up.
+                Without a finite ``noise.clip``, and along the surface, they do not count.
 
         Raises:
             InputError: readings of another number of sensors.

@@ -114,12 +114,17 @@ def find_placements(session: BenchSession) -> Placements:
             continue
         rows.append((change, limited[low:high].mean(axis=0)))
         spans.append((starts[begin], starts[end]))
-    error, (change, parts) = (
-        noise * np.sqrt(1 / 5 + 1 / (2 * _REST)),
-        np.array(rows).reshape(-1, 2, len(noise)).swapaxes(0, 1),
+    change, parts = np.array(rows).reshape(-1, 2, len(noise)).swapaxes(0, 1)
+    error = noise * np.sqrt(1 / 5 + 1 / (2 * _REST))
+    return Placements(
+        change,
+        np.array(spans).reshape(-1, 2),
+        resting[block],
+        error,
+        unsteady,
+        reached=(np.abs(change) > np.maximum(_LOADED * error, _STEPS * steps)).any(axis=0),
+        limited=parts,
     )
-    reached = (np.abs(change) > np.maximum(_LOADED * error, _STEPS * steps)).any(axis=0)
-    return Placements(change, np.array(spans).reshape(-1, 2), resting[block], error, unsteady, reached, parts)
 
 
 def _find_loads(values: np.ndarray, limits: np.ndarray) -> np.ndarray:

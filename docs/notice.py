@@ -20,7 +20,8 @@ project follows. The Corpus of Social Touch (docs/data.md) and weights of Effici
 part of the project: whoever uses them obtains them under their own terms.
 
 Dependencies. None is part of the repository or of the wheel; pip installs them. The licences are those that
-the packages of constraints.txt state. `make notice` writes this list.
+the packages of constraints.txt state. `make notice` writes this list. The extra `optuna` (MIT, its plugin for
+Hydra too) and aeon (BSD-3-Clause, of experiments/peers) have environments of their own.
 
 """
 

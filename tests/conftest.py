@@ -148,7 +148,7 @@ def no_thread_survives():
     before = set(threading.enumerate())
     yield
     deadline = monotonic() + 10
-    # MLflow's pool and tqdm's monitor end with the interpreter; Python 3.11 lists threads of C code for ever.
+    # MLflow's pool and tqdm's monitor end with the interpreter. Threads of pytest-xdist may appear any time.
     lasting = ("Mlflow", "tqdm_monitor", "Dummy-")
     new = lambda thread: thread not in before and not thread.name.startswith(lasting)  # noqa: E731
     while left := [thread for thread in threading.enumerate() if new(thread)]:

@@ -7,7 +7,6 @@ left out.
 """
 
 import math
-import time
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, replace
@@ -47,7 +46,7 @@ from skin.touch.shapes import Shapes
 _COLUMNS = (
     "rms_mm", "median_mm", "force_median_%", "peak_median_%", "peak_covered_%", "covered_%", "covered_low_%",
     "covered_high_%", "area_median_mm2", "direction_median_deg", "grid_rms_mm", "grid_median_mm",
-    "grid_force_median_%", "grid_direction_median_deg", "ms_median", "ms_p99",
+    "grid_force_median_%", "grid_direction_median_deg",
 )  # fmt: skip
 
 
@@ -119,14 +118,12 @@ class Contact:
         described = Thickness(Mechanics(device.simulator, body, sensors, noise), posterior)
         candidates, works = posterior.candidates, np.ones(len(sensors), dtype=bool)
         first, length = self.counted if self.thickness != (1, 1) else (0, len(readings))
-        estimates, seconds = list[Any](), list[float]()
+        estimates = list[FrameEstimate]()
         for number, values in enumerate(readings):
             if number % length == 0:
                 learned = copy(described)
                 posterior.assume(candidates, noise)
-            start = time.process_time()
             estimates.append(posterior.estimate(values))
-            seconds.append(time.process_time() - start)
             if estimates[-1].fingertip and estimates[-1].number == 1:
                 learned.add(Observation.of(values, works, ~works, posterior.noise))
         counted = np.arange(len(readings)) % length >= first
@@ -136,8 +133,6 @@ class Contact:
         )
         if exact and self.grid:
             figures |= grid_errors(exact, body, noise, prior, readings, contacts[chosen, 0], self.grid)
-        times = 1e3 * np.quantile(seconds, [0.5, 0.99])
-        figures |= {"ms_median": float(times[0]), "ms_p99": float(times[1])}
         texts = {
             key: f"{each:.4g}".replace("nan", "") if isinstance(each, float) else str(each)
             for key, each in figures.items()

@@ -147,7 +147,7 @@ class ContactDetector:
         since: s, when the contact began; None without contact.
         void: (S,), bool, sensors that read below the baseline, faster than it may drift: something touched
             them when it was taken, or the device has changed it. They stay void until the next tare.
-        beyond: (S,), bool, sensors that became invalid while their reading was high.
+        beyond: (S,), bool, sensors that became invalid, or lost values, while their reading was high.
         lost: (S,), bool, sensors that fell to rest at once, though none of the others fell in proportion,
             until they rise again.
     """
@@ -184,9 +184,13 @@ class ContactDetector:
 
     def rises(self, readings: np.ndarray, valid: np.ndarray) -> np.ndarray:
         """Return which readings (T, S), N, rise by the threshold above the baseline, (T, S), bool."""
+        risen = valid & (readings - self.baseline >= self._threshold)
         # Back at the rest of the tare is no rise: a wire has contact again.
-        rested = np.abs(readings - self.rest) < self._threshold
-        return valid & (readings - self.baseline >= self._threshold) & ~rested
+        return risen & (np.abs(readings - self.rest) >= self._threshold)
+
+    def begins(self, readings: np.ndarray) -> np.ndarray:
+        """Return which readings (S,), N, are as high as where a touch begins, (S,), bool."""
+        return np.asarray(readings - self.rest >= _LIMITS.begun * self._threshold)
 
     def falls(self, readings: np.ndarray, valid: np.ndarray) -> np.ndarray:
         """Return which readings (T, S), N, are so far below their rest that no touch explains it.
@@ -201,13 +205,16 @@ class ContactDetector:
         """(S,), N, that a reading falls below its rest where neither noise nor drift explains it."""
         return np.maximum(self._threshold, _LIMITS.noise * self.noise)
 
-    def update(self, readings: np.ndarray, valid: np.ndarray, t: float) -> bool:
+    def update(
+        self, readings: np.ndarray, valid: np.ndarray, t: float, hidden: np.ndarray | bool = False
+    ) -> bool:
         """Update with the window that ends now; return whether something touches the skin.
 
         Args:
             readings: (T, S), N, tared.
             valid: (T, S), bool.
             t: s, on a clock that never goes back.
+            hidden: (S,), bool, sensors that have lost values since the last update, while they were high.
         """
         risen, recent = self.rises(readings, valid), slice(-self._recent, None)
         sound = valid & ~self.falls(readings, valid)
@@ -215,7 +222,7 @@ class ContactDetector:
         self._doubtful |= self._touched & ~sound[-1]
         released = np.where(self._doubtful, rested_long, rested) | self._fall(readings, valid)
         self._touched = risen[recent].any(axis=0) | (self._touched & ~released) | self._held
-        self._touched |= self._find_faults(readings, valid, risen[-1])
+        self._touched |= self._find_faults(readings, valid, risen[-1], hidden)
         self._doubtful &= self._touched
         if self._touched.any():
             if self.since is None:
@@ -225,15 +232,13 @@ class ContactDetector:
                 self.since = t - (len(risen) - 2 - before) / self._rate
         else:
             self.since = None
-        passed = 0.0 if self._updated_at is None else min(t - self._updated_at, _LIMITS.step)
-        self._follow(readings[recent], valid[recent], sound[recent].all(axis=0), passed)
-        self._updated_at = t
+        passed, self._updated_at = t - (t if self._updated_at is None else self._updated_at), t
+        self._follow(readings[recent], valid[recent], sound[recent].all(axis=0), min(passed, _LIMITS.step))
         return self.since is not None
 
     def _fall(self, readings: np.ndarray, valid: np.ndarray) -> np.ndarray:
         """Return which sensors, held since a restart, have fallen, (S,); find void baselines."""
-        recent = slice(-self._recent, None)
-        rises = np.where(valid, readings - self.rest, np.inf)[recent].max(axis=0)
+        rises = np.where(valid, readings - self.rest, np.inf)[-self._recent :].max(axis=0)
         self._top = np.where(valid[-1], np.maximum(self._top, readings[-1] - self.rest), self._top)
         fallen = self._held & (rises <= self._top - self._threshold)
         self._held &= ~fallen
@@ -242,12 +247,15 @@ class ContactDetector:
         self._peak = max(self._peak, float(np.where(valid[-1], readings[-1] - self.rest, 0.0).max()))
         return fallen
 
-    def _find_faults(self, readings: np.ndarray, valid: np.ndarray, risen: np.ndarray) -> np.ndarray:
+    def _find_faults(
+        self, readings: np.ndarray, valid: np.ndarray, risen: np.ndarray, hidden: np.ndarray | bool
+    ) -> np.ndarray:
         """Find sensors whose range ends, or whose wire breaks, while something presses them.
 
         Args:
             readings, valid: (T, S), the latest of a window of three or more.
             risen: (S,), bool, of the latest readings.
+            hidden: as of :meth:`update`.
 
         Returns:
             (S,), bool, such sensors that something still presses.
@@ -255,18 +263,20 @@ class ContactDetector:
         self.lost &= ~risen
         # Sensors that lag may fall a little later than others.
         before, latest, now = np.where(valid, readings - self.rest, np.nan)[-3:]
-        self.beyond = ~valid[-1] & (self.beyond | self._touched | (latest >= _LIMITS.begun * self._threshold))
+        self.beyond = hidden | ~valid[-1] & (
+            self.beyond | self._touched | (latest >= _LIMITS.begun * self._threshold)
+        )
         expected, visible = before[:, None] * self._fractions, minimum_visible(self.noise, self._threshold)
         shown = expected >= visible
         steady = np.abs(now - before) < expected / 2
         witnesses = shown & steady & (np.minimum(before, now) >= expected / 2)
-        fell = (before >= _LIMITS.high * self._threshold) & (np.abs(now) < self._threshold)
-        fell &= witnesses.any(axis=1) & (steady | ~shown).all(axis=1) & ~self.lost
+        fell = (before >= _LIMITS.high * self._threshold) & (np.abs(now) < self._threshold) & ~self.lost
+        fell &= witnesses.any(axis=1) & (steady | ~shown).all(axis=1)
         if fell.any():
             self.lost |= fell
             self._witnesses[fell], self._levels = witnesses[fell], before
-        still_pressed = self._witnesses & (now >= np.maximum(self._levels / 2, visible))
-        return self.beyond | self.lost & still_pressed.any(axis=1)
+        still = now >= np.maximum(self._levels / 2, visible)
+        return self.beyond | self.lost & (self._witnesses & still).any(axis=1)
 
     def _follow(self, readings: np.ndarray, valid: np.ndarray, sound: np.ndarray, passed: float) -> None:
         """Move baseline and rest towards the latest readings, as far as ``passed`` s allow.

@@ -81,6 +81,8 @@ Classify = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 _GAP = 0.5
 """s without a frame after which the history of the window is lost: longer than any burst of a bridge."""
+_RUN = 4
+"""Frames lost in a row that are no accident: of a link that loses a tenth, one run in 10,000 is as long."""
 
 
 @checked("detection")
@@ -142,8 +144,8 @@ class Engine:
         rate: of the training, Hz.
         detection: settings of the contact detection.
         patience: settings of debouncing.
-        presses: (S, S), N, readings of a press at the limit of ``dangerous`` on each sensor: where no valid
-            one rises by the threshold, the position is unknown. None: each sensor feels what is on itself.
+        presses: (S, S), N, readings of a press at the limit of ``dangerous`` on each sensor; None: each
+            sensor feels what is on itself.
         danger: combines the model's probability of ``dangerous`` with the largest reading; None: the model's.
         guarantee: of the threshold; it lapses while a watch reports a sensor. None: there is none.
 
@@ -177,13 +179,10 @@ class Engine:
         self._held = held_frames(self.detection.longest, self.rate, self.frames)
         self._shown = longest_shown(self._held, ceil(RELEASE * self.rate - 1e-9), self.frames)
         self.above = 0.5 if self.patience.above is None else self.patience.above
-        self._responds = (
-            np.eye(self.sensors) > 0 if self.presses is None else self.presses >= self.detection.threshold
-        )
         self._losses = _Losses()
         self._latest: NewtonFrame | None = None
-        self._pause = 0.0  # s between the latest readings and those before
-        self._tick, self._decided = -1, True
+        # The pause is the time between the latest readings and those before, s.
+        self._pause, self._tick, self._decided = 0.0, -1, True
         self.reset()
 
     @property
@@ -191,8 +190,8 @@ class Engine:
         """(S, S), readings of other sensors under a touch, relative to that of the sensor; None: unknown."""
         if self.presses is None:
             return None
-        own = np.maximum(np.diagonal(self.presses), 1e-9)
-        return np.asarray(self.presses / own[:, None] - np.eye(self.sensors))
+        own = np.maximum(np.diagonal(self.presses), 1e-9)[:, None]
+        return np.asarray(self.presses / own - np.eye(self.sensors))
 
     def reset(self, raised: np.ndarray | None = None, noise: np.ndarray | None = None) -> None:
         """Forget readings, alarm and contact, after a tare of the untouched skin.
@@ -202,12 +201,14 @@ class Engine:
                 have touched it. None: no rest is stored.
             noise: (S,), N, standard deviation of the readings of the untouched skin; None: as before.
         """
-        raised = np.zeros(self.sensors) if raised is None else raised
-        self.detector.reset(raised >= self.detection.threshold)
+        self._high = self._hidden = np.zeros(self.sensors, dtype=bool)
+        self.detector.reset(self._high if raised is None else raised >= self.detection.threshold)
         self.detector.noise = self.detector.noise if noise is None else noise
         self.window.clear()
-        shape = self.frames, self.sensors
-        self._idle = np.zeros(shape, dtype=np.float32), np.ones(shape, dtype=bool)
+        self._idle = (
+            np.zeros((self.frames, self.sensors), dtype=np.float32),
+            np.ones((self.frames, self.sensors), dtype=bool),
+        )
         self.alarm, self._peak_probability, self._ended = False, 0.0, -inf
         label, patience = self.patience.label, self.patience
         self._touch, self._danger = Debounce(label, label), Debounce(patience.alarm, patience.calm)
@@ -253,9 +254,8 @@ class Engine:
         """Return whether the history of the window is lost with these readings."""
         if self._latest is None:
             return False
-        pause = readings.t - self._latest.t
         restarted = readings.frame.segment != self._latest.frame.segment
-        return restarted or (pause > _GAP and pause > 3 * self.window.period)
+        return restarted or readings.t - self._latest.t > max(_GAP, 3 * self.window.period)
 
     def _add(self, readings: NewtonFrame) -> bool:
         """Add readings to the window; return whether a decision is due."""
@@ -271,8 +271,12 @@ class Engine:
         sent = readings._replace(mask=readings.mask & ~(Reason.FROZEN | Reason.IMPLAUSIBLE))
         newtons = np.where(readings.mask & Reason.IMPLAUSIBLE, np.inf, readings.newtons)
         self.window.add(Frame(None, t, t, newtons, sent.usable, 0, frame.lost, frame.after, sent.saturated))
+        no_number = readings.mask & (Reason.MISSING | Reason.IMPOSSIBLE | Reason.IMPLAUSIBLE)
+        # What is lost while a reading is high may be a force beyond the range, and all of a tap.
+        self._hidden = self._hidden | self._high & ((no_number > 0) | (frame.lost >= _RUN))
+        self._high = np.where(no_number, self._high, self.detector.begins(readings.newtons))
         # What a channel does all the time must not hide what frames do in a contact.
-        failed = readings.mask & ~before.mask & (Reason.MISSING | Reason.IMPOSSIBLE)
+        failed = no_number & ~before.mask & ~Reason.IMPLAUSIBLE
         self._losses.add(frame.lost + failed.any(), t, self.detector.since is not None)
         tick, self._tick = self._tick, floor((t + 1e-6) * DECISIONS)  # a rounding of the clock
         return tick != self._tick
@@ -285,7 +289,8 @@ class Engine:
         self._decided = True
         readings, valid = window.values.astype(np.float32), window.valid & (latest.mask & Reason.FROZEN == 0)
         below = self.detector.falls(readings, valid)
-        self.detector.update(readings, valid, latest.t)
+        self.detector.update(readings, valid, latest.t, self._hidden)
+        self._hidden = np.zeros_like(self._hidden)
         risen = bool(self.detector.rises(readings, valid).any())
         readings, valid = self._fill(readings, valid & ~below & ~self.detector.lost, window.before)
         blind, notes = self._find_blind(valid[-1], below[-1])
@@ -324,7 +329,7 @@ class Engine:
         return readings, valid
 
     def _find_blind(self, valid: np.ndarray, below: np.ndarray) -> tuple[tuple[int, ...], tuple[Note, ...]]:
-        """Return the sensors where a touch would stay undetected, and the notes on a decision.
+        """Return the sensors where a touch may stay undetected, and the notes on a decision.
 
         Args:
             valid, below: (S,), bool, sensors whose latest reading can be used; sensors below rest.
@@ -333,15 +338,15 @@ class Engine:
         # A tap may come and go; but a device of the rate of a slow model may lose two frames, too.
         paused = bool(self._pause > max(_GAP / 2, 2.5 / self.rate))
         changed = np.isin(np.arange(self.sensors), self.changed)
-        blind = ~self._responds[:, valid & ~void].any(axis=1) | void | paused | changed
-        masked = blind & ~(void | below | beyond | lost | paused | changed)
+        # A neighbour that responds need not tell a dangerous press from others.
+        blind = ~valid | void | paused | changed
         sensors = {
             "below": below,
             "void": void,
             "over_range": beyond,
             "lost_wire": lost,
             "changed": changed,
-            "masked": masked,
+            "masked": ~(valid | void | below | beyond | lost | paused | changed),
         }
         notes = [Note(code, _numbers(which)) for code, which in sensors.items() if which.any()]
         if self.guarantee is not None:
@@ -364,7 +369,7 @@ class Engine:
         # A touch that leaves the window looks shorter than it was, so a press would become a tap.
         finished = touched and decision.time - self._ended > 2 * self.patience.label
         labels = self._debounce_labels({} if finished else probabilities, decision.time, period)
-        notes = self._collect_notes(decision.draft.notes, probabilities, touched)
+        notes = self._collect_notes(decision.draft.notes, probabilities, touched or touching)
         if "dangerous" in probabilities:
             labels |= {"dangerous": self.alarm}
             probabilities |= {"dangerous": max(self._peak_probability, probabilities["dangerous"])}

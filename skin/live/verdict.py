@@ -14,11 +14,11 @@ NOTES = {
     "stale": "{text}",
     "below": "{sensors} below rest: a broken wire, device.scale of the wrong sign, or a tare under load",
     "void": "the baseline of {sensors} is void, as readings fell below it: tare the untouched skin",
-    "over_range": "no value of {sensors} since the force rose: beyond the range, or a broken wire",
+    "over_range": "values of {sensors} were lost under a force: beyond the range, or a broken wire",
     "unreadable": "more frames are unreadable in this contact than at rest: values beyond the range?",
     "lost_wire": "{sensors} fell to rest while neighbours stay pressed: a broken wire",
     "changed": "{sensors} have changed, by what the others read: check, calibrate or tare the skin",
-    "masked": "a touch near {sensors} would stay undetected: no valid reading",
+    "masked": "a touch near {sensors} may stay undetected: no valid reading",
     "pause": "no frame for {seconds:.2f} s, in which a touch may have come and gone",
     "near_threshold": "probably dangerous, but below the threshold of the alarm",
     "unverified": "{text}",
@@ -95,7 +95,7 @@ class Verdict:
         gap: whether frames are missing in the window.
         masked: sensors without a valid reading.
         contact: duration of the contact, s; None without contact.
-        unknown: sensors where a dangerous touch would stay undetected, because no valid sensor would respond.
+        unknown: sensors where a dangerous touch may stay undetected: they have no valid reading.
         notes: on what may be wrong, the gravest first.
         agreeing: label -> its probability in the latest window that agreed with the debounced label; where it
             is missing, that of this window.
@@ -116,7 +116,7 @@ class Verdict:
 
     @property
     def state(self) -> State:
-        """``touch``; ``unknown``, if a dangerous touch on a sensor would stay undetected; or ``no touch``."""
+        """``touch``; ``unknown``, if a dangerous touch on a sensor may stay undetected; or ``no touch``."""
         return (
             "touch" if self.touched or self.contact is not None else "unknown" if self.unknown else "no touch"
         )

@@ -125,13 +125,17 @@ def over_range(word):
     return lambda row: ",".join(word if value > 3 else f"{value:.3f}" for value in row)
 
 
+def cut(row):  # a line that breaks off above 3 N
+    return over_range("")(row)[: 20 if row.max() > 3 else None]
+
+
 def hexadecimal(row):
     """Write counts that have letters under a press alone: the whole line is unreadable."""
     return " ".join(f"{0x200 + (int(value / SCALE) if value > 0.3 else 5):03X}" for value in row)
 
 
-@pytest.mark.parametrize("write", [*map(over_range, ("ovf", "OL", "3e38")), hexadecimal])
-@pytest.mark.parametrize("length", [0.3, 4.0])
+@pytest.mark.parametrize("write", [*map(over_range, ("nan", "OL", "3e38")), cut, hexadecimal])
+@pytest.mark.parametrize("length", [0.1, 0.3, 4.0])
 def test_values_that_are_lost_under_a_press(write, length):
     presses = [(8 + 6 * n, 8 + 6 * n + length, 2 * n, 6.0) for n in range(3)]
     values = force(26, *presses)
@@ -141,8 +145,13 @@ def test_values_that_are_lost_under_a_press(write, length):
     seen = watch(stream, scale=SCALE if write is hexadecimal else 1.0)
     for begin, end, *_ in presses:
         assert seen.hidden(begin, end + 0.3) <= HIDDEN
-        touch = [look for look in seen.looks if begin + 0.2 < look.t < end]
+        after = begin + (HIDDEN if write is cut else 0.2)  # without frames there is no verdict
+        touch = [look for look in seen.looks if after < look.t < end]
         assert all(look.danger is not False for look in touch)
+        words = {word for look in seen.looks if begin < look.t < end + 1 for word in look.words}
+        assert "safe" not in words
+        # Of lines that are lost from the beginning nothing may be left.
+        assert words & {"dangerous", "dangerous?"} or (write, length) == (hexadecimal, 0.1)
     assert seen.states(5, 7.9) == {"no touch"}
 
 

@@ -183,7 +183,7 @@ def replay_presses(
     press: np.ndarray,
     count: int,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return which presses raise the alarm, (P,), bool, and which sensors work in them, (P, S), bool.
+    """Return which presses raise the alarm, (P,), bool, and which sensors work before them, (P, S), bool.
 
     Each press begins with an untouched skin, and with a new tare if the pause before it is long enough.
 
@@ -202,23 +202,23 @@ def replay_presses(
     """
     tare = Tare(convert, FEWEST / rate, rate)
     streams, noise, latest = defaultdict[int, list[NewtonFrame]](list), dict[int, np.ndarray | None](), -1
-    values, received = np.zeros(raw.shape[1]), np.flatnonzero(np.isfinite(raw).any(axis=1))
+    alarmed, works = np.zeros(count, dtype=bool), np.zeros((count, raw.shape[1]), dtype=bool)
+    values, begun, received = np.zeros(raw.shape[1]), 0, np.flatnonzero(np.isfinite(raw).any(axis=1))
     for row, lost in zip(received, np.diff(received, prepend=received[:1] - 1) - 1, strict=True):
         number, t, valid = int(press[row]), float(time[row]), np.isfinite(raw[row])
         values = np.where(valid, raw[row], values)
         readings = tare.add(Frame(None, t, t, values, valid, 0, int(lost)), number >= 0)
         if number < 0 <= latest:
             tare.restart()
-        latest = number
+        latest, begun = number, max(begun, number + 1)
+        if number < 0 and tare.conversion is not None:  # a press that silences a sensor, or all, counts
+            works[begun:] = ~tare.conversion.broken
         if readings is not None and tare.conversion is not None and number >= 0:
             streams[number].append(readings)
             noise[number] = tare.conversion.noise
     if not streams:
         raise InputError(f"no press can be judged: {tare.status or 'none follows a rest of the skin'}")
-    alarmed, works = np.zeros(count, dtype=bool), np.zeros((count, len(values)), dtype=bool)
-    for number, stream in streams.items():
-        alarmed[number] = alarms(stream, noise[number])
-        works[number] = np.mean([readings.usable for readings in stream], axis=0) > 0.5
+    alarmed[list(streams)] = [alarms(stream, noise[number]) for number, stream in streams.items()]
     return alarmed, works
 
 

@@ -7,6 +7,8 @@ Parameter: command, the words of ``skin live``. Without lines all is unknown and
 
 import json
 import subprocess
+from contextlib import suppress
+from datetime import UTC, datetime
 from queue import Empty, Queue
 from threading import Event, Thread
 
@@ -35,7 +37,6 @@ class SkinNode(Node):
         self._thread.start()
 
     def destroy_node(self) -> None:
-        """End ``skin live``, the threads and the node."""
         self._over.set()
         self._live.terminate()
         self._thread.join(2 * SILENCE)
@@ -66,21 +67,20 @@ class SkinNode(Node):
     def _publish(self, message: dict, line: str) -> None:
         if message["schema"] != SCHEMA:
             raise ValueError(f"schema {message['schema']}, this node reads {SCHEMA}")
+        late = (datetime.now(UTC) - datetime.fromisoformat(message["time"])).total_seconds() > SILENCE
         self._verdict.publish(String(data=line))
         self._contacts.publish(String(data=json.dumps(message["contacts"])))
         self._danger.publish(Bool(data=message["alarm"]))
-        self._unknown.publish(Bool(data=message["state"] == "unknown"))
-        self._stale.publish(Bool(data=message["stale"]))
+        self._unknown.publish(Bool(data=late or message["state"] == "unknown"))
+        self._stale.publish(Bool(data=late or message["stale"]))
 
 
 def main() -> None:
-    """Run the node until Ctrl-C."""
     rclpy.init()
     node = SkinNode()
     try:
-        rclpy.spin(node)
-    except KeyboardInterrupt:
-        pass
+        with suppress(KeyboardInterrupt):
+            rclpy.spin(node)
     finally:
         node.destroy_node()
         rclpy.try_shutdown()

@@ -61,7 +61,7 @@ class MessageQueue:
         file: open for writing.
         failed: called with the error when the file cannot be written any more, as its reader is gone.
         form: writes them.
-        waiting: messages for a slow reader; then the oldest is dropped.
+        waiting: most messages for a slow reader; then the oldest is dropped.
         ending: s in which a slow reader may take the last messages.
     """
 
@@ -69,8 +69,8 @@ class MessageQueue:
         self,
         file: IO[Any],
         failed: Callable[[Exception], object],
-        form: Form = write_json,
-        waiting: int = 256,
+        form: Form,
+        waiting: int,
         ending: float = 1.0,
     ) -> None:
         self._file, self._failed, self._form, self._most, self._ending = file, failed, form, waiting, ending
@@ -148,7 +148,8 @@ def write_events(
             queue.add({"event": event, **verdict_message(latest, *described, now)})
         return bool(chosen)
 
-    with MessageQueue(file, failed, form) as queue:
+    # An old verdict would tell a slow reader of a skin that is no longer so.
+    with MessageQueue(file, failed, form, 2 if wanted is VERDICTS else 256) as queue:
         write(monotonic(), "started")
         display.observers.append(observe)
         try:

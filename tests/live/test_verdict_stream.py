@@ -108,7 +108,7 @@ def test_a_reader_that_is_slow_delays_nothing_and_misses_the_oldest(shown):
         while numbers[-1] < 5_000:
             numbers.append(json.loads(lines.readline())["number"])
     assert numbers == sorted(numbers)
-    assert len(numbers) < 4_000
+    assert len(numbers) < 200  # of the pipe, and two
 
 
 def test_the_view_closes_with_the_reader_of_its_lines(shown):
@@ -124,7 +124,7 @@ def test_what_waits_is_written_before_the_end(shown):
         with os.fdopen(writing, "w", buffering=1) as file, write_events(shown, file, shown.close, VERDICTS):
             for _ in range(20):
                 shown.set_verdict(verdict(), monotonic())
-        assert [json.loads(line)["number"] for line in lines] == [*range(1, 21)]
+        assert [json.loads(line)["number"] for line in lines][-2:] == [19, 20]
 
 
 def test_each_change_is_a_line_with_its_time(tmp_path):

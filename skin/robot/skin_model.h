@@ -63,7 +63,8 @@ static struct {
   float feature[SKIN_SLOTS];
   /* What a program reads: */
   uint8_t state, alarm, touch;
-  uint8_t unknown; /* a sensor is below its rest, or gives no number: a touch on it is not known */
+  uint8_t unknown; /* a sensor is below its rest, or gave no number in the window: a touch on it is not known */
+  uint16_t lost;   /* decisions until all sensors have given numbers for a window */
   float probability[SKIN_LABELS];
 } skin;
 
@@ -711,7 +712,8 @@ static inline void skin_decide(void) {
   skin.danger = skin_debounce(skin.danger, dangerous, &skin.calming, SKIN_RISE, SKIN_FALL);
   skin.alarm = skin.danger || (skin.alarm && contact); /* latched until the contact ends */
   skin.touch = skin_debounce(skin.touch, contact || risen || learned, &skin.wanting, SKIN_WAIT, SKIN_WAIT);
-  skin.unknown = 0;
+  skin.unknown = skin.lost > 0;
+  skin.lost -= skin.lost > 0;
   for (int s = 0; s < SKIN_SENSORS; s++) skin.unknown |= skin_below(SKIN_FRAMES - 1, s) || !skin_tared(s);
   int touch = skin.touch || skin.alarm || contact;
   skin.state = touch ? SKIN_TOUCH : skin.unknown ? SKIN_UNKNOWN : SKIN_NO_TOUCH;
@@ -771,6 +773,7 @@ static inline int skin_add(const float *newtons) {
       skin.rest[s] += (change * change - skin.rest[s]) * 8.0f / (SKIN_FRAMES * SKIN_PHASES * SKIN_TICK + 8);
       skin.baseline[s] = newtons[s];
     }
+    if (!isfinite(newtons[s])) skin.lost = SKIN_FRAMES * SKIN_PHASES; /* beyond the range? */
     int16_t value = skin_clamp((newtons[s] - skin.zero[s]) / SKIN_STEP);
     for (int p = 0; p < SKIN_PHASES; p++) {
       int16_t *largest = &skin.ring[p][skin.newest[p]][s];

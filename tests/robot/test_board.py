@@ -108,6 +108,9 @@ def test_states_and_alarms_are_those_of_the_live_view(board, touches):
     assert np.column_stack([answers[:, 0] == 2, answers[:, 1:3] > 0]).tolist() == states
     unknown = {said.state for said, state in zip(verdicts, answers[:, 0], strict=True) if state == 3}
     assert unknown == ({"unknown"} if touches and touches[0][3] < 0 else set())
+    values[-100:-90, 1] = np.nan  # a tap that a sensor does not tell
+    lost = asked(program, "frames", values).reshape(-1, 3 + SENSORS)[-18:, 0]
+    assert set(lost) <= {2, 3}
     assert asked(program, "frames", values * np.float32("nan"))[-3 - SENSORS] == 3  # broken from the start
     assert bool(touches) == answers[:, 1].any()
 
@@ -186,7 +189,7 @@ def test_every_frame_of_the_sketch_of_a_skin_is_read(tmp_path):
     frames = decoder.feed("".join(lines).encode())
     assert (decoder.sensors, [frame.seq for frame in frames]) == (6, list(range(1200)))
     assert decoder.frame_format.check == "crc16"
-    assert decoder.header == Header(1, 6, 100.0, "adc", 10, "uno")
+    assert decoder.header == Header(1, 6, 100.0, "adc", 10)
     assert decoder.stats.bad.total() + decoder.stats.lost + decoder.stats.resets == 0
     values = np.stack([frame.values for frame in frames])
     assert values[:, 5] - values[:, 0] == pytest.approx(500, abs=97)

@@ -7,6 +7,7 @@ const uint8_t N = sizeof(PINS);
 const uint32_t BAUD = 115200;         // 16 channels reach about 149 Hz at it, 64 channels 43 Hz
 const uint32_t PERIOD_US = 10000;     // 100 Hz
 const uint16_t BITS = 10;             // resolution of the converter
+const char ID[] = "";                 // as in " id=left": a name that no other board has
 const uint16_t HEADER_EVERY = 1 + 1000000 / PERIOD_US;  // frames between two headers: a second
 
 char line[32 + 6 * N];
@@ -44,7 +45,7 @@ void loop() {
   if ((int32_t)(now_us - due_us) > 0) due_us = now_us;  // late: slower rather than in bursts
   if (seq % HEADER_EVERY == 0) {
     char header[80];
-    sprintf(header, "# skin proto=1 n=%u rate=%lu unit=adc bits=%u id=uno", N, 1000000UL / PERIOD_US, BITS);
+    sprintf(header, "# skin proto=1 n=%u rate=%lu unit=adc bits=%u%s", N, 1000000UL / PERIOD_US, BITS, ID);
     send(header);
   }
   int length = sprintf(line, "%lu,%lu", (unsigned long)seq++, (unsigned long)now_us);

@@ -268,8 +268,7 @@ class Adapter:
             titles = ["values.*" if name == "values" else name for name in groups]
             return partial(read_pattern, numbers, pattern, marks, rows), titles
         find, named = partial(find_row, pattern), "name" in groups
-        if named and self.rows is None:
-            keys = keys or learn_keys(find, lines)
+        keys = keys or (learn_keys(find, lines) if named and self.rows is None else ())
         return partial(read_named, numbers, find, keys if named else ()), keys
 
     def _lines(self, data: bytes) -> list[bytes]:

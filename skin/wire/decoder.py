@@ -3,7 +3,7 @@
 import re
 from collections import Counter, deque
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import inf
 from typing import Literal
 
@@ -231,10 +231,11 @@ class Decoder:
             return False
         self.frame_format, self.sensors = detected, detected.sensors
         self.stats.format, self.stats.check = detected.name, detected.check
+        # The next connection may send the keys in another order.
+        self.adapter = replace(self.adapter, names=detected.keys) if detected.keys else self.adapter
         if (roles := detected.roles) and roles.unit is not None:
             self._clock.expect(roles.unit, self.adapter.time_unit is not None)
-        self._all_valid = np.ones(self.sensors, dtype=bool)
-        self._all_valid.flags.writeable = False
+        self._all_valid = np.broadcast_to(np.True_, self.sensors)  # nobody can change it
         if len(self._latest) != self.sensors:
             self._latest = np.zeros(self.sensors)
         return True

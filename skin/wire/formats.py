@@ -4,7 +4,7 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
-from functools import cached_property
+from functools import cached_property, partial
 from math import inf, nan
 from typing import Literal
 
@@ -13,7 +13,7 @@ import numpy as np
 from skin.device.resampling import Check, FrameError
 from skin.errors import InputError
 from skin.wire.clocks import UNITS
-from skin.wire.lines import Reader
+from skin.wire.lines import Reader, read_named
 from skin.wire.protocol import Line, RawFrame
 
 
@@ -167,6 +167,15 @@ class FrameFormat:
     def sensors(self) -> int:
         """S."""
         return self.roles.sensors * (self.rows or 1) if self.roles else 0
+
+    @property
+    def keys(self) -> tuple[str, ...]:
+        """Names by which the values of a piece are found; empty: they are in a fixed order."""
+        return (
+            tuple(self.reader.args[2])
+            if isinstance(self.reader, partial) and self.reader.func is read_named
+            else ()
+        )
 
     def names(self, count: int) -> Sequence[str]:
         """Return the names of ``count`` fields; empty: they have none."""

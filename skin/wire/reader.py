@@ -49,7 +49,7 @@ class Port:
         silence: s without a byte after which a socket is closed and opened again, if it is to be reconnected;
             None or 0: never. A computer that lost its power closes no connection. Serial ports are left open:
             the system reports when one is unplugged, and opening one restarts many boards.
-        tare: duration of the tare, s.
+        tare: duration of the tare, s; without one nothing would tell a frozen device from one at rest.
         scale: N per unit of the device; negative if values fall with force.
         calibration: calibration file.
         sensitivity: N per unit of a sensor by its data sheet; the conversion to N must agree with it.
@@ -68,7 +68,7 @@ class Port:
     timeout: PositiveFloat = 6.0
     backoff: Annotated[tuple[PositiveFloat, PositiveFloat], RISING] = (1.0, 10.0)
     silence: NonNegativeFloat | None = 5.0
-    tare: NonNegativeFloat = 2.0
+    tare: PositiveFloat = 2.0
     scale: float | None = None
     calibration: str | None = None
     sensitivity: PositiveFloat | None = None

@@ -448,7 +448,7 @@ class SerialSource:
         minimum = max(self.settings.tare, minimum)
         # Other formats than our protocol have no header.
         patience = HEADER if self.settings.frames.kind == "protocol" else 0.0
-        notify("reading the untouched skin: keep off" if self.settings.tare else "reading the rate")
+        notify("reading the untouched skin: keep off")
         while True:
             try:
                 frames += skin.read(1)

@@ -263,8 +263,7 @@ class Tare:
 
     def take_earlier(self) -> list[NewtonFrame]:
         """Return the frames before the first conversion in newtons, once that is known, and once."""
-        conversion = self.conversion
-        earlier = [] if conversion is None else [conversion.convert(*waiting) for waiting in self._waiting]
+        earlier = [self.conversion.convert(*each) for each in self._waiting] if self.conversion else []
         self._waiting.clear()
         return earlier
 

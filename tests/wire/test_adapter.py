@@ -427,6 +427,15 @@ def test_what_is_no_stream_is_shown():
         propose([(0.0, noise[:2000]), (1.0, noise[2000:])])
 
 
+def test_keys_keep_their_channels_at_a_reconnection():
+    decoder = Decoder(adapter=Adapter(kind="json"))
+    for keys in ("abc", "cab"):
+        rows = [{key: ord(key) + n % 2 for key in keys} for n in range(200)]
+        frames = decoder.feed("".join(json.dumps(row) + "\n" for row in rows).encode(), 1.0)
+        assert frames[-1].values.tolist() == [98, 99, 100]
+        decoder.restart()
+
+
 def test_the_shipped_adapters_read_what_they_are_named_after():
     rng = np.random.default_rng(3)
     rows = np.round(rng.normal(0, 50, (200, 3, 4)), 2)

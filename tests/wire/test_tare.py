@@ -122,7 +122,6 @@ def settled(force, seconds, **how):
     [
         (np.zeros(1000), 2.0, 500, 2.1, []),
         (PRESS, 2.0, 500, 6.4, ["the skin is touched: let go"]),
-        (np.full(1000, 50.0), 0.0, 0, 1.1, []),  # without a tare, only the rate is read
     ],
 )
 def test_an_untouched_skin_gives_its_baseline_and_every_frame_until_then(force, seconds, rest, end, said):

@@ -130,8 +130,6 @@ def test_a_loop_of_ones_own_trains(capsys):
     ("settings", "message"),
     [
         ({"simulater": "naive"}, "Could not override 'simulater'"),
-        ({"simulator": "x"}, "Could not find 'simulator/x'"),
-        ({"data": {"gesturs": 3}}, "Could not override 'data.gesturs'"),
         ({"data": {"gestures": "few"}}, "Value 'few' of type 'str' could not be converted to Integer"),
         ({"data": None}, "must be a string or a list"),
         ({"device": {"offset": -1}}, "device.offset=-1 must be greater than or equal to 0"),
@@ -186,7 +184,6 @@ def test_other_arrays_are_refused(example, change, message):
         ({"body": 3}, "body must be a body such as skin.Sheet"),
         ({"layout": "gird"}, "there is no layout gird: give one of file, grid"),
         ({"layout": "none.csv"}, "no layout file none.csv"),
-        ({"layout": 3}, "layout must be a layout such as skin.Grid"),
     ],
 )
 def test_a_skin_that_cannot_be_built_is_refused(settings, message, tmp_path):

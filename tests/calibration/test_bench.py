@@ -114,8 +114,6 @@ def test_a_gauge_of_its_own_file_is_delayed(tmp_path):
 @pytest.mark.parametrize(
     ("text", "reason"),
     [
-        ("time,a\n", "no rows"),
-        ("time\n1\n2\n", "no column of a sensor"),
         ("a,b\n1,2\n3,4\n", "time must be columns of numbers, found a, b"),
         ("time,a\n1,2\n", "at least two rows are needed, got 1"),
         ("t_us,a\n5,2\n5,3\n5,2\n", "after row 0 it goes from 5e-06 to 5e-06 s: check the clock"),

@@ -23,15 +23,12 @@ def refused(capsys, monkeypatch):
     [
         ("simulater=solid", "there is no setting or group simulater: did you mean simulator?"),
         ("device.nois=3", "there is no setting or group device.nois: did you mean device.noise?"),
-        ("touch.rat=3", "there is no setting or group touch.rat: did you mean touch.rate?"),
         ("model.widths=[3]", "group model.widths, but model=gcn has it"),
         ("simulator=solit", "there is no simulator=solit: did you mean solid? There are fem, naive, solid"),
-        ("simulator=xyz", "there is no simulator=xyz: there are fem, naive, solid\n"),
         ("seed=[", "seed=["),
         ("out=bench (1).csv", "out=bench (1).csv cannot be read as an override, quote its value"),
         ("data.name=a,b", "Ambiguous value for argument 'data.name=a,b'"),
         ("qqqq=3", "there is no setting or group qqqq: --help lists them"),
-        ("qqqq.rate=3", "there is no setting or group qqqq.rate: --help lists them"),
         ("trainer.qqqq=3", "Could not override 'trainer.qqqq'"),  # of Hydra: with + it reaches the class
     ],
 )

@@ -58,8 +58,6 @@ def test_a_sweep_has_a_line_for_each_thickness_and_grid(run, tmp_path):
     ("given", "words"),
     [
         (["design.margin=0.04"], "margin=0.04 m leaves no place on 0.24 x 0.08 m: give less than 0.04"),
-        (["design.touches=3"], "design.touches=3 must be"),
-        (["design.noise=0"], "design.noise=0 must be greater than 0"),
         (["design.radii=[0.01,0.002]"], "must be a range [minimum, maximum]"),
         (["device.noise=[0.05,0.2]"], "design.noise="),
         (["design=sweep", "simulator=naive"], "needs a simulator with mechanics: set simulator=solid"),

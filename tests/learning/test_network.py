@@ -210,7 +210,6 @@ GRAPH, PYG = "representation=graph model=gcn", "representation=graph model=pyg"
         (f"{PYG} +model.network.headz=4", "model.network refuses its settings: .*headz"),
         ("representation=graph model=transformer model.width=10", "got model.width=10: set model.width=12"),
         (f"{GRAPH} representation.positions=deformed representation.weight=none", "changes nothing at"),
-        ("representation=interp representation.method=[]", r"^representation\.method=.*: as in .*=linear$"),
         ("representation=interp representation.method=[nearest,quintic]", "quintic.*: as in .*=linear$"),
         ("trainer.precision=bf16-true", "give 32-true, 16-mixed or bf16-mixed"),
     ],

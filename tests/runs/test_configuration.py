@@ -179,7 +179,6 @@ RULES = ["experiment=rules", "simulator=naive", "data.gestures=80", "device.test
     ("overrides", "same"),
     [
         (["tracking.uri=sqlite:///elsewhere.db", "tracking.resume=false", "tracking.threads=1"], True),
-        (["trainer.precision=bf16-mixed", "trainer.accelerator=gpu"], True),
         (["trainer.devices=2", "trainer.strategy=ddp", "+trainer.num_nodes=2"], True),
         (["+trainer.enable_progress_bar=true"], True),
         *(([one], False) for one in ("seed=1", "simulator=naive", "device.noise=1", "trainer.max_epochs=3")),

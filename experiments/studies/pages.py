@@ -82,7 +82,10 @@ def write_csv(frame: pd.DataFrame, path: Path) -> Path:
 
 def markdown(table: pd.DataFrame) -> str:
     """Return a table of texts as Markdown."""
-    lines = ["| " + " | ".join(line) + " |" for line in [list(table.columns), *table.to_numpy().tolist()]]
+    lines = [
+        "| " + " | ".join(line) + " |"
+        for line in [list(table.columns), *table.fillna("").to_numpy().tolist()]
+    ]
     return "\n".join([lines[0], "|" + "---|" * len(table.columns), *lines[1:]]) + "\n"
 
 

@@ -183,14 +183,10 @@ class ContactDetector:
         self._top[:] = -np.inf
 
     def rises(self, readings: np.ndarray, valid: np.ndarray) -> np.ndarray:
-        """Return which readings (T, S), N, rise by the threshold above the baseline, (T, S), bool."""
+        """Return which readings (..., S), N, rise by the threshold above the baseline, (..., S), bool."""
         risen = valid & (readings - self.baseline >= self._threshold)
         # Back at the rest of the tare is no rise: a wire has contact again.
         return risen & (np.abs(readings - self.rest) >= self._threshold)
-
-    def begins(self, readings: np.ndarray) -> np.ndarray:
-        """Return which readings (S,), N, are as high as where a touch begins, (S,), bool."""
-        return np.asarray(readings - self.rest >= _LIMITS.begun * self._threshold)
 
     def falls(self, readings: np.ndarray, valid: np.ndarray) -> np.ndarray:
         """Return which readings (T, S), N, are so far below their rest that no touch explains it.
@@ -229,7 +225,7 @@ class ContactDetector:
                 self._peak = 0.0
                 idle = np.flatnonzero(~risen.any(axis=1))
                 before = int(idle[-1]) if len(idle) else -1
-                self.since = t - (len(risen) - 2 - before) / self._rate
+                self.since = min(t, t - (len(risen) - 2 - before) / self._rate)
         else:
             self.since = None
         passed, self._updated_at = t - (t if self._updated_at is None else self._updated_at), t

@@ -211,8 +211,8 @@ def replay_presses(
         if number < 0 <= latest:
             tare.restart()
         latest, begun = number, max(begun, number + 1)
-        if number < 0 and tare.conversion is not None:  # a press that silences a sensor, or all, counts
-            works[begun:] = ~tare.conversion.broken
+        if number < 0 and readings is not None:  # a press that silences a sensor, or all, counts
+            works[begun:] = readings.usable
         if readings is not None and tare.conversion is not None and number >= 0:
             streams[number].append(readings)
             noise[number] = tare.conversion.noise

@@ -252,10 +252,10 @@ class Engine:
 
     def _interrupted(self, readings: NewtonFrame) -> bool:
         """Return whether the history of the window is lost with these readings."""
-        if self._latest is None:
-            return False
-        restarted = readings.frame.segment != self._latest.frame.segment
-        return restarted or readings.t - self._latest.t > max(_GAP, 3 * self.window.period)
+        latest = self._latest or readings
+        pause = readings.t - latest.t  # the period takes long to compute
+        restarted = readings.frame.segment != latest.frame.segment
+        return restarted or (pause > _GAP and pause > 3 * self.window.period)
 
     def _add(self, readings: NewtonFrame) -> bool:
         """Add readings to the window; return whether a decision is due."""
@@ -272,9 +272,11 @@ class Engine:
         newtons = np.where(readings.mask & Reason.IMPLAUSIBLE, np.inf, readings.newtons)
         self.window.add(Frame(None, t, t, newtons, sent.usable, 0, frame.lost, frame.after, sent.saturated))
         no_number = readings.mask & (Reason.MISSING | Reason.IMPOSSIBLE | Reason.IMPLAUSIBLE)
-        # What is lost while a reading is high may be a force beyond the range, and all of a tap.
-        self._hidden = self._hidden | self._high & ((no_number > 0) | (frame.lost >= _RUN))
-        self._high = np.where(no_number, self._high, self.detector.begins(readings.newtons))
+        # What is lost in a touch, more than by chance, may be a force beyond the range, and all of a tap.
+        self._hidden = self._hidden | self._high & (
+            (no_number & before.mask > 0) | (frame.lost >= _RUN > before.frame.lost)
+        )
+        self._high = np.where(no_number, self._high, self.detector.rises(readings.newtons, no_number == 0))
         # What a channel does all the time must not hide what frames do in a contact.
         failed = no_number & ~before.mask & ~Reason.IMPLAUSIBLE
         self._losses.add(frame.lost + failed.any(), t, self.detector.since is not None)

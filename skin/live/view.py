@@ -148,8 +148,8 @@ def write_events(
             queue.add({"event": event, **verdict_message(latest, *described, now)})
         return bool(chosen)
 
-    # An old verdict would tell a slow reader of a skin that is no longer so.
-    with MessageQueue(file, failed, form, 2 if wanted is VERDICTS else 256) as queue:
+    # A second of verdicts, as frames come in bursts: old ones tell of a skin that is no longer so.
+    with MessageQueue(file, failed, form, 24 if wanted is VERDICTS else 256) as queue:
         write(monotonic(), "started")
         display.observers.append(observe)
         try:

@@ -178,11 +178,16 @@ def test_a_restart_is_no_sign_of_life():
     assert watch(lines(values, restart=4.0)).states(16, 30) == {"unknown"}
 
 
-def test_frames_that_are_lost_at_random_make_no_touch_doubtful():
-    probability = np.random.default_rng(0)
-    kept = [data for data in lines(force(30, (8, 28, 4, 2.0))) if probability.random() > 0.1]
-    seen = watch(kept)
-    assert "unreadable" not in seen.notes(0, 30)
+@pytest.mark.parametrize("lost", ["frames", "values"])
+def test_what_is_lost_at_random_makes_no_touch_doubtful(lost):
+    probability, values = np.random.default_rng(0), force(30, (8, 28, 4, 2.0))
+    if lost == "frames":
+        stream = [data for data in lines(values) if probability.random() > 0.1]
+    else:
+        values[probability.random(values.shape) < 0.01] = np.nan
+        stream = [",".join(map(str, row)).encode() + b"\n" for row in values]
+    seen = watch(stream, scale=1.0)
+    assert not seen.notes(0, 30) & {"unreadable", "over_range"}
     assert {look.danger for look in seen.looks if 12 < look.t < 26} == {False}
 
 

@@ -33,6 +33,8 @@ from skin.core.files import CONF, ROOT, results, write
 from skin.core.messages import quiet
 from skin.device.resampling import Frame
 from skin.device.simulated import Simulated
+from skin.inference.noise import Noise
+from skin.inference.posterior import Posterior
 from skin.learning.network import Network
 from skin.live.engine import Detection, Engine
 from skin.runs.build import TorchModel, build_data, build_device, build_learner
@@ -99,8 +101,10 @@ def measure_generation(simulator: str, repeats: int, gestures: int = 4038) -> Fi
     The operator is warm; everything else starts from the seed: sampling, redraws, labels, rendering,
     readings, imperfections.
     """
-    config = training_config(f"simulator={simulator}", f"data.gestures={gestures}")
-    device, seeds = build_device(config).simulated("gestures are generated"), count()
+    device = build_device(training_config(f"simulator={simulator}", f"data.gestures={gestures}")).simulated(
+        "gestures are generated"
+    )
+    seeds = count()
     seconds = median_seconds(lambda: device.replace(data_seed=next(seeds)).touches("train"), repeats)
     return {"gestures_per_second": gestures / seconds}
 
@@ -127,6 +131,22 @@ def measure_training(row: str, repeats: int) -> Figures:
     assert isinstance(learner, Network)
     learner.fit(build_data(config, build_device(config)))
     return {"seconds_per_epoch": learner.seconds_per_epoch}
+
+
+def measure_contacts(number: int, repeats: int) -> Figures:
+    """Return the processor time of an estimate of so many contacts, ms: median and 99th percentile.
+
+    Of the default skin, in the frame of most force of a touch, on one thread.
+    """
+    device = build_device(
+        training_config("simulator=solid", "touch=fingertips", f"touch.contacts=[{number},{number}]")
+    ).simulated("contacts are estimated")
+    posterior, clock = Posterior(device.model, Noise(0.05, frames=10), device.body), time.process_time
+    seconds = [
+        timeit.timeit(partial(posterior.estimate, touch[touch.sum(1).argmax()]), timer=clock, number=1)
+        for touch in device.replace(test_gestures=100 * repeats).touches("test").readings.double().numpy()
+    ]
+    return dict(zip(("p50_ms", "p99_ms"), 1e3 * np.percentile(seconds, [50, 99]), strict=True))
 
 
 def measure_decoder(repeats: int, rate: float = 1000.0, sensors: int = 25) -> Figures:
@@ -217,6 +237,7 @@ BENCHMARKS: dict[str, Callable[[int], Figures]] = {
     },
     **{f"live.{row}": partial(measure_latency, row) for row in ("best_fresh", "any_skin")},
     "live.onnx": partial(measure_latency, "best_fresh", onnx=True),
+    **{f"contacts.{number}": partial(measure_contacts, number) for number in (1, 3)},
     "wire": measure_decoder,
 }
 """Name -> function of the number of repeats."""

@@ -127,17 +127,23 @@ class Contact:
             if estimates[-1].fingertip and estimates[-1].number == 1:
                 learned.add(Observation.of(values, works, ~works, posterior.noise))
         counted = np.arange(len(readings)) % length >= first
-        together = length - first if first else 1
         figures = summarise_estimates(
-            [*compress(estimates, counted)], contacts[chosen][counted], prior, together
+            [*compress(estimates, counted)],
+            contacts[chosen][counted],
+            prior,
+            length - first if first else 1,
         )
         if exact and self.grid:
             figures |= grid_errors(exact, body, noise, prior, readings, contacts[chosen, 0], self.grid)
-        texts = {
-            key: f"{each:.4g}".replace("nan", "") if isinstance(each, float) else str(each)
-            for key, each in figures.items()
-        }
-        return pd.DataFrame([{"row": subject.condition} | texts])
+        return pd.DataFrame(
+            [
+                {"row": subject.condition}
+                | {
+                    key: f"{each:.4g}".replace("nan", "") if isinstance(each, float) else str(each)
+                    for key, each in figures.items()
+                }
+            ]
+        )
 
     def _draw_contacts(
         self, body: AbstractBody, prior: FingertipPrior, count: int, rng: np.random.Generator

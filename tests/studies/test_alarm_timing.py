@@ -49,7 +49,7 @@ def test_an_alarm_stays_until_the_touch_ends(engine, course):
     found = [play_touch(subject, device, force, RATE, number) for number, force in enumerate(forces)]
     assert not any(one.early for one in found)
     raised = [one for one in found if one.raised == one.raised]
-    assert all(one.kept for one in found)
+    assert all(one.kept for one in raised)
     # Small trainings miss some; most must be there, and the alarm ends with the window that shows the touch.
     assert len(raised) >= len(found) / 2
     assert all(one.cleared < 4.5 for one in raised)

@@ -274,7 +274,7 @@ class Engine:
         no_number = readings.mask & (Reason.MISSING | Reason.IMPOSSIBLE | Reason.IMPLAUSIBLE)
         # What is lost in a touch, more than by chance, may be a force beyond the range, and all of a tap.
         self._hidden = self._hidden | self._high & (
-            (no_number & before.mask > 0) | (frame.lost >= _RUN > before.frame.lost)
+            ((no_number > 0) & ~before.usable) | (frame.lost >= _RUN > before.frame.lost)
         )
         self._high = np.where(no_number, self._high, self.detector.rises(readings.newtons, no_number == 0))
         # What a channel does all the time must not hide what frames do in a contact.

@@ -45,7 +45,8 @@ void loop() {
   if ((int32_t)(now_us - due_us) > 0) due_us = now_us;  // late: slower rather than in bursts
   if (seq % HEADER_EVERY == 0) {
     char header[80];
-    sprintf(header, "# skin proto=1 n=%u rate=%lu unit=adc bits=%u%s", N, 1000000UL / PERIOD_US, BITS, ID);
+    snprintf(header, sizeof(header), "# skin proto=1 n=%u rate=%lu unit=adc bits=%u%s", N,
+             1000000UL / PERIOD_US, BITS, ID);
     send(header);
   }
   int length = sprintf(line, "%lu,%lu", (unsigned long)seq++, (unsigned long)now_us);

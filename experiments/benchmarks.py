@@ -136,13 +136,13 @@ def measure_training(row: str, repeats: int) -> Figures:
 def measure_contacts(number: int, repeats: int) -> Figures:
     """Return the processor time of an estimate of so many contacts, ms: median and 99th percentile.
 
-    Of the default skin, in the frame of most force of a touch, on one thread. The posterior does not know
-    that gains differ by 5 %, so that it searches for three contacts in most frames: the slow case.
+    Of the default skin after its tare, in the frame of most force of a touch of 5 N or more, on one thread.
     """
-    device = build_device(
-        training_config("simulator=solid", "touch=fingertips", f"touch.contacts=[{number},{number}]")
-    ).simulated("contacts are estimated")
-    posterior, clock = Posterior(device.model, Noise(0.05, frames=10), device.body), time.process_time
+    touch = "touch=fingertips", "touch.force=5.0", f"touch.contacts=[{number},{number}]"
+    device = build_device(training_config("simulator=solid", "device.offset=0.0", *touch)).simulated(
+        "contacts are estimated"
+    )
+    posterior, clock = Posterior(device.model, Noise(0.05, gain=0.05), device.body), time.process_time
     seconds = [
         timeit.timeit(partial(posterior.estimate, touch[touch.sum(1).argmax()]), timer=clock, number=1)
         for touch in device.replace(test_gestures=100 * repeats).touches("test").readings.double().numpy()

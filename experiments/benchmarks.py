@@ -138,10 +138,15 @@ def measure_contacts(number: int, repeats: int) -> Figures:
 
     Of the default skin after its tare, in the frame of most force of a touch of 5 N or more, on one thread.
     """
-    touch = "touch=fingertips", "touch.force=5.0", f"touch.contacts=[{number},{number}]"
-    device = build_device(training_config("simulator=solid", "device.offset=0.0", *touch)).simulated(
-        "contacts are estimated"
-    )
+    device = build_device(
+        training_config(
+            "simulator=solid",
+            "device.offset=0.0",
+            "touch=fingertips",
+            "touch.force=5.0",
+            f"touch.contacts=[{number},{number}]",
+        )
+    ).simulated("contacts are estimated")
     posterior, clock = Posterior(device.model, Noise(0.05, gain=0.05), device.body), time.process_time
     seconds = [
         timeit.timeit(partial(posterior.estimate, touch[touch.sum(1).argmax()]), timer=clock, number=1)

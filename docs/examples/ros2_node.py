@@ -8,16 +8,16 @@ Parameter: command, the words of ``skin live``. Without lines all is unknown and
 import json
 import subprocess
 from contextlib import suppress
+from datetime import datetime
 from queue import Empty, Queue
 from threading import Event, Thread
-from time import gmtime, strftime, time
+from time import time
 
 import rclpy
 from rclpy.node import Node
 from std_msgs.msg import Bool, String
 
-SCHEMA = 1
-SILENCE = 1.0  # s; skin live prints a line every 0.5 s or more often
+SCHEMA, SILENCE = 1, 1.0  # s; skin live prints a line every 0.5 s or more often
 
 
 class SkinNode(Node):
@@ -54,8 +54,8 @@ class SkinNode(Node):
                 self._publish(json.loads(line), line.decode().strip())
             except Empty:
                 self._lose(f"no line for {SILENCE} s; exit code of skin live: {self._live.poll()}")
-            except ValueError as error:
-                self._lose(str(error))
+            except (ValueError, LookupError, TypeError) as error:
+                self._lose(f"not a line of skin live: {error!r}")
 
     def _lose(self, reason: str) -> None:
         for flag in (self._unknown, self._stale):
@@ -67,7 +67,7 @@ class SkinNode(Node):
     def _publish(self, message: dict, line: str) -> None:
         if message["schema"] != SCHEMA:
             raise ValueError(f"schema {message['schema']}, this node reads {SCHEMA}")
-        late = message["time"] < strftime("%Y-%m-%dT%H:%M:%S", gmtime(time() - SILENCE))
+        late = datetime.fromisoformat(message["time"].replace("Z", "+00:00")).timestamp() < time() - SILENCE
         self._verdict.publish(String(data=line))
         self._contacts.publish(String(data=json.dumps(message["contacts"])))
         self._danger.publish(Bool(data=message["alarm"]))

@@ -351,7 +351,7 @@ def print_calibration(calibration: Calibration, errors: HeldOutErrors | None = N
     )
     gains = pd.Series(calibration.sensors["gain"], dtype=float)
     groups: dict[str, Sequence[int] | np.ndarray] = {
-        **calibration.broken,
+        **{kind + " or never loaded" * (kind == "dead"): each for kind, each in calibration.broken.items()},
         "inverse, values fall with force": np.flatnonzero(calibration.signs < 0),
         "curved, as in a table": list(calibration.tables),
         f"weak, less than {_WEAK:.0%} of the median gain": np.flatnonzero(gains < _WEAK * gains.median()),

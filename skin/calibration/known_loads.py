@@ -234,7 +234,7 @@ def fit_known_load(device: Simulated, session: BenchSession, load: KnownLoad) ->
         session,
         rests.assign(gain=gains),
         signs,
-        {"dead": np.flatnonzero(loaded & ~placements.reached).tolist()},
+        {"dead": missed.tolist()},  # a gain that nobody knows hides any force
         {"placements": len(placements.change)}
         | {name: part for name, part in vars(load).items() if part}
         | (

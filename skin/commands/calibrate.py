@@ -13,6 +13,7 @@ calibrate.demo=true first writes the session of an emulated device: no hardware 
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Annotated, Any
 
 from annotated_types import Ge, Gt, Lt
@@ -36,8 +37,8 @@ def main(
     calibrate: dict[str, Any],
 ) -> None:
     """Print the errors on held-out presses, or what a known load gives, and write the calibration."""
-    if session is None:
-        raise InputError("which session? add session=bench.csv, or try session=demo.csv calibrate.demo=true")
+    if session is None or (calibrate["demo"] and Path(session).expanduser().exists()):
+        raise InputError("which session? add session=bench.csv; with calibrate.demo=true, that of a new file")
     by_load = any(value is not None for value in (weight, base, incline, downhill, height))
     if by_load and presses is not None:
         raise InputError("a known load replaces the gauge: leave out presses=, or weight= and base=")
@@ -70,10 +71,14 @@ def main(
             "or the clock wrong?"
         )
         sys.exit(1)
-    about = {**calibration.about, "session": session, "presses_file": presses}
     channels = list(ordered(recorded, settings).channels or ())
     print(
         write_calibration(
-            replace(calibration, about=about, channels=channels * (channels != sorted(channels))), out
+            replace(
+                calibration,
+                about={**calibration.about, "session": session, "presses_file": presses},
+                channels=channels * (channels != sorted(channels)),
+            ),
+            out,
         )
     )

@@ -1,6 +1,6 @@
 """Check the scale of a skin at a port with a known load on three sensors.
 
-    skin check device.port=/dev/ttyACM0 device.scale=0.039 weight=0.5 base=0.006
+    skin check device.port=/dev/ttyACM0 device.scale=0.039 weight=1.5 base=0.006
     skin check device.port=/dev/ttyACM0 device.calibration=mine.yaml
 
 The load is a second reference: a weight (kg) on a round base (radius, m), or a finger while a kitchen scale

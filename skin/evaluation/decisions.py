@@ -139,6 +139,8 @@ class ContactDetector:
         drift: N/s.
         fractions: (S, S), reading of each sensor under a touch on another, as a fraction of its reading;
             None: no sensor feels what is on another.
+        along: (S,), bool, channels of sites with three axes that measure along the surface: a touch lowers
+            them as well as it raises them.
 
     Attributes:
         baseline: (S,), N, above which readings rise.
@@ -159,8 +161,9 @@ class ContactDetector:
         threshold: float,
         drift: float = DRIFT,
         fractions: np.ndarray | None = None,
+        along: np.ndarray | bool = False,
     ) -> None:
-        self._rate, self._threshold, self._drift = rate, threshold, drift
+        self._rate, self._threshold, self._drift, self._along = rate, threshold, drift, along
         self._recent, self._long = (max(1, ceil(span * rate - 1e-9)) for span in (RELEASE, _LIMITS.rest))
         self._fractions = np.zeros((sensors, sensors)) if fractions is None else fractions
         self._witnesses = np.zeros((sensors, sensors), dtype=bool)
@@ -198,8 +201,8 @@ class ContactDetector:
 
     @property
     def _minimum(self) -> np.ndarray:
-        """(S,), N, that a reading falls below its rest where neither noise nor drift explains it."""
-        return np.maximum(self._threshold, _LIMITS.noise * self.noise)
+        """(S,), N, that a reading falls below its rest where neither noise, drift nor a touch explains it."""
+        return np.where(self._along, np.inf, np.maximum(self._threshold, _LIMITS.noise * self.noise))
 
     def update(
         self, readings: np.ndarray, valid: np.ndarray, t: float, hidden: np.ndarray | bool = False
@@ -301,4 +304,5 @@ class ContactDetector:
         # Noise alone must not lower the baseline, because it rises slowly.
         least = np.stack([away + max(lift, 0.0), away]) + _LIMITS.margin * self._threshold
         far = np.clip(least, falls, 0.0).min(axis=0)
-        return np.where(self._touched, 0.0, np.where(far < 0, far, np.clip(away, -rise, rise)))
+        pressed = self._touched | self._along & self._touched.any()
+        return np.where(pressed, 0.0, np.where(far < 0, far, np.clip(away, -rise, rise)))

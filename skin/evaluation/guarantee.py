@@ -248,10 +248,11 @@ class Guarantee:
     lapsed: str = ""
     verified: bool = True
 
-    def on_device(self, as_chosen: bool, verified: bool) -> "Guarantee":
-        """Return the guarantee for a device: it lapses with another contact threshold or drift."""
-        lapsed = self.lapsed or "live.touch or live.drift is another than it was made for" * (not as_chosen)
-        return replace(self, lapsed=lapsed, verified=verified)
+    def on_device(self, as_chosen: bool, in_range: bool, verified: bool) -> "Guarantee":
+        """Return the guarantee for a device: it lapses with another contact threshold or a short range."""
+        lapsed = "live.touch or live.drift is another than it was made for" * (not as_chosen)
+        short = f"a range ends below {MARGIN:g} x the limit" * (not in_range)
+        return replace(self, lapsed=self.lapsed or lapsed or short, verified=verified)
 
     def state(self, changed: Sequence[int]) -> Literal["valid", "unverified", "lapsed"]:
         """Return whether it holds for a live view; ``changed``: sensors that a watch reports."""
@@ -266,9 +267,8 @@ class Guarantee:
 
     def under(self, live: LiveConditions) -> "Guarantee":
         """Return the guarantee for a live view: it lapses at another rate or patience than its own."""
-        other = live.patience != self.patience
-        lapsed = f"live.patience.alarm is {live.patience:g} s, and not {self.patience:g}" * other
-        return replace(self, lapsed=lapsed).at(live.rate)
+        lapsed = f"live.patience.alarm is {live.patience:g} s, and not {self.patience:g}"
+        return replace(self, lapsed=lapsed * (live.patience != self.patience)).at(live.rate)
 
     def sentence(self) -> str:
         """Return the promise in words, with its conditions."""

@@ -371,7 +371,8 @@ class Posterior:
         # Of a channel along the surface, it is unknown at which of its two limits it is.
         bounded = (np.arange(sensors) % axes == axes - 1) & (self.noise.clip < math.inf)
         works = True if valid is None else np.asarray(valid, bool)
-        return values, np.isfinite(values) & works & (~clips | bounded), clips
+        # Infinity is more than any limit.
+        return values, (np.isfinite(values) | clips & (values > 0)) & works & (~clips | bounded), clips
 
     @_THREADS.wrap(limits=1, user_api="blas")
     def estimate_touch(

@@ -138,7 +138,9 @@ def estimate_contacts(posterior: "Posterior", nominal: "Noise", readings: MeanRe
     rounding = readings.step / 12**0.5
     # Without a tare, the device's offsets are unknown, too.
     frame, offset = (nominal.frame, nominal.offset) if readings.noise is None else (readings.noise, rounding)
-    limits = readings.values[readings.saturated]
+    # Of a channel along the surface, it is unknown at which of its two limits it is.
+    inwards = np.arange(1, 1 + len(readings.values)) % posterior.candidates.axes == 0
+    limits = readings.values[readings.saturated & inwards]
     # A sensor at its limit says that it would read more: than the least of them, if there are several.
     clip = max(float(limits.min()), QUIET) if len(limits) else np.inf
     posterior.noise = replace(

@@ -148,6 +148,7 @@ class Engine:
             sensor feels what is on itself.
         danger: combines the model's probability of ``dangerous`` with the largest reading; None: the model's.
         guarantee: of the threshold; it lapses while a watch reports a sensor. None: there is none.
+        along: (S,), bool, channels along the surface, as in :class:`ContactDetector`.
 
     Attributes:
         window: of the latest readings, N.
@@ -155,6 +156,7 @@ class Engine:
         above: probability above which a touch is dangerous.
         alarm: the latest verdict was dangerous, and the contact has not ended.
         changed: sensors that a watch reports, whose positions are unknown.
+        short: (S,), bool, sensors whose range ends below what a dangerous touch may read.
         device_rate: frames a second, Hz, as measured; 0: unknown.
     """
 
@@ -168,13 +170,20 @@ class Engine:
     presses: np.ndarray | None = None
     danger: DangerScore | None = None
     guarantee: Guarantee | None = None
+    along: np.ndarray | bool = False
     changed: tuple[int, ...] = field(default=(), init=False)
     device_rate: float = field(default=0.0, init=False)
+    short: np.ndarray | bool = field(default=False, init=False)
 
     def __post_init__(self) -> None:
         self.window = Window(self.frames, self.rate, self.sensors)
         self.detector = ContactDetector(
-            self.sensors, self.rate, self.detection.threshold, self.detection.drift, self.fractions
+            self.sensors,
+            self.rate,
+            self.detection.threshold,
+            self.detection.drift,
+            self.fractions,
+            self.along,
         )
         self._held = held_frames(self.detection.longest, self.rate, self.frames)
         self._shown = longest_shown(self._held, ceil(RELEASE * self.rate - 1e-9), self.frames)
@@ -191,7 +200,7 @@ class Engine:
         if self.presses is None:
             return None
         own = np.maximum(np.diagonal(self.presses), 1e-9)[:, None]
-        return np.asarray(self.presses / own - np.eye(self.sensors))
+        return np.where(self.along, 0.0, self.presses / own - np.eye(self.sensors))
 
     def reset(self, raised: np.ndarray | None = None, noise: np.ndarray | None = None) -> None:
         """Forget readings, alarm and contact, after a tare of the untouched skin.
@@ -273,8 +282,10 @@ class Engine:
         self.window.add(Frame(None, t, t, newtons, sent.usable, 0, frame.lost, frame.after, sent.saturated))
         no_number = readings.mask & (Reason.MISSING | Reason.IMPOSSIBLE | Reason.IMPLAUSIBLE)
         # What is lost in a touch, more than by chance, may be a force beyond the range, and all of a tap.
-        self._hidden = self._hidden | self._high & (
-            ((no_number > 0) & ~before.usable) | (frame.lost >= _RUN > before.frame.lost)
+        self._hidden = (
+            self._hidden
+            | self._high & (((no_number > 0) & ~before.usable) | (frame.lost >= _RUN > before.frame.lost))
+            | readings.saturated & self.short
         )
         self._high = np.where(no_number, self._high, self.detector.rises(readings.newtons, no_number == 0))
         # What a channel does all the time must not hide what frames do in a contact.
@@ -407,9 +418,8 @@ class Engine:
         notes = self._lasting | {note.code: note for note in present}
         # What makes a touch uncertain holds until it ends.
         self._lasting = {code: note for code, note in notes.items() if code in LASTING and touched}
-        if 0.5 < probabilities.get("dangerous", 0.0) <= self.above and touched and not self.alarm:
-            notes["near_threshold"] = Note("near_threshold")
-        return order_notes(notes.values())
+        near = 0.5 < probabilities.get("dangerous", 0.0) <= self.above and touched and not self.alarm
+        return order_notes([*notes.values(), *[Note("near_threshold")] * near])
 
     def _debounce_labels(
         self, probabilities: dict[str, float], time: float, period: float

@@ -19,7 +19,7 @@ from skin.device.resampling import Frame
 from skin.errors import InputError
 from skin.evaluation.alarm import choose_alarm_threshold
 from skin.evaluation.decisions import DRIFT, minimum_visible
-from skin.evaluation.guarantee import Guarantee
+from skin.evaluation.guarantee import MARGIN, Guarantee
 from skin.evaluation.operating_point import DangerScore, FinalThreshold, OperatingPoint
 from skin.inference.mechanics import Mechanics
 from skin.live.engine import DebounceSettings, Detection, Engine
@@ -87,19 +87,17 @@ class SelfTest:
         scale = (
             "only its range tests the scale"
             if device.maximum is not None  # too large or too small a force would leave the range
-            else "the device declares no range, so its scale is not checked"
+            else "the device declares no range (device.limits), so its scale is not checked"
         )
-        more = "" if raised.all() else f", {expected.sum()} with nominal settings"
-        say(f"{text}{more}; {silent and f'not on {silent}; '}{scale}")
-        text += f", not {expected.sum()}" + (f"; {missed} cannot raise it" if missed else "")
+        more = "" if raised.all() else f", {expected.sum()} with nominal settings; not on {silent}"
+        say(f"{text}{more}; {scale}")
+        text += f", not {expected.sum()}" + f"; {missed} cannot raise it" * bool(missed)
         if expected.mean() < self.minimum:
             raise InputError(
                 f"{text}, even with nominal settings: train another run, or a longer one; {_OVERRIDE}"
             )
-        few = (
-            raised[valid].sum() < self.found * expected[valid].sum() or conversion.broken.mean() > self.masked
-        )
-        if missed or few:
+        few = raised[valid].sum() < self.found * expected[valid].sum()
+        if missed or few or conversion.broken.mean() > self.masked:
             raise InputError(f"{text}: {self._suspect(conversion)} is most likely wrong; {_OVERRIDE}")
         # A threshold above the nominal one may hide weaker touches alone.
         if self.used.above > self.nominal.above:
@@ -137,13 +135,23 @@ class SelfTest:
 
         Their pressure is ``strength`` times the limit of ``dangerous``.
         """
-        engine, raised = replace(engine), list[bool]()
-        for number, sensor in enumerate(self._sensors):
-            rest, stream = _press(
-                number, number >= len(self.presses), strength * self.presses[sensor], conversion, device
-            )
-            raised.append(raises_alarm(engine, stream, conversion.noise, rest))
-        return np.array(raised)
+        engine = replace(engine)
+        return np.array(
+            [
+                raises_alarm(
+                    engine,
+                    conversion.noise,
+                    *_press(
+                        number,
+                        number >= len(self.presses),
+                        strength * self.presses[sensor],
+                        conversion,
+                        device,
+                    ),
+                )
+                for number, sensor in enumerate(self._sensors)
+            ]
+        )
 
     def _suspect(self, conversion: UnitConversion) -> str:
         """Return what hides presses: the mask, or settings in use that are not nominal, or the device's."""
@@ -165,16 +173,14 @@ class SelfTest:
         )
 
 
-def raises_alarm(
-    engine: Engine, stream: Sequence[NewtonFrame], noise: np.ndarray | None, rest: int = 0
-) -> bool:
+def raises_alarm(engine: Engine, noise: np.ndarray | None, rest: int, stream: Sequence[NewtonFrame]) -> bool:
     """Return whether a touch of the untouched skin raises the alarm.
 
     Args:
         engine: is reset.
-        stream: the readings.
         noise: (S,), N, standard deviation of the untouched skin; None: unknown.
         rest: number of readings at the beginning on which there is nothing to decide.
+        stream: the readings.
     """
     engine.reset(noise=noise)
     engine.remember(stream[:rest])
@@ -219,9 +225,7 @@ def _press(
     load = np.interp(time, corners, [0, 1, 1, 0])
     with np.errstate(all="ignore"):  # any scale is tried
         values = np.nan_to_num(conversion.raw(load[:, None] * press))
-        values = np.round(values) if device.whole else values
-        if (device.minimum, device.maximum) != (None, None):
-            values = np.clip(values, device.minimum, device.maximum)
+        values = np.clip(np.round(values) if device.whole else values, device.minimum, device.maximum)
     low, high = (
         np.inf * sign if limit is None else limit for sign, limit in zip((-1, 1), device.limits, strict=True)
     )
@@ -364,13 +368,17 @@ class LiveSetup:
             say(found.text)
         if found.state == "unverified":
             add_note(Note("unverified", detail=found.text))
+        presses, largest = nominal.presses, largest_force(conversion, source.raw_range)
+        if presses is not None:
+            engine.short = largest < MARGIN * np.diagonal(presses)
         if engine.guarantee is not None:
             engine.guarantee = engine.guarantee.on_device(
                 engine.detection == nominal.detection,
+                not np.any(engine.short),
                 # The mechanics of an emulated skin may be others than those of the guarantee.
-                source.port is None or found.state in ("checked", "declared"),
+                source.port is None
+                or (found.state in ("checked", "declared") and bool(np.isfinite(largest).all())),
             )
-        presses = nominal.presses
         if not test:
             say("no self-test: live.selftest=false")
         elif presses is None or not self.model.alarms:
@@ -408,8 +416,10 @@ class LiveSetup:
         """
         while (conversion := source.tare.conversion) is None:
             sleep(0.1)
-        patience = replace(engine.patience, above=point.threshold)
-        used, usual = (replace(each, patience=patience, danger=point.score) for each in (engine, nominal))
+        used, usual = (
+            replace(each, patience=replace(engine.patience, above=point.threshold), danger=point.score)
+            for each in (engine, nominal)
+        )
         if test and used.presses is not None:
             SelfTest(used.presses, used, usual).run(conversion, source.raw_range, say)
 
@@ -496,6 +506,13 @@ def watch_run(
     )
 
 
+def largest_force(conversion: UnitConversion, device: RawRange) -> np.ndarray:
+    """Return the largest force, (S,), N, that each sensor of a device can show; NaN where it is unknown."""
+    bounds = zip(device.limits, (device.minimum, device.maximum), strict=True)
+    least, most = np.array([bound if limit is None else limit for limit, bound in bounds], float)
+    return conversion.newtons(np.where(conversion.scale > 0, most, least))
+
+
 def engine_settings(
     model: Model,
     patience: DebounceSettings,
@@ -538,6 +555,8 @@ def engine_settings(
         model.presses,
         danger,
         guarantee,
+        # All channels of a site but the last.
+        np.append((np.diff(model.positions, axis=0) == 0).all(1), False),
     )
 
 

@@ -268,12 +268,11 @@ class Display:
             fresh = 1 if since is None else min(max(1, self._number - since), len(self._frames))
             latest = [self._frames[-1 - back] for back in range(fresh)]
             refusal = REFUSALS[self._refusal] if now - self._asked_at <= self.confirm else ""
-            line = ", ".join(filter(None, (refusal, self.line)))
             peak, number, valid = self._peak, self._number, self._valid
         values, saturated = (np.max(part, axis=0) for part in zip(*latest, strict=True))
-        readings = np.where(valid, values, 0.0), valid, saturated & valid
+        readings = np.where(valid, values, 0.0), valid, saturated & valid, assessment
         notes = *self.describe(assessment, now), self.contacts.tangential
-        return DisplayState(number, *readings, assessment, line, peak, *notes)
+        return DisplayState(number, *readings, ", ".join(filter(None, (refusal, self.line))), peak, *notes)
 
     def describe(self, assessment: Assessment, now: float) -> tuple[tuple[Note, ...], dict[str, Any]]:
         """Return what belongs to an assessment: the notes, the gravest first, and contacts."""

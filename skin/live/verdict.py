@@ -14,7 +14,7 @@ NOTES = {
     "stale": "{text}",
     "below": "{sensors} below rest: a broken wire, device.scale of the wrong sign, or a tare under load",
     "void": "the baseline of {sensors} is void, as readings fell below it: tare the untouched skin",
-    "over_range": "values of {sensors} were lost under a force: beyond the range, or a broken wire",
+    "over_range": "values of {sensors} were lost or cut off under force: beyond the range, or a broken wire",
     "unreadable": "more frames are unreadable in this contact than at rest: values beyond the range?",
     "lost_wire": "{sensors} fell to rest while neighbours stay pressed: a broken wire",
     "changed": "{sensors} have changed, by what the others read: check, calibrate or tare the skin",
@@ -25,7 +25,7 @@ NOTES = {
     "clock": "{text}",
     "provisional": "the threshold of the alarm is provisional and raises more false alarms{text}",
     "guarantee_lapsed": "a guarantee that has lapsed: {text}",
-    "guarantee_unverified": "a guarantee for a device whose scale is unverified: {text}",
+    "guarantee_unverified": "a guarantee for a device whose scale or range is unverified: {text}",
     "guarantee_valid": "guarantee: {text}",
 }
 """Code of each note -> its sentence, the gravest first."""

@@ -212,8 +212,11 @@ def show_in_terminal(display: Display, console: Console) -> Iterator[None]:
         refresh_per_second=8,
         transient=True,
     )
-    lines = write_events(display, console.file, display.close, CHANGES | {"change"})
-    with live if console.is_terminal else lines:
+    with (
+        live
+        if console.is_terminal
+        else write_events(display, console.file, display.close, CHANGES | {"change"})
+    ):
         yield
 
 
@@ -319,10 +322,10 @@ def show(
                 display.add_note(Note("provisional"))
             if live.verdicts is None:
                 opened.enter_context(show_in_terminal(display, Console()))
-            check = partial(setup.check, source, engine, nominal, live.selftest, _say, display.add_note)
-            test = partial(setup.check_final, source, engine, nominal, live.selftest, _say)
-            adopt = partial(next, adopt_final(final, test, engine, display), None)
-            loop = LiveLoop(source.skin, source.tare, engine, display, check, adopt)
+            given = source, engine, nominal, live.selftest, _say
+            adopt = adopt_final(final, partial(setup.check_final, *given), engine, display)
+            check = partial(setup.check, *given, display.add_note)
+            loop = LiveLoop(source.skin, source.tare, engine, display, check, partial(next, adopt, None))
             opened.callback(lambda: _say(f"{loop.verdicts} verdicts, {loop.line}"))
             gc.collect()  # a search among all that is loaded would stop the loop for 0.3 s, again and again
             gc.freeze()

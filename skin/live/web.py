@@ -117,8 +117,6 @@ def _application(display: Display) -> Starlette:
             }
         )
 
-    # Other host names are refused, so that pages of other sites cannot read the skin.
-    local = Middleware(TrustedHostMiddleware, allowed_hosts=[_HOST, "localhost"])
     return Starlette(
         routes=[
             Route(
@@ -133,7 +131,8 @@ def _application(display: Display) -> Starlette:
             Route("/pictures", pictures),
             Route("/tare", tare, methods=["POST"]),
         ],
-        middleware=[local],
+        # Other host names are refused, so that pages of other sites cannot read the skin.
+        middleware=[Middleware(TrustedHostMiddleware, allowed_hosts=[_HOST, "localhost"])],
     )
 
 

@@ -198,7 +198,7 @@ def reading_rows(mesh: Hexahedra, sensors: Sensors) -> sp.csr_array:
     fractions = np.zeros((len(sensors), len(mesh.lines[2])))
     np.put_along_axis(fractions, near, weights * ~tilted[:, None], axis=1)
     rows = sp.csr_array((len(sensors), 3 * len(mesh.nodes)))
-    parts = fractions[:, :, None] * sensors.measured[:, None]
+    parts = fractions[:, :, None] * (sensors.measured * np.sign(sensors.normals[:, 2:]))[:, None]
     for plane, axis in np.argwhere(np.abs(parts).max(axis=0) > 1e-9).tolist():
         rows = rows + sp.diags_array(parts[:, plane, axis]) @ _pressed(mesh, sensors, plane, axis)
     return rows + _stressed(mesh, sensors) if tilted.any() else rows

@@ -185,6 +185,7 @@ class Mujoco(ImperfectionSettings, AbstractDevice):
         """Draw touches: their objects, times, paths and forces."""
         # Size and danger follow from what is pressed: only dynamic and press, bits 1 and 2, are drawn.
         labels, side = balanced(count, random, range(0, 8, 2)), min(self.size)
+        least, most = self.pressure
         kinds, sizes = random.choice(self.objects, count), random.random((count, 2))
         geoms, half, area = zip(*map(draw_object, kinds, sizes, [side] * count), strict=True)
         # Turned as far as there is room.
@@ -192,15 +193,13 @@ class Mujoco(ImperfectionSettings, AbstractDevice):
         turned = np.abs(np.cos(angle))[:, None] * extents + np.abs(np.sin(angle))[:, None] * extents[:, ::-1]
         fits = (2 * turned + spare < self.size).all(axis=1)
         room = np.where(fits[:, None], turned, extents) + spare / 2
-        least, most = np.log(self.pressure)
-        drawn = draw_times(labels, self.settings, self.padded, random)
-        drawn |= {
+        drawn = draw_times(labels, self.settings, self.padded, random) | {
             "shape": np.array([self.objects.index(kind) for kind in kinds]),
             "geoms": np.array(geoms),
             "angle": np.where(fits, angle, 0),
             "low": -room,
             "high": room,
-            "force": np.exp(random.uniform(least, most, count)) * area,
+            "force": np.exp(random.uniform(np.log(least), np.log(most), count)) * area,
             "friction": random.uniform(*self.friction, count),
         }
         return drawn | draw_motion(labels[:, 1], drawn, self.settings, self.size, random.random((count, 4)))
@@ -298,8 +297,8 @@ class Mujoco(ImperfectionSettings, AbstractDevice):
         """Return the target position of an object at some times, (N, 3), m: in the model, with y and z up."""
         fraction = np.clip(np.minimum(times - begin, end - times) * self.settings.ramp / (end - begin), 0, 1)
         lift = _LIFT * np.clip(np.maximum(begin - times, times - end) / _APPROACH, 0, 1)
-        direction = np.array([np.cos(touch["direction"]), np.sin(touch["direction"])])
         moved = touch["speed"] * self.settings.rate * np.clip(times - begin, 0, None)
-        position = fold(touch["start"] + moved[:, None] * direction, touch["span"]) - touch["low"]
+        along = np.column_stack([moved * np.cos(touch["direction"]), moved * np.sin(touch["direction"])])
+        position = fold(touch["start"] + along, touch["span"]) - touch["low"]
         depth = touch["force"] / _STIFFNESS + _OVERLAP * np.cbrt(touch["force"] / _NOMINAL)
         return np.column_stack([(position - np.array(self.size) / 2) * [1, -1], lift - fraction * depth])

@@ -74,9 +74,13 @@ class Pressing:
             near = np.flatnonzero(np.isfinite(gaps).any(axis=0))
             totals = np.array([press.force[2] for press in presses]) / np.prod(self._body.cell)
             compliance = self.compliance[near[:, None], near]
-            start = _sink(gaps[:, near], totals * float(compliance.diagonal().mean()))
-            gap, total, begin = (torch.from_numpy(values) for values in (gaps[:, near], totals, start))
-            pressure[:, near] = solve_contact(compliance, gap, total, begin, iterations=1000).pressure
+            pressure[:, near] = solve_contact(
+                compliance,
+                torch.from_numpy(gaps[:, near]),
+                torch.from_numpy(totals),
+                torch.from_numpy(_sink(gaps[:, near], totals * float(compliance.diagonal().mean()))),
+                iterations=1000,
+            ).pressure
         return pressure.unflatten(1, self._body.shape)
 
     @torch.no_grad()
@@ -151,6 +155,8 @@ class MujocoSurface:
             self._site = model.site(site).id
         except KeyError as error:
             raise InputError(f"the model has no site {site!r}: {error.args[0]}") from error
+        if model.opt.enableflags & self._mujoco.mjtEnableBit.mjENBL_SLEEP:
+            raise InputError("objects that sleep have no contacts: leave out the model's flag sleep")
         x, y = ((np.arange(count) + 0.5) * cell for count, cell in zip(body.cells, body.cell, strict=True))
         self._cells = np.stack([*np.meshgrid(x, y), np.zeros(body.shape)], axis=-1).reshape(-1, 3)
         middle = np.array([*body.size, 0.0]) / 2
@@ -163,18 +169,22 @@ class MujocoSurface:
 
     def _find_carrier(self, site: str) -> int:
         """Return the number of the geom under the site; warn where it does not carry the whole skin."""
-        data = self._mujoco.MjData(self._model)
-        self._mujoco.mj_kinematics(self._model, data)
+        model, data = self._model, self._mujoco.MjData(self._model)
+        self._mujoco.mj_kinematics(model, data)
         points, axes = self._place(data)
-        owner = self._model.site_bodyid[self._site]
-        depth, numbers = self._cast(data, self._model.geom_bodyid == owner, points, axes[:, 2])
+        owner = model.site_bodyid[self._site]
+        # Other geoms, such as those of a robot's looks, have no contacts.
+        solid = ((model.geom_contype | model.geom_conaffinity) > 0) | np.isin(
+            np.arange(model.ngeom), [model.pair_geom1, model.pair_geom2]
+        )
+        depth, numbers = self._cast(data, solid & (model.geom_bodyid == owner), points, axes[:, 2])
         carrier = int(numbers[(self._points**2).sum(1).argmin()])
         # An arm's surface lies below the plane of the site.
         beyond = (numbers != carrier) | (np.abs(depth) > self._body.thickness + np.ptp(self._points[:, 2]))
         if carrier < 0 or beyond.all():
             raise InputError(
-                f"site {site} of body {self._model.body(owner).name or owner} lies on no geom: put it on the "
-                "surface of the geom that carries the skin, in the same body, with z outwards"
+                f"site {site} of body {self._model.body(owner).name or owner} lies on no geom that collides: "
+                "put it on the surface of the geom that carries the skin, in the same body, with z outwards"
             )
         if beyond.any():
             warnings.warn(
@@ -202,11 +212,19 @@ class MujocoSurface:
             self._mujoco.mj_contactForce(self._model, data, row, wrench)
             cell = int(((contact.pos[row] - points) ** 2).sum(1).argmin())
             off = self._frames[cell] @ axes.T @ (contact.pos[row] - points[cell]) * [1, 1, 0]
-            frame = self._body.frame(self._cells[cell] + off) @ self._axes.T @ axes.T
             # It acts on the second geom.
-            force = mine[row] @ [-1, 1] * (frame @ contact.frame[row].reshape(3, 3).T @ wrench[:3])
-            if force[2] > 0 and (np.abs(off[:2]) <= np.array(self._body.cell) / 2 + _ROUNDING).all():
-                touches[contact.geom[row].sum() - self.geom].append((cell, force))
+            push = mine[row] @ [-1, 1] * (contact.frame[row].reshape(3, 3).T @ wrench[:3])
+            force = self._body.frame(self._cells[cell] + off) @ self._axes.T @ axes.T @ push
+            geom = contact.geom[row].sum() - self.geom
+            if (np.abs(off[:2]) > np.array(self._body.cell) / 2 + _ROUNDING).any():
+                warnings.warn(
+                    f"geom {self._model.geom(geom).name or geom} has contacts beside the skin, which do not "
+                    "count: MuJoCo puts those of flat faces at their corners; the geom that carries the skin "
+                    "should be no larger than the skin",
+                    stacklevel=3,
+                )
+            elif force[2] > 0:
+                touches[geom].append((cell, force))
         return [self._press(data, points, axes, *touch) for touch in touches.items()]
 
     def _press(
@@ -220,8 +238,7 @@ class MujocoSurface:
         """Return the press of a geom from the cell and the force of each of its contacts."""
         normals = self._frames[:, 2] @ axes.T
         inward = sum(force[2] * normals[cell] for cell, force in parts)
-        inward = inward / np.linalg.norm(inward)
-        gap, _ = self._cast(data, [geom], points, inward)
+        gap, _ = self._cast(data, [geom], points, inward / np.linalg.norm(inward))
         gap[normals @ inward <= 0] = np.inf  # on the far side of a curved skin
         if not np.isfinite(gap).any():  # it is between the middles of cells
             gap[parts[0][0]] = 0.0
@@ -256,9 +273,19 @@ class MujocoSurface:
             model.geom_group[:] = 0
             # Rays pass through what is invisible.
             model.geom_group[geoms], model.geom_matid[geoms], model.geom_rgba[geoms] = 1, -1, 1
-            vectors = ((points - origin) / lengths[:, None]).ravel()
             self._mujoco.mj_multiRay(
-                model, data, origin, vectors, _SEEN, True, -1, numbers, hits, None, len(points), 2 * _FAR
+                model,
+                data,
+                origin,
+                ((points - origin) / lengths[:, None]).ravel(),
+                _SEEN,
+                True,
+                -1,
+                numbers,
+                hits,
+                None,
+                len(points),
+                2 * _FAR,
             )
         finally:
             for name, values in settings.items():
@@ -321,8 +348,11 @@ class MujocoSkin:
         Args:
             data: ``mujoco.MjData`` after ``mj_step`` or ``mj_forward``.
         """
-        presses = [(press, 0) for press in self.surface.presses(data)]
-        return self._pressing.frames(presses, 1)[1][0].double().numpy()
+        return (
+            self._pressing.frames([(each, 0) for each in self.surface.presses(data)], 1)[1][0]
+            .double()
+            .numpy()
+        )
 
     def contacts(self, data: Any) -> FrameEstimate:
         """Return where and how hard the skin is touched, as its readings tell; ``data`` as in ``read``."""

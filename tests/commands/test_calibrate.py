@@ -22,6 +22,10 @@ def test_from_a_bench_to_touches_of_the_calibrated_device(run, tmp_path):
     done = run(tmp_path, "calibrate", *words, store=False)
     assert "Warning" not in done.stderr
     assert "8 presses" in done.stdout
+    assert (
+        "give session=bench.csv, or a new one"
+        in run(tmp_path, "calibrate", *words, store=False, code=2).stderr
+    )
     assert "RMSE on 2 held-out presses" in done.stdout
     assert len(read_calibration(out)) == 4
     touches = tmp_path / "touches.csv"
@@ -90,10 +94,10 @@ LOAD, PERIOD = 2.8, 4.2  # s
 
 @pytest.fixture
 def port(configured):
-    """Serve a skin in counts of 0.02 N, on which 0.5 kg lies on three sensors, one after the other."""
+    """Serve a skin in counts of 0.02 N, on which 1.5 kg lies on three sensors, one after the other."""
     model = build_skin(configured(*NAIVE))
     simulator = model.simulator(model.body, model.sensors)
-    expected = base_readings(simulator, model.body, model.sensors, KnownLoad(0.5, 0.006))[0]
+    expected = base_readings(simulator, model.body, model.sensors, KnownLoad(1.5, 0.006))[0]
     plug, noise = Plug(), np.random.default_rng(0)
     now, sent = 0.0, monotonic()
 

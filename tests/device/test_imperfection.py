@@ -223,13 +223,6 @@ def touches():
     return force
 
 
-@pytest.mark.parametrize("rate", [10.0, 30.0, 50.0, 70.0])
-def test_the_middle_of_an_interval_is_the_frame(rate):
-    number = round(rate / 10)
-    fine = between_frames(touches(), 10.0, rate)
-    assert torch.equal(fine[:, number // 2 :: number], touches())
-
-
 @pytest.mark.parametrize("rate", [20.0, 40.0, 50.0, 500.0])
 def test_a_device_reads_a_short_tap_at_any_phase(rate):
     """A reading is up to half its interval from the peak, towards which the force rises in half a frame."""
@@ -332,26 +325,6 @@ def test_a_touch_that_goes_on_is_shown_to_the_middle_of_its_last_frame():
     assert readings[:, 4].max() > 2.4
 
 
-@pytest.mark.parametrize("drawn", [0.0, 1e-12, 30.0])
-def test_rare_draws_of_noise_are_finite(drawn):
-    class Rare(np.random.Generator):
-        def standard_exponential(self, size=None, dtype=np.float64, **options):
-            return np.full(size, drawn, dtype)
-
-    device = Imperfection(rate=(10.0, 1000.0), aligned=False, gain_spread=0.0, offset=0.0, noise=1.0)
-    constants = device.constants(3, generator(0), 50)
-    readings = measure(device, constants, torch.zeros(50, 12, 3), 10.0, Rare(np.random.PCG64(1)))[0]
-    assert readings.isfinite().all()
-    assert readings.abs().max() < 8
-
-
-def test_a_share_of_devices_reads_the_frames_of_the_model():
-    force = touches()[:1].expand(2000, -1, -1)
-    device = Imperfection(rate=(10.0, 1000.0), aligned=False, framed=0.3, **NONE)
-    framed = (read(device, force, 2000)[0] - force).abs().amax(dim=(1, 2)) < 1e-6
-    assert framed.float().mean().item() == pytest.approx(0.3, abs=0.05)
-
-
 def test_a_share_of_devices_has_no_lag_and_each_has_one_scale():
     ranges = {"time_constant": (0.02, 0.1), "hysteresis": (0.01, 0.1), "independent": True}
     device = Imperfection(without_lag=0.4, **ranges)
@@ -362,20 +335,6 @@ def test_a_share_of_devices_has_no_lag_and_each_has_one_scale():
     gain = former.constants(3, generator(0), 2000).gain
     assert torch.equal(gain, gain[:, :, :1].expand_as(gain))
     assert gain[:, 0, 0].log().std().item() == pytest.approx(0.2, abs=0.02)
-
-
-def test_independent_ranges_are_not_correlated():
-    names = ("noise", "time_constant", "hysteresis", "rate")
-    ranges = dict.fromkeys(names[:3], (0.0, 0.1)) | {"rate": (10.0, 1000.0)}
-    for independent in (False, True):
-        device = Imperfection(independent=independent, **ranges)
-        constants = device.constants(4, generator(0), 2000)
-        values = np.stack([getattr(constants, name).double().numpy().ravel() for name in names])
-        correlation = np.corrcoef(values[:3])[np.triu_indices(3, 1)]
-        assert (np.abs(correlation) < 0.1).all() if independent else (correlation > 0.99).all()
-        rate = np.log(values[3])
-        assert abs(np.corrcoef(values[0], rate)[0, 1]) < 0.1
-        assert rate.mean() == pytest.approx(np.log(100), abs=0.15)
 
 
 @pytest.mark.parametrize("rate", [10.0, 30.0, 1000.0])

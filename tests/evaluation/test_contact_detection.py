@@ -96,6 +96,18 @@ def test_a_sensor_that_fails_in_a_contact_does_not_end_it():
     assert not any(said[171:])
 
 
+def test_a_touch_lowers_a_channel_along_the_surface_and_is_over_when_it_ends():
+    values = np.zeros((60, 3))
+    values[20:40] = -2.0, 0.0, 3.0
+    for along in (False, np.array([True, True, False])):
+        detector = ContactDetector(3, 20.0, 0.3, along=along)
+        for end in range(10, 61):
+            detector.update(values[end - 10 : end], np.ones((10, 3), bool), end / 20)
+        fallen = detector.void.any() or detector.falls(values, np.ones((60, 3), bool)).any()
+        assert bool(fallen) != np.any(along)
+        assert detector.since is None
+
+
 def test_a_new_tare_ends_a_contact():
     contact = ContactDetector(3, RATE, THRESHOLD)
     follow(contact, on((0, 40), (1.0, 50)))

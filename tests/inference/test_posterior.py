@@ -299,6 +299,8 @@ def test_a_sensor_that_clips_says_at_least_so_much():
     prior = FingertipPrior(force=20.0)
     readings = np.minimum(measure(true, noise, 18), noise.clip)
     (contact,) = posterior(True, noise, prior).estimate(readings).contacts
+    beyond = np.where(readings < noise.clip, readings, np.inf)
+    assert posterior(True, noise, prior).estimate(beyond).contacts[0].force == contact.force
     blind = posterior(True, noise, prior).estimate(readings, readings < noise.clip).contacts
     assert np.linalg.norm(contact.position - touch[0, 0, :2]) < 0.006
     assert contact.force > 20

@@ -17,7 +17,7 @@ import numpy as np
 import psutil
 import pytest
 
-from skin import Grid, InputError, Noise, Sheet, Solid
+from skin import Grid, InputError, Noise, Posterior, Sheet, Solid
 from skin.device.resampling import Frame
 from skin.inference.candidates import disc_readings
 from skin.inference.mechanics import Mechanics
@@ -111,7 +111,7 @@ def frames(values, end=1.0, conversion=CONVERSION, **changes):
 
 def moment(values, **changes):
     """Return readings of now."""
-    valid, none = np.ones(SENSORS, dtype=bool), np.zeros(SENSORS, dtype=bool)
+    valid, none = np.ones(len(values), dtype=bool), np.zeros(len(values), dtype=bool)
     readings = MeanReadings(np.asarray(values, dtype=float), valid, none, 0.05, 10, 0.0, 1.0, monotonic())
     return readings._replace(**changes)
 
@@ -195,6 +195,16 @@ def test_broken_sensors_do_not_look_like_no_contact(posterior, felt):
     assert clipped["state"] == "contacts"
     assert clipped["contacts"][0]["force"] > 3
     assert contact_text_lines(clipped)[-1].startswith("beyond the range of sensors")
+
+
+def test_a_limit_along_the_surface_bounds_no_force():
+    skin = Solid(BODY, Grid(3, 3, (0.01, 0.01), depth=0.005, axes="three").sensors(BODY))
+    values = 20 * disc_readings(skin, BODY, TRUTH, 0.0015)[0]
+    limited = np.abs(values) >= 0.3 * np.abs(values).max()
+    limited[12] = True  # along x of the middle: at its lower limit
+    values[12] = -5.0
+    seen = estimate_contacts(Posterior(skin, NOISE, BODY), NOISE, moment(values, saturated=limited))
+    assert seen["probabilities"][0] < 0.1
 
 
 def test_messages_of_every_state_have_the_same_fields(posterior, felt):

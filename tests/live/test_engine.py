@@ -298,6 +298,16 @@ def test_a_guarantee_holds_at_its_own_rate(rate, state):
     assert note.code == f"guarantee_{state}"
 
 
+@pytest.mark.parametrize(("short", "danger"), [(False, False), (True, None)])
+def test_a_touch_beyond_a_short_range_is_not_safe_until_it_ends(short, danger):
+    subject = rested()
+    subject.short = np.full(4, short)
+    limits = [np.full(4, n == 20) for n in range(60)]
+    sent = [frame(0.6 + n / 100, np.ones(4), saturated=limit) for n, limit in enumerate(limits)]
+    assert push(subject, sent)[-1].danger is danger
+    assert play(subject, np.zeros((100, 4)), start=1.2)[-1].danger is False
+
+
 def test_where_a_sensor_has_changed_no_touch_is_safe():
     subject = rested()
     subject.changed = (2,)

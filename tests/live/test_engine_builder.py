@@ -182,8 +182,9 @@ PROMISE = {"rate": 0.001, "touches": 3000, "misses": 0, "conditions": "mild", "p
         (200.0, {}, "the device sends 100 frames a second, and not 200"),
         (100.0, {"patience": DebounceSettings(alarm=0.05)}, "live.patience.alarm is 0.05 s, and not 0.1"),
         (100.0, {"touch": 0.5}, "live.touch or live.drift is another"),
+        (100.0, {}, "a range ends below 1.1 x the limit"),
     ],
-    ids=["same", "rate", "patience", "touch"],
+    ids=["same", "rate", "patience", "touch", "range"],
 )
 def test_a_guarantee_of_a_file_holds_or_has_lapsed(trained, skin, tmp_path, device_rate, other, reason):
     of, touches = trained
@@ -193,10 +194,12 @@ def test_a_guarantee_of_a_file_holds_or_has_lapsed(trained, skin, tmp_path, devi
     write_model(of.learner.pipeline(of.sites), described, touches, tmp_path / "skin.onnx")
     said, notes, conversion = [], [], unit_conversion(6, None, 1.0, None, None)
     with ExitStack() as opened:
-        setup = watch_exported(str(tmp_path / "skin.onnx"), {"port": skin}, said.append, opened)
+        device = {"port": skin, "limits": [None, 1.0 if "range" in reason else 99.0]}
+        setup = watch_exported(str(tmp_path / "skin.onnx"), device, said.append, opened)
         source, engine, nominal = setup.watch(replace(LIVE, **other), said.append)[:3]
         setup.check(source, engine, nominal, False, said.append, notes.append, conversion)
-    lapse = f"; lapsed, as {reason}" if reason and not other.get("touch") else ""
+    assert np.all(engine.short) == ("range" in reason)
+    lapse = f"; lapsed, as {reason}" if reason.startswith(("the", "live.patience")) else ""
     assert any(text.endswith(f"at most 0.1 % missed, 95 %, 3,000 touches, mild{lapse}") for text in said)
     rest = np.zeros(6), np.ones(6, dtype=bool)
     stream = [conversion.convert(Frame(None, t, t, *rest)) for t in np.arange(0.0, 1.0, 0.01).tolist()]

@@ -230,7 +230,8 @@ def stand_in(published, parameters):
 
 def test_the_ros_node_publishes_verdicts_and_marks_their_loss(monkeypatch):
     published = []
-    for name, module in stand_in(published, {"command": [sys.executable, "-c", LIVE]}).items():
+    wrapped = [sys.executable, "-c", f"print(3, flush=True)\n{LIVE}"]
+    for name, module in stand_in(published, {"command": wrapped}).items():
         monkeypatch.setitem(sys.modules, name, module)
     path = ROOT / "docs" / "examples" / "ros2_node.py"
     assert len(path.read_text().splitlines()) <= 90

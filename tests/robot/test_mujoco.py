@@ -29,7 +29,8 @@ OBJECTS = {
 """MuJoCo's geom, height of its middle, m, and mass, kg."""
 SKIN = """<mujoco><worldbody>
 <geom name="floor" type="plane" size="1 1 0.1" pos="0 0 -0.0075"/>
-<body name="table"><geom name="pad" type="box" size="0.08 0.08 0.0075"/>
+<body name="table"><geom type="box" size="0.08 0.08 0.0076" contype="0" conaffinity="0"/>
+<geom name="pad" type="box" size="0.08 0.08 0.0075"/>
 <site name="skin" pos="0 0 0.0075"/><site name="above" pos="0.5 0 0.1"/></body>
 <body name="air" pos="0 0 1"><site name="free"/></body>
 {objects}</worldbody></mujoco>"""
@@ -68,6 +69,18 @@ def test_the_pressure_sums_to_the_weight_of_an_object(covered, name):
     y, x = np.indices(BODY.shape) + 0.5
     centre = [(pressure * along).sum() / pressure.sum() * 0.01 - 0.08 for along in (x, y)]
     assert centre == pytest.approx([0.013, 0.02], abs=0.005)  # half a cell; y is down in the chart
+
+
+def test_what_no_contact_shows_is_refused_or_named(covered):
+    plate = '<body pos="0 0 0.099"><geom type="box" size="0.2 0.2 0.0925"/><freejoint/></body>'
+    text, sleep = SKIN.format(objects=plate), '><option><flag sleep="enable"/></option>'
+    model = mujoco.MjModel.from_xml_string(text.replace('0.08 0.08 0.0075"', '0.12 0.12 0.0075"'))
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    with pytest.warns(UserWarning, match="has contacts beside the skin, which do not count"):
+        assert covered(model).read(data).max() == 0
+    with pytest.raises(InputError, match="objects that sleep"):
+        covered(mujoco.MjModel.from_xml_string(text.replace(">", sleep, 1)))
 
 
 def test_readings_of_two_objects_are_the_sum_of_each_alone(covered):
@@ -165,7 +178,7 @@ def test_without_a_package_one_sentence_says_what_to_install(
     ("site", "said"),
     [
         ("skn", r"^the model has no site 'skn': .*'above', 'free', 'skin'"),
-        ("free", "^site free of body air lies on no geom: put it on the surface"),
+        ("free", "^site free of body air lies on no geom that collides: put it on the surface"),
         ("above", "^site above of body table lies on no geom"),
     ],
 )

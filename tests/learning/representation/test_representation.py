@@ -111,11 +111,6 @@ def test_outside_the_hull_the_nearest_value_holds(points, method):
     )
 
 
-def test_sensors_in_a_line_are_refused(points):
-    with pytest.raises(InputError, match=r"got 3: set representation\.method=nearest"):
-        representation.weights(np.array([[0.0, 0.0], [0.1, 0.1], [0.2, 0.2]]), points, "linear")
-
-
 @pytest.fixture
 def touches():
     """Five touches of nine sensors on a skin of 0.2 x 0.1 m; one sensor is dead in the first touch."""
@@ -243,14 +238,6 @@ def test_an_invalid_reading_says_nothing(make, given):
     assert torch.equal(shown, representation(zero, valid).x)
     if not representation.windowed:
         assert torch.equal(shown, representation(zero, torch.ones_like(valid)).x)
-
-
-def test_scale_divides_the_readings(make, given):
-    positions, size, readings, valid = given
-    one, other = (make(positions, size, scale=scale) for scale in (10.0, 5.0))
-    first = slice(12) if one.windowed else slice(None)  # its second view has a unit of its own
-    shown = other(readings / 2, valid).x[..., first]
-    torch.testing.assert_close(shown, one(readings, valid).x[..., first])
 
 
 def test_touches_do_not_see_each_other(make, given):

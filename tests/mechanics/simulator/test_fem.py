@@ -133,14 +133,6 @@ def stored(folder: Path) -> Path:
     return path
 
 
-def test_it_is_built_once_without_noise(tmp_path, built, recwarn):
-    first, second = (cached(STRUCTURE, SENSORS, tmp_path) for _ in range(2))
-    assert not recwarn
-    assert len(built) == 1
-    assert same(first, second)
-    assert same(first, build(STRUCTURE, SENSORS))
-
-
 def _rewrite(**changes):
     def damage(path: Path) -> None:
         with np.load(path) as file:

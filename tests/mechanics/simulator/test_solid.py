@@ -84,7 +84,7 @@ def test_a_tilted_sensor_feels_shear():
     """Traction q along x adds 2 q sin cos to what pushes across a plane leaning along x, in a wide sheet."""
     sheet, angle = Sheet([0.2, 0.2], [20, 20], LAYERS), np.deg2rad(30)
     leaning, flat = (np.sin(angle), 0, np.cos(angle)), (0, 0, 1)
-    skin = solid(sensors((0.1, 0.1, 0.0025), (0.1, 0.1, 0.0025), normals=[leaning, flat]), sheet)
+    skin = solid(sensors(*[(0.1, 0.1, 0.0025)] * 3, normals=[leaning, flat, (0, 0, -1)]), sheet)
     nothing = torch.full(sheet.shape, 1e3)
     pushed = skin(nothing).readings.double()
     sheared = skin(nothing, torch.tensor([0.5, 0.0])).readings.double()
@@ -92,6 +92,7 @@ def test_a_tilted_sensor_feels_shear():
     change = (sheared - pushed).numpy() / (1e3 * 1e-4)
     assert change[0] == pytest.approx(2 * 0.5 * np.sin(angle) * np.cos(angle), rel=0.03)
     assert change[1] == pytest.approx(0, abs=0.01)
+    assert pushed[2] == pytest.approx(pushed[1])  # up or down reads the same
 
 
 def test_sensors_of_three_axes_read_what_endless_layers_do():

@@ -51,7 +51,7 @@ class FingertipPrior:
 
     def __post_init__(self) -> None:
         known = self.friction is None or 0 <= self.friction < math.inf
-        if not (min(*self.numbers, self.large) >= 0 < self.numbers[1] and known):
+        if not (all(value >= 0 for value in (*self.numbers, self.large)) and self.numbers[1] > 0 and known):
             raise InputError(
                 "a prior of fingertips needs probabilities of 0 or more, above 0 of one contact, and "
                 f"friction of 0 or more, got numbers={list(self.numbers)}, large={self.large:g} and "

@@ -35,7 +35,7 @@ class Noise:
     thickness: tuple[float, float] = (1.0, 1.0)
 
     def __post_init__(self) -> None:
-        known = min(self.gain, self.offset, self.position) >= 0
+        known = all(value >= 0 for value in (self.gain, self.offset, self.position))  # NaN is not
         if not (self.frame > 0 and self.frames >= 1 and self.clip > 0 and known):
             raise InputError(
                 "noise needs a standard deviation above 0 N in a frame, frames >= 1, clip > 0 N, and gain, "

@@ -122,13 +122,6 @@ def test_stuck_and_saturated_sensors_are_invalid_and_say_one_thing():
     assert ((levels > 0) & (levels < 10)).sum() == 2
 
 
-def test_drift_grows_with_time():
-    said, *_ = apply(torch.zeros(1, 301, 1000), drift=0.02)
-    assert (said[0, 0] == 0).all()
-    assert float(said[0, 300].std()) == pytest.approx(0.02 * 30, rel=0.1)
-    torch.testing.assert_close(said[0, 100] * 3, said[0, 300])
-
-
 def test_a_tare_is_taken_after_the_converter():
     said, *_ = apply(torch.zeros(1, 50, 200), quantum=0.5, offset=2.0, tare=True, noise=0.01)
     steps = (said - said[:, :1]) / 0.5

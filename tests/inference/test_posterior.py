@@ -2,7 +2,7 @@
 
 from copy import copy
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ from scipy.special import log_ndtr
 from scipy.stats import kstest
 
 import skin
-from skin import Arm, FingertipPrior, Grid, Noise, PlatesAndBeams, Posterior, Sheet, Solid
+from skin import Arm, FingertipPrior, Grid, InputError, Noise, PlatesAndBeams, Posterior, Sheet, Solid
 from skin.inference.candidates import CandidateReadings, disc_readings
 from skin.inference.posterior import ContactEstimate, FrameEstimate
 from skin.mechanics.simulator.naive import Naive
@@ -290,6 +290,12 @@ def test_an_invalid_sensor_counts_for_nothing():
     assert same(clean, posterior().estimate(np.where(valid, readings, np.nan)))
     whole = posterior().estimate(readings)
     assert clean.contacts[0].position_deviation.max() > whole.contacts[0].position_deviation.max()
+
+
+@pytest.mark.parametrize("make", [partial(Noise, 0.05, offset=np.nan), partial(FingertipPrior, large=np.nan)])
+def test_a_number_without_meaning_is_refused(make):
+    with pytest.raises(InputError, match="of 0 or more"):
+        make()
 
 
 def test_a_sensor_that_clips_says_at_least_so_much():

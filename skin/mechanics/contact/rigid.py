@@ -12,6 +12,7 @@ from torch import Tensor
 
 from skin.body.base import AbstractBody
 from skin.core.settings import checked
+from skin.errors import InputError
 from skin.mechanics.simulator.base import AbstractSimulator
 from skin.touch.gestures import GestureSettings
 from skin.touch.movie import AbstractContact, ContactProblem, ContactResult, measure_gestures
@@ -68,7 +69,14 @@ def solve_contact(
         start: (B, N), initial pressures, up to a factor; None: uniform.
         tolerance: the residual at which a problem is solved.
         iterations: maximum number of iterations.
+
+    Raises:
+        InputError: a sum below 0, or a gap that is nowhere finite.
     """
+    if not ((total >= 0).all() and gap.isfinite().any(1).all()):
+        raise InputError(
+            "solve_contact takes sums of pressure of 0 Pa or more, and gaps that are finite somewhere"
+        )
     parts = [
         _solve_part(
             compliance,

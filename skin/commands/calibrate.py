@@ -38,7 +38,7 @@ def main(
 ) -> None:
     """Print the errors on held-out presses, or what a known load gives, and write the calibration."""
     if session is None or (calibrate["demo"] and Path(session).expanduser().exists()):
-        raise InputError("which session? add session=bench.csv; with calibrate.demo=true, that of a new file")
+        raise InputError("which session? add session=bench.csv; for a demo, a file that does not exist")
     by_load = any(value is not None for value in (weight, base, incline, downhill, height))
     if by_load and presses is not None:
         raise InputError("a known load replaces the gauge: leave out presses=, or weight= and base=")

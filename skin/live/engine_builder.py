@@ -140,7 +140,6 @@ class SelfTest:
             [
                 raises_alarm(
                     engine,
-                    conversion.noise,
                     *_press(
                         number,
                         number >= len(self.presses),
@@ -173,14 +172,16 @@ class SelfTest:
         )
 
 
-def raises_alarm(engine: Engine, noise: np.ndarray | None, rest: int, stream: Sequence[NewtonFrame]) -> bool:
+def raises_alarm(
+    engine: Engine, stream: Sequence[NewtonFrame], noise: np.ndarray | None, rest: int = 0
+) -> bool:
     """Return whether a touch of the untouched skin raises the alarm.
 
     Args:
         engine: is reset.
+        stream: the readings.
         noise: (S,), N, standard deviation of the untouched skin; None: unknown.
         rest: number of readings at the beginning on which there is nothing to decide.
-        stream: the readings.
     """
     engine.reset(noise=noise)
     engine.remember(stream[:rest])
@@ -202,7 +203,7 @@ def _press(
     spans: tuple[float, ...] = (0.4, 0.2, 0.4, 0.2),
     slowly: float = 4.0,
     apart: float = 1000.0,
-) -> tuple[int, list[NewtonFrame]]:
+) -> tuple[list[NewtonFrame], np.ndarray | None, int]:
     """Return the readings of a press, as they come from the device.
 
     Args:
@@ -217,7 +218,7 @@ def _press(
         apart: s between two presses: each begins with an untouched skin.
 
     Returns:
-        Number of readings at rest before the press, and all readings.
+        The readings, the noise of the untouched skin, (S,), N, and the number of readings before the press.
     """
     rest, rise, hold, fall = spans
     corners = np.cumsum([rest, slowly if slow else rise, hold, fall])
@@ -233,7 +234,7 @@ def _press(
         Frame(None, t, t, row, np.isfinite(row), number, 0, "", (row <= low) | (row >= high))
         for t, row in zip((time + apart * number).tolist(), values, strict=True)
     )
-    return round(rest * rate), [conversion.convert(frame) for frame in frames]
+    return [conversion.convert(frame) for frame in frames], conversion.noise, round(rest * rate)
 
 
 # The settings of ``skin live``.

@@ -143,8 +143,11 @@ def load_table(path: str | Path, what: str) -> tuple[pd.DataFrame, dict[str, Any
             metadata, table = _join(path)
         elif path.suffix == ".parquet":
             with pa.parquet.ParquetFile(path) as file:
-                size = 16.0 * file.metadata.num_rows * file.metadata.num_columns
-                require_memory(size, f"the {what} {path}", "give fewer rows")
+                require_memory(
+                    16.0 * file.metadata.num_rows * file.metadata.num_columns,
+                    f"the {what} {path}",
+                    "give fewer rows",
+                )
                 content = file.read()
             metadata = json.loads((content.schema.metadata or {}).get(_KEY, b"{}"))
             table = content.to_pandas()
@@ -263,8 +266,9 @@ class Gauge:
         """Return force, (T,), N, and number of the press, (T,), -1 outside of presses, at times (T,), s."""
         row = np.clip(np.searchsorted(self.time, time, side="right") - 1, 0, len(self.time) - 1)
         after = np.minimum(row + 1, len(self.time) - 1)
-        press = np.where(self.press[row] == self.press[after], self.press[row], -1)
-        press = np.where(time == self.time[row], self.press[row], press)
+        press = np.where(
+            (self.press[row] == self.press[after]) | (time == self.time[row]), self.press[row], -1
+        )
         press[(time < self.time[0]) | (time > self.time[-1])] = -1
         return np.where(press >= 0, np.interp(time, self.time, self.force), 0.0), press
 
@@ -433,8 +437,10 @@ def write_bench_session(session: BenchSession, path: str | Path) -> Path:
     metadata = json.dumps({"unit": session.unit, "bits": session.bits})
     with whole(path) as partial:
         if path.suffix == ".parquet":
-            written = pa.Table.from_pandas(table, preserve_index=False)
-            pa.parquet.write_table(written.replace_schema_metadata({_KEY: metadata}), partial)
+            pa.parquet.write_table(
+                pa.Table.from_pandas(table, preserve_index=False).replace_schema_metadata({_KEY: metadata}),
+                partial,
+            )
         else:
             table.to_csv(partial, index=False)
     return path
@@ -476,8 +482,10 @@ class BenchData:
     @cached_property
     def idle(self) -> np.ndarray:
         """Frames without a press, (T,), bool."""
-        ends = np.maximum.reduceat(self.gauge.time, self.gauge.first) + _TAIL
-        return self.session.time > np.append(-np.inf, ends)[self.begun]
+        return (
+            self.session.time
+            > np.append(-np.inf, np.maximum.reduceat(self.gauge.time, self.gauge.first) + _TAIL)[self.begun]
+        )
 
     @cached_property
     def peaks(self) -> np.ndarray:

@@ -24,10 +24,8 @@ from skin.mechanics.relaxation import first_order_lag
 
 _LAGS = 24  # time constants for which the lagged force is tabulated
 _SLOWEST = 1.0  # s, the longest of them: what the tail of a press can show
-_SUDDEN = (
-    0.1,
-    2,
-)  # of the peak, a change between frames; frames beside it, which an error of the clocks shifts
+# Of the peak, a change between frames; frames beside it, which an error of the clocks shifts.
+_SUDDEN = 0.1, 2
 _REACHED = 0.05  # of the strongest press of a sensor: a weaker one says nothing that can be relied on
 # Of a value: error of the simulated shape of a press, added to the noise. Of the factors of the nearest
 # presses: what sensors misplaced by 1 mm cause.
@@ -113,9 +111,12 @@ class Loads:
         """The press of every frame, (T,), until its lag is over; -1 outside, and where the force jumps."""
         bench, owner = self.bench, self.bench.begun - 1
         force, (fraction, beside) = pd.Series(bench.applied[0]), _SUDDEN
-        jumps = force.diff().abs() > fraction * force.groupby(owner).transform("max")
-        near = np.convolve(jumps, np.ones(2 * beside + 1), mode="same") > 0
-        return np.where(bench.idle | near | ~np.isin(owner, list(self.presses)), -1, owner)
+        near = np.convolve(
+            force.diff().abs() > fraction * force.groupby(owner).transform("max"),
+            np.ones(2 * beside + 1),
+            mode="same",
+        )
+        return np.where(bench.idle | (near > 0) | ~np.isin(owner, list(self.presses)), -1, owner)
 
     @cached_property
     def lags(self) -> np.ndarray:

@@ -115,10 +115,10 @@ def _describe(
     at = math.exp(float(np.median([channel.middle[1] for channel in bent.values()]))) if bent else 1.0
     tables = {n: channel.table(at) for n, channel in bent.items() if channel.kind == "table"}
     values["clip"] = pd.Series({n: channel.clip for n, channel in channels.items()})
-    fitted = {
-        n: [channel.gain(at), channel.hysteresis, channel.time_constant] for n, channel in known.items()
-    }
-    values[["gain", "hysteresis", "time_constant"]] = pd.DataFrame.from_dict(fitted, orient="index")
+    values[["gain", "hysteresis", "time_constant"]] = pd.DataFrame.from_dict(
+        {n: [channel.gain(at), channel.hysteresis, channel.time_constant] for n, channel in known.items()},
+        orient="index",
+    )
     if bent:
         values["exponent"] = pd.Series(
             {n: channel.slopes[0] if channel.kind == "power" else 1.0 for n, channel in known.items()}
@@ -169,13 +169,12 @@ def convert_to_newton(
     values[values.columns.difference(["hysteresis", "time_constant", "exponent"])] *= scale
     # Six digits, and no negative 0.
     values = values.map(lambda value: float(f"{value:.6g}") + 0.0)
-    known = values[alive].dropna(axis="columns", how="all")
     ranges = {"dead": [0.0, float((~alive).sum())]} | {
-        str(name): [float(column.min()), float(column.max())] for name, column in known.items()
+        str(name): [float(column.min()), float(column.max())]
+        for name, column in values[alive].dropna(axis="columns", how="all").items()
     }
-    sensors = values.astype(object).where(values.notna(), None).to_dict("list")
     return Calibration(
-        {str(name): column for name, column in sensors.items()},
+        values.rename(columns=str).astype(object).where(values.notna(), None).to_dict("list"),
         {kind: list(map(int, numbers)) for kind, numbers in broken.items()},
         ranges,
         scale,
@@ -241,8 +240,8 @@ def evaluate_held_out(bench: BenchData, fraction: float) -> HeldOutErrors:
     shown = simulated / (calibration.scale * calibration.signs) + calibration.zero
     loaded = bench.loading & (bench.applied[0] > _LOADED * bench.gauge.force.max())
     force, expected = (estimate_force(raw, answers, calibration) for raw in (bench.session.raw, shown))
-    ratios = pd.Series(force / expected)[loaded].groupby(bench.applied[1][loaded]).median()
-    return HeldOutErrors(rmse, held, ratios.dropna().to_numpy())
+    ratios = pd.Series(force / expected)[loaded].groupby(bench.applied[1][loaded]).median().dropna()
+    return HeldOutErrors(rmse, held, ratios.to_numpy())
 
 
 def predict_session(bench: BenchData, calibration: Calibration) -> np.ndarray:

@@ -29,6 +29,7 @@ from skin.device.resampling import Frame, StreamClock
 from skin.device.simulated import Simulated
 from skin.errors import InputError
 from skin.mechanics.simulator.base import AbstractSimulator
+from skin.touch.labels import Limits
 from skin.touch.shapes import pressed_images
 from skin.wire.channels import UnitConversion
 from skin.wire.emulator import Converter
@@ -40,6 +41,10 @@ _QUIETER = 200.0  # times that the noise of sensors may be below that of the sim
 _INCLINED = "incline=20 downhill=[45,225] height=0.01"
 _ALONG = 0.1  # of the reading inwards: cross-talk of a fiftieth would change less by a fifth
 _MISSED = 0.25  # fraction of the sensors that may have no gain
+_THUMB = 0.011  # m, radius of a press at the limit of dangerous touches
+# Part of its reading that a second load must give: after 2 kg on 20 mm, a response that is a square root is
+# then off by more than 25 % on skins of up to 25 mm.
+_FIRM = 0.7
 _PATIENCE = 60.0  # s in which a further load must be put down
 
 
@@ -365,6 +370,26 @@ def _fit_gains(
 # A second load, measured while it is put on three sensors.
 
 
+def firm_readings(
+    model: AbstractSimulator, body: AbstractBody, sensors: Sensors, load: KnownLoad, limits: Limits
+) -> np.ndarray:
+    """Return the readings under a second load over each of N sites, (N, S), N.
+
+    Raises:
+        InputError: they are far below those of a dangerous press, up to which sensors may be curved.
+    """
+    base = min(_THUMB, *(side / 2 for side in body.size))
+    firm = KnownLoad(min(limits.pressure * math.pi * base**2, limits.force) / GRAVITY, base)
+    expected, needed = (base_readings(model, body, sensors, used)[0] for used in (load, firm))
+    if np.median(share := expected.max(axis=1) / needed.max(axis=1)) < _FIRM:
+        raise InputError(
+            f"this load reads only {np.median(share):.0%} of a press at the limit of dangerous touches, and "
+            "would not show a curve of the sensors: give a heavier and wider one, as in "
+            f"weight={firm.weight:.1f} base={base:g}"
+        )
+    return expected
+
+
 def measure_ratios(
     frames: Iterable[Frame],
     first: Sequence[Frame],
@@ -389,7 +414,6 @@ def measure_ratios(
     clock, stream, ratios, enough = StreamClock(), iter(frames), dict[str, float](), min(3, len(expected))
     rate = (len(first) - 1) / np.ptp([clock(frame) for frame in first])
     rows = [conversion.newtons(frame.values) for frame in first]
-    shapes = expected / np.linalg.norm(expected, axis=1, keepdims=True)
     while further := [conversion.newtons(frame.values) for frame in islice(stream, math.ceil(rate))]:
         rows += further
         time = np.arange(len(rows)) / rate
@@ -404,7 +428,7 @@ def measure_ratios(
         counted = np.ptp(found.span, axis=1) >= seconds
         for change in found.change[counted]:
             # The pattern identifies the site for any scale and sign.
-            site = int(np.abs(shapes @ change).argmax())
+            site = int(np.abs(expected @ change / np.linalg.norm(expected, axis=1)).argmax())
             sensor = expected.shape[1] // len(expected) * (site + 1) - 1  # inwards
             if str(sensor) not in ratios:
                 say(

@@ -119,8 +119,14 @@ def collect_responses(bench: BenchData) -> Responses:
     """Return the responses of all channels of a session, which do not depend on places or layout."""
     raw, (force, press) = pd.DataFrame(bench.session.raw), bench.applied
     # The rest of a press is that since the previous one; without any, that of the press before.
-    rests = raw[bench.idle].groupby(bench.begun[bench.idle]).median()
-    rests = rests.reindex(range(len(bench.gauge))).ffill().bfill()
+    rests = (
+        raw[bench.idle]
+        .groupby(bench.begun[bench.idle])
+        .median()
+        .reindex(range(len(bench.gauge)))
+        .ffill()
+        .bfill()
+    )
     loading = raw.assign(force=force, press=press)[bench.loading]
     step = (
         loading.groupby("press").cumcount()

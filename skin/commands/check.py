@@ -22,15 +22,20 @@ from skin.runs.configuration import Config
 def main(config: Config, weight: float | None, base: float | None, seconds: Annotated[float, Ge(2)]) -> None:
     """Compare readings under the load with predicted ones, and store the result."""
     from skin.calibration.check import Check, describe_setup, store_check
-    from skin.calibration.known_loads import KnownLoad, base_readings, measure_ratios
+    from skin.calibration.known_loads import KnownLoad, firm_readings, measure_ratios
     from skin.record.serial import require_port
     from skin.runs.build import build_device, build_skin
+    from skin.touch.fingertips import read_touch
     from skin.wire.reader import SkinDisconnected, SkinTimeout
 
     device = require_port(build_device(config))
-    load = KnownLoad.of(weight, base, device.size)
-    model = build_skin(config).simulator(device.body, device.sensors)
-    expected = base_readings(model, device.body, device.sensors, load)[0]
+    expected = firm_readings(
+        build_skin(config).simulator(device.body, device.sensors),
+        device.body,
+        device.sensors,
+        load := KnownLoad.of(weight, base, device.size),
+        read_touch(config.touch).danger,
+    )
     try:
         with device.wire.open() as skin:
             first, conversion = device.wire.warm_up(skin, notify)
@@ -41,7 +46,8 @@ def main(config: Config, weight: float | None, base: float | None, seconds: Anno
             ratios = measure_ratios(skin, first, conversion, expected, seconds, notify)
     except (SkinTimeout, SkinDisconnected) as error:
         raise InputError(f"{config.device['port']}: {error}") from error
-    rest = conversion.zero if conversion.rest is None else conversion.raw(conversion.rest)
     setup = describe_setup(device.wire, skin.header, conversion, device.sensors.positions, device.size)
-    path = store_check(Check(setup, datetime.now(UTC).isoformat(timespec="seconds"), ratios, rest.tolist()))
+    date = datetime.now(UTC).isoformat(timespec="seconds")
+    rest = conversion.zero if conversion.rest is None else conversion.raw(conversion.rest)
+    path = store_check(Check(setup, date, ratios, rest.tolist()))
     print(f"{path}: the scale agrees, times {', '.join(f'{ratio:.3g}' for ratio in ratios.values())}")

@@ -19,6 +19,7 @@ from skin.calibration.known_loads import (
     emulate_placements,
     emulate_session,
     find_placements,
+    firm_readings,
     fit_known_load,
     stair_gauge,
 )
@@ -28,6 +29,8 @@ from skin.device.simulated import Simulated
 from skin.errors import InputError
 from skin.evaluation.alarm import _remaining
 from skin.mechanics.simulator.solid import Solid
+from skin.touch.fingertips import read_touch
+from skin.wire.channels import AGREES
 from tests.budget import free
 from tests.calibration.test_fit import device, solid
 
@@ -208,6 +211,19 @@ def test_an_incline_of_an_arm_is_refused():
         model = Solid(arm, sensors)
     with pytest.raises(InputError, match="the body is no flat sheet"):
         base_readings(model, arm, sensors, INCLINED)
+
+
+def test_a_second_load_reads_enough_to_show_a_curve():
+    body = Sheet([0.12, 0.12], [12, 12], [{"material": "EcoFlex 00-30", "thickness": 0.02}])
+    skin, limits = (body, Grid(2, 2, depth=0.0195).sensors(body)), read_touch(None).danger
+    with free():
+        model = Solid(*skin)
+    with pytest.raises(InputError, match=r"reads only \d+% of .* as in weight=3.5 base=0.011"):
+        firm_readings(model, *skin, KnownLoad(1.5, 0.006), limits)
+    first = base_readings(model, *skin, WEIGHT)[0].max(axis=1)
+    second = firm_readings(model, *skin, KnownLoad(3.5, 0.011), limits).max(axis=1)
+    square_roots = (first * second) ** 0.5  # with the gains that the first load gives
+    assert (square_roots / second < 1 - AGREES).all()
 
 
 def test_an_untouched_session_has_no_placement():

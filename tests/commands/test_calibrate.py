@@ -114,12 +114,13 @@ def port(configured):
     plug.unplug()
 
 
-@pytest.mark.parametrize("scale", [0.02, 0.002])
-def test_three_loads_at_a_port(run, tmp_path, monkeypatch, port, scale):
+@pytest.mark.parametrize(("scale", "weight"), [(0.02, 1.5), (0.002, 1.5), (0.02, 0.5)])
+def test_three_loads_at_a_port(run, tmp_path, monkeypatch, port, scale, weight):
     monkeypatch.setenv("SKIN_DATA", str(tmp_path / "data"))
-    done = run(tmp_path, "check", *NAIVE, port, f"device.scale={scale}", "seconds=2", store=False, code=None)
+    words = "check", *NAIVE, port, f"device.scale={scale}", f"weight={weight}", "seconds=2"
+    done = run(tmp_path, *words, store=False, code=None)
     files = list((tmp_path / "data").rglob("*.json"))
-    if scale == 0.02:
+    if (scale, weight) == (0.02, 1.5):
         (stored,) = [json.loads(file.read_text()) for file in files]
         assert stored["setup"]["device"] == "arm-L"
         assert list(stored["ratios"]) == ["0", "1", "2"]
@@ -127,4 +128,5 @@ def test_three_loads_at_a_port(run, tmp_path, monkeypatch, port, scale):
         assert "3 of 3" in done.stderr
     else:
         assert (done.returncode, files) == (2, [])
-        assert "nothing was stored" in done.stderr.splitlines()[-1]
+        reason = "nothing was stored" if weight == 1.5 else "give a heavier and wider one"
+        assert reason in done.stderr.splitlines()[-1]

@@ -114,14 +114,6 @@ def test_predictions_tell_of_every_test_gesture(device, tried):
     assert table["speed"].to_pylist() == test.parameters["speed"].tolist()
 
 
-def test_a_layout_of_a_prime_number_of_sensors_makes_no_grid(configured, tmp_path):
-    path = tmp_path / "seven.csv"
-    path.write_text("x_m,y_m\n" + "".join(f"{0.02 * i + 0.01},0.05\n" for i in range(7)))
-    small = "simulator=naive", "data.gestures=80", "device.test_gestures=48"
-    device = build_device(configured(*small, f"layout.path={path}"))
-    assert "unseen_layout" in evaluate(Knows(), device, SETTINGS, POINT).unavailable
-
-
 def test_what_is_not_defined_has_a_reason_and_is_shown_as_a_dash(made_up_device, tmp_path):
     class AllDangerous(type(made_up_device)):
         def touches(self, split, epoch=0):

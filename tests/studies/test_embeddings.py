@@ -111,15 +111,6 @@ def three():
     return frame
 
 
-def test_the_table_has_means_and_deviations(three):
-    table = embeddings.embeddings_table(three)
-    head, (degree, *_) = list(table.columns), table.to_numpy().tolist()
-    assert head[:4] == ["input", "big", "press", "mean"]
-    assert degree[0] == "Graph2Vec, degree"
-    assert degree[1:4] == ["55.0 ± 1.0", "45.0 ± 1.0", "50.0 ± 1.0"]
-    assert degree[4:] == ["100.0 ± 0.0", "90.0 ± 1.0", "20.0 ± 0.0"]
-
-
 def test_verdicts_follow_the_figures(three):
     words = [line.split("**")[1] for line in embeddings.embedding_statements(three)]
     # layout against the best label; against readings, 0 ± 5.0; against chance, 0 ± 2.5 and 45 ± 2.5

@@ -60,9 +60,11 @@ def main(
     if load is not None:
         calibration, errors = fit_known_load(device, ordered(recorded, settings), load), None
     else:
-        bench = wired_bench(device, recorded, settings)
         calibration, errors = fit_presses(
-            device, bench, calibrate["held_out"], settings.force_scale is not None
+            device,
+            wired_bench(device, recorded, settings),
+            calibrate["held_out"],
+            settings.force_scale is not None,
         )
     print_calibration(calibration, errors)
     if errors and not errors.helps:

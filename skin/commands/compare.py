@@ -42,8 +42,7 @@ def main(
     device = build_device(config).simulated("a session is compared with a simulation")
     comparison = compare_session(device, session, presses, compare)
     agreement = [] if run is None else compare_predictions(run, config, comparison, device)
-    bench = comparison.bench
-    alarm = _test_alarm(run, config, bench, device, compare) if run and bench else []
+    alarm = _test_alarm(run, config, comparison.bench, device, compare) if run and comparison.bench else []
     if compare["miss_rate"] is not None and not alarm:
         raise InputError("compare.miss_rate needs presses of known force, and run= with an alarm to test")
     calibrated = f" with {device.calibration}." if device.calibration else ", not calibrated."

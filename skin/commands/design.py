@@ -19,8 +19,7 @@ from skin.runs.configuration import Config
 def main(config: Config, out: str | None, design: dict[str, Any]) -> None:
     """Build the chosen analysis from its settings, run it and write its files."""
     settings = dict(design)
-    target = import_target(settings.pop("_target_"), "design._target_")
-    analysis = configured(target, settings, "design")
+    analysis = configured(import_target(settings.pop("_target_"), "design._target_"), settings, "design")
 
     from skin.runs.build import build_device, build_skin
 

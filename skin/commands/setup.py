@@ -30,9 +30,13 @@ def main(config: Config, out: str, step: str | None, steps: dict[str, Any]) -> N
         raise InputError("device.port is missing: add device.port=/dev/ttyACM0, the port of your board")
     if step not in (None, *steps):
         raise InputError(f"there is no step={step}: give one of {', '.join(steps)}")
-    folder, given = results(out), [word for word in overrides() if not word.startswith("step=")]
-    order, done = list(steps), [(folder / about.get("file", "")).is_file() for about in steps.values()]
-    number = order.index(step) if step else done.index(False)
+    folder, order = results(out), list(steps)
+    given = [word for word in overrides() if not word.startswith("step=")]
+    files = (folder / about.get("file", "") for about in steps.values())
+    times = [file.stat().st_mtime if file.is_file() else inf for file in files]
+    # A step is due again if one before it was repeated.
+    due = (number for number, time in enumerate(times) if time == inf or time < max(times[: number + 1]))
+    number = order.index(step) if step else next(due)
     with suppress(EOFError, KeyboardInterrupt):
         while number < len(order):
             about = steps[order[number]]

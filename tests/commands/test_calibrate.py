@@ -34,7 +34,6 @@ def test_from_a_bench_to_touches_of_the_calibrated_device(run, tmp_path):
 
 @pytest.mark.slow("fits the noise of a data set")
 def test_a_calibration_that_does_not_help_ends_with_1_and_writes_nothing(run, tmp_path):
-    """A skin that is what the simulation says cannot gain from a fit to its noise."""
     perfect = ["device.gain_spread=0", "device.offset=0", "device.clip=1000"]
     session, out = tmp_path / "bench.csv", tmp_path / "mine.yaml"
     files = f"session={session}", f"out={out}"

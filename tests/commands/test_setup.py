@@ -129,6 +129,8 @@ def test_a_step_that_fails_is_offered_again_and_the_guide_goes_on_where_it_was(r
     assert steps(asked(run, monkeypatch, tmp_path, "")) == ["board", "board"]
     assert steps(asked(run, monkeypatch, tmp_path, "", "", program="true")) == ["board", "values", "skin"]
     assert steps(asked(run, monkeypatch, tmp_path)) == ["skin"]
+    asked(run, monkeypatch, tmp_path, "", program="true", words=["step=board"])
+    assert steps(asked(run, monkeypatch, tmp_path)) == ["values"]
     assert steps(asked(run, monkeypatch, tmp_path, "q", words=["step=check"])) == ["check"]
 
 

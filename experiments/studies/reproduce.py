@@ -28,8 +28,9 @@ Written by `python -m experiments.studies.reproduce` from the statements of stud
 
 - `study=…` is short for `skin study study=…`. Empty cells repeat the command above. Default settings,
   three or five seeds. In parentheses: report sections.
-- Differences are in percentage points, ± [margin](protocol.md#intervals-and-comparisons). *agree* and
-  *disagree* need three seeds, or devices of one training. With so many statements, some are due to chance.
+- Differences are in percentage points, ± [margin](protocol.md#intervals-and-comparisons) over seeds and
+  devices; other test gestures add some tenths. *agree* and *disagree* need three seeds, or devices of one
+  training. With so many statements, some are due to chance.
 - Images have a tenth of the gestures: too few for a GRU or LSTM alone.
 """
 

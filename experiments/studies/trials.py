@@ -103,7 +103,7 @@ def run_study(study: Study, config: Config, folder: Path, smoke: bool) -> bool:
         print(f"shard {config.shard} is measured: the same command without shard= writes the results")
         return complete
     frame = pd.DataFrame([*trials, *votes(study, pd.DataFrame(trials))])
-    path = folder / (f"study_{study.name}" if store else study.name)
+    path = folder / ((f"study_{study.name}" if store else study.name) + "_incomplete" * (not complete))
     if study.metrics and store:
         words = [f"{study.name}: {study.about}", *(study.small if smoke else ())]
         words += [word for word in passed_overrides() if not word.startswith("tracking.")]
@@ -368,7 +368,8 @@ def measure_once(
         identity, name = run.tags["fingerprint"], run.finished.title
     key = hashlib.sha256(json.dumps(depends).encode()).hexdigest()[:16]
     path = FOLDER / study / f"{identity}-{key}.parquet"
-    frame = read_frame(path) if resume else None
+    # What is behind the name of a predictor may have changed.
+    frame = read_frame(path) if resume and not hasattr(measure, "predictor") else None
     if frame is None:
         frame = measure(replace(subject, model=run.model))
         frame.attrs |= {"run": identity, "name": name, "measure": repr(measure), "source": source_tags()}

@@ -51,7 +51,7 @@ class Presses(AbstractDevice):
 
     def touches(self, split: str, epoch: int = 0) -> Touches:
         source = torch.Generator().manual_seed(sum(map(ord, split)))
-        count = 100 if split == "train" else 40
+        count = {"train": 100, "test": 40}[split]  # the others are for what is chosen later, as the alarm
         x, force = 0.04 * torch.rand(count, generator=source), 1 + 4 * torch.rand(count, generator=source)
         sites = 0.01 * (torch.arange(4) + 0.5)
         gesture = torch.arange(count) % 3

@@ -5,6 +5,7 @@ What is not a plain table is read by a function ``reader(path) -> Recording``, w
 reader=package.function``), never a file.
 """
 
+import re
 from collections.abc import Mapping, Sequence
 from fnmatch import fnmatch
 from pathlib import Path
@@ -98,7 +99,7 @@ def _read_touches(mapping: ForeignFormat, path: Path, folder: Path) -> list[_Tou
     if mapping.baseline == "idle":
         values = values - np.nanmedian(values, axis=0)
     elif mapping.baseline is not None:
-        first = values[: mapping.baseline]
+        first = values[: max(1, int((spans[:, 1] <= mapping.baseline).sum()))]  # frames of these rows
         values = values - np.nan_to_num(first).sum(axis=0) / (~np.isnan(first)).sum(axis=0).clip(1)
     targets = {
         name: TARGETS[name][its.unit] * parse_numbers(table, its.column, path, f"targets.{name}")
@@ -118,7 +119,7 @@ def _read_touches(mapping: ForeignFormat, path: Path, folder: Path) -> list[_Tou
         begin = mapping.segments.before if mapping.segments.by == "row" else 0
         part = values[rows][: len(frames) - begin]
         frames[begin : begin + len(part)] = part
-        lines = slice(*spans[rows].ravel()[[0, -1]])  # rows of the file, all of its frames
+        lines = slice(*spans[rows].ravel()[[0, -1]])  # rows of the file
         where = f"{path}: rows {lines.start + 1} to {lines.stop}"
         found = {what: [*dict.fromkeys(column[lines])] for what, column in texts.items()}
         for name in named:
@@ -126,7 +127,8 @@ def _read_touches(mapping: ForeignFormat, path: Path, folder: Path) -> list[_Tou
                 raise InputError(
                     f"{where}: groups: each touch needs one {name}, got {' and '.join(map(str, one[:3]))}"
                 )
-        measured = {name: _reduce(name, column[lines]) for name, column in targets.items()}
+        shown = slice(lines.start, int(spans[rows][len(part) - 1, 1]))  # of a touch that is cut
+        measured = {name: _reduce(name, column[shown]) for name, column in targets.items()}
         touches.append(
             {
                 "frames": frames,
@@ -147,9 +149,9 @@ def _read_touches(mapping: ForeignFormat, path: Path, folder: Path) -> list[_Tou
 
 def _readings(mapping: ForeignFormat, table: pd.DataFrame, path: Path) -> np.ndarray:
     """Return the readings of a file, (R, S), float32, N."""
-    its = mapping.channels
+    its, named = mapping.channels, {*re.compile(mapping.fields or "").groupindex, *(mapping.groups or ())}
     names: Sequence[Column] = (
-        [name for name in table.columns if fnmatch(name, its.columns)] or [its.columns]
+        [name for name in table.columns if fnmatch(name, its.columns) and name not in named] or [its.columns]
         if isinstance(its.columns, str)
         else its.columns
     )
@@ -178,8 +180,7 @@ def _check_missing(values: np.ndarray, name: Column, path: Path, peak: float = 0
     """
     size = np.abs(values - np.nanmedian(values)) if not np.isnan(values).all() else values
     gaps = np.flatnonzero(np.diff(np.isnan(values).astype(int)) == 1)
-    largest = np.nanmax(size, initial=0.0)
-    usual = np.nanquantile(size, 0.9) if largest else 0.0
+    usual = np.nanquantile(size, 0.9) if (largest := np.nanmax(size, initial=0.0)) else 0.0
     if len(gaps) >= pieces and np.mean(size[gaps]) > max(peak * largest, usual):
         raise InputError(
             f"{path}: column {name} has no value {len(gaps)} times right after its largest ones: is that a "

@@ -329,12 +329,11 @@ def parse_numbers(table: pd.DataFrame, name: Column, path: Path, what: str) -> n
     require_columns(table, [name], path, what)
     column = table[str(name)]
     values = pd.to_numeric(column, errors="coerce")
-    if (wrong := np.flatnonzero(values.isna() & column.notna())).size:
+    if (wrong := np.flatnonzero((values.isna() & column.notna()) | (values.abs() == np.inf))).size:
         text = str(column.iloc[wrong[0]])[:40]
         raise InputError(
             f"{path}: column {name} has {text!r} in row {wrong[0] + 1}, no number: list it in "
             "table.na_values unless it stands for a value over the range, or correct table.decimal, "
             "table.skiprows or, for dates, table.parse_dates and date_format"
         )
-    array = values.to_numpy(dtype=float, na_value=np.nan)
-    return np.where(np.isfinite(array), array, np.nan)
+    return values.to_numpy(dtype=float, na_value=np.nan)

@@ -170,11 +170,10 @@ class Serial(AbstractDevice):
         if self.labels == "announced":
             return AnnouncedSegmenter(window, announcements, self.task)
         if self.labels == "none":
-            valid = np.ones(len(self.sensors), dtype=bool)
             return ContinuousSegmenter(
                 window,
                 max(done, default=-1) + 1,
-                lambda values: bool((conversion(values, valid)[0] > self.trigger).any()),
+                lambda frame: bool((conversion(frame.values, frame.valid)[0] > self.trigger).any()),
             )
         planned = enumerate(label_plan(self.task.names, -(-self.gestures // 2 ** len(self.task)), self.seed))
         left = (

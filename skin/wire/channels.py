@@ -60,8 +60,8 @@ class ChannelHealth:
     five seconds while most others do is stuck, or dead if it has never changed. A channel that has never
     changed is also dead if another has had noise of more than one count for five seconds. Neither state is
     detected if the noise of the untouched skin is below one count. A single change makes the channel usable
-    again. A channel that stays at the largest value it has ever sent, far above its smallest, is saturated at
-    an unknown limit rather than stuck, because a held press must not be masked.
+    again. A channel that stays where it had the most force ever, far from its other end, is saturated at an
+    unknown limit rather than stuck, because a held press must not be masked.
 
     A value that the converter cannot give is unusable at once.
 
@@ -100,13 +100,20 @@ class ChannelHealth:
         """Let the device's clock begin anew; what is known of each channel is kept, also that it is stuck."""
         self._begins = True
 
-    def check(self, values: np.ndarray, t: float, limited: np.ndarray | None = None) -> np.ndarray:
+    def check(
+        self,
+        values: np.ndarray,
+        t: float,
+        limited: np.ndarray | None = None,
+        polarity: np.ndarray | None = None,
+    ) -> np.ndarray:
         """Return the mask of a frame, (S,), int, of :class:`Reason`.
 
         Args:
             values: (S,), as sent.
             t: s, rising.
             limited: (S,), bool, channels that are known to be at a limit; None: none is.
+            polarity: (S,), below 0 where values fall with force; None: nowhere.
         """
         self._clock += 0.0 if self._begins else t - self._time
         self._time, self._begins, t = t, False, self._clock
@@ -130,13 +137,19 @@ class ChannelHealth:
         # Noise below half a step changes only values near an edge; a double step is more than that.
         self._large_step_at[step > 1.5 * self._smallest[self._judges].min()] = t
         self._noisy_since[t - self._large_step_at >= self._active] = t
-        others_change = t - self._active_since >= self._silent
         never = ~self._ever & (t - self._noisy_since[self._judges].min() >= self._silent)
-        inactive = (unchanged >= self._silent) & (others_change | never)
-        low, high = self.limits
-        low, high = -inf if low is None else low, inf if high is None else high
+        inactive = (unchanged >= self._silent) & ((t - self._active_since >= self._silent) | never)
+        low, high = (
+            end if limit is None else limit for limit, end in zip(self.limits, (-inf, inf), strict=True)
+        )
         loaded = self._ever & (self._maximum - self._minimum >= self._far * self._smallest)
-        saturated = (values >= high) | (values <= low) | (inactive & loaded & (values >= self._maximum))
+        # The end of falling values without force is no bound of a force: a wire may be broken.
+        rising = np.ones(len(values), dtype=bool) if polarity is None else polarity > 0
+        saturated = (
+            (rising & (values >= high))
+            | (values <= low)
+            | (inactive & loaded & np.where(rising, values >= self._maximum, values <= self._minimum))
+        )
         saturated = saturated if limited is None else saturated | limited
         impossible = (values > self.largest) | (values < -self._below * self.largest)
         self.mask = np.where(

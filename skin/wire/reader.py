@@ -320,7 +320,8 @@ class WireFeed:
     def _judge(self, frame: Frame) -> Frame:
         if frame.after not in ("", "gap"):
             self._health.restart()
-        mask = self._health.check(frame.values, frame.t, frame.saturated) | ~frame.valid * Reason.MISSING
+        health = self._health.check(frame.values, frame.t, frame.saturated, frame.polarity)
+        mask = health | ~frame.valid * Reason.MISSING
         frame = frame._replace(valid=mask <= Reason.SATURATED, saturated=mask == Reason.SATURATED, mask=mask)
         return frame.inwards() if self._taken == INWARDS else frame
 

@@ -237,16 +237,14 @@ class ContinuousSegmenter(AbstractSegmenter):
     Args:
         window: as in :class:`AbstractSegmenter`.
         first: number of the first.
-        wanted: whether a frame's values may begin a window; None: any frame may.
+        begins: whether a frame may begin a window; None: any may.
     """
 
-    def __init__(
-        self, window: Window, first: int = 0, begins: Callable[[np.ndarray], bool] | None = None
-    ) -> None:
+    def __init__(self, window: Window, first: int = 0, begins: Callable[[Frame], bool] | None = None) -> None:
         super().__init__(window)
-        self._numbers, self._wanted = count(first), begins
+        self._numbers, self._begins = count(first), begins
 
     def _begin(self, frame: Frame) -> RecordedGesture | None:
-        if self._wanted is not None and not self._wanted(frame.values):
+        if self._begins is not None and not self._begins(frame):
             return None
         return RecordedGesture(next(self._numbers), None, frame.t, frame.segment)

@@ -101,12 +101,13 @@ def test_nothing_is_known_of_a_pause(tmp_path, rate):
     assert touches.readings[9, -2] == touches.readings[10, 0] == 3
 
 
-@pytest.mark.parametrize("baseline", [None, 2, "idle"])
-def test_a_baseline_is_subtracted(tmp_path, baseline):
-    text = "t,s0\n" + "".join(f"{100 * n},{value}\n" for n, value in enumerate([7, 7, 9, 7]))
-    channels = {"columns": ["s0"], "unit": "N"}
-    recording = convert(tmp_path, PLAIN | {"baseline": baseline, "channels": channels}, **{"a.csv": text})
-    expected = [7, 7, 9, 7] if baseline is None else [0, 0, 2, 0]
+@pytest.mark.parametrize(("baseline", "step"), [(None, 100), (2, 100), ("idle", 100), (2, 50)])
+def test_a_baseline_is_subtracted(tmp_path, baseline, step):
+    """Of twice as many rows, two are one frame."""
+    text = "t,s0\n" + "".join(f"{step * n},{value}\n" for n, value in enumerate([7, 7, 9, 7]))
+    given = {"baseline": baseline, "channels": {"columns": ["s0"], "unit": "N"}, "rate": 10.0}
+    recording = convert(tmp_path, PLAIN | given, **{"a.csv": text})
+    expected = [7, 7, 9, 7] if baseline is None else [0, 0, 2, 0] if step == 100 else [0, 2, 0, 0]
     assert recording.touches.readings.flatten().tolist() == pytest.approx(expected)
 
 
@@ -115,6 +116,8 @@ def test_a_missing_value_is_invalid(tmp_path):
     recording = convert(tmp_path, PLAIN | {"table": {"na_values": [-999]}}, **{"a.csv": text})
     assert recording.touches.valid[0, :3, 0].tolist() == [True, False, False]
     assert recording.touches.readings[0, 1:3, 0].tolist() == [0, 0]
+    with pytest.raises(InputError, match="column s0 has 'inf' in row 2"):
+        convert(tmp_path, PLAIN, **{"a.csv": text.replace("100,,", "100,inf,")})
 
 
 def test_positions_are_of_the_mapping_or_of_the_layout(tmp_path):

@@ -14,16 +14,6 @@ def test_generation_and_operators_are_timed_with_an_empty_cache(tmp_path, monkey
     assert run_alone("generation.fem", 1)["gestures_per_second"] > 100
 
 
-@pytest.mark.slow("measures times of verdicts")
-@pytest.mark.parametrize("name", ["best_fresh", "any_skin", "onnx"])
-def test_a_verdict_is_timed_by_the_wall_and_by_the_core(name):
-    figures = run_alone(f"live.{name}", 1)
-    assert set(figures) == {"p50_ms", "p99_ms", "core_ms", "core_share", "memory_mb"}
-    # A frame without a decision takes a fiftieth of that.
-    assert 0.2 < figures["p50_ms"] <= figures["p99_ms"]
-    assert 0 < figures["core_share"] < 1
-
-
 @pytest.mark.parametrize(
     ("words", "reason"),
     [("--repeats 1", "choose from 3"), ("--repeat x", "invalid int"), ("--only page", "'generation.fem'")],

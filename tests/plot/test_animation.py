@@ -7,7 +7,7 @@ from PIL import Image
 
 from skin.errors import InputError
 from skin.plot.animation import VIEWS, read_scene, simulate_scene, thinning, write_animation
-from skin.plot.figures import confusions, images, misclassified, misclassified_fractions, save_figure, traces
+from skin.plot.figures import confusions, images, save_figure, traces
 from skin.plot.plot3d import Scene
 from skin.runs.build import build_device
 
@@ -119,17 +119,6 @@ def test_a_confusion_matrix_shows_shares_of_each_true_class():
     assert texts == [["75.0%", "30"], ["25.0%", "10"], ["25.0%", "1"], ["75.0%", "3"]]
     figure = confusions({"x": np.array([[5, 5], [0, 0]])}, ("no", "yes"))
     assert figure.axes[0].texts[2].get_text() == "0.0%\n0"
-
-
-def test_static_touches_stand_on_their_own_and_slides_in_their_bin():
-    speeds = np.array([0, 0, 0.03, 0.09, 0.11, 0.20])
-    wrong, bins = np.array([True, False, False, True, True, True]), np.array([0.03, 0.10, 0.20])
-    fractions, errors = misclassified_fractions(speeds, wrong, bins)
-    assert errors == pytest.approx([0.5 / 2**0.5, 0.5 / 2**0.5, 0])
-    figure = misclassified({"row": (fractions, errors)}, "big", bins)
-    x, y = figure.axes[0].containers[0].lines[0].get_data()
-    assert x == pytest.approx([0, 65, 150])
-    assert y == pytest.approx([0.5, 0.5, 1.0])
 
 
 def test_a_trace_is_of_the_most_active_sensor():

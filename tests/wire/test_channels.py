@@ -56,14 +56,13 @@ def test_a_held_press_that_saturates_is_never_stuck(limits):
     assert health.states() == ("ok",) * 5
 
 
-def test_a_held_press_of_a_falling_channel_at_its_end_is_never_stuck():
-    """The decoder knows that 0 is the end of a channel whose values fall with force."""
-    frames = noisy(1500)
+@pytest.mark.parametrize(("low", "first"), [(0, 200), (None, 700)])
+def test_a_held_press_of_a_falling_channel_at_its_end_is_never_stuck(low, first):
+    frames, falling = noisy(1500), np.full(5, -1)
     frames[200:1400, 1] = 0
-    health = ChannelHealth((None, 1023))
-    rows = zip(frames.astype(float), frames == 0, strict=True)
-    masks = np.array([health.check(row, n * 0.01, end) for n, (row, end) in enumerate(rows)])
-    assert (masks[200:1400] == [OK, SATURATED, OK, OK, OK]).all()
+    health = ChannelHealth((low, 1023))
+    masks = [health.check(row, n * 0.01, None, falling) for n, row in enumerate(frames * 1.0)]
+    assert (np.array(masks[first:1400]) == [OK, SATURATED, OK, OK, OK]).all()
 
 
 def test_a_silence_makes_no_channel_stuck():
@@ -74,6 +73,14 @@ def test_a_silence_makes_no_channel_stuck():
     masks = check(health, np.where(np.arange(5) == 1, frames[-1], noisy(600)), 20.01)
     assert masks[-1, 1] == STUCK, "what stays is found after it"
     assert not masks[:, [0, 2, 3, 4]].any()
+
+
+@pytest.mark.parametrize(("polarity", "state"), [(1, SATURATED), (-1, STUCK)])
+def test_a_wire_that_breaks_to_the_end_without_force_is_stuck(polarity, state):
+    frames, health = noisy(1500), ChannelHealth((None, 1023))
+    frames[200:, 1] = 1023
+    masks = [health.check(row, n * 0.01, polarity=np.full(5, polarity)) for n, row in enumerate(frames * 1.0)]
+    assert masks[-1][1] == state
 
 
 @pytest.mark.parametrize("state", ["dead", "stuck"])
@@ -201,13 +208,13 @@ def test_frames_come_in_the_order_of_the_layout():
     assert plain.feed(b"".join(encode_line([1, 2, 3], n, 1000 * n) for n in range(4)))[0].polarity is None
 
 
-def test_both_ends_of_the_converter_saturate_a_channel_whose_values_fall():
+def test_the_other_end_of_the_converter_saturates_a_channel_whose_values_fall():
     rows = [[500 + n % 2, 500 + n % 2] for n in range(10)] + [[0, 0], [1023, 1023], [1, 1022]]
     data = encode_header(Header(n=2, bits=10))
     data += b"".join(encode_line(row, n, 1000 * n) for n, row in enumerate(rows))
     with opened(data, layout=2, polarity=[1, -1]) as skin:
         frames = skin.read(len(rows), timeout=20)
-    assert [(*frame.saturated,) for frame in frames[-3:]] == [(False, True), (True, True), (False, False)]
+    assert [(*frame.saturated,) for frame in frames[-3:]] == [(False, True), (True, False), (False, False)]
     assert all(frame.valid.all() for frame in frames)
 
 

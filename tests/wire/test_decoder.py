@@ -74,6 +74,12 @@ def test_bare_values_are_recognised(separator, sensors):
     assert (frames[0].seq, frames[0].t, frames[0].t_host) == (None, 5.0, 5.0)
 
 
+def test_a_clock_with_a_sign_goes_on_below_0():
+    signed = (2**31 - 28_500 + 1000 * np.arange(40)).astype(np.uint32).astype(np.int32)
+    frames = Decoder(4).feed(b"".join(b"%d,%d,1,2,3,4\n" % row for row in enumerate(signed)))
+    assert np.diff([frame.t for frame in frames]) == pytest.approx([0.001] * 38)
+
+
 def test_a_header_tells_the_number_of_sensors_at_the_third_line():
     header = Header(n=4, bits=10)
     decoder = Decoder()

@@ -91,7 +91,7 @@ def test_a_person_begins_skips_and_ends():
 def test_windows_one_after_the_other_or_that_wait_for_a_touch():
     gestures = shown(ContinuousSegmenter(window(0.1), first=5), frames(range(35)))
     assert [(gesture.number, gesture.frames[0].seq) for gesture in gestures] == [(5, 0), (6, 10), (7, 20)]
-    segmenter = ContinuousSegmenter(window(0.1), begins=lambda values: values[0] % 50 > 40)
+    segmenter = ContinuousSegmenter(window(0.1), begins=lambda frame: frame.values[0] % 50 > 40)
     gestures = shown(segmenter, frames(range(120)))
     assert [gesture.frames[0].seq for gesture in gestures] == [41, 91]
 

@@ -292,7 +292,11 @@ class Decoder:
         values, valid, over = raw.values, self._all_valid, None
         if not raw.finite:
             over = np.isinf(values)
-            limit = 2.0**header.bits - 1 if header and header.bits else self.adapter.limit
+            limit = (
+                2.0**header.bits - 1
+                if self.adapter.limit is None and header and header.bits
+                else self.adapter.limit
+            )
             values = np.where(over, np.nan if limit is None else limit, values)
             valid = np.isfinite(values)
             stats.invalid += len(valid) - int(np.count_nonzero(valid))

@@ -16,6 +16,7 @@ from skin.errors import InputError
 from skin.wire.adapter import Adapter, read_adapter
 from skin.wire.decoder import Decoder
 from skin.wire.proposal import propose
+from skin.wire.protocol import Header, encode_header
 from skin.wire.reader import Port, WireFeed
 from tests.damage import DAMAGED_FILES
 
@@ -391,9 +392,10 @@ def test_letters_that_only_a_press_shows_are_no_decimal_numbers():
     assert proposed([press if n % 20 == 7 else line for n, line in enumerate(lines)]).base == 16
 
 
-@pytest.mark.parametrize(("limit", "valid"), [(None, False), (1023.0, True)])
+@pytest.mark.parametrize(("limit", "valid"), [(None, False), (1023.0, True), (900.0, True)])
 def test_a_word_for_over_range_is_no_missing_value(limit, valid):
-    lines = b"".join(b"%d,%d\n" % (100 + n % 3, 120 + n % 2) for n in range(40)) + b"OL,121\n"
+    header = encode_header(Header(n=2, bits=10)) * (limit == 900)
+    lines = header + b"".join(b"%d,%d\n" % (100 + n % 3, 120 + n % 2) for n in range(40)) + b"OL,121\n"
     frame = Decoder(adapter=Adapter(kind="text", limit=limit)).feed(lines)[-1]
     assert frame.saturated.tolist() == [True, False]
     assert frame.valid.tolist() == [valid, True]

@@ -256,8 +256,10 @@ class FrameEstimate:
 
     def exceeds(self, pressure: float) -> float:
         """Return the probability that some fingertip's highest pressure is above a limit, Pa."""
-        below = [math.prod(1 - contact.exceeds(pressure) for contact in each) for each in self.given]
-        return float(self.probabilities @ (1 - np.array(below)))
+        return float(
+            self.probabilities
+            @ [1 - math.prod(1 - contact.exceeds(pressure) for contact in each) for each in self.given]
+        )
 
     def to_json(self, time: float, noise_fit: float = 1e-4) -> dict[str, Any]:
         """Return the estimate as JSON data, the fields of ``docs/export.md``.
@@ -268,8 +270,6 @@ class FrameEstimate:
         """
         none = self.number == 0 and self.fit >= noise_fit and self.large < 0.5
         known = self.fingertip or none
-        # The strongest of the fingertips that fit best: a reader must find where a hard touch is.
-        contacts = self.contacts if known else self.contacts[:1]
         return {
             "state": "no contact" if none else "contacts" if known else "not a fingertip",
             "reason": self.unknown or "",
@@ -281,7 +281,8 @@ class FrameEstimate:
             "number": self.number if known else None,
             "probability": round(float(self.probabilities[self.number]), 6) if known else None,
             "probabilities": self.probabilities.round(6).tolist() if known else None,
-            "contacts": [contact.to_json() for contact in contacts],
+            # The strongest of the fingertips that fit best: a reader must find where a hard touch is.
+            "contacts": [contact.to_json() for contact in self.contacts[: None if known else 1]],
         }
 
 
@@ -370,9 +371,9 @@ class Posterior:
         clips = values >= self.noise.clip if saturated is None else np.asarray(saturated, bool)
         # Of a channel along the surface, it is unknown at which of its two limits it is.
         bounded = (np.arange(sensors) % axes == axes - 1) & (self.noise.clip < math.inf)
-        works = True if valid is None else np.asarray(valid, bool)
         # Infinity is more than any limit.
-        return values, (np.isfinite(values) | clips & (values > 0)) & works & (~clips | bounded), clips
+        valued = (np.isfinite(values) | clips & (values > 0)) & (~clips | bounded)
+        return values, valued & (True if valid is None else np.asarray(valid, bool)), clips
 
     @_THREADS.wrap(limits=1, user_api="blas")
     def estimate_touch(
@@ -391,8 +392,9 @@ class Posterior:
         works, limited = np.logical_and.reduce(valued), np.logical_or.reduce(valued & clips)
         mean, frames = values.mean(0), self.noise.frames * len(values)
         clip = max(float(mean[works & limited].min(initial=self.noise.clip)), self.noise.frame)
-        noise = replace(self.noise, frames=frames, clip=clip)
-        return self._frame(Observation.of(mean, works, limited, noise))
+        return self._frame(
+            Observation.of(mean, works, limited, replace(self.noise, frames=frames, clip=clip))
+        )
 
     def _frame(self, frame: Observation) -> FrameEstimate:
         """Return the estimate of a frame, which depends on nothing else."""
@@ -404,9 +406,12 @@ class Posterior:
         evidence, mixtures = self._several(frame, single, maximum)
         logs = np.array(evidence) + self._numbers[: len(evidence)]
         number, total = int(logs.argmax()), float(logsumexp(logs))
-        nothing = frame.readings**2 @ frame.counts / frame.noise.floor
-        misfits = [nothing, single.misfit, *(mixture.misfit for mixture in mixtures)]
-        fit = float(gammaincc(max(frame.counts.sum(), 1) / 2, misfits[number] / 2))
+        misfit = [
+            frame.readings**2 @ frame.counts / frame.noise.floor,  # of no contact
+            single.misfit,
+            *(mixture.misfit for mixture in mixtures),
+        ][number]
+        fit = float(gammaincc(max(frame.counts.sum(), 1) / 2, misfit / 2))
         clouds = [[], [single], *map(self._search.clouds, mixtures)]
         if number > 1:
             clouds[number] = self._search.clouds(self._search.walk(frame, mixtures[number - 2]))
@@ -461,7 +466,10 @@ class Posterior:
         total = weight.sum(1)
         # Three radii of the variance of a box, which is up to a third of the range: the peak falls as r^2.
         radii = boxes[:, 2:] + widths[:, 2:] * np.sqrt(1 / 8) * np.array([-1, 0, 1])
-        peaks = (self.prior.peak(radii)[:, :, None] * force[:, None]).reshape(len(force), -1)
+        parts = _disc_parts(np.vstack([cloud.mode[:3], boxes]), self.candidates.size)
+        peaks = np.einsum("nr,nj->nrj", self.prior.peak(radii) / parts[1:, None], force).reshape(
+            len(force), -1
+        )
         thirds = np.tile(weight / 3, 3)
         middle = total @ boxes
         deviation = np.sqrt(total @ ((boxes - middle) ** 2 + widths**2 / 12))
@@ -478,13 +486,22 @@ class Posterior:
             np.sqrt(squares) if len(sideways) else None,
             float(middle[2]),
             float(deviation[2]),
-            float(self.prior.peak(cloud.mode[2]) * cloud.mode[3]),
+            float(self.prior.peak(cloud.mode[2]) * cloud.mode[3] / parts[0]),
             (low, high),
             boxes[:, :2],
             widths[:, :2],
             peaks,
             thirds,
         )
+
+
+def _disc_parts(discs: np.ndarray, size: np.ndarray) -> np.ndarray:
+    """Return how much of discs (N, 3), m, lies on the surface, which carries the whole force, (N,).
+
+    It is the product of what each edge leaves.
+    """
+    reach = np.clip(np.hstack([discs[:, :2], size - discs[:, :2]]) / discs[:, 2:], -1, 1)
+    return np.prod(0.5 + (reach * np.sqrt(1 - reach**2) + np.arcsin(reach)) / np.pi, axis=1)
 
 
 def _unknown(sensors: int, frame: Observation, prior: FingertipPrior, force: float) -> str | None:

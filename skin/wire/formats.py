@@ -63,7 +63,7 @@ class Roles:
         fields, finite = line.fields, line.finite
         seq = None if self.counter is None else fields[self.counter]
         # Microseconds in 32 bits with a sign fall below 0 after 36 minutes.
-        ticks = None if self.time is None else float(fields[self.time]) + 2.0**32 * (fields[self.time] < 0)
+        ticks = None if self.time is None else float(fields[self.time] + 2.0**32 * (fields[self.time] < 0))
         if (seq is not None and (not 0 <= seq < inf or seq % 1)) or (
             ticks is not None and not 0 <= ticks < inf
         ):

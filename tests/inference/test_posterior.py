@@ -6,7 +6,7 @@ from functools import cache, partial
 
 import numpy as np
 import pytest
-from scipy.special import log_ndtr
+from scipy.special import expit, log_ndtr
 from scipy.stats import kstest
 
 import skin
@@ -376,6 +376,21 @@ def test_a_limit_of_pressure_has_a_probability():
     nothing = posterior(True, Noise(1.0), FingertipPrior(force=10.0)).estimate(np.zeros(25))
     assert (nothing.number, nothing.contacts) == (0, ())
     assert nothing.given[1][0].exceeds(90e3) > nothing.exceeds(90e3) > 0.1
+
+
+def test_the_pressure_of_a_disc_that_the_edge_cuts_is_that_of_its_rest():
+    touches = draw(12, 23, margin=0.02)
+    touches[:, 0, 0] = np.linspace(0, 0.012, 12)
+    x, y = np.meshgrid(*2 * [np.arange(1e-4, 0.03, 2e-4)])
+    readings, ratios = measure(true_readings(touches), precise := Noise(0.001), 5), []
+    for (contact,), reading in zip(touches, readings, strict=True):
+        pressure = expit((contact[2] - np.hypot(x - contact[0], y - 0.015)) / FingertipPrior().rim)
+        true = contact[3] * pressure.max() / pressure.sum() / 2e-4**2
+        (found,) = posterior(noise=precise, prior=SINGLE, contacts=1).estimate(reading).contacts
+        ratios.append([found.peak / true, *np.array(found.peak_interval) / true])
+    peak, low, high = np.transpose(ratios)
+    assert np.median(peak) == pytest.approx(1, abs=0.1)
+    assert ((low < 1) & (high > 1)).sum() >= 9
 
 
 def test_a_number_that_is_improbable_is_passed_over():

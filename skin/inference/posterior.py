@@ -500,7 +500,7 @@ def _disc_parts(discs: np.ndarray, size: np.ndarray) -> np.ndarray:
 
     It is the product of what each edge leaves.
     """
-    reach = np.clip(np.hstack([discs[:, :2], size - discs[:, :2]]) / discs[:, 2:], -1, 1)
+    reach = np.clip(np.hstack([discs[:, :2], size - discs[:, :2]]) / discs[:, 2:], 0, 1)
     return np.prod(0.5 + (reach * np.sqrt(1 - reach**2) + np.arcsin(reach)) / np.pi, axis=1)
 
 

@@ -321,7 +321,7 @@ class ExpectedPosterior:
     ) -> np.ndarray:
         """Return how many of the forces raise no sensor, (N,), at places (N, 2), m, by a medium fingertip."""
         discs = np.column_stack([places, np.full(len(places), sum(self.radii) / 2)])
-        largest = disc_readings(simulator, body, discs, self.rim).max(axis=1)
+        largest = np.abs(disc_readings(simulator, body, discs, self.rim)).max(axis=1)
         return np.sum([~self._noise.exceeds(force * largest) for force in self.forces], axis=0)
 
     def _local_precision(self, responses: Sensitivity, force: float, body: AbstractBody) -> float:

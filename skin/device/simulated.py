@@ -282,8 +282,11 @@ class Simulated(ImperfectionSettings, AbstractDevice):
     described: Callable[[AbstractBody, Sensors], AbstractSimulator] | None = None
 
     def __post_init__(self) -> None:
-        if self.stream and self.direction:
-            raise InputError("data.direction=true needs whole gestures: leave out data.stream=true")
+        settings = read_touch(self.touch)
+        if self.direction and (self.stream or settings.ongoing):
+            raise InputError(
+                "data.direction=true needs whole gestures: leave out data.stream=true and touch.ongoing"
+            )
         if self.stream and relaxes(self.body):
             raise InputError(
                 "a skin that relaxes is simulated touch by touch from rest, where it stays, got "
@@ -293,7 +296,6 @@ class Simulated(ImperfectionSettings, AbstractDevice):
         self.true_sensors = misplace(
             self.sensors, self.size, self.position_error, self.seed, self.footprint_error
         )
-        settings = read_touch(self.touch)
         task = TOUCH_OR_NOT if self.stream else TOUCH_SLIDING if self.direction else TOUCH
         self.task = task.with_labels(tuple(settings.labels))
         self.window, self.model_rate = settings.frames.window, float(settings.rate)

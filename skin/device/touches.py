@@ -3,6 +3,7 @@
 import hashlib
 import math
 from collections.abc import Callable, Iterable, Sequence
+from copy import copy
 from dataclasses import dataclass, field, replace
 from math import nan
 from typing import Any
@@ -181,8 +182,10 @@ def concatenate(parts: Sequence[Recording]) -> Recording:
         present = [tensor for tensor in tensors if tensor is not None]
         return torch.cat(present) if present else None
 
-    names = ("readings", "valid", "labels", "motion", "saturated")
-    joined = {name: together(getattr(part.touches, name) for part in parts) for name in names}
+    joined = {
+        name: together(getattr(part.touches, name) for part in parts)
+        for name in ("readings", "valid", "labels", "motion", "saturated")
+    }
     contacts = join_contacts([part.touches.contacts for part in parts])
     return replace(
         first,
@@ -210,8 +213,7 @@ GROUP = "group_"
 
 def one_hot(numbers: Tensor, count: int) -> Tensor:
     """Return labels (B, L), 0 or 1, of L = ``count`` classes with numbers (B,); NaN where that is NaN."""
-    labels = numbers.nan_to_num().long()[:, None] == torch.arange(count)
-    return labels.float().where(~numbers.isnan()[:, None], nan)
+    return (numbers[:, None] == torch.arange(count)).float().where(~numbers.isnan()[:, None], nan)
 
 
 def touches_hash(touches: Touches) -> str:
@@ -271,8 +273,7 @@ class Timeline:
             float32, even if the window shows a part of it, all 0 without contact.
         """
         nearest = torch.searchsorted(self.end, starts, right=True)
-        last = torch.searchsorted(self.begin, starts + window)
-        maximum = max(1, int((last - nearest).amax()))
+        maximum = max(1, int((torch.searchsorted(self.begin, starts + window) - nearest).amax()))
         candidates = (nearest[:, None] + torch.arange(maximum)).clamp(max=len(self.begin) - 1)
         first = torch.maximum(self.begin[candidates], starts[:, None])
         beyond = torch.minimum(self.end[candidates], starts[:, None] + window)
@@ -299,6 +300,8 @@ def draw_timeline(
         generator: source of randomness.
         fewest: gestures drawn at a time.
     """
+    sampler = copy(sampler)
+    sampler.settings = replace(sampler.settings, ongoing=0.0)  # no window cuts the touches of a stream
     frames = sampler.settings.frames
     typical = (sum(frames.tap) + sum(frames.press)) / 4 + sum(gap) / 2
     movies: list[Movie] = []

@@ -137,6 +137,7 @@ class Relaxing(AbstractSimulator):
         at = speeds(self.lags)
         bodies = (make_elastic(body, speed) for speed in [*at, math.inf])
         self.models = nn.ModuleList(simulator(elastic, sensors) for elastic in bodies)
+        self.axes = self._relaxed.axes
         self._relaxed.linear(torch.zeros(body.shape))  # raises here instead of in the first batch
         terms = 1 / (1 + np.outer(at, self.lags))
         self.register_buffer("fractions", torch.from_numpy(np.linalg.inv(terms)))

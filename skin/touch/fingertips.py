@@ -214,6 +214,7 @@ class FingertipSampler(AbstractSampler):
         for attempt in range(1, self.settings.redraws + 1):
             movie = self._draw(wanted, generator, pending, attempt)
             right = (movie.labels[:, drawn].numpy() == wanted[pending][:, drawn]).all(axis=1)
+            right &= (movie.parameters["force"] <= self.settings.danger.human_force).numpy()
             movies.append(movie[torch.from_numpy(np.flatnonzero(right))])
             finished.append(pending[right])
             pending = pending[~right]

@@ -155,6 +155,7 @@ def test_the_summary_counts(plain):
         ({"touch": {"shapes": ["potato"]}}, r"no shape potato"),
         ({"touch": {"shear": 0.5}}, r"got simulator=naive: set simulator=solid, or touch.shear=0"),
         ({"direction": True, "stream": True}, r"leave out data.stream=true"),
+        ({"direction": True, "touch": {"ongoing": 0.4}}, r"and touch.ongoing"),
     ],
 )
 def test_bad_settings_are_refused(changes, message):

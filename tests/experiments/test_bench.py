@@ -8,7 +8,6 @@ from experiments.benchmarks import main, run_alone
 @pytest.mark.slow("measures the generation of data")
 def test_generation_and_operators_are_timed_with_an_empty_cache(tmp_path, monkeypatch):
     monkeypatch.setenv("SKIN_CACHE", str(tmp_path))
-    # A warm operator is there in a hundredth of that.
     assert run_alone("operator.fem", 1)["build_seconds"] > 0.02
     assert not list(tmp_path.iterdir())
     assert run_alone("generation.fem", 1)["gestures_per_second"] > 100

@@ -86,7 +86,6 @@ def test_nodes_move_as_sensors_on_them_do(constraint):
     pressure[1, 4, 1] = 90e3
     moved = deflection(body, pressure, constraint)
     assert moved.shape == (2, 2, 7, 9)
-    # the operator's way is the adjoint one: a solve per sensor, not per frame
     nodes = np.array([[0.05, 0.02, 0.005], [0.02, 0.05, 0.005], [0.06, 0.01, 0.005]])
     seen = build(Structure(body, constraint), Sensors(nodes, (0.01, 0.01)))
     loads = pressure.flatten(1).double().numpy().T

@@ -10,7 +10,7 @@ from skin.body.sheet import Sheet
 from skin.errors import InputError
 from skin.mechanics.contact.prescribed import Prescribed
 from skin.touch.fingertips import FingertipSampler, FingertipSettings
-from skin.touch.labels import Thresholds
+from skin.touch.labels import Limits, Thresholds
 from tests.touch.movie_labels import movie_labels
 
 LAYER = [{"material": "EcoFlex 00-30", "thickness": 0.005}]
@@ -29,7 +29,7 @@ def sampler(body=BODIES["sheet"], padded=True, **settings) -> FingertipSampler:
 @pytest.fixture(scope="module", params=BODIES)
 def sampled(request):
     """A sampler, its movie, the dense pressure and the contacts, whose absent ones are 0."""
-    source = sampler(BODIES[request.param])
+    source = sampler(BODIES[request.param], limits=Limits(90.5e3, tap_pressure=90.5e3, human_force=20.0))
     movie = source.sample(160, np.random.default_rng(3))
     return source, movie, movie.pressure().double(), movie.contacts.double().nan_to_num(0)
 
@@ -52,6 +52,7 @@ def test_the_pressure_is_that_of_the_contacts(sampled):
 def test_contacts_are_within_their_ranges(sampled):
     source, movie, _, _ = sampled
     settings = source.settings
+    assert movie.force.max() <= settings.danger.human_force
     contacts = movie.contacts.double()
     x, y, radius, force, peak = contacts[~contacts[..., 0].isnan()].unbind(-1)
     assert settings.radius[0] <= radius.min() * (1 + 1e-6)

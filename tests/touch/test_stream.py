@@ -25,7 +25,7 @@ def device(**changes) -> Simulated:
 @pytest.fixture(scope="module")
 def dense():
     """A strip of a perfect device with touches close together, and its dense movie (F, H, W)."""
-    strip = device(**PERFECT).simulate_stream(500, gap=[1, 25])
+    strip = device(**PERFECT, touch=GestureSettings(ongoing=0.5)).simulate_stream(500, gap=[1, 25])
     movie = strip.timeline.movie
     pressure, onset = movie.pressure(), movie.parameters["onset"].long()
     stream = torch.zeros(500, *BODY.shape)

@@ -41,7 +41,8 @@ def beam_stiffness(width: np.ndarray, height: np.ndarray, length: float, materia
         material: what the beams are made of.
 
     The second moments are the report's (equations 6 to 9): Iy = w h^3 / 12 bends the beam about its local y,
-    which moves it along x, and Ix = h w^3 / 12 bends it about its local z. On square cells they are equal.
+    which moves it along x, and Ix = h w^3 / 12 bends it about its local z. They are exchanged: bending along
+    x needs h w^3 / 12. On square cells they are equal but at the rim, where readings differ by up to 1 %.
     """
     second_y = width * height**3 / 12
     second_x = height * width**3 / 12

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from skin.runs.build import training_data as data
     from skin.wire.skin import open_skin as open_skin
 
-__version__ = "0.2.0"
+__version__ = "0.3.0"
 __all__ = ["Arm", "Grid", "InputError", "LayoutFile", "PlatesAndBeams", "Sheet", "Solid"]
 __all__ += ["FingertipPrior", "Noise", "Posterior", "data", "load_run", "open_skin", "read_recording"]
 __all__ += ["solve_contact", "surface_compliance"]

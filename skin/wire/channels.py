@@ -143,14 +143,15 @@ class ChannelHealth:
             end if limit is None else limit for limit, end in zip(self.limits, (-inf, inf), strict=True)
         )
         loaded = self._ever & (self._maximum - self._minimum >= self._far * self._smallest)
-        # The end of falling values without force is no bound of a force: a wire may be broken.
-        rising = np.ones(len(values), dtype=bool) if polarity is None else polarity > 0
+        # The end without force is no bound of a force, as of a broken wire; along the surface both ends are.
+        rising = np.ones(len(values), dtype=bool)
+        rising[self._judges] = True if polarity is None else polarity[self._judges] > 0
         saturated = (
             (rising & (values >= high))
             | (values <= low)
             | (inactive & loaded & np.where(rising, values >= self._maximum, values <= self._minimum))
+            | (False if limited is None else limited)
         )
-        saturated = saturated if limited is None else saturated | limited
         impossible = (values > self.largest) | (values < -self._below * self.largest)
         self.mask = np.where(
             impossible,

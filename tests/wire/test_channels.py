@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from skin.device.calibration import Calibration, read_calibration
-from skin.device.resampling import Window
+from skin.device.resampling import INWARDS, Window
 from skin.errors import InputError
 from skin.wire.channels import ChannelHealth, Reason, unit_conversion
 from skin.wire.decoder import Decoder
@@ -41,7 +41,6 @@ def test_a_value_at_a_limit_is_saturated():
 
 @pytest.mark.parametrize("limits", [(None, 900.0), (None, None)])
 def test_a_held_press_that_saturates_is_never_stuck(limits):
-    """The channel does not change for 12 s, with a limit that is known and one that is not."""
     frames = noisy(1500)
     frames[200:230, 1] += np.linspace(0, 390, 30).astype(int)
     frames[230:1430, 1] = 900
@@ -81,6 +80,9 @@ def test_a_wire_that_breaks_to_the_end_without_force_is_stuck(polarity, state):
     frames[200:, 1] = 1023
     masks = [health.check(row, n * 0.01, polarity=np.full(5, polarity)) for n, row in enumerate(frames * 1.0)]
     assert masks[-1][1] == state
+    three, ends = ChannelHealth((None, 1023), judges=INWARDS), np.full(3, 1023.0)
+    ends = three.check(ends, 0.0, polarity=np.full(3, polarity))
+    assert ends.tolist() == [SATURATED, SATURATED, SATURATED if polarity > 0 else OK]
 
 
 @pytest.mark.parametrize("state", ["dead", "stuck"])

@@ -57,7 +57,6 @@ def test_force_is_counted_from_the_first_quiet_second():
 
 
 def test_the_baseline_is_that_of_maxima_over_the_intervals_of_the_model():
-    """The window shows maxima, of which an untouched skin's must be 0."""
     watch, rows = watched(scale=1.0), noisy(400)
     shown = [one.newtons for row in frames(rows) if (one := watch.add(row)) is not None]
     highest = np.stack(shown)[: len(shown) // 10 * 10].reshape(-1, 10, 3).max(axis=1)
@@ -66,7 +65,6 @@ def test_the_baseline_is_that_of_maxima_over_the_intervals_of_the_model():
 
 @pytest.mark.parametrize("late", [0.0, 0.5, 5.0])
 def test_a_device_may_declare_its_unit_a_little_late(late):
-    """Many send their header every five seconds."""
     headers = []
     convert = lambda baseline, header: unit_conversion(3, baseline, None, None, header)  # noqa: E731
     watch = Tare(convert, 0.0, RATE, lambda: headers[0] if headers else None)

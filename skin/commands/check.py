@@ -29,11 +29,12 @@ def main(config: Config, weight: float | None, base: float | None, seconds: Anno
     from skin.wire.reader import SkinDisconnected, SkinTimeout
 
     device = require_port(build_device(config))
+    load = KnownLoad.of(weight, base, device.size)
     expected = firm_readings(
         build_skin(config).simulator(device.body, device.sensors),
         device.body,
         device.sensors,
-        load := KnownLoad.of(weight, base, device.size),
+        load,
         read_touch(config.touch).danger,
     )
     try:
@@ -47,7 +48,6 @@ def main(config: Config, weight: float | None, base: float | None, seconds: Anno
     except (SkinTimeout, SkinDisconnected) as error:
         raise InputError(f"{config.device['port']}: {error}") from error
     setup = describe_setup(device.wire, skin.header, conversion, device.sensors.positions, device.size)
-    date = datetime.now(UTC).isoformat(timespec="seconds")
     rest = conversion.zero if conversion.rest is None else conversion.raw(conversion.rest)
-    path = store_check(Check(setup, date, ratios, rest.tolist()))
+    path = store_check(Check(setup, datetime.now(UTC).isoformat(timespec="seconds"), ratios, rest.tolist()))
     print(f"{path}: the scale agrees, times {', '.join(f'{ratio:.3g}' for ratio in ratios.values())}")

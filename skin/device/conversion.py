@@ -6,7 +6,7 @@ reader=package.function``), never a file.
 """
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
@@ -91,7 +91,16 @@ def convert_files(
 def _read_touches(mapping: ForeignFormat, path: Path, folder: Path) -> list[_Touch]:
     """Return the touches of a file."""
     table = read_table(mapping, path, folder)
-    values = _readings(mapping, table, path)
+    labels, groups = mapping.labels or {}, mapping.groups
+    named = groups if isinstance(groups, Mapping) else {str(name): (name,) for name in groups}
+    sources = {
+        **{f"labels.{name}": rule.column for name, rule in labels.items() if rule.column is not None},
+        **({"classes": mapping.classes.column} if mapping.classes else {}),
+        **{f"groups.{name}": columns for name, columns in named.items()},
+    }
+    texts = {what: _joined(columns, table, path, what) for what, columns in sources.items()}
+    # A pattern of channels leaves out the columns of labels and groups.
+    values = _readings(mapping, table, path, pd.Series([*sources.values()], dtype=object).explode())
     rate, step = _rate(mapping, table, path)
     spans = np.arange(len(table))[:, None] + [0, 1]
     if step is not None:
@@ -105,14 +114,6 @@ def _read_touches(mapping: ForeignFormat, path: Path, folder: Path) -> list[_Tou
         name: TARGETS[name][its.unit] * parse_numbers(table, its.column, path, f"targets.{name}")
         for name, its in (mapping.targets or {}).items()
     }
-    labels, groups = mapping.labels or {}, mapping.groups
-    named = groups if isinstance(groups, Mapping) else {str(name): (name,) for name in groups}
-    sources = {
-        **{f"labels.{name}": rule.column for name, rule in labels.items() if rule.column is not None},
-        **({"classes": mapping.classes.column} if mapping.classes else {}),
-        **{f"groups.{name}": columns for name, columns in named.items()},
-    }
-    texts = {what: _joined(columns, table, path, what) for what, columns in sources.items()}
     touches = []
     for rows in _segments(mapping, values):
         frames = np.zeros((mapping.segments.frames, values.shape[1]), dtype=np.float32)
@@ -147,11 +148,13 @@ def _read_touches(mapping: ForeignFormat, path: Path, folder: Path) -> list[_Tou
     return touches
 
 
-def _readings(mapping: ForeignFormat, table: pd.DataFrame, path: Path) -> np.ndarray:
-    """Return the readings of a file, (R, S), float32, N."""
-    its, named = mapping.channels, {*re.compile(mapping.fields or "").groupindex, *(mapping.groups or ())}
+def _readings(
+    mapping: ForeignFormat, table: pd.DataFrame, path: Path, others: Iterable[Column]
+) -> np.ndarray:
+    """Return the readings of a file, (R, S), float32, N; a pattern leaves out fields and other columns."""
+    its, apart = mapping.channels, {*re.compile(mapping.fields or "").groupindex, *map(str, others)}
     names: Sequence[Column] = (
-        [name for name in table.columns if fnmatch(name, its.columns) and name not in named] or [its.columns]
+        [name for name in table.columns if fnmatch(name, its.columns) and name not in apart] or [its.columns]
         if isinstance(its.columns, str)
         else its.columns
     )
